@@ -1,0 +1,23 @@
+# Everything runs in .venv, which any target sets up first.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: fly test test-slow lint
+
+fly: .venv/installed  ## four Crazyflies on the paper's circle
+	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
+
+test: .venv/installed
+	$(BIN)/pytest -n 2 -m "not slow"
+
+test-slow: .venv/installed
+	$(BIN)/pytest -n 2 -m slow
+
+lint: .venv/installed
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet -c constraints.txt -e ".[dev]"
+	touch $@

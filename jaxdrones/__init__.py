@@ -1,0 +1,48 @@
+"""A vectorised, differentiable simulator of quadrotor teams."""
+
+from jaxdrones.backends.explicit import Effect, Pair, Step, make_step
+from jaxdrones.backends.rollout import rollout
+from jaxdrones.dynamics import (
+    downwash,
+    downwash_paper,
+    drag,
+    drag_world_axes,
+    euler,
+    ground_effect,
+    ground_effect_paper,
+    implicit_midpoint,
+    instant_rotors,
+    lagging_rotors,
+    rk4,
+    semi_implicit_euler,
+)
+from jaxdrones.params import Params, repeat, stack
+from jaxdrones.state import State
+from jaxdrones.urdf import load_params
+from jaxdrones.wrench import Wrench
+
+__all__ = [
+    "Effect",
+    "Pair",
+    "Params",
+    "State",
+    "Step",
+    "Wrench",
+    "downwash",
+    "downwash_paper",
+    "drag",
+    "drag_world_axes",
+    "euler",
+    "ground_effect",
+    "ground_effect_paper",
+    "implicit_midpoint",
+    "instant_rotors",
+    "lagging_rotors",
+    "load_params",
+    "make_step",
+    "repeat",
+    "rk4",
+    "rollout",
+    "semi_implicit_euler",
+    "stack",
+]

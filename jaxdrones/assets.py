@@ -1,0 +1,16 @@
+"""Where the bundled files are."""
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parent
+
+
+def folder() -> Path:
+    """The folder of bundled files: inside the wheel, or `assets/` of the checkout."""
+    bundled = _PACKAGE / "_assets"
+    return bundled if bundled.is_dir() else _PACKAGE.parent / "assets"
+
+
+def vehicles() -> dict[str, Path]:
+    """The bundled vehicles: name -> URDF."""
+    return {path.stem: path for path in sorted(folder().glob("*.urdf"))}

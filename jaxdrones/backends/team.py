@@ -1,0 +1,27 @@
+"""What every backend demands of a team."""
+
+from jaxdrones.checks import check_shape
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+_SHAPES = {
+    "inertia": (3,),
+    "rotor_pos": (4, 3),
+    "rotor_spin": (4,),
+    "wind": (3,),
+    "drag_coeff": (3,),
+    "downwash_coeff": (3,),
+}
+_STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
+
+
+def check_team(params: Params, state: State, rpm) -> None:
+    """Raise `ValueError` unless the arrays are those of one team of n drones."""
+    check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
+    n = len(state.pos)
+    for name, width in _STATE.items():
+        check_shape(f"state.{name}", getattr(state, name), (n, width), f"state.pos has {n} drones")
+    for name, leaf in vars(params).items():
+        hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
+        check_shape(f"params.{name}", leaf, (n, *_SHAPES.get(name, ())), hint)
+    check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")

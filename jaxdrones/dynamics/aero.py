@@ -1,0 +1,63 @@
+"""Aerodynamic effects on one drone: drag (paper, equation 4) and ground effect (equation 5).
+
+`drag` and `ground_effect` are the smooth, physical ones; `drag_world_axes` and `ground_effect_paper`
+compute what the paper's simulator does, for its figures and its recorded data.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.dynamics.rotors import thrust
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.wrench import Wrench
+
+_RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
+_FLOOR = 1.63  # propeller radii; height below which ground effect levels off: the paper's clip for the Crazyflie
+
+
+def drag(params: Params, state: State) -> Wrench:
+    """Rotor drag on the air-relative velocity: -k_D sum(rotor speed) v, coefficients along the body axes."""
+    air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
+    return Wrench.of_force(-params.drag_coeff * _summed_rotor_speed(state) * air_velocity)
+
+
+def drag_world_axes(params: Params, state: State) -> Wrench:
+    """Rotor drag as the reference computes it, with the coefficients along the world axes."""
+    force = -params.drag_coeff * _summed_rotor_speed(state) * (state.vel - params.wind)
+    return Wrench.of_force(rotation.rotate_inverse(state.quat, force))
+
+
+def ground_effect(params: Params, state: State) -> Wrench:
+    """Extra thrust near the ground, smooth and bounded.
+
+    Each rotor gains k_G (r_P / 4)^2 / sqrt(h^4 + h_0^4) of its thrust: equation 5 far above
+    h_0 = 1.63 propeller radii, level below. The gain fades with the squared cosine of the tilt and is zero upside down.
+    """
+    height = _rotor_heights(params, state)
+    floor = _FLOOR * params.prop_radius
+    gain = params.ground_effect_coeff * (params.prop_radius / 4) ** 2 / jnp.sqrt(height**4 + floor**4)
+    upright = jnp.maximum(rotation.z_axis(state.quat)[2], 0) ** 2
+    return Wrench.of_thrusts(params.rotor_pos, upright * gain * thrust(params, state))
+
+
+def ground_effect_paper(params: Params, state: State) -> Wrench:
+    """Equation 5 with the reference's clip of the height and its gate at 90 degrees of roll or pitch."""
+    clip = params.prop_radius / 4 * jnp.sqrt(15 / 4 * params.ground_effect_coeff)
+    height = jnp.maximum(_rotor_heights(params, state), clip)
+    gain = params.ground_effect_coeff * (params.prop_radius / (4 * height)) ** 2
+    roll, pitch, _ = rotation.to_rpy(state.quat)
+    upright = (jnp.abs(roll) < jnp.pi / 2) & (jnp.abs(pitch) < jnp.pi / 2)
+    return Wrench.of_thrusts(params.rotor_pos, jnp.where(upright, gain * thrust(params, state), 0))
+
+
+def _summed_rotor_speed(state: State) -> Float[Array, ""]:
+    """rad/s."""
+    return _RADIANS_PER_SECOND * jnp.sum(state.rpm)
+
+
+def _rotor_heights(params: Params, state: State) -> Float[Array, "4"]:
+    """World z of each rotor, m."""
+    up = rotation.to_matrix(state.quat)[2]
+    return state.pos[2] + jnp.sum(params.rotor_pos * up[None], axis=-1)

@@ -1,0 +1,22 @@
+"""Newton-Euler: wrench -> accelerations."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.wrench import Wrench
+
+
+def newton_euler(params: Params, state: State, wrench: Wrench) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Linear acceleration (m/s^2, world) and angular acceleration (rad/s^2, body); paper, equations 2 and 3."""
+    gravity = jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
+    acc = rotation.rotate(state.quat, wrench.force) / params.mass - gravity
+    gyroscopic = rotation.cross(state.omega, params.inertia * state.omega)
+    return acc, (wrench.torque - gyroscopic) / params.inertia
+
+
+def quat_rate(state: State) -> Float[Array, "4"]:
+    """q' = q (omega, 0) / 2."""
+    return rotation.multiply(state.quat, jnp.append(state.omega / 2, 0.0))

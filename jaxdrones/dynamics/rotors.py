@@ -1,0 +1,36 @@
+"""Rotors: how their speed follows the command, and the wrench they produce (paper, equations 1 to 3)."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.wrench import Wrench
+
+
+def instant_rotors(
+    params: Params, rpm: Float[Array, "4"], command: Float[Array, "4"]
+) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
+    """The paper's rotors: the command (RPM) acts at once. Returns the speed and its rate, RPM and RPM/s."""
+    return command, jnp.zeros_like(command)
+
+
+def lagging_rotors(
+    params: Params, rpm: Float[Array, "4"], command: Float[Array, "4"]
+) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
+    """First-order lag with separate rise and fall times. Returns the speed and its rate, RPM and RPM/s."""
+    error = command - rpm
+    tau = jnp.where(error > 0, params.rotor_rise_time, params.rotor_fall_time)
+    return rpm, error / tau
+
+
+def thrust(params: Params, state: State) -> Float[Array, "4"]:
+    """Thrust of each rotor, N along body z: F_i = k_F P_i^2."""
+    return params.kf * state.rpm**2
+
+
+def rotor_wrench(params: Params, state: State) -> Wrench:
+    """Thrusts at the rotors and reaction torques about body z: T = sum of spin_i k_T P_i^2."""
+    wrench = Wrench.of_thrusts(params.rotor_pos, thrust(params, state))
+    yaw_torque = params.km * jnp.sum(params.rotor_spin * state.rpm**2)
+    return wrench.replace(torque=wrench.torque.at[2].add(yaw_torque))

@@ -1,0 +1,115 @@
+"""What does not change in flight: the constants of a vehicle and of the air around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdrones.checks import check_shape, check_whole
+
+
+class Params(flax.struct.PyTreeNode):
+    """Constants of one drone, or of a team with a leading drone axis on every array.
+
+    Surroundings that somebody else drives (wind, air density) are here too and may be set anew each step.
+    """
+
+    mass: Array
+    """() kg."""
+    inertia: Array
+    """(3,) principal moments about the body axes, kg m^2."""
+    rotor_pos: Array
+    """(4, 3) rotor positions, m, body."""
+    rotor_spin: Array
+    """(4,) +1 or -1: sign of the reaction torque on the body about its z axis."""
+    kf: Array
+    """() thrust coefficient, N/RPM^2."""
+    km: Array
+    """() torque coefficient, N m/RPM^2."""
+    max_rpm: Array
+    """() highest rotor speed, RPM; does not follow the mass."""
+    rotor_rise_time: Array
+    """() time constant of a lagging rotor that speeds up, s."""
+    rotor_fall_time: Array
+    """() time constant of a lagging rotor that slows down, s."""
+    gravity: Array
+    """() acceleration towards -z, m/s^2."""
+    air_density: Array
+    """() kg/m^3."""
+    wind: Array
+    """(3,) velocity of the air, m/s, world."""
+    drag_coeff: Array
+    """(3,) rotor drag per axis, N per m/s of air speed and rad/s of summed rotor speed."""
+    ground_effect_coeff: Array
+    """() k_G of the paper's equation 5."""
+    downwash_coeff: Array
+    """(3,) k_D1 (N), k_D2, k_D3 (m) of the paper's equation 6."""
+    inflow_loss: Array
+    """() share of a rotor's thrust lost per m/s of downwash through it, s/m."""
+    prop_radius: Array
+    """() m."""
+    max_speed: Array
+    """() m/s."""
+    collision_radius: Array
+    """() radius of the collision cylinder, m."""
+    collision_height: Array
+    """() height of the collision cylinder, m."""
+    collision_offset: Array
+    """() height of the cylinder's centre above the centre of mass, m."""
+
+    @property
+    def weight(self) -> Array:
+        """() m g, N."""
+        return self.mass * self.gravity
+
+    @property
+    def arm(self) -> Array:
+        """() mean horizontal distance of a rotor from the centre of mass, m."""
+        return jnp.mean(jnp.sqrt(jnp.sum(self.rotor_pos[..., :2] ** 2, axis=-1)), axis=-1)
+
+    @property
+    def hover_rpm(self) -> Array:
+        """() rotor speed at which four rotors carry the weight, RPM."""
+        return jnp.sqrt(self.weight / (4 * self.kf))
+
+    @property
+    def max_thrust(self) -> Array:
+        """() of the four rotors together, N."""
+        return 4 * self.kf * self.max_rpm**2
+
+    @property
+    def max_xy_torque(self) -> Array:
+        """() largest roll torque: the rotors on one side at full speed, the others at rest, N m."""
+        return self.kf * self.max_rpm**2 * jnp.sum(jnp.abs(self.rotor_pos[..., 1]), axis=-1) / 2
+
+    @property
+    def max_z_torque(self) -> Array:
+        """() largest yaw torque: two rotors at full speed, the others at rest, N m."""
+        return 2 * self.km * self.max_rpm**2
+
+
+def stack(team: Sequence[Params]) -> Params:
+    """A team of any vehicles: every array gains a leading drone axis.
+
+    Raises:
+        ValueError: an empty sequence, or a member that is already a team.
+    """
+    check_whole("number of drones", len(team))
+    for i, params in enumerate(team):
+        check_shape(f"mass of drone {i}", params.mass, (), "stack takes the parameters of single drones")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *team)
+
+
+def repeat(params: Params, n: int) -> Params:
+    """A team of `n` equal drones.
+
+    Raises:
+        ValueError: `n` < 1, or `params` is already a team.
+    """
+    check_whole("number of drones", n)
+    check_shape("mass", params.mass, (), "repeat takes the parameters of a single drone")
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), params)

@@ -1,0 +1,120 @@
+"""Unit quaternions (x, y, z, w), body to world, and the vector algebra that goes with them.
+
+Every function is about one rotation, never a batch: use `jax.vmap` for more. All are differentiable
+everywhere they are defined, also at zero rotation.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_EXP_TERMS = 9
+
+
+def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Vector product a x b."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Hamilton product p q: first the rotation q, then p."""
+    u, v = p[:3], q[:3]
+    vector = p[3] * v + q[3] * u + cross(u, v)
+    return jnp.append(vector, p[3] * q[3] - jnp.sum(u * v))
+
+
+def conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The inverse rotation of a unit quaternion."""
+    return jnp.append(-q[:3], q[3])
+
+
+def rotate(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
+    """R v: a vector from the body frame to the world frame."""
+    u, w = q[:3], q[3]
+    t = 2 * cross(u, v)
+    return v + w * t + cross(u, t)
+
+
+def rotate_inverse(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
+    """R^T v: a vector from the world frame to the body frame."""
+    return rotate(conjugate(q), v)
+
+
+def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
+    """R e_z: the body z axis (thrust axis) in the world frame."""
+    x, y, z, w = q
+    return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+
+
+def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The unit quaternion along q (not zero)."""
+    return q / jnp.sqrt(jnp.sum(q * q))
+
+
+def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
+    """The rotation by |v| rad about v.
+
+    A Taylor series in the squared half angle: no square root and no division, so it is as smooth at
+    zero as elsewhere, and faster than `sin` and `cos`. Exact to float64 up to 2 rad, to 1e-7 up to a
+    full turn; integrators stay far below (2 rad per 240 Hz step is 480 rad/s).
+    """
+    s = jnp.sum(v * v) / 4
+    cos, sinc = 1.0, 1.0
+    for k in range(2 * _EXP_TERMS, 0, -2):  # Horner's scheme from the highest term
+        cos = 1 - s / ((k - 1) * k) * cos
+        sinc = 1 - s / (k * (k + 1)) * sinc
+    return jnp.append(v * (sinc / 2), cos)
+
+
+def to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """The rotation matrix R."""
+    x, y, z, w = q
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def from_rpy(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
+    """The quaternion of roll, pitch, yaw (rad) about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    cr, cp, cy = jnp.cos(rpy / 2)
+    sr, sp, sy = jnp.sin(rpy / 2)
+    return jnp.stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def to_rpy(q: Float[Array, "4"]) -> Float[Array, "3"]:
+    """Roll, pitch, yaw (rad) about fixed axes, as Bullet extracts them.
+
+    Within 0.26 degrees of pitch +-90 degrees (|sin| >= 0.99999) roll is set to zero and yaw takes it up.
+    """
+    x, y, z, w = q
+    sin_pitch = 2 * (w * y - x * z)
+    up, down = sin_pitch >= 0.99999, sin_pitch <= -0.99999
+    regular = ~(up | down)
+    roll = _atan2(2 * (y * z + w * x), w * w - x * x - y * y + z * z, regular)
+    pitch = jnp.arcsin(jnp.where(regular, sin_pitch, 0))
+    yaw = _atan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z, regular)
+    yaw_up, yaw_down = 2 * _atan2(-x, y, up), 2 * _atan2(x, -y, down)
+    return jnp.stack(
+        [
+            roll,
+            jnp.where(up, jnp.pi / 2, jnp.where(down, -jnp.pi / 2, pitch)),
+            jnp.where(up, yaw_up, jnp.where(down, yaw_down, yaw)),
+        ]
+    )
+
+
+def _atan2(y, x, where):
+    """atan2 where it is used, else zero with a zero gradient."""
+    return jnp.where(where, jnp.arctan2(jnp.where(where, y, 0), jnp.where(where, x, 1)), 0)

@@ -1,0 +1,46 @@
+"""What changes in flight."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_finite, check_shape
+
+
+class State(flax.struct.PyTreeNode):
+    """Rigid body and rotors of one drone, or of a team with a leading drone axis on every array."""
+
+    pos: Array
+    """(3,) position of the centre of mass, m, world."""
+    quat: Array
+    """(4,) attitude, unit quaternion (x, y, z, w), body to world; the sign is free."""
+    vel: Array
+    """(3,) velocity, m/s, world."""
+    omega: Array
+    """(3,) angular velocity, rad/s, body."""
+    rpm: Array
+    """(4,) rotor speeds, revolutions per minute."""
+
+    @classmethod
+    def at_rest(cls, pos: Float[Array, "n 3"], yaw: Float[Array, " n"] | None = None) -> State:
+        """A level team at rest with its rotors standing still.
+
+        Args:
+            pos: (n, 3) positions, m, world.
+            yaw: (n,) headings, rad; zero when left out.
+
+        Raises:
+            ValueError: a wrong shape, no drone, or a number that is not finite.
+        """
+        pos = jnp.asarray(pos, float)
+        check_shape("pos", pos, ("n", 3), "one row (x, y, z) per drone")
+        n = len(pos)
+        yaw = jnp.zeros(n) if yaw is None else jnp.asarray(yaw, float)
+        check_shape("yaw", yaw, (n,), "one heading per drone")
+        check_finite("pos", pos)
+        check_finite("yaw", yaw)
+        zero = jnp.zeros_like(yaw)
+        quat = jnp.stack([zero, zero, jnp.sin(yaw / 2), jnp.cos(yaw / 2)], axis=-1)
+        return cls(pos, quat, jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 4)))

@@ -1,0 +1,18 @@
+"""Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
+
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".jax_cache"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+@pytest.fixture(autouse=True)
+def precision(request):
+    with jax.enable_x64(request.node.get_closest_marker("float32") is None):
+        yield

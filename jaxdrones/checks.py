@@ -27,8 +27,8 @@ def check_finite(name: str, tree) -> None:
 
 
 def check_positive(name: str, value: float, unit: str) -> None:
-    """Raise unless a concrete number is positive and finite."""
-    if not (np.isfinite(value) and value > 0):
+    """Raise unless a number is positive and finite; a traced one cannot be looked at."""
+    if not isinstance(value, jax.core.Tracer) and not (np.isfinite(value) and value > 0):
         raise ValueError(f"{name} is {value}; give a positive number ({unit})")
 
 

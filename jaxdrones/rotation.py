@@ -7,6 +7,8 @@ everywhere they are defined, also at zero rotation.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.numerics import safe_sqrt
+
 _EXP_TERMS = 9
 
 
@@ -15,6 +17,12 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     ax, ay, az = a
     bx, by, bz = b
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def unit(v: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The direction of v; zero, with a zero gradient, where v is zero."""
+    length = safe_sqrt(jnp.sum(v * v))
+    return v / jnp.where(length > 0, length, 1)
 
 
 def multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -77,6 +85,16 @@ def to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
             jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
         ]
     )
+
+
+def from_matrix(r: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """The quaternion of a rotation matrix, by Shepperd's method: divides by the largest component."""
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    diagonal = jnp.append(2 * jnp.diagonal(r) - trace, trace)  # 4 q_i^2 - 1
+    skew = jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])  # 4 w (x, y, z)
+    products = jnp.zeros((4, 4), r.dtype).at[:3, :3].set(r + r.T).at[3, :3].set(skew).at[:3, 3].set(skew)
+    products = products.at[jnp.diag_indices(4)].set(1 + diagonal)  # 4 q_i q_j
+    return normalize(products[jnp.argmax(diagonal)])
 
 
 def from_rpy(rpy: Float[Array, "3"]) -> Float[Array, "4"]:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 
-from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.backends.team import check_team
+from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, rotor_wrench, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
 from jaxdrones.params import Params

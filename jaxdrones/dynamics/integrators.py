@@ -53,9 +53,10 @@ def rk4(derivative: Derivative, state: State, dt: float) -> State:
 
 
 def implicit_midpoint(derivative: Derivative, state: State, dt: float) -> State:
-    """x + dt f((x + x')/2), order 2: keeps the energy of a tumbling body, which is quadratic in its rates.
+    """The implicit midpoint rule x + dt f((x + x')/2), order 2.
 
-    Solved by eight fixed-point iterations; each shrinks the error by a factor of about |omega| dt / 2.
+    It keeps what is quadratic in the state, so a tumbling body neither gains nor loses energy. Solved by eight
+    fixed-point iterations; each shrinks the error by a factor of about |omega| dt / 2.
     """
 
     def iterate(rate: State, _: None) -> tuple[State, None]:
@@ -74,6 +75,6 @@ def _normalized(state: State) -> State:
 
 
 def _turn(quat: Float[Array, "4"], rotation_vector: Float[Array, "3"]) -> Float[Array, "4"]:
-    """q exp(v), kept at unit length by one Newton step, which needs neither root nor division."""
+    """The attitude after a turn, q exp(v), kept at unit length by a Newton step: neither root nor division."""
     quat = rotation.multiply(quat, rotation.exp(rotation_vector))
     return quat * (1.5 - 0.5 * jnp.sum(quat * quat))

@@ -18,5 +18,5 @@ def newton_euler(params: Params, state: State, wrench: Wrench) -> tuple[Float[Ar
 
 
 def quat_rate(state: State) -> Float[Array, "4"]:
-    """q' = q (omega, 0) / 2."""
+    """Rate of the attitude, q' = q (omega, 0) / 2."""
     return rotation.multiply(state.quat, jnp.append(state.omega / 2, 0.0))

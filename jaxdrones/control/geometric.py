@@ -1,0 +1,80 @@
+"""Geometric tracking on SE(3) (Lee, Leok, McClamroch 2010; the attitude target after Mellinger and Kumar 2011)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_positive, check_shape
+from jaxdrones.control import attitude
+from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+
+class Gains(flax.struct.PyTreeNode):
+    """Gains per unit of mass and inertia, so that one set serves every vehicle."""
+
+    pos: Array
+    """(3,) 1/s^2."""
+    vel: Array
+    """(3,) 1/s."""
+    attitude: Array
+    """(3,) 1/s^2."""
+    rate: Array
+    """(3,) 1/s."""
+
+
+def gains() -> Gains:
+    """Position at 2.5 rad/s, tilt at 20 rad/s, yaw at 10 rad/s, damping 0.7 to 0.8: for rotors that do not lag."""
+    return Gains(
+        pos=jnp.array([6.25, 6.25, 6.25]),
+        vel=jnp.array([4.0, 4.0, 4.0]),
+        attitude=jnp.array([400.0, 400.0, 100.0]),
+        rate=jnp.array([28.0, 28.0, 14.0]),
+    )
+
+
+def control(
+    gains: Gains, params: Params, memory: Any, state: State, setpoint: Setpoint, *, dt: float
+) -> tuple[Any, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM, up to `max_rpm`.
+
+    f = m (a_d - k_x e_x - k_v e_v + g e_z), thrust f . R e_z, and
+    tau = -J (k_R e_R + k_w e_w) + w x J w - J (w x R^T R_d w_d), with e_w = w - R^T R_d w_d.
+
+    Args:
+        gains: of the two loops.
+        params: of the drone.
+        memory: none is kept; handed through.
+        state: of the drone.
+        setpoint: pos, vel, acc, yaw, omega; all are used.
+        dt: time between calls, s; only checked.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+    """
+    check_positive("dt", dt, "s")
+    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
+    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+
+    acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
+    acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
+    r = rotation.to_matrix(state.quat)
+    target = attitude.from_thrust(acc, setpoint.yaw)
+
+    thrust = params.mass * jnp.sum(acc * r[:, 2])
+    omega_target = r.T @ (target @ setpoint.omega)
+    omega_rate = (
+        -gains.attitude * attitude.error(r, target)
+        - gains.rate * (state.omega - omega_target)
+        - rotation.cross(state.omega, omega_target)
+    )
+    torque = params.inertia * omega_rate + rotation.cross(state.omega, params.inertia * state.omega)
+    rpm = rpm_from_wrench(params, jnp.maximum(thrust, 0), torque)
+    return memory, jnp.minimum(rpm, params.max_rpm)

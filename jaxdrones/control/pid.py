@@ -1,0 +1,136 @@
+"""The paper's PID for Crazyflies: position loop, attitude loop, PWM mixer.
+
+After the controller of the University of Toronto's Dynamic Systems Lab. Torques and thrust are in units of the
+Crazyflie's 16-bit PWM, whatever the vehicle.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_choice, check_positive, check_shape, check_whole
+from jaxdrones.control import attitude
+from jaxdrones.control.allocation import mixer
+from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.numerics import safe_sqrt
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+VEHICLES = ("cf2x", "cf2p")
+
+_PWM_TO_RPM = 0.2685  # RPM per PWM unit
+_PWM_OFFSET = 4070.3  # RPM
+_PWM_RANGE = (20000.0, 65535.0)
+_MAX_TORQUE = 3200.0  # PWM
+_MAX_POS_INTEGRAL = (2.0, 2.0, 0.15)  # m s
+_MAX_RPY_INTEGRAL = (1.0, 1.0, 1500.0)  # rad s
+
+
+class Gains(flax.struct.PyTreeNode):
+    """Gains of the two loops."""
+
+    pos_p: Array
+    """(3,) N/m."""
+    pos_i: Array
+    """(3,) N/(m s)."""
+    pos_d: Array
+    """(3,) N s/m."""
+    rpy_p: Array
+    """(3,) PWM/rad."""
+    rpy_i: Array
+    """(3,) PWM/(rad s)."""
+    rpy_d: Array
+    """(3,) PWM s/rad."""
+
+
+class Memory(flax.struct.PyTreeNode):
+    """What the controller of one drone keeps between calls; a fresh one is zero."""
+
+    pos_integral: Array
+    """(3,) integrated position error, m s."""
+    rpy_integral: Array
+    """(3,) integrated attitude error, rad s."""
+    rpy: Array
+    """(3,) roll, pitch, yaw at the last call, rad."""
+
+
+def gains(vehicle: str = "cf2x") -> Gains:
+    """The paper's gains for `cf2x` and `cf2p`.
+
+    Raises:
+        ValueError: another vehicle; the gains fit a Crazyflie's mass, inertia and PWM.
+    """
+    check_choice("vehicle with PID gains", vehicle, VEHICLES)
+    return Gains(
+        pos_p=jnp.array([0.4, 0.4, 1.25]),
+        pos_i=jnp.array([0.05, 0.05, 0.05]),
+        pos_d=jnp.array([0.2, 0.2, 0.5]),
+        rpy_p=jnp.array([70000.0, 70000.0, 60000.0]),
+        rpy_i=jnp.array([0.0, 0.0, 500.0]),
+        rpy_d=jnp.array([20000.0, 20000.0, 12000.0]),
+    )
+
+
+def init(n: int) -> Memory:
+    """Fresh memory for a team of n drones."""
+    check_whole("number of drones", n)
+    return Memory(jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 3)))
+
+
+def control(
+    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
+) -> tuple[Memory, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM, between 9,440 and 21,666.
+
+    Args:
+        gains: of the two loops.
+        params: of the drone.
+        memory: of the last call.
+        state: of the drone.
+        setpoint: pos, vel, yaw, and omega, which is taken for Euler rates; acc is not used.
+        dt: time between calls, s.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+    """
+    check_positive("dt", dt, "s")
+    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
+    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+    memory, thrust, target = position_loop(gains, params, memory, state, setpoint, dt)
+    memory, torque = attitude_loop(gains, memory, state, target, setpoint.omega, dt)
+    pwm = jnp.clip(thrust + mixer(params) @ torque, *_PWM_RANGE)
+    return memory, _PWM_TO_RPM * pwm + _PWM_OFFSET
+
+
+def position_loop(
+    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, dt: float
+) -> tuple[Memory, Float[Array, ""], Float[Array, "3 3"]]:
+    """Thrust per rotor (PWM, not clipped) and the attitude that points it where the position error asks."""
+    error = setpoint.pos - state.pos
+    limit = jnp.array(_MAX_POS_INTEGRAL)
+    integral = jnp.clip(memory.pos_integral + error * dt, -limit, limit)
+    force = gains.pos_p * error + gains.pos_i * integral + gains.pos_d * (setpoint.vel - state.vel)
+    force = force + jnp.stack([jnp.zeros_like(params.mass), jnp.zeros_like(params.mass), params.weight])
+    thrust = jnp.maximum(jnp.sum(force * rotation.z_axis(state.quat)), 0)
+    pwm = (safe_sqrt(thrust / (4 * params.kf)) - _PWM_OFFSET) / _PWM_TO_RPM
+    return memory.replace(pos_integral=integral), pwm, attitude.from_thrust(force, setpoint.yaw)
+
+
+def attitude_loop(
+    gains: Gains, memory: Memory, state: State, target: Float[Array, "3 3"], rpy_rate: Float[Array, "3"], dt: float
+) -> tuple[Memory, Float[Array, "3"]]:
+    """Torque (PWM) towards the attitude `target`.
+
+    The rate is a difference of roll, pitch, yaw that is not unwrapped, as in the reference: it kicks where yaw
+    crosses +-180 degrees.
+    """
+    rpy = rotation.to_rpy(state.quat)
+    error = 2 * attitude.error(rotation.to_matrix(state.quat), target)
+    rate_error = rpy_rate - (rpy - memory.rpy) / dt
+    limit = jnp.array(_MAX_RPY_INTEGRAL)
+    integral = jnp.clip(memory.rpy_integral - error * dt, -limit, limit)
+    torque = -gains.rpy_p * error + gains.rpy_d * rate_error + gains.rpy_i * integral
+    return memory.replace(rpy_integral=integral, rpy=rpy), jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE)

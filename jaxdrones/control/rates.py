@@ -1,0 +1,89 @@
+"""Collective thrust and body rates: an outer loop that commands them and an inner loop that follows them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_positive, check_shape
+from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+
+class Gains(flax.struct.PyTreeNode):
+    """Gains of the outer loop (the reference's, for its racer) and of the inner one."""
+
+    pos: Array
+    """(3,) 1/s^2."""
+    vel: Array
+    """(3,) 1/s."""
+    attitude: Array
+    """(3,) rad/s per half radian of error."""
+    rate: Array
+    """(3,) 1/s."""
+
+
+def gains() -> Gains:
+    """The reference's outer loop; an inner loop of 40 rad/s in roll and pitch and 15 rad/s in yaw."""
+    return Gains(
+        pos=jnp.array([3.0, 3.0, 8.0]),
+        vel=jnp.array([2.5, 2.5, 5.0]),
+        attitude=jnp.array([5.0, 5.0, 1.0]),
+        rate=jnp.array([40.0, 40.0, 15.0]),
+    )
+
+
+def control(
+    gains: Gains, params: Params, memory: Any, state: State, setpoint: Setpoint, *, dt: float
+) -> tuple[Any, Float[Array, "4"]]:
+    """Both loops: rotor speeds of one drone, RPM, up to `max_rpm`.
+
+    Args:
+        gains: of both loops.
+        params: of the drone.
+        memory: none is kept; handed through.
+        state: of the drone.
+        setpoint: pos, vel, acc and yaw; omega is not used.
+        dt: time between calls, s; only checked.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+    """
+    check_positive("dt", dt, "s")
+    collective, omega = command(gains, params, state, setpoint)
+    return memory, follow(gains, params, state, collective, omega)
+
+
+def command(
+    gains: Gains, params: Params, state: State, setpoint: Setpoint
+) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    """Outer loop: collective thrust per mass (m/s^2, body z) and body rates (rad/s) towards a setpoint."""
+    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
+    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+    acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
+    acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
+    collective = jnp.sum(acc * rotation.z_axis(state.quat))
+
+    left = jnp.stack([-jnp.sin(setpoint.yaw), jnp.cos(setpoint.yaw), jnp.zeros_like(setpoint.yaw)])
+    z = rotation.unit(acc)
+    x = rotation.unit(rotation.cross(left, z))
+    target = rotation.from_matrix(jnp.stack([x, rotation.cross(z, x), z], axis=-1))
+    error = rotation.multiply(rotation.conjugate(state.quat), target)
+    return collective, 2 * gains.attitude * error[:3] * jnp.where(error[3] < 0, -1, 1)
+
+
+def follow(
+    gains: Gains, params: Params, state: State, collective: Float[Array, ""], omega: Float[Array, "3"]
+) -> Float[Array, "4"]:
+    """Inner loop: rotor speeds (RPM, up to `max_rpm`) for a collective thrust per mass and body rates."""
+    check_shape("omega", omega, (3,), "body rates of one drone; use jax.vmap for a team")
+    gyroscopic = rotation.cross(state.omega, params.inertia * state.omega)
+    torque = params.inertia * gains.rate * (omega - state.omega) + gyroscopic
+    rpm = rpm_from_wrench(params, jnp.maximum(params.mass * collective, 0), torque)
+    return jnp.minimum(rpm, params.max_rpm)

@@ -1,0 +1,115 @@
+"""The paper's simple PID for the Hummingbird: angles from a desired force, thrust and torque by least squares."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_positive, check_shape, check_whole
+from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.numerics import safe_sqrt
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+_MAX_TILT = jnp.pi / 6  # rad, of the roll and pitch targets
+
+
+class Gains(flax.struct.PyTreeNode):
+    """Gains of the two loops."""
+
+    pos_p: Array
+    """(3,) N/m."""
+    pos_i: Array
+    """(3,) N/(m s)."""
+    pos_d: Array
+    """(3,) N s/m."""
+    rpy_p: Array
+    """(3,) N m/rad."""
+    rpy_i: Array
+    """(3,) N m/(rad s)."""
+    rpy_d: Array
+    """(3,) N m s/rad."""
+
+
+class Memory(flax.struct.PyTreeNode):
+    """What the controller of one drone keeps between calls; a fresh one is zero."""
+
+    pos_integral: Array
+    """(3,) integrated position error, m s; not limited."""
+    rpy_integral: Array
+    """(3,) integrated angle error, rad s; not limited."""
+    pos_error: Array
+    """(3,) position error at the last call, m."""
+    rpy_error: Array
+    """(3,) angle error at the last call, rad."""
+
+
+def gains() -> Gains:
+    """The paper's gains for the Hummingbird (`hb`)."""
+    return Gains(
+        pos_p=jnp.array([0.1, 0.1, 0.2]),
+        pos_i=jnp.array([1e-4, 1e-4, 1e-4]),
+        pos_d=jnp.array([0.3, 0.3, 0.4]),
+        rpy_p=jnp.array([0.3, 0.3, 0.05]),
+        rpy_i=jnp.array([1e-4, 1e-4, 1e-4]),
+        rpy_d=jnp.array([0.3, 0.3, 0.5]),
+    )
+
+
+def init(n: int) -> Memory:
+    """Fresh memory for a team of n drones."""
+    check_whole("number of drones", n)
+    return Memory(jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 3)))
+
+
+def control(
+    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
+) -> tuple[Memory, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM; not limited.
+
+    Heads north: of the setpoint only `pos` is used. Derivatives are differences of errors, so the first call kicks.
+
+    Args:
+        gains: of the two loops.
+        params: of the drone.
+        memory: of the last call.
+        state: of the drone.
+        setpoint: where to be.
+        dt: time between calls, s.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+    """
+    check_positive("dt", dt, "s")
+    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
+    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+
+    pos_error = setpoint.pos - state.pos
+    pos_integral = memory.pos_integral + pos_error * dt
+    pos_rate = (pos_error - memory.pos_error) / dt
+    force = gains.pos_p * pos_error + gains.pos_i * pos_integral + gains.pos_d * pos_rate
+    force = force + jnp.stack([jnp.zeros_like(params.mass), jnp.zeros_like(params.mass), params.weight])
+
+    rpy_error = _wrap_yaw(_angles_of(force) - rotation.to_rpy(state.quat))
+    rpy_integral = memory.rpy_integral + rpy_error * dt
+    rpy_rate = (rpy_error - memory.rpy_error) / dt
+    torque = gains.rpy_p * rpy_error + gains.rpy_i * rpy_integral + gains.rpy_d * rpy_rate
+
+    thrust = rotation.rotate(state.quat, force)[2]  # as the reference has it; the force along body z would be R^T f
+    return Memory(pos_integral, rpy_integral, pos_error, rpy_error), rpm_from_wrench(params, thrust, torque)
+
+
+def _angles_of(force: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Roll and pitch that point body z (or -z) along the force, limited, and yaw zero; rad."""
+    x, y, z = jnp.where(force[2] < 0, -force, force)
+    roll = jnp.arctan2(-y, safe_sqrt(x**2 + z**2))
+    pitch = jnp.arctan2(x, z)
+    return jnp.clip(jnp.stack([roll, pitch, jnp.zeros_like(roll)]), -_MAX_TILT, _MAX_TILT)
+
+
+def _wrap_yaw(rpy: Float[Array, "3"]) -> Float[Array, "3"]:
+    yaw = rpy[2]
+    return rpy.at[2].add(2 * jnp.pi * ((yaw < -jnp.pi).astype(yaw.dtype) - (yaw > jnp.pi).astype(yaw.dtype)))

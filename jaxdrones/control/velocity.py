@@ -1,0 +1,35 @@
+"""The paper's velocity input (equation 8): a direction and a share of a speed limit, flown by the PID."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_shape
+from jaxdrones.control import pid
+from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+SPEED_SHARE = 0.03  # of the vehicle's highest speed, at magnitude 1
+
+
+def control(
+    gains: pid.Gains, params: Params, memory: pid.Memory, state: State, action: Float[Array, "4"], *, dt: float
+) -> tuple[pid.Memory, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM.
+
+    Args:
+        gains: of the PID.
+        params: of the drone.
+        memory: of the PID.
+        state: of the drone.
+        action: (4,) direction x, y, z of any length, and magnitude: the share of the speed limit, sign ignored.
+        dt: time between calls, s.
+
+    The position target is where the drone is and the yaw target how it is headed, so only the velocity error acts.
+    """
+    check_shape("action", action, (4,), "direction (3) and magnitude of one drone; use jax.vmap for a team")
+    speed = SPEED_SHARE * params.max_speed * jnp.abs(action[3])
+    yaw = rotation.to_rpy(state.quat)[2]
+    setpoint = Setpoint.at(state.pos, vel=speed * rotation.unit(action[:3]), yaw=yaw)
+    return pid.control(gains, params, memory, state, setpoint, dt=dt)

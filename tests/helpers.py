@@ -1,0 +1,68 @@
+"""Teams in flight, and comparisons that say which array differs."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdrones
+from jaxdrones import Params, State
+
+VEHICLES = ("cf2x", "cf2p", "hb", "racer")
+INTEGRATORS = (jaxdrones.euler, jaxdrones.semi_implicit_euler, jaxdrones.implicit_midpoint, jaxdrones.rk4)
+
+
+def name_of(function) -> str:
+    return function.__name__
+
+
+def flying(params: Params, seed: int = 0, tilt: float = 1.0) -> State:
+    """A team in full flight near (0, 0, 1) m; `tilt` 1 is any attitude, 0 is level."""
+    rng = np.random.default_rng(seed)
+    n = len(params.mass)
+    quat = tilt * rng.normal(size=(n, 4)) + [0, 0, 0, 1 - tilt]
+    return State(
+        pos=jnp.array(rng.uniform(-0.4, 0.4, (n, 3)) + [0, 0, 1]),
+        quat=jnp.array(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
+        vel=jnp.array(rng.uniform(-3, 3, (n, 3))),
+        omega=jnp.array(rng.uniform(-5, 5, (n, 3))),
+        rpm=jnp.array(rng.uniform(0.7, 1.1, (n, 4))) * params.hover_rpm[:, None],
+    )
+
+
+def tape(params: Params, length: int, seed: int = 1) -> jax.Array:
+    """Rotor speeds (length, n, 4) within a tenth of the hover speed."""
+    shape = (length, len(params.mass), 4)
+    return jnp.array(np.random.default_rng(seed).uniform(0.9, 1.1, shape)) * params.hover_rpm[None, :, None]
+
+
+@partial(jax.jit, static_argnums=0)
+def fly(step, params: Params, state: State, rpm: jax.Array) -> State:
+    """The states after each row of a tape of rotor speeds."""
+    return jaxdrones.rollout(step, lambda params, rpm, state, k: (rpm, rpm[k]), params, state, rpm, len(rpm))[1]
+
+
+def to_world(function, q, x):
+    """Apply a rotation function to arrays with any leading axes."""
+    x = jnp.asarray(x)
+    rows = x.reshape(-1, x.shape[-1])
+    return jax.vmap(function, (None, 0))(q, rows).reshape(x.shape)
+
+
+def assert_close(actual, expected, atol: float, rtol: float = 0.0) -> None:
+    """Every array of two equal pytrees agrees."""
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(actual), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=rtol, atol=atol, err_msg=jax.tree_util.keystr(path))
+
+
+def assert_same_motion(actual: State, expected: State, atol: float) -> None:
+    """Two motions agree, quaternions up to sign."""
+    sign = jnp.sign(jnp.sum(actual.quat * expected.quat, axis=-1, keepdims=True))
+    assert_close(actual.replace(quat=sign * actual.quat), expected, atol)
+
+
+def assert_finite(tree) -> None:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        assert np.all(np.isfinite(leaf)), f"{jax.tree_util.keystr(path)} is not finite: {leaf}"

@@ -15,7 +15,7 @@ Control = Callable[[Params, Any, State, jax.Array], tuple[Any, jax.Array]]
 
 
 def rollout(
-    step: Step, control: Control, params: Params, state: State, memory: Any, length: int, start: int = 0
+    step: Step, control: Control, params: Params, state: State, memory: Any, length: int
 ) -> tuple[State, State]:
     """Fly `length` control steps.
 
@@ -26,7 +26,6 @@ def rollout(
         state: of the team, at the start.
         memory: what the controller keeps between calls, any pytree; `None` if nothing.
         length: number of control steps.
-        start: the first k.
 
     Returns:
         The final state, and the state after every control step: arrays (length, n, ...).
@@ -44,5 +43,5 @@ def rollout(
         state = step(params, state, rpm)
         return (memory, state), state
 
-    (_, final), trajectory = jax.lax.scan(advance, (memory, state), start + jnp.arange(length))
+    (_, final), trajectory = jax.lax.scan(advance, (memory, state), jnp.arange(length))
     return final, trajectory

@@ -40,6 +40,10 @@ def gains() -> Gains:
     )
 
 
+def init(n: int) -> None:
+    """Memory for a team of n drones: none is kept."""
+
+
 def control(
     gains: Gains, params: Params, memory: Any, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Any, Float[Array, "4"]]:

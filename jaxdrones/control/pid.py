@@ -21,7 +21,7 @@ from jaxdrones.state import State
 
 VEHICLES = ("cf2x", "cf2p")
 
-_PWM_TO_RPM = 0.2685  # RPM per PWM unit
+_PWM_TO_RPM = 0.2685  # RPM per unit of the 16-bit PWM
 _PWM_OFFSET = 4070.3  # RPM
 _PWM_RANGE = (20000.0, 65535.0)
 _MAX_TORQUE = 3200.0  # PWM
@@ -55,6 +55,11 @@ class Memory(flax.struct.PyTreeNode):
     """(3,) integrated attitude error, rad s."""
     rpy: Array
     """(3,) roll, pitch, yaw at the last call, rad."""
+
+
+def rpm_to_pwm(rpm):
+    """The Crazyflie's 16-bit PWM of a rotor speed (RPM), any shape."""
+    return (rpm - _PWM_OFFSET) / _PWM_TO_RPM
 
 
 def gains(vehicle: str = "cf2x") -> Gains:
@@ -115,7 +120,7 @@ def position_loop(
     force = gains.pos_p * error + gains.pos_i * integral + gains.pos_d * (setpoint.vel - state.vel)
     force = force + jnp.stack([jnp.zeros_like(params.mass), jnp.zeros_like(params.mass), params.weight])
     thrust = jnp.maximum(jnp.sum(force * rotation.z_axis(state.quat)), 0)
-    pwm = (safe_sqrt(thrust / (4 * params.kf)) - _PWM_OFFSET) / _PWM_TO_RPM
+    pwm = rpm_to_pwm(safe_sqrt(thrust / (4 * params.kf)))
     return memory.replace(pos_integral=integral), pwm, attitude.from_thrust(force, setpoint.yaw)
 
 

@@ -29,7 +29,11 @@ def control(
     The position target is where the drone is and the yaw target how it is headed, so only the velocity error acts.
     """
     check_shape("action", action, (4,), "direction (3) and magnitude of one drone; use jax.vmap for a team")
-    speed = SPEED_SHARE * params.max_speed * jnp.abs(action[3])
     yaw = rotation.to_rpy(state.quat)[2]
-    setpoint = Setpoint.at(state.pos, vel=speed * rotation.unit(action[:3]), yaw=yaw)
+    setpoint = Setpoint.at(state.pos, vel=commanded(params, action), yaw=yaw)
     return pid.control(gains, params, memory, state, setpoint, dt=dt)
+
+
+def commanded(params: Params, action: Float[Array, "4"]) -> Float[Array, "3"]:
+    """The velocity that an action asks for, m/s, world."""
+    return SPEED_SHARE * params.max_speed * jnp.abs(action[3]) * rotation.unit(action[:3])

@@ -1,0 +1,94 @@
+"""What a flight leaves behind: its log and its numbers."""
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from jaxdrones.control.pid import rpm_to_pwm
+
+_BAND = 0.1  # share of the steady error within which a response counts as settled
+_LEAST_BAND = 5e-3  # m or m/s
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """The log of a flight of n drones over K control steps; row k is the state at time t[k]."""
+
+    t: np.ndarray  # (K,) s
+    pos: np.ndarray  # (K, n, 3) m, world
+    quat: np.ndarray  # (K, n, 4) body to world
+    rpy: np.ndarray  # (K, n, 3) rad
+    vel: np.ndarray  # (K, n, 3) m/s, world
+    omega: np.ndarray  # (K, n, 3) rad/s, body
+    rpm: np.ndarray  # (K, n, 4) RPM
+    target_pos: np.ndarray  # (K, n, 3) m; NaN where a velocity is commanded
+    target_vel: np.ndarray  # (K, n, 3) m/s; NaN where a position is commanded
+    labels: tuple[str, ...]  # n names
+
+    def first_not_finite(self) -> tuple[float, str] | None:
+        """Time and name of the first drone whose state is not a number, if any."""
+        broken = ~np.isfinite(self.pos).all(-1)
+        if not broken.any():
+            return None
+        k, i = np.argwhere(broken)[0]
+        return float(self.t[k]), self.labels[i]
+
+    def results(self, after: float) -> list[dict[str, float | str | None]]:
+        """One row of numbers per drone, taken from time `after` (s), or half of a shorter flight, to the end.
+
+        The error is the distance to the target position, or the difference to the target velocity. The steady error is
+        its mean over the last quarter of the flight; it has settled when it stays within 10 % (or 5 mm, 5 mm/s) of that,
+        `None` if it does not before the last quarter.
+        """
+        commanded_velocity = np.isnan(self.target_pos).any()
+        miss = self.vel - self.target_vel if commanded_velocity else self.pos - self.target_pos
+        error = np.linalg.norm(miss, axis=-1)
+        unit = "m_s" if commanded_velocity else "m"
+        late = self.t >= (after if after < self.t[-1] else self.t[-1] / 2)
+        steady = self.t >= self.t[-1] * 3 / 4
+        return [
+            {
+                "drone": label,
+                f"rms_error_{unit}": float(np.sqrt(np.mean(error[late, i] ** 2))),
+                f"peak_error_{unit}": float(error[late, i].max()),
+                f"steady_error_{unit}": float(error[steady, i].mean()),
+                "settled_after_s": _settling(self.t, error[:, i], steady),
+                "lowest_z_m": float(self.pos[late, i, 2].min()),
+                "highest_z_m": float(self.pos[late, i, 2].max()),
+                "peak_vz_m_s": float(self.vel[late, i, 2].max()),
+                "peak_speed_m_s": float(np.linalg.norm(self.vel[late, i], axis=-1).max()),
+                "rpm_std": float(self.rpm[late, i].std(axis=0).max()),
+            }
+            for i, label in enumerate(self.labels)
+        ]
+
+    def arrays(self, pwm: bool = False) -> dict[str, np.ndarray]:
+        """The log by name; `pwm` adds the Crazyflie's PWM beside the RPM."""
+        arrays = {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        return arrays | {"pwm": rpm_to_pwm(self.rpm)} if pwm else arrays
+
+    def save_npz(self, path: Path, pwm: bool = False) -> None:
+        """Write the named arrays."""
+        np.savez_compressed(path, **self.arrays(pwm))
+
+    def save_csv(self, path: Path, pwm: bool = False) -> None:
+        """Write one line per time and drone."""
+        axes = {"pos": "xyz", "quat": "xyzw", "rpy": "rpy", "vel": "xyz", "omega": "xyz", "rpm": "0123", "pwm": "0123"}
+        axes |= {"target_pos": "xyz", "target_vel": "xyz"}
+        arrays = {name: array for name, array in self.arrays(pwm).items() if name in axes}
+        with path.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t", "drone"] + [f"{name}_{axis}" for name in arrays for axis in axes[name]])
+            for k, t in enumerate(self.t):
+                for i, label in enumerate(self.labels):
+                    writer.writerow([t, label, *np.concatenate([array[k, i] for array in arrays.values()])])
+
+
+def _settling(t: np.ndarray, error: np.ndarray, steady: np.ndarray) -> float | None:
+    mean = error[steady].mean()
+    outside = np.flatnonzero(~(np.abs(error - mean) <= max(_BAND * mean, _LEAST_BAND)))
+    if len(outside) == 0:
+        return 0.0
+    return None if steady[outside[-1]] else float(t[outside[-1] + 1])

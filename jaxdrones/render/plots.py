@@ -1,0 +1,76 @@
+"""Figures of flights, laid out like the paper's. Needs matplotlib (extra `cli`)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxdrones.record import Record
+
+# panel: (array of the record, column, label), in the order of the paper's figures, left and right in turn
+PANELS = {
+    "x": ("pos", 0, "x (m)"),
+    "vx": ("vel", 0, "vx (m/s)"),
+    "y": ("pos", 1, "y (m)"),
+    "vy": ("vel", 1, "vy (m/s)"),
+    "z": ("pos", 2, "z (m)"),
+    "vz": ("vel", 2, "vz (m/s)"),
+    "roll": ("rpy", 0, "roll (rad)"),
+    "omega_x": ("omega", 0, "ωx (rad/s)"),
+    "pitch": ("rpy", 1, "pitch (rad)"),
+    "omega_y": ("omega", 1, "ωy (rad/s)"),
+    "yaw": ("rpy", 2, "yaw (rad)"),
+    "omega_z": ("omega", 2, "ωz (rad/s)"),
+    "rpm0": ("rpm", 0, "P0 (RPM)"),
+    "rpm1": ("rpm", 1, "P1 (RPM)"),
+    "rpm2": ("rpm", 2, "P2 (RPM)"),
+    "rpm3": ("rpm", 3, "P3 (RPM)"),
+}
+
+
+def check_matplotlib() -> None:
+    """Raise if no figure can be drawn.
+
+    Raises:
+        ValueError: matplotlib is not installed; says how to get it.
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        raise ValueError(
+            'matplotlib is not installed, so no figure can be drawn; pip install "jaxdrones[cli]", or pass --no-figure'
+        ) from None
+
+
+def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = ()) -> None:
+    """Draw a flight: one line per drone, the commanded values dashed.
+
+    Args:
+        record: the flight.
+        path: of the picture; its suffix chooses the format.
+        title: above the figure.
+        panels: names of `PANELS`; all when empty.
+    """
+    from matplotlib.figure import Figure  # the one import of matplotlib; it takes half a second
+
+    panels = panels or list(PANELS)
+    columns = min(2, len(panels) // 2)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(max(8, 5.5 * columns), 1.5 * rows + 1.2), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    targets = {"pos": record.target_pos, "vel": record.target_vel}
+    for axis, name in zip(axes, panels, strict=False):
+        array, column, label = PANELS[name]
+        for i, drone in enumerate(record.labels):
+            (line,) = axis.plot(record.t, getattr(record, array)[:, i, column], linewidth=1, label=drone)
+            if array in targets and np.isfinite(targets[array]).any():
+                axis.plot(
+                    record.t, targets[array][:, i, column], "--", linewidth=0.8, color=line.get_color(), alpha=0.6
+                )
+        axis.set_ylabel(label)
+        axis.grid(linewidth=0.3)
+    for axis in axes[-columns:]:
+        axis.set_xlabel("t (s)")
+    figure.suptitle(title, fontsize="medium")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.savefig(path, dpi=120)

@@ -14,17 +14,17 @@ from jaxdrones.render import plots
 
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
-    "rms_error_m": ("rms error (m)", "{:.4f}"),
-    "peak_error_m": ("peak error (m)", "{:.4f}"),
-    "rms_error_m_s": ("rms error (m/s)", "{:.4f}"),
-    "peak_error_m_s": ("peak error (m/s)", "{:.4f}"),
+    "rms_error_m": ("rms (m)", "{:.4f}"),
+    "peak_error_m": ("peak (m)", "{:.4f}"),
     "steady_error_m": ("steady (m)", "{:.4f}"),
+    "rms_error_m_s": ("rms (m/s)", "{:.4f}"),
+    "peak_error_m_s": ("peak (m/s)", "{:.4f}"),
     "steady_error_m_s": ("steady (m/s)", "{:.4f}"),
     "settled_after_s": ("settled (s)", "{:.2f}"),
-    "lowest_z_m": ("lowest z (m)", "{:.4f}"),
-    "highest_z_m": ("highest z (m)", "{:.4f}"),
-    "peak_vz_m_s": ("peak vz (m/s)", "{:.4f}"),
-    "peak_speed_m_s": ("peak speed (m/s)", "{:.4f}"),
+    "lowest_z_m": ("z min (m)", "{:.4f}"),
+    "highest_z_m": ("z max (m)", "{:.4f}"),
+    "peak_vz_m_s": ("vz max (m/s)", "{:.4f}"),
+    "peak_speed_m_s": ("|v| max (m/s)", "{:.4f}"),
     "rpm_std": ("RPM std", "{:.1f}"),
 }
 
@@ -35,9 +35,15 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         return options.run(options)
-    except (ValueError, OSError) as error:
-        print(f"jaxdrones: error: {error}", file=sys.stderr)
-        return 2
+    except OSError as error:
+        return _complain(f"{error.filename}: {error.strerror}; choose another --output")
+    except ValueError as error:
+        return _complain(str(error))
+
+
+def _complain(message: str, code: int = 2) -> int:
+    print(f"jaxdrones: error: {message}", file=sys.stderr)
+    return code
 
 
 class _Parser(argparse.ArgumentParser):
@@ -91,6 +97,7 @@ def _fly(options: argparse.Namespace) -> int:
     if not options.no_figure:
         plots.check_matplotlib()
     output = options.output or Path("runs") / options.flight
+    output.mkdir(parents=True, exist_ok=True)
     with _progress() as progress:
         record = fly(
             options.flight,
@@ -106,7 +113,6 @@ def _fly(options: argparse.Namespace) -> int:
             progress=progress,
         )
     flight = FLIGHTS[options.flight]
-    output.mkdir(parents=True, exist_ok=True)
     files = [output / "log.npz"]
     record.save_npz(files[0], options.pwm)
     if options.csv:
@@ -118,14 +124,15 @@ def _fly(options: argparse.Namespace) -> int:
 
     results = record.results(flight.settled)
     if options.json:
-        print(json.dumps({"flight": options.flight, "results": results, "files": [str(file) for file in files]}))
+        print(json.dumps(record.conditions | {"results": results, "files": list(map(str, files))}))
     else:
+        print(_headline(record.conditions))
         print(_table(results))
         print("wrote " + ", ".join(map(str, files)))
     broken = record.first_not_finite()
     if broken:
-        print(f"jaxdrones: error: {broken[1]} left the numbers at t = {broken[0]:.3f} s", file=sys.stderr)
-    return 1 if broken else 0
+        return _complain(f"the state of {broken[1]} is not finite from t = {broken[0]:.3f} s on", 1)
+    return 0
 
 
 def _list(options: argparse.Namespace) -> int:
@@ -161,6 +168,15 @@ def _progress():
         return
     with tqdm(total=100, desc="flying", unit="%", leave=False, disable=None, file=sys.stderr) as bar:
         yield lambda share: bar.update(round(100 * share) - bar.n)
+
+
+def _headline(conditions: dict) -> str:
+    """What was flown, on one line."""
+    return (
+        "{flight}: {drones} x {vehicle}, {controller} at {control_hz} Hz, {integrator} at {physics_hz} Hz, "
+        "{rotors} rotors, ".format(**conditions)
+        + f"effects: {', '.join(conditions['effects']) or 'none'}, {conditions['duration']:g} s"
+    )
 
 
 def _table(results: list[dict]) -> str:

@@ -24,7 +24,6 @@ from jaxdrones.urdf import load_params
 PHYSICS_HZ = 240  # at least; raised to a multiple of the control rate
 
 _START_SPREAD = 0.01  # m; standard deviation of the start when a seed is given
-_CONTROLLER_OF = {"cf2x": "pid", "cf2p": "pid", "hb": "simple_pid"}  # others: geometric
 
 _DIRECTIONS = np.array([[-0.5, 1.0, 0.0], [0.0, 1.0, 0.0], [0.2, 1.0, 0.2], [0.0, 1.0, 0.5]])
 _HEADINGS = np.array([0, np.pi / 3, np.pi / 4, np.pi / 2])  # rad
@@ -164,17 +163,24 @@ def fly(
     duration = flight.duration if duration is None else duration
     control_hz = flight.control_hz if control_hz is None else control_hz
     effects = flight.effects if effects is None else effects
+    if controller is None:
+        controller = "pid" if name == "velocity" or vehicle in pid.VEHICLES else "geometric"
     check_whole("drones", n)
+    check_whole("control rate (Hz)", control_hz)
     check_positive("duration", duration, "s")
-    check_whole("control rate", control_hz)
+    check_choice("controller", controller, CONTROLLERS)
     for effect in effects:
         check_choice("effect", effect, EFFECTS | PAIRS)
     if n != flight.drones and not flight.any_number:
         raise ValueError(f"drones is {n}; the {name} flight takes {flight.drones}: {', '.join(flight.labels)}")
+    if name == "velocity" and controller != "pid":
+        raise ValueError(f"controller is {controller!r}; the velocity flight is flown by 'pid'")
 
     dt = 1 / control_hz
     substeps = math.ceil(PHYSICS_HZ / control_hz)
-    steps = max(1, round(duration * control_hz))
+    steps = round(duration * control_hz)
+    if steps == 0:
+        raise ValueError(f"duration is {duration} s, less than half a control period; give {dt:.4g} s or more")
     pilot, memory = _pilot(name, controller, vehicle, n, dt)
     step = make_step(
         effects=[EFFECTS[effect] for effect in effects if effect in EFFECTS],
@@ -202,18 +208,27 @@ def fly(
 
     log = jax.device_get(fly_all(load_params(vehicle)))
     jax.effects_barrier()
-    return Record(**log, labels=flight.labels or tuple(f"drone {i}" for i in range(n)))
+    conditions = dict(
+        flight=name,
+        vehicle=str(vehicle),
+        drones=n,
+        controller=controller,
+        control_hz=control_hz,
+        physics_hz=control_hz * substeps,
+        integrator=integrator,
+        rotors=rotors,
+        effects=list(effects),
+        duration=steps * dt,
+        seed=seed,
+    )
+    return Record(**log, labels=flight.labels or tuple(f"drone {i}" for i in range(n)), conditions=conditions)
 
 
-def _pilot(flight: str, controller: str | None, vehicle: str, n: int, dt: float):
+def _pilot(flight: str, controller: str, vehicle: str, n: int, dt: float):
     """The controller of one drone, and fresh memory for n."""
     if flight == "velocity":
-        if controller not in (None, "pid"):
-            raise ValueError(f"controller is {controller!r}; the velocity flight is flown by 'pid'")
         return functools.partial(velocity.control, pid.gains(vehicle), dt=dt), pid.init(n)
-    name = _CONTROLLER_OF.get(vehicle, "geometric") if controller is None else controller
-    check_choice("controller", name, CONTROLLERS)
-    module = CONTROLLERS[name]
+    module = CONTROLLERS[controller]
     gains = pid.gains(vehicle) if module is pid else module.gains()
     return functools.partial(module.control, gains, dt=dt), module.init(n)
 

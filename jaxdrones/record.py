@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ class Record:
     target_pos: np.ndarray  # (K, n, 3) m; NaN where a velocity is commanded
     target_vel: np.ndarray  # (K, n, 3) m/s; NaN where a position is commanded
     labels: tuple[str, ...]  # n names
+    conditions: dict[str, object]  # what was flown: vehicle, controller, rates, effects, ...
 
     def first_not_finite(self) -> tuple[float, str] | None:
         """Time and name of the first drone whose state is not a number, if any."""
@@ -38,35 +40,37 @@ class Record:
     def results(self, after: float) -> list[dict[str, float | str | None]]:
         """One row of numbers per drone, taken from time `after` (s), or half of a shorter flight, to the end.
 
-        The error is the distance to the target position, or the difference to the target velocity. The steady error is
-        its mean over the last quarter of the flight; it has settled when it stays within 10 % (or 5 mm, 5 mm/s) of that,
-        `None` if it does not before the last quarter.
+        The error is the distance to the target position, or the difference to the target velocity. The steady error
+        is its mean over the last quarter of the flight. It has settled when it stays within 10 % (or 5 mm, 5 mm/s) of
+        that; `None` if it does not before the last quarter. Numbers that are not finite are `None` too.
         """
         commanded_velocity = np.isnan(self.target_pos).any()
         miss = self.vel - self.target_vel if commanded_velocity else self.pos - self.target_pos
-        error = np.linalg.norm(miss, axis=-1)
         unit = "m_s" if commanded_velocity else "m"
         late = self.t >= (after if after < self.t[-1] else self.t[-1] / 2)
         steady = self.t >= self.t[-1] * 3 / 4
-        return [
-            {
-                "drone": label,
-                f"rms_error_{unit}": float(np.sqrt(np.mean(error[late, i] ** 2))),
-                f"peak_error_{unit}": float(error[late, i].max()),
-                f"steady_error_{unit}": float(error[steady, i].mean()),
-                "settled_after_s": _settling(self.t, error[:, i], steady),
-                "lowest_z_m": float(self.pos[late, i, 2].min()),
-                "highest_z_m": float(self.pos[late, i, 2].max()),
-                "peak_vz_m_s": float(self.vel[late, i, 2].max()),
-                "peak_speed_m_s": float(np.linalg.norm(self.vel[late, i], axis=-1).max()),
-                "rpm_std": float(self.rpm[late, i].std(axis=0).max()),
+        with np.errstate(over="ignore", invalid="ignore"):  # of a drone that broke
+            error, speed = np.linalg.norm(miss, axis=-1), np.linalg.norm(self.vel, axis=-1)
+            columns = {
+                f"rms_error_{unit}": np.sqrt(np.mean(error[late] ** 2, axis=0)),
+                f"peak_error_{unit}": error[late].max(axis=0),
+                f"steady_error_{unit}": error[steady].mean(axis=0),
+                "settled_after_s": [_settling(self.t, e, steady) for e in error.T],
+                "lowest_z_m": self.pos[late, :, 2].min(axis=0),
+                "highest_z_m": self.pos[late, :, 2].max(axis=0),
+                "peak_vz_m_s": self.vel[late, :, 2].max(axis=0),
+                "peak_speed_m_s": speed[late].max(axis=0),
+                "rpm_std": self.rpm[late].std(axis=0).max(axis=-1),
             }
+        return [
+            {"drone": label} | {name: float(x[i]) if np.isfinite(x[i]) else None for name, x in columns.items()}
             for i, label in enumerate(self.labels)
         ]
 
     def arrays(self, pwm: bool = False) -> dict[str, np.ndarray]:
-        """The log by name; `pwm` adds the Crazyflie's PWM beside the RPM."""
+        """The log by name, the conditions as JSON; `pwm` adds the Crazyflie's PWM beside the RPM."""
         arrays = {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        arrays["conditions"] = np.asarray(json.dumps(self.conditions))
         return arrays | {"pwm": rpm_to_pwm(self.rpm)} if pwm else arrays
 
     def save_npz(self, path: Path, pwm: bool = False) -> None:
@@ -86,9 +90,9 @@ class Record:
                     writer.writerow([t, label, *np.concatenate([array[k, i] for array in arrays.values()])])
 
 
-def _settling(t: np.ndarray, error: np.ndarray, steady: np.ndarray) -> float | None:
+def _settling(t: np.ndarray, error: np.ndarray, steady: np.ndarray) -> float:
     mean = error[steady].mean()
     outside = np.flatnonzero(~(np.abs(error - mean) <= max(_BAND * mean, _LEAST_BAND)))
     if len(outside) == 0:
         return 0.0
-    return None if steady[outside[-1]] else float(t[outside[-1] + 1])
+    return np.nan if steady[outside[-1]] else float(t[outside[-1] + 1])

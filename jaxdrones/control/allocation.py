@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones.checks import check_shape
 from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 
@@ -23,7 +24,12 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
     Where the exact inverse asks for a negative thrust it is the non-negative least-squares solution of
     A P^2 = b, with rows 1, y/L, -x/L, spin and b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). There is no
     upper limit. Differentiable; where a rotor is held at zero its derivative is zero.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`).
     """
+    check_shape("thrust", thrust, (), "one number for one drone; use jax.vmap for a team")
+    check_shape("torque", torque, (3,), "a vector for one drone; use jax.vmap for a team")
     x, y, _ = params.rotor_pos.T
     arm = params.arm
     matrix = jnp.stack([jnp.ones_like(x), y / arm, -x / arm, params.rotor_spin])

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_positive, check_shape
+from jaxdrones.checks import check_positive
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -64,8 +65,7 @@ def control(
         ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
     """
     check_positive("dt", dt, "s")
-    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
-    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+    check_single(params, state, setpoint)
 
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
     acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])

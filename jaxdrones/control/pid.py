@@ -11,10 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_choice, check_positive, check_shape, check_whole
+from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control.single import check_single
 from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -68,7 +69,10 @@ def gains(vehicle: str = "cf2x") -> Gains:
     Raises:
         ValueError: another vehicle; the gains fit a Crazyflie's mass, inertia and PWM.
     """
-    check_choice("vehicle with PID gains", vehicle, VEHICLES)
+    if vehicle not in VEHICLES:
+        raise ValueError(
+            f"there are no PID gains for {vehicle!r}, only for {', '.join(VEHICLES)}; use another controller"
+        )
     return Gains(
         pos_p=jnp.array([0.4, 0.4, 1.25]),
         pos_i=jnp.array([0.05, 0.05, 0.05]),
@@ -102,8 +106,7 @@ def control(
         ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
     """
     check_positive("dt", dt, "s")
-    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
-    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+    check_single(params, state, setpoint, memory)
     memory, thrust, target = position_loop(gains, params, memory, state, setpoint, dt)
     memory, torque = attitude_loop(gains, memory, state, target, setpoint.omega, dt)
     pwm = jnp.clip(thrust + mixer(params) @ torque, *_PWM_RANGE)

@@ -12,6 +12,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_positive, check_shape
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -68,8 +69,7 @@ def command(
     gains: Gains, params: Params, state: State, setpoint: Setpoint
 ) -> tuple[Float[Array, ""], Float[Array, "3"]]:
     """Outer loop: collective thrust per mass (m/s^2, body z) and body rates (rad/s) towards a setpoint."""
-    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
-    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+    check_single(params, state, setpoint)
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
     acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
     collective = jnp.sum(acc * rotation.z_axis(state.quat))
@@ -79,13 +79,16 @@ def command(
     x = rotation.unit(rotation.cross(left, z))
     target = rotation.from_matrix(jnp.stack([x, rotation.cross(z, x), z], axis=-1))
     error = rotation.multiply(rotation.conjugate(state.quat), target)
-    return collective, 2 * gains.attitude * error[:3] * jnp.where(error[3] < 0, -1, 1)
+    shorter_way = jnp.where(error[3] < 0, -1, 1)
+    turn = jnp.where(jnp.any(acc != 0), shorter_way, 0)  # no force, no attitude to turn to
+    return collective, 2 * gains.attitude * error[:3] * turn
 
 
 def follow(
     gains: Gains, params: Params, state: State, collective: Float[Array, ""], omega: Float[Array, "3"]
 ) -> Float[Array, "4"]:
     """Inner loop: rotor speeds (RPM, up to `max_rpm`) for a collective thrust per mass and body rates."""
+    check_single(params, state)
     check_shape("omega", omega, (3,), "body rates of one drone; use jax.vmap for a team")
     gyroscopic = rotation.cross(state.omega, params.inertia * state.omega)
     torque = params.inertia * gains.rate * (omega - state.omega) + gyroscopic

@@ -35,8 +35,8 @@ class Setpoint(flax.struct.PyTreeNode):
         zero = jnp.zeros_like(pos)
         return cls(
             pos=pos,
-            vel=zero if vel is None else vel,
-            acc=zero if acc is None else acc,
-            yaw=zero[..., 0] if yaw is None else yaw,
-            omega=zero if omega is None else omega,
+            vel=zero if vel is None else jnp.asarray(vel),
+            acc=zero if acc is None else jnp.asarray(acc),
+            yaw=zero[..., 0] if yaw is None else jnp.asarray(yaw),
+            omega=zero if omega is None else jnp.asarray(omega),
         )

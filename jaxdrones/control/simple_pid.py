@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_positive, check_shape, check_whole
+from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control.single import check_single
 from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -71,6 +72,7 @@ def control(
     """Rotor speeds of one drone, RPM; not limited.
 
     Heads north: of the setpoint only `pos` is used. Derivatives are differences of errors, so the first call kicks.
+    With the Hummingbird's own inertia it needs 60 calls per second; the paper's 48 go with a fivefold one.
 
     Args:
         gains: of the two loops.
@@ -84,8 +86,7 @@ def control(
         ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
     """
     check_positive("dt", dt, "s")
-    check_shape("state.pos", state.pos, (3,), "a controller is about one drone; use jax.vmap for a team")
-    check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
+    check_single(params, state, setpoint, memory)
 
     pos_error = setpoint.pos - state.pos
     pos_integral = memory.pos_integral + pos_error * dt
@@ -105,8 +106,9 @@ def control(
 def _angles_of(force: Float[Array, "3"]) -> Float[Array, "3"]:
     """Roll and pitch that point body z (or -z) along the force, limited, and yaw zero; rad."""
     x, y, z = jnp.where(force[2] < 0, -force, force)
-    roll = jnp.arctan2(-y, safe_sqrt(x**2 + z**2))
-    pitch = jnp.arctan2(x, z)
+    no_pitch = (x == 0) & (z == 0)  # arctan2 has no derivative at (0, 0)
+    roll = jnp.arctan2(-y, jnp.where(no_pitch & (y == 0), 1, safe_sqrt(x**2 + z**2)))
+    pitch = jnp.arctan2(x, jnp.where(no_pitch, 1, z))
     return jnp.clip(jnp.stack([roll, pitch, jnp.zeros_like(roll)]), -_MAX_TILT, _MAX_TILT)
 
 

@@ -7,6 +7,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_shape
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -27,7 +28,11 @@ def control(
         dt: time between calls, s.
 
     The position target is where the drone is and the yaw target how it is headed, so only the velocity error acts.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
     """
+    check_single(params, state)
     check_shape("action", action, (4,), "direction (3) and magnitude of one drone; use jax.vmap for a team")
     yaw = rotation.to_rpy(state.quat)[2]
     setpoint = Setpoint.at(state.pos, vel=commanded(params, action), yaw=yaw)

@@ -1,0 +1,23 @@
+"""What every controller demands of its arguments."""
+
+from typing import Any
+
+from jaxdrones.checks import check_shape
+from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+_HINT = "a controller is about one drone; use jax.vmap for a team"
+_STATE = {"pos": (3,), "quat": (4,), "vel": (3,), "omega": (3,)}
+_SETPOINT = {"pos": (3,), "vel": (3,), "acc": (3,), "yaw": (), "omega": (3,)}
+
+
+def check_single(params: Params, state: State, setpoint: Setpoint | None = None, memory: Any = None) -> None:
+    """Raise `ValueError` unless the arrays are those of one drone; what is `None` is not looked at."""
+    for name, shape in _STATE.items():
+        check_shape(f"state.{name}", getattr(state, name), shape, _HINT)
+    check_shape("params.mass", params.mass, (), _HINT)
+    for name, shape in _SETPOINT.items() if setpoint is not None else ():
+        check_shape(f"setpoint.{name}", getattr(setpoint, name), shape, "one target for one drone")
+    for name, value in vars(memory).items() if memory is not None else ():
+        check_shape(f"memory.{name}", value, (3,), _HINT)

@@ -35,7 +35,7 @@ class State(flax.struct.PyTreeNode):
             ValueError: a wrong shape, no drone, or a number that is not finite.
         """
         pos = jnp.asarray(pos, float)
-        check_shape("pos", pos, ("n", 3), "one row (x, y, z) per drone")
+        check_shape("pos", pos, ("n", 3), "one row (x, y, z) per drone, at least one drone")
         n = len(pos)
         yaw = jnp.zeros(n) if yaw is None else jnp.asarray(yaw, float)
         check_shape("yaw", yaw, (n,), "one heading per drone")

@@ -47,10 +47,9 @@ def make_step(
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)
-    for name, functions in ("effects", effects), ("pairs", pairs), ("rotors", [rotors]), ("integrator", [integrator]):
-        for function in functions:
-            if not callable(function):
-                raise ValueError(f"{name}: {function!r} is not a function; give for example jaxdrones.{_EXAMPLE[name]}")
+    effects, pairs = _functions("effects", effects), _functions("pairs", pairs)
+    _functions("rotors", [rotors])
+    _functions("integrator", [integrator])
 
     def derivative(params: Params, state: State, command: jax.Array) -> State:
         rpm, rpm_rate = jax.vmap(rotors)(params, state.rpm, command)
@@ -62,6 +61,7 @@ def make_step(
         return State(pos=state.vel, quat=jax.vmap(quat_rate)(state), vel=acc, omega=omega_rate, rpm=rpm_rate)
 
     def step(params: Params, state: State, rpm: jax.Array) -> State:
+        rpm = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
         check_team(params, state, rpm)
         speed, _ = jax.vmap(rotors)(params, state.rpm, rpm)
         state = state.replace(rpm=speed)
@@ -91,6 +91,18 @@ def _from_others(pair: Pair, params: Params, state: State) -> Wrench:
         return jax.tree.map(lambda x: jnp.sum(x, axis=0), wrenches)
 
     return jax.vmap(on)(index, params, state)
+
+
+def _functions(name: str, functions: Sequence[Callable]) -> tuple[Callable, ...]:
+    """What an argument of `make_step` holds, or an error if it is not a sequence of functions."""
+    example = f"jaxdrones.{_EXAMPLE[name]}"
+    if callable(functions):
+        raise ValueError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
+    functions = tuple(functions)
+    for function in functions:
+        if not callable(function):
+            raise ValueError(f"{name}: {function!r} is not a function; give for example {example}")
+    return functions
 
 
 _EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}

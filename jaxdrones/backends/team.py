@@ -17,7 +17,7 @@ _STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
 
 def check_team(params: Params, state: State, rpm) -> None:
     """Raise `ValueError` unless the arrays are those of one team of n drones."""
-    check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
+    check_shape("state.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap")
     n = len(state.pos)
     for name, width in _STATE.items():
         check_shape(f"state.{name}", getattr(state, name), (n, width), f"state.pos has {n} drones")

@@ -54,7 +54,7 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
     from matplotlib.figure import Figure  # the one import of matplotlib; it takes half a second
 
     panels = panels or list(PANELS)
-    columns = min(2, len(panels) // 2)
+    columns = 1 if len(panels) < 4 else 2
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(max(8, 5.5 * columns), 1.5 * rows + 1.2), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()

@@ -1,0 +1,38 @@
+import numpy as np
+import pytest
+
+from jaxdrones.tasks import curves
+
+
+def test_the_circle_is_a_circle_and_starts_where_the_paper_says():
+    circle = curves.circle(radius=0.3, period=10.0)
+    start = circle.positions(4)
+    angle = 2 * np.pi * np.arange(4) / 6 + np.pi / 2
+    expected = np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle) - 0.3, 0.1 + 0.05 * np.arange(4)], axis=-1)
+    np.testing.assert_allclose(start, expected, atol=1e-12)
+    np.testing.assert_allclose(circle.positions(4, 10.0), start, atol=1e-12)
+    np.testing.assert_allclose(circle.positions(1, 5.0)[0], [0, -0.6, 0.1], atol=1e-12)
+
+
+def test_drones_that_cross_are_above_each_other_twice_a_period():
+    crossing = curves.crossing(2)
+    np.testing.assert_allclose(crossing.positions(2), [[0.5, 0, 1.0], [-0.5, 0, 0.5]], atol=1e-12)
+    for t in (1.25, 3.75):
+        np.testing.assert_allclose(crossing.positions(2, t)[:, 0], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("curve", [curves.circle(), curves.crossing(3), curves.hop()])
+def test_velocity_and_acceleration_are_the_derivatives_of_the_curve(curve):
+    h = 1e-4
+    before, now, after = (np.asarray(curve.positions(3, 0.7 + d)) for d in (-h, 0, h))
+    setpoints = curve.setpoints(3, 0.7)
+    np.testing.assert_allclose(setpoints.pos, now, atol=1e-14)
+    np.testing.assert_allclose(setpoints.vel, (after - before) / (2 * h), atol=1e-7)
+    np.testing.assert_allclose(setpoints.acc, (after - 2 * now + before) / h**2, atol=1e-6)
+
+
+def test_nobody_and_no_time_are_refused():
+    with pytest.raises(ValueError, match="number of drones is 0"):
+        curves.circle().positions(0)
+    with pytest.raises(ValueError, match="period is 0"):
+        curves.circle(period=0)

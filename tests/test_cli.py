@@ -1,0 +1,98 @@
+"""The command line as a user meets it."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from jaxdrones import flights
+from jaxdrones.cli import main
+
+SHORT = ["--duration", "0.25", "--drones", "2"]
+
+
+def test_fly_prints_a_table_and_writes_log_and_figure(tmp_path, capsys):
+    assert main(["fly", "circle", *SHORT, "--output", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "circle: 2 x cf2x, pid at 120 Hz, semi_implicit_euler at 240 Hz" in out
+    assert "rms (m)" in out and "drone 1" in out
+    assert (tmp_path / "flight.png").read_bytes().startswith(b"\x89PNG")
+    log = np.load(tmp_path / "log.npz")
+    assert log["pos"].shape == (30, 2, 3) and log["rpm"].shape == (30, 2, 4)
+    assert json.loads(str(log["conditions"]))["control_hz"] == 120
+
+
+def test_json_is_one_object_and_nothing_else_on_stdout(tmp_path, capsys):
+    assert main(["fly", "downwash", "--duration", "0.2", "--json", "--output", str(tmp_path)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["effects"] == ["downwash_paper"] and len(report["results"]) == 2
+    assert report["files"] == [str(tmp_path / "log.npz"), str(tmp_path / "flight.png")]
+
+
+def test_csv_and_pwm_come_on_request(tmp_path):
+    assert main(["fly", "circle", *SHORT, "--csv", "--pwm", "--no-figure", "--output", str(tmp_path)]) == 0
+    log = np.load(tmp_path / "log.npz")
+    np.testing.assert_allclose(0.2685 * log["pwm"] + 4070.3, log["rpm"], rtol=1e-6)
+    with (tmp_path / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 60
+    assert float(rows[-1]["pos_z"]) == pytest.approx(log["pos"][-1, 1, 2])
+    assert float(rows[-1]["pwm_3"]) == pytest.approx(log["pwm"][-1, 1, 3])
+    assert not (tmp_path / "flight.png").exists()
+
+
+def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypatch):
+    record = flights.fly("circle", drones=2, duration=0.25)
+    pos = np.array(record.pos)
+    pos[12:, 1] = np.nan
+    monkeypatch.setattr("jaxdrones.cli.fly", lambda *_, **__: dataclasses.replace(record, pos=pos))
+    assert main(["fly", "circle", "--no-figure", "--json", "--output", str(tmp_path)]) == 1
+    captured = capsys.readouterr()
+    assert "the state of drone 1 is not finite from t = 0.108 s on" in captured.err
+    rows = json.loads(captured.out)["results"]
+    assert rows[0]["rms_error_m"] > 0 and rows[1]["rms_error_m"] is None
+    assert (tmp_path / "log.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fly", "cirle"], "did you mean 'circle'"),
+        (["fly", "circle", "--vehicle", "cf9"], "unknown vehicle 'cf9'"),
+        (["fly", "circle", "--effects", "drag,magic"], "unknown effect 'magic'"),
+        (["fly", "circle", "--integrator", "rk9"], "unknown integrator 'rk9'"),
+        (["fly", "circle", "--drones", "zero"], "invalid int value: 'zero'"),
+        (["fly", "circle", "--drones", "0"], "drones is 0"),
+        (["fly", "circle", "--duration", "-2"], "duration is -2.0"),
+        (["fly", "circle", "--duration", "nan"], "duration is nan"),
+        (["fly", "circle", "--vehicle", "missing.urdf"], "missing.urdf: cannot be read"),
+        (["fly"], "required: FLIGHT"),
+        (["soar"], "invalid choice: 'soar'"),
+    ],
+)
+def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    captured = capsys.readouterr()
+    assert code == 2 and captured.out == ""
+    assert message in captured.err and captured.err.count("\n") == 1
+
+
+def test_an_output_that_cannot_be_a_folder_is_refused_before_the_flight(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert main(["fly", "circle", "--output", str(tmp_path / "file")]) == 2
+    assert "choose another --output" in capsys.readouterr().err
+
+
+def test_list_names_what_can_be_chosen(capsys):
+    assert main(["list", "--json"]) == 0
+    names = json.loads(capsys.readouterr().out)
+    assert {"cf2x", "cf2p", "hb", "racer"} == set(names["vehicles"])
+    assert {"drag", "ground_effect", "downwash", "downwash_paper"} <= set(names["effects"])
+    assert main(["list"]) == 0
+    assert "integrators" in capsys.readouterr().out

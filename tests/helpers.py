@@ -23,7 +23,7 @@ def flying(params: Params, seed: int = 0, tilt: float = 1.0) -> State:
     n = len(params.mass)
     quat = tilt * rng.normal(size=(n, 4)) + [0, 0, 0, 1 - tilt]
     return State(
-        pos=jnp.array(rng.uniform(-0.4, 0.4, (n, 3)) + [0, 0, 1]),
+        pos=jnp.array(rng.uniform([-0.4, -0.4, 0.6], [0.4, 0.4, 1.4], (n, 3))),
         quat=jnp.array(quat / np.linalg.norm(quat, axis=-1, keepdims=True)),
         vel=jnp.array(rng.uniform(-3, 3, (n, 3))),
         omega=jnp.array(rng.uniform(-5, 5, (n, 3))),

@@ -1,0 +1,74 @@
+"""Who may import whom, and what `import jaxdrones` costs."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxdrones
+
+PACKAGE = Path(jaxdrones.__file__).parent
+
+NOUNS = ("assets", "checks", "numerics", "params", "rotation", "state", "urdf", "wrench")
+LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports another
+    (NOUNS,),
+    (("dynamics",), ("control",), ("sensing",)),
+    (("backends",), ("tasks",)),
+    (("envs",), ("flights", "record")),
+    (("adapters", "learning", "render", "cli"),),
+    (("",),),  # the package itself, which re-exports
+)
+PLACE = {
+    module: (layer, peer) for layer, peers in enumerate(LAYERS) for peer, group in enumerate(peers) for module in group
+}
+OPTIONAL = ("gymnasium", "pettingzoo", "brax", "pybullet", "matplotlib", "tqdm")
+
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def top(file: Path) -> str:
+    """`dynamics` for jaxdrones/dynamics/aero.py, the empty name for jaxdrones/__init__.py."""
+    first = file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return "" if first == "__init__" else first
+
+
+def imports(file: Path) -> set[str]:
+    """Top-level names of the package that a file imports, wherever in the file it does."""
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            paths = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import; write the full name"
+            paths = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for path in paths:
+            package, _, rest = path.partition(".")
+            if package == "jaxdrones":
+                module = rest.partition(".")[0]
+                found.add(module if module in PLACE else "")
+    return found
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_imports_point_to_lower_layers(file):
+    assert top(file) in PLACE, f"{file} has no layer; say in LAYERS where it belongs"
+    layer, peer = PLACE[top(file)]
+    for module in imports(file):
+        other_layer, other_peer = PLACE[module]
+        allowed = other_layer < layer or (other_layer, other_peer) == (layer, peer)
+        assert allowed, f"{file.name} imports jaxdrones.{module or '__init__'}, which is not below it"
+
+
+def test_the_imports_of_a_file_are_found():
+    assert imports(PACKAGE / "backends" / "explicit.py") >= {"backends", "checks", "dynamics", "params", "state"}
+    assert imports(PACKAGE / "dynamics" / "aero.py") >= {"rotation", "dynamics", "wrench"}
+
+
+def test_importing_the_package_loads_no_optional_library():
+    code = "import sys, jaxdrones; print(*(name for name in sys.argv[1:] if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code, *OPTIONAL], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

@@ -1,0 +1,103 @@
+"""Quaternions against scipy, against recorded conversions, and smooth where formulas tend to break."""
+
+import golden_data
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxdrones import rotation
+
+ROUND_OFF = 1e-14  # a dozen float64 operations on numbers of order one
+
+quats = Rotation.random(50, rng=0).as_quat()
+others = Rotation.random(50, rng=1).as_quat()
+vectors = np.random.default_rng(2).normal(size=(50, 3))
+
+
+def each(function, *arrays):
+    return np.asarray(jax.jit(jax.vmap(function))(*map(jnp.array, arrays)))
+
+
+def up_to_sign(quat):
+    return quat * np.sign(quat[:, 3:])
+
+
+def test_rotate_turns_body_vectors_into_the_world():
+    expected = Rotation.from_quat(quats).apply(vectors)
+    np.testing.assert_allclose(each(rotation.rotate, quats, vectors), expected, atol=ROUND_OFF)
+
+
+def test_rotate_inverse_undoes_rotate():
+    turned = each(rotation.rotate, quats, vectors)
+    np.testing.assert_allclose(each(rotation.rotate_inverse, quats, turned), vectors, atol=ROUND_OFF)
+
+
+def test_a_product_rotates_by_its_right_factor_first():
+    expected = (Rotation.from_quat(quats) * Rotation.from_quat(others)).apply(vectors)
+    product = each(rotation.multiply, quats, others)
+    np.testing.assert_allclose(each(rotation.rotate, product, vectors), expected, atol=ROUND_OFF)
+
+
+def test_the_matrix_is_the_rotation():
+    np.testing.assert_allclose(each(rotation.to_matrix, quats), Rotation.from_quat(quats).as_matrix(), atol=ROUND_OFF)
+
+
+def test_the_z_axis_is_the_last_column_of_the_matrix():
+    columns = Rotation.from_quat(quats).as_matrix()[:, :, 2]
+    np.testing.assert_allclose(each(rotation.z_axis, quats), columns, atol=ROUND_OFF)
+
+
+def test_cross_is_the_vector_product():
+    a, b = vectors[:25], vectors[25:]
+    np.testing.assert_allclose(each(rotation.cross, a, b), np.cross(a, b), atol=ROUND_OFF)
+
+
+def test_normalize_gives_unit_length_and_keeps_the_direction():
+    np.testing.assert_allclose(each(rotation.normalize, 3 * quats), quats, atol=ROUND_OFF)
+
+
+@pytest.mark.parametrize(("angle", "atol"), [(0.0, 0), (1e-9, 1e-16), (0.1, 1e-15), (2.0, 1e-14), (2 * np.pi, 1e-7)])
+def test_exp_is_the_rotation_vector_to_the_accuracy_it_promises(angle, atol):
+    axes = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    expected = np.hstack([axes * np.sin(angle / 2), np.full((len(axes), 1), np.cos(angle / 2))])
+    np.testing.assert_allclose(each(rotation.exp, angle * axes), expected, rtol=0, atol=atol)
+
+
+def test_exp_is_smooth_at_zero():
+    half_turn_rate = np.vstack([np.eye(3) / 2, np.zeros(3)])
+    np.testing.assert_array_equal(jax.jit(jax.jacobian(rotation.exp))(jnp.zeros(3)), half_turn_rate)
+    curvature = jax.jit(jax.hessian(rotation.exp))(jnp.zeros(3))  # cos(|v|/2) = 1 - |v|^2/8, the rest is odd
+    np.testing.assert_array_equal(curvature, np.concatenate([np.zeros((3, 3, 3)), -np.eye(3)[None] / 4]))
+
+
+def test_roll_pitch_yaw_come_back():
+    rpy = np.random.default_rng(3).uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (50, 3))
+    np.testing.assert_allclose(each(rotation.to_rpy, each(rotation.from_rpy, rpy)), rpy, atol=1e-12)
+
+
+def test_conversions_agree_with_recorded_ones():
+    recorded = golden_data.load("attitude_conversions").arrays
+    np.testing.assert_allclose(each(rotation.to_matrix, recorded["quat"]), recorded["rot"], atol=ROUND_OFF)
+    np.testing.assert_allclose(
+        up_to_sign(each(rotation.from_rpy, recorded["rpy_in"])), up_to_sign(recorded["quat_out"]), atol=ROUND_OFF
+    )
+    difference = each(rotation.to_rpy, recorded["quat"]) - recorded["rpy"]
+    # asin(s) loses half the digits as s nears 0.99999: 1e-16 / sqrt(1 - s^2) = 2e-14.
+    np.testing.assert_allclose((difference + np.pi) % (2 * np.pi) - np.pi, 0, atol=1e-12)
+
+
+def test_roll_pitch_yaw_have_finite_gradients_also_at_the_poles():
+    pitch = np.array([0.0, np.pi / 2, -np.pi / 2, np.pi / 2 - 0.004])
+    quat = each(rotation.from_rpy, np.column_stack([0 * pitch, pitch, 0 * pitch + 0.3]))
+    assert np.all(np.isfinite(each(jax.jacobian(rotation.to_rpy), quat)))
+
+
+def test_roll_pitch_yaw_are_continuous_where_the_pole_begins():
+    """Just outside the band roll and yaw are nearly undetermined, but they still describe the same attitude."""
+    pitch = np.arcsin(0.99999) + np.array([-1e-7, 1e-7])
+    quat = each(rotation.from_rpy, np.column_stack([0 * pitch, pitch, 0 * pitch + 0.7]))
+    again = each(rotation.from_rpy, each(rotation.to_rpy, quat))
+    # Inside the band pitch becomes 90 degrees: off by acos(0.99999) = 0.0045 rad, half of it in the quaternion.
+    assert np.all(np.abs(np.sum(quat * again, axis=1)) >= np.cos(0.0045 / 2) - 1e-9)

@@ -1,5 +1,6 @@
 """A vectorised, differentiable simulator of quadrotor teams."""
 
+from jaxdrones import rotation
 from jaxdrones.backends.explicit import Effect, Pair, Step, make_step
 from jaxdrones.backends.rollout import rollout
 from jaxdrones.dynamics import (
@@ -43,6 +44,7 @@ __all__ = [
     "repeat",
     "rk4",
     "rollout",
+    "rotation",
     "semi_implicit_euler",
     "stack",
 ]

@@ -1,4 +1,4 @@
-"""The paper's four control flights (its figures 5 to 8), for any vehicle, effects and controller."""
+"""The paper's four control flights (its figures 6 to 9), for any vehicle, effects and controller."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""The four flights do what the paper's figures 5 to 8 show."""
+"""The four flights do what the paper's figures 6 to 9 show."""
 
 import numpy as np
 import pytest

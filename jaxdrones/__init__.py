@@ -1,8 +1,9 @@
 """A vectorised, differentiable simulator of quadrotor teams."""
 
 from jaxdrones import rotation
-from jaxdrones.backends.explicit import Effect, Pair, Step, make_step
+from jaxdrones.backends.explicit import Step, make_step
 from jaxdrones.backends.rollout import rollout
+from jaxdrones.backends.wrenches import Effect, Pair
 from jaxdrones.dynamics import (
     downwash,
     downwash_paper,

@@ -6,18 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones.backends.team import check_team
+from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_total_wrench
 from jaxdrones.checks import check_positive, check_whole
-from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, rotor_wrench, semi_implicit_euler
+from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.wrench import Wrench
 
-Effect = Callable[[Params, State], Wrench]
-Pair = Callable[[Params, State, Params, State], Wrench]
 Step = Callable[[Params, State, jax.Array], State]
-
-_OUT_OF_REACH = 1e3  # m
 
 
 def make_step(
@@ -47,17 +43,14 @@ def make_step(
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)
-    effects, pairs = _functions("effects", effects), _functions("pairs", pairs)
-    _functions("rotors", [rotors])
-    _functions("integrator", [integrator])
+    check_functions("rotors", [rotors])
+    check_functions("integrator", [integrator])
+    total_wrench = make_total_wrench(effects, pairs)
 
     def derivative(params: Params, state: State, command: jax.Array) -> State:
         rpm, rpm_rate = jax.vmap(rotors)(params, state.rpm, command)
         state = state.replace(rpm=rpm)
-        wrench = jax.vmap(lambda p, s: sum((effect(p, s) for effect in effects), rotor_wrench(p, s)))(params, state)
-        for pair in pairs:
-            wrench = wrench + _from_others(pair, params, state)
-        acc, omega_rate = jax.vmap(newton_euler)(params, state, wrench)
+        acc, omega_rate = jax.vmap(newton_euler)(params, state, total_wrench(params, state))
         return State(pos=state.vel, quat=jax.vmap(quat_rate)(state), vel=acc, omega=omega_rate, rpm=rpm_rate)
 
     def step(params: Params, state: State, rpm: jax.Array) -> State:
@@ -72,37 +65,3 @@ def make_step(
         return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, length=substeps)[0]
 
     return jax.jit(step, inline=True)
-
-
-def _from_others(pair: Pair, params: Params, state: State) -> Wrench:
-    """The sum of a pair effect over all other drones, for every drone of the team."""
-    index = jnp.arange(len(state.pos))
-
-    def on(i, own_params, own_state):
-        def because_of(j, other, other_state):
-            # A drone is not its own neighbour. Its copy is moved out of reach before it is masked, so that
-            # neither value nor gradient of a pair is ever taken at zero distance.
-            itself = i == j
-            other_state = other_state.replace(pos=other_state.pos + jnp.where(itself, _OUT_OF_REACH, 0))
-            wrench = pair(own_params, own_state, other, other_state)
-            return jax.tree.map(lambda x: jnp.where(itself, 0, x), wrench)
-
-        wrenches = jax.vmap(because_of)(index, params, state)
-        return jax.tree.map(lambda x: jnp.sum(x, axis=0), wrenches)
-
-    return jax.vmap(on)(index, params, state)
-
-
-def _functions(name: str, functions: Sequence[Callable]) -> tuple[Callable, ...]:
-    """What an argument of `make_step` holds, or an error if it is not a sequence of functions."""
-    example = f"jaxdrones.{_EXAMPLE[name]}"
-    if callable(functions):
-        raise ValueError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
-    functions = tuple(functions)
-    for function in functions:
-        if not callable(function):
-            raise ValueError(f"{name}: {function!r} is not a function; give for example {example}")
-    return functions
-
-
-_EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}

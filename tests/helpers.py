@@ -1,6 +1,6 @@
 """Teams in flight, and comparisons that say which array differs."""
 
-from functools import partial
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,9 @@ from jaxdrones import Params, State
 
 VEHICLES = ("cf2x", "cf2p", "hb", "racer")
 INTEGRATORS = (jaxdrones.euler, jaxdrones.semi_implicit_euler, jaxdrones.implicit_midpoint, jaxdrones.rk4)
+
+
+make_step = lru_cache(jaxdrones.make_step)  # one compilation for all tests of a module that ask for the same step
 
 
 def name_of(function) -> str:

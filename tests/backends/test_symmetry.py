@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from helpers import VEHICLES, assert_close, assert_same_motion, fly, flying, tape, to_world
+from helpers import VEHICLES, assert_close, assert_same_motion, fly, flying, make_step, tape, to_world
 from scipy.spatial.transform import Rotation
 
 import jaxdrones
@@ -61,14 +61,14 @@ def _times(x, signs):
 @pytest.mark.parametrize(("effects", "pairs"), [SMOOTH, PAPER], ids=["smooth", "paper"])
 def test_turning_the_world_about_the_vertical_turns_the_flight(effects, pairs):
     """The paper's drag has equal coefficients along x and y, so it does not notice either."""
-    step = jaxdrones.make_step(effects, pairs)
+    step = make_step(effects, pairs)
     q = jnp.array(Rotation.from_rotvec([0, 0, 1.1]).as_quat())
     flown = fly(step, turned_wind(q, windy), turned(q, start), command)
     assert_same_motion(flown, turned(q, fly(step, windy, start, command)), ROUND_OFF)
 
 
 def test_moving_the_world_sideways_moves_the_flight():
-    step = jaxdrones.make_step(*SMOOTH)
+    step = make_step(*SMOOTH)
     shift = jnp.array([5.0, -7.0, 0.0])
     moved = fly(step, windy, start.replace(pos=start.pos + shift[None]), command)
     here = fly(step, windy, start, command)
@@ -77,7 +77,7 @@ def test_moving_the_world_sideways_moves_the_flight():
 
 def test_without_gravity_and_ground_there_is_no_up():
     """Drag acts in the body frame and the jet along a thrust axis, so any rotation and shift will do."""
-    step = jaxdrones.make_step((drag,), (downwash,))
+    step = make_step((drag,), (downwash,))
     free = windy.replace(gravity=jnp.zeros(3))
     q = jnp.array(Rotation.random(rng=0).as_quat())
     shift = jnp.array([1.0, 2.0, -30.0])
@@ -90,7 +90,7 @@ def test_without_gravity_and_ground_there_is_no_up():
 @pytest.mark.parametrize(("effects", "pairs"), [SMOOTH, PAPER], ids=["smooth", "paper"])
 def test_a_mirrored_team_flies_the_mirrored_flight(effects, pairs):
     """A vehicle in the mirror has its rotors on the other side, turning the other way."""
-    step = jaxdrones.make_step(effects, pairs)
+    step = make_step(effects, pairs)
     sides = jnp.array([1.0, -1, 1])
     in_mirror = windy.replace(
         rotor_pos=windy.rotor_pos * sides[None, None], rotor_spin=-windy.rotor_spin, wind=windy.wind * sides[None]
@@ -102,7 +102,7 @@ def test_a_mirrored_team_flies_the_mirrored_flight(effects, pairs):
 @pytest.mark.parametrize("vehicle", ["cf2x", "racer"])
 def test_a_cross_is_its_own_mirror_image(vehicle):
     """Left and right rotors of an x frame change places; the spins already fit."""
-    step = jaxdrones.make_step((drag, ground_effect))
+    step = make_step((drag, ground_effect))
     pair = jaxdrones.repeat(jaxdrones.load_params(vehicle), 2)
     states, rpm = flying(pair), tape(pair, 100)
     swap = jnp.array([3, 2, 1, 0])
@@ -115,7 +115,7 @@ def test_a_cross_is_its_own_mirror_image(vehicle):
 @pytest.mark.parametrize("vehicle", VEHICLES)
 def test_a_quarter_turn_of_the_numbering_changes_nothing(vehicle):
     """Rotors may be listed in any order."""
-    step = jaxdrones.make_step((drag, ground_effect))
+    step = make_step((drag, ground_effect))
     drone = jaxdrones.repeat(jaxdrones.load_params(vehicle), 1)
     states, rpm = flying(drone), tape(drone, 100)
     order = jnp.array([1, 2, 3, 0])
@@ -126,7 +126,7 @@ def test_a_quarter_turn_of_the_numbering_changes_nothing(vehicle):
 
 
 def test_drones_may_be_listed_in_any_order():
-    step = jaxdrones.make_step(*SMOOTH)
+    step = make_step(*SMOOTH)
     order = jnp.array([2, 0, 1])
     team_, start_ = jax.tree.map(lambda x: x[order], (windy, start))
     flown = fly(step, team_, start_, command[:, order])

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import INTEGRATORS, flying, name_of
+from helpers import INTEGRATORS, flying, make_step, name_of
 
 import jaxdrones
 from jaxdrones import (
@@ -109,7 +109,7 @@ def test_semi_implicit_euler_gains_the_documented_energy(vehicle, gain):
 def test_without_forces_a_drone_flies_straight_on(integrator):
     team = jaxdrones.repeat(params.replace(gravity=jnp.zeros(())), 3)
     start = flying(team)
-    end = jaxdrones.make_step(integrator=integrator, substeps=240)(team, start, jnp.zeros((3, 4)))
+    end = make_step(integrator=integrator, substeps=240)(team, start, jnp.zeros((3, 4)))
     np.testing.assert_array_equal(end.vel, start.vel)
     np.testing.assert_allclose(end.pos, start.pos + start.vel, atol=1e-12)  # 240 roundings of 1e-16 times 3 m
 
@@ -120,9 +120,7 @@ def test_without_forces_a_drone_flies_straight_on(integrator):
 def test_a_falling_drone_follows_the_parabola(integrator, lag):
     """Exactly for order 2 and up; the Eulers are ahead or behind by half a step's worth of velocity."""
     team = jaxdrones.repeat(params, 1)
-    end = jaxdrones.make_step(integrator=integrator, dt=1 / 240, substeps=240)(
-        team, State.at_rest(np.zeros((1, 3))), jnp.zeros((1, 4))
-    )
+    end = make_step(integrator=integrator, substeps=240)(team, State.at_rest(np.zeros((1, 3))), jnp.zeros((1, 4)))
     np.testing.assert_allclose(end.vel, [[0, 0, -9.8]], atol=1e-12)
     np.testing.assert_allclose(end.pos, [[0, 0, -9.8 / 2 * (1 + lag / 240)]], atol=1e-12)
 
@@ -131,5 +129,5 @@ def test_a_falling_drone_follows_the_parabola(integrator, lag):
 def test_quaternions_keep_unit_length(integrator):
     team = jaxdrones.repeat(params, 3)
     start = flying(team).replace(omega=jnp.array([[10.0, 5, 20], [0, 0, 0], [-30, 20, 10]]))
-    end = jaxdrones.make_step(integrator=integrator, substeps=240)(team, start, start.rpm)
+    end = make_step(integrator=integrator, substeps=240)(team, start, start.rpm)
     np.testing.assert_allclose(np.linalg.norm(end.quat, axis=1), 1, atol=1e-15 * 3)

@@ -1,0 +1,192 @@
+from functools import partial
+
+import golden_data
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+from closed_loop import mirrored, recorded_vehicle
+from helpers import VEHICLES
+
+import jaxdrones
+from jaxdrones import State
+from jaxdrones.control.allocation import mixer, rpm_from_wrench
+from jaxdrones.dynamics import rotor_wrench
+
+allocate = jax.jit(rpm_from_wrench)
+allocate_all = jax.jit(jax.vmap(rpm_from_wrench, (None, 0, 0)))
+
+MIXERS = {  # columns roll, pitch, yaw; of the reference
+    "cf2x": [(-0.5, -0.5, -1), (-0.5, 0.5, 1), (0.5, 0.5, -1), (0.5, -0.5, 1)],
+    "cf2x of the paper": [(0.5, -0.5, -1), (0.5, 0.5, 1), (-0.5, 0.5, -1), (-0.5, -0.5, 1)],
+    "cf2p": [(0, -1, -1), (1, 0, 1), (0, 1, -1), (-1, 0, 1)],
+}
+
+
+@pytest.mark.parametrize("vehicle", MIXERS)
+def test_the_mixer_follows_from_where_the_rotors_are(vehicle):
+    params = jaxdrones.load_params(vehicle.split()[0])
+    params = mirrored(params) if "paper" in vehicle else params
+    np.testing.assert_allclose(mixer(params), MIXERS[vehicle], rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_roll_pitch_and_yaw_of_the_mixer_turn_about_their_own_axis(vehicle):
+    params = jaxdrones.load_params(vehicle)
+    squares = params.hover_rpm**2 * (1 + 0.1 * mixer(params).T)
+    wrench = wrenches_of(params, jnp.sqrt(squares))
+    np.testing.assert_allclose(wrench.force[:, 2], params.weight, rtol=1e-12)
+    torque = np.asarray(wrench.torque)
+    assert np.all(np.diagonal(torque) > 0)
+    np.testing.assert_allclose(torque, np.diag(np.diagonal(torque)), rtol=0, atol=1e-12 * np.min(np.diagonal(torque)))
+
+
+@pytest.mark.parametrize("name", golden_data.names("nnls_*"))
+def test_recorded_allocations_agree(name):
+    case = golden_data.load(name)
+    action = jnp.array(case.arrays["action"])
+    assert 0 < case.arrays["infeasible"].sum() < len(action)
+    rpm = allocate_all(recorded_vehicle(case), action[:, 0], action[:, 1:])
+    np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 1e-11
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("name", golden_data.names("nnls_*"))
+def test_recorded_allocations_agree_in_float32(name):
+    case = golden_data.load(name)
+    params = recorded_vehicle(case)
+    action = jnp.array(case.arrays["action"])
+    rpm = allocate_all(params, action[:, 0], action[:, 1:])
+    # Thrusts are differences of terms of the size of the largest, so it is squares that agree: a few roundings of 6e-8.
+    scale = np.max(case.arrays["rpm"] ** 2, axis=-1, keepdims=True)
+    np.testing.assert_allclose(rpm**2 / scale, case.arrays["rpm"] ** 2 / scale, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_what_rotors_can_produce_is_produced(vehicle):
+    """Also with rotors at rest, on the border of what is possible."""
+    params = jaxdrones.load_params(vehicle)
+    rng = np.random.default_rng(0)
+    share = rng.uniform(0, 1, (100, 4)) * (rng.uniform(size=(100, 4)) < 0.8)
+    wanted = wrenches_of(params, params.max_rpm * share)
+    wrench = wrenches_of(params, allocate_all(params, wanted.force[:, 2], wanted.torque))
+    np.testing.assert_allclose(wrench.force, wanted.force, rtol=0, atol=1e-12 * params.max_thrust)
+    scale = jnp.stack([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
+    np.testing.assert_allclose((wrench.torque - wanted.torque) / scale[None], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_what_they_cannot_is_missed_by_the_least_squares(vehicle):
+    """SciPy minimises the same, and no step to squares that are not negative comes closer."""
+    params = jaxdrones.load_params(vehicle)
+    thrust, torque = wild_wrenches(params, 300, seed=1)
+    squares = np.asarray(allocate_all(params, thrust, torque)) ** 2
+    matrix, target = least_squares_problem(params, thrust, torque)
+    scale = np.max(np.abs(target), axis=-1)
+    assert np.mean(np.any(np.linalg.solve(matrix, target.T) < 0, axis=0)) > 0.5, "most should be infeasible"
+
+    for x, b, unit in zip(squares, target, scale, strict=True):
+        expected, _ = scipy.optimize.nnls(matrix, b / unit)
+        np.testing.assert_allclose(x / unit, expected, rtol=0, atol=1e-12)
+
+    def miss(x):
+        return np.linalg.norm(x @ matrix.T - target, axis=-1) / scale
+
+    step = np.random.default_rng(2).normal(size=squares.shape) * scale[:, None]
+    for size in (1e-1, 1e-3):
+        assert np.all(miss(np.maximum(squares + size * step, 0)) >= miss(squares) - 1e-12)
+
+
+def test_nothing_is_asked_of_rotors_that_should_pull():
+    params = jaxdrones.load_params("cf2x")
+    np.testing.assert_array_equal(allocate(params, -params.weight, jnp.zeros(3)), 0)
+
+
+def test_rotor_speeds_are_continuous_where_a_wrench_stops_being_feasible():
+    """From hover to a torque far beyond it; the squares of a least-squares solution are Lipschitz in the target."""
+    params = jaxdrones.load_params("cf2x")
+    share = jnp.linspace(0, 3, 3001)
+    thrust = jnp.full(len(share), params.weight)
+    torque = share[:, None] * params.weight * params.arm * jnp.array([[0.7, 0.5, 0.0]])
+    squares = allocate_all(params, thrust, torque) ** 2 / params.hover_rpm**2
+    assert jnp.any(jnp.min(squares, axis=1) > 0.1) and jnp.any(jnp.min(squares, axis=1) == 0)
+    assert jnp.max(jnp.abs(jnp.diff(squares, axis=0))) < 5 * 4 * (share[1] - share[0])
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_gradients_of_the_allocation_agree_with_differences_in_and_out_of_reach(vehicle):
+    params = jaxdrones.load_params(vehicle)
+    thrust, torque = wild_wrenches(params, 60, seed=3)
+    unit = jnp.concatenate([params.max_thrust[None], jnp.full(2, params.max_xy_torque), params.max_z_torque[None]])
+    wrenches = jnp.column_stack([thrust, torque]) / unit[None]
+    # Away from where a rotor starts or stops: there the root has no derivative.
+    rpm = allocate_all(params, thrust, torque)
+    clear = jnp.all((rpm == 0) | (rpm > 0.05 * params.max_rpm), axis=1)
+    wrenches, rpm = wrenches[clear], rpm[clear]
+    assert jnp.sum(jnp.all(rpm > 0, axis=1)) >= 5 and jnp.sum(jnp.any(rpm == 0, axis=1)) >= 5
+
+    jacobian, differences = gradients_and_differences(params, unit, wrenches)
+    # The squares are piecewise linear in the wrench, so only the rounding of 1e-16 / 1e-6 is left.
+    np.testing.assert_allclose(jacobian, differences, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("thrust", [0.0, -0.1])
+def test_gradients_of_the_allocation_are_zero_at_rest(thrust):
+    params = jaxdrones.load_params("cf2x")
+    gradients = jax.jit(jax.jacrev(rpm_from_wrench, argnums=(1, 2)))(params, jnp.array(thrust), jnp.zeros(3))
+    for gradient in gradients:
+        np.testing.assert_array_equal(gradient, 0)
+
+
+def test_compiled_and_batched_allocations_equal_single_ones():
+    params = jaxdrones.load_params("racer")
+    thrust, torque = wild_wrenches(params, 8, seed=4)
+    batched = allocate_all(params, thrust, torque)
+    for i in range(len(thrust)):
+        eager = rpm_from_wrench(params, thrust[i], torque[i])
+        np.testing.assert_allclose(batched[i], eager, rtol=0, atol=1e-6)  # RPM; sums in another order, then a root
+        np.testing.assert_allclose(allocate(params, thrust[i], torque[i]), eager, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "thrust", "torque"), [("thrust", (2,), (3,)), ("torque", (), (2, 3))])
+def test_wrenches_of_a_team_are_refused(name, thrust, torque):
+    with pytest.raises(ValueError, match=rf"{name} has shape .*expected .*use jax\.vmap"):
+        rpm_from_wrench(jaxdrones.load_params("cf2x"), jnp.zeros(thrust), jnp.zeros(torque))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0))
+def wrenches_of(params, rpm):
+    zero = jnp.zeros(3)
+    return rotor_wrench(params, State(zero, jnp.array([0.0, 0, 0, 1]), zero, zero, rpm))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, None, 0))
+def gradients_and_differences(params, unit, wrench):
+    """Of the squares of the rotor speeds in the wrench, both in units of the highest."""
+
+    def squares(wrench):
+        return (rpm_from_wrench(params, wrench[0] * unit[0], wrench[1:] * unit[1:]) / params.max_rpm) ** 2
+
+    h = 1e-6
+    there, back = (jax.vmap(squares)(wrench[None] + sign * h * jnp.eye(4)) for sign in (1, -1))
+    return jax.jacrev(squares)(wrench), (there - back).T / (2 * h)
+
+
+def wild_wrenches(params, n, seed):
+    """Thrusts from below zero to the highest and torques up to the largest, most of them together infeasible."""
+    rng = np.random.default_rng(seed)
+    thrust = params.max_thrust * rng.uniform(-0.1, 1, n)
+    limits = np.array([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
+    return thrust, jnp.array(rng.uniform(-1, 1, (n, 3)) * limits)
+
+
+def least_squares_problem(params, thrust, torque):
+    """A and b of A x = b in squares of RPM, as the reference weighs its rows."""
+    x, y, _ = np.asarray(params.rotor_pos).T
+    arm = np.mean(np.hypot(x, y))
+    matrix = np.stack([np.ones(4), y / arm, -x / arm, np.asarray(params.rotor_spin)])
+    scale = np.array([params.kf, params.kf * arm, params.kf * arm, params.km])
+    return matrix, np.column_stack([thrust, torque]) / scale

@@ -1,0 +1,75 @@
+from functools import partial
+
+import golden_data
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_loop import hovering, one, reaches, recorded_vehicle, team_of
+
+from jaxdrones import State
+from jaxdrones.control import simple_pid
+from jaxdrones.control.setpoint import Setpoint
+
+
+@pytest.mark.parametrize("name", golden_data.names("simplepid_sequence_*"))
+def test_recorded_sequences_agree_in_speeds_and_memory(name):
+    case = golden_data.load(name)
+    rows = [jnp.array(case.arrays[key]) for key in ("pos", "quat", "target_pos")]
+    memory, rpm = call_in_sequence(recorded_vehicle(case), case.about["dt"], *rows)
+    np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 2e-11
+    np.testing.assert_allclose(memory.pos_integral, case.arrays["integral_pos_e"], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(memory.rpy_integral, case.arrays["integral_rpy_e"], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(memory.pos_error, case.arrays["last_pos_e"], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(memory.rpy_error, case.arrays["last_rpy_e"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("hz", [60, 240])
+def test_a_hummingbird_reaches_a_place_30_cm_off(hz):
+    """A slow loop: sqrt(P / m) is 0.45 rad/s in x and y."""
+    error = fly_30_cm(hz, seconds=20)
+    assert np.max(error) < 0.6
+    assert error[-1] < 0.005  # measured: 0.4 mm
+
+
+def test_at_48_hz_a_hummingbird_with_its_own_inertia_is_not_stable():
+    """The reference's flights at 48 Hz have the fivefold inertia that its engine made of the collision shape."""
+    assert np.max(fly_30_cm(48, seconds=10)[-48:]) > 0.5  # measured: 0.9 m
+
+
+def test_the_first_call_kicks_and_the_second_does_not():
+    """Derivatives are differences of errors, and the last error in a fresh memory is zero."""
+    team = team_of("hb")
+    params, state, memory = one(team), one(hovering(team)), one(simple_pid.init(1))
+    error, dt = 0.01, 1 / 240
+    forces = []
+    for _ in range(2):
+        setpoint = Setpoint.at(state.pos + jnp.array([0, 0, error]))
+        memory, rpm = call(params, memory, state, setpoint, dt)
+        forces.append(jnp.sum(params.kf * rpm**2) - params.weight)
+    p, i, d = 0.2, 1e-4, 0.4
+    expected = p * error + i * error * dt * np.array([1, 2]) + d * error / dt * np.array([1, 0])
+    np.testing.assert_allclose(forces, expected, rtol=0, atol=1e-12)
+
+
+def fly_30_cm(hz, seconds):
+    """Distance from the target, m. The memory holds the first error, so there is no kick."""
+    memory = simple_pid.init(1).replace(pos_error=jnp.array([[0.3, -0.3, 0.3]]))
+    return reaches(simple_pid, ("hb",), (0.3, -0.3, 1.3), seconds, hz, memory=memory)
+
+
+@jax.jit
+def call(params, memory, state, setpoint, dt):
+    return simple_pid.control(simple_pid.gains(), params, memory, state, setpoint, dt=dt)
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
+def call_in_sequence(params, dt, pos, quat, target_pos):
+    def advance(memory, row):
+        pos, quat, target_pos = row
+        state = State(pos, quat, jnp.zeros(3), jnp.zeros(3), jnp.zeros(4))
+        memory, rpm = simple_pid.control(simple_pid.gains(), params, memory, state, Setpoint.at(target_pos), dt=dt)
+        return memory, (memory, rpm)
+
+    return jax.lax.scan(advance, one(simple_pid.init(1)), (pos, quat, target_pos))[1]

@@ -1,4 +1,4 @@
-"""The command line: `jaxdrones fly`, `jaxdrones list`."""
+"""The command line: `jaxdrones fly`, `jaxdrones compare`, `jaxdrones list`."""
 
 import argparse
 import contextlib
@@ -7,10 +7,13 @@ import sys
 from pathlib import Path
 
 from jaxdrones import assets
+from jaxdrones.conditions import BACKENDS
 from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
-from jaxdrones.flights import FLIGHTS, fly
-from jaxdrones.render import plots
+from jaxdrones.flights import fly, scene_of
+from jaxdrones.record import Record, divergence
+from jaxdrones.render import plots, video
+from jaxdrones.tasks.examples import FLIGHTS
 
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
@@ -26,6 +29,12 @@ _COLUMNS = {  # result: (heading, format)
     "peak_vz_m_s": ("vz max (m/s)", "{:.4f}"),
     "peak_speed_m_s": ("|v| max (m/s)", "{:.4f}"),
     "rpm_std": ("RPM std", "{:.1f}"),
+    "t_s": ("t (s)", "{:.2f}"),
+    "pos_m": ("position (m)", "{:.2e}"),
+    "vel_m_s": ("velocity (m/s)", "{:.2e}"),
+    "angle_rad": ("attitude (rad)", "{:.2e}"),
+    "omega_rad_s": ("rates (rad/s)", "{:.2e}"),
+    "rpm": ("rotors (RPM)", "{:.2e}"),
 }
 
 
@@ -36,8 +45,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return options.run(options)
     except OSError as error:
-        return _complain(f"{error.filename}: {error.strerror}; choose another --output")
-    except ValueError as error:
+        unwritable = f"{error.filename}: {error.strerror}; choose another --output"
+        return _complain(unwritable if error.filename else str(error))
+    except (ValueError, ImportError) as error:
         return _complain(str(error))
 
 
@@ -55,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jaxdrones", description="Simulate teams of quadrotors.", allow_abbrev=False)
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
     _add_fly(commands)
+    _add_compare(commands)
     _add_list(commands)
     return parser
 
@@ -69,6 +80,21 @@ def _add_fly(commands) -> None:
         epilog="What is left out is the flight's own. `jaxdrones list` shows the names to choose from.",
         allow_abbrev=False,
     )
+    _add_conditions(parser)
+    parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
+    parser.add_argument("--obstacles", action="store_true", help="put the paper's obstacles up (bullet)")
+    parser.add_argument("--gui", action="store_true", help="watch in Bullet's window, with motor sliders (bullet)")
+    parser.add_argument("--video", type=Path, metavar="FILE", help="film the flight as .mp4 or .gif; either backend")
+    parser.add_argument("--cameras", action="store_true", help="write what each drone sees as PNG; either backend")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="folder of log and figure (runs/FLIGHT)")
+    parser.add_argument("--csv", action="store_true", help="write the log as CSV too")
+    parser.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM beside the RPM")
+    parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    parser.set_defaults(run=_fly)
+
+
+def _add_conditions(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
     parser.add_argument("--drones", type=int, metavar="N", help="number of drones")
     parser.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
@@ -79,12 +105,19 @@ def _add_fly(commands) -> None:
     parser.add_argument("--rotors", default="instant", help=f"{', '.join(ROTORS)} (instant)")
     parser.add_argument("--integrator", default="semi_implicit_euler", help=f"{', '.join(INTEGRATORS)}")
     parser.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="folder of log and figure (runs/FLIGHT)")
-    parser.add_argument("--csv", action="store_true", help="write the log as CSV too")
-    parser.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM beside the RPM")
-    parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
+
+
+def _add_compare(commands) -> None:
+    parser = commands.add_parser(
+        "compare",
+        help="fly an example on both backends and print how they part",
+        description="Fly an example on two backends from the same start and print their divergence over time.",
+        allow_abbrev=False,
+    )
+    _add_conditions(parser)
+    parser.add_argument("--backends", default="explicit,bullet", metavar="A,B", help="two of " + ", ".join(BACKENDS))
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
-    parser.set_defaults(run=_fly)
+    parser.set_defaults(run=_compare)
 
 
 def _add_list(commands) -> None:
@@ -96,10 +129,28 @@ def _add_list(commands) -> None:
 def _fly(options: argparse.Namespace) -> int:
     if not options.no_figure:
         plots.check_matplotlib()
+    if options.video:
+        video.check_video(options.video)
     output = options.output or Path("runs") / options.flight
     output.mkdir(parents=True, exist_ok=True)
+    record = _flown(options, backend=options.backend, obstacles=options.obstacles, gui=options.gui)
+    files = _write(record, options, output)
+    results = record.results(FLIGHTS[options.flight].settled)
+    if options.json:
+        print(json.dumps(record.conditions.as_dict() | {"results": results, "files": list(map(str, files))}))
+    else:
+        print(record.conditions)
+        print(_table(results))
+        print("wrote " + ", ".join(map(str, files)))
+    broken = record.first_not_finite()
+    if broken:
+        return _complain(f"the state of {broken[1]} is not finite from t = {broken[0]:.3f} s on", 1)
+    return 0
+
+
+def _flown(options: argparse.Namespace, **more) -> Record:
     with _progress() as progress:
-        record = fly(
+        return fly(
             options.flight,
             vehicle=options.vehicle,
             drones=options.drones,
@@ -111,27 +162,43 @@ def _fly(options: argparse.Namespace) -> int:
             integrator=options.integrator,
             seed=options.seed,
             progress=progress,
+            **more,
         )
-    flight = FLIGHTS[options.flight]
+
+
+def _write(record: Record, options: argparse.Namespace, output: Path) -> list[Path]:
+    """Log, figure, film and pictures, as asked for."""
     files = [output / "log.npz"]
     record.save_npz(files[0], options.pwm)
     if options.csv:
         files.append(output / "log.csv")
         record.save_csv(files[-1], options.pwm)
     if not options.no_figure:
+        example = FLIGHTS[options.flight]
         files.append(output / "flight.png")
-        plots.save_flight(record, files[-1], f"{options.flight}: {flight.summary}", flight.panels)
+        plots.save_flight(record, files[-1], f"{options.flight}: {example.summary}", example.panels)
+    if options.video or options.cameras:
+        from jaxdrones.render import replay  # needs pybullet
 
-    results = record.results(flight.settled)
+        if options.video:
+            replay.film(record, options.video, scene_of(record.conditions))
+            files.append(options.video)
+        if options.cameras:
+            files.append(output / "cameras")
+            replay.save_cameras(record, files[-1], scene_of(record.conditions))
+    return files
+
+
+def _compare(options: argparse.Namespace) -> int:
+    names = options.backends.split(",")
+    if len(names) != 2:
+        raise ValueError(f"--backends is {options.backends!r}; give two, for example explicit,bullet")
+    rows = divergence(*(_flown(options, backend=name) for name in names))
     if options.json:
-        print(json.dumps(record.conditions | {"results": results, "files": list(map(str, files))}))
+        print(json.dumps({"flight": options.flight, "backends": names, "divergence": rows}))
     else:
-        print(_headline(record.conditions))
-        print(_table(results))
-        print("wrote " + ", ".join(map(str, files)))
-    broken = record.first_not_finite()
-    if broken:
-        return _complain(f"the state of {broken[1]} is not finite from t = {broken[0]:.3f} s on", 1)
+        print(f"{options.flight}: {names[0]} against {names[1]}, largest difference over the drones")
+        print(_table(rows))
     return 0
 
 
@@ -143,6 +210,7 @@ def _list(options: argparse.Namespace) -> int:
         "controllers": list(CONTROLLERS),
         "rotors": list(ROTORS),
         "integrators": list(INTEGRATORS),
+        "backends": list(BACKENDS),
     }
     if options.json:
         print(json.dumps(names))
@@ -168,15 +236,6 @@ def _progress():
         return
     with tqdm(total=100, desc="flying", unit="%", leave=False, disable=None, file=sys.stderr) as bar:
         yield lambda share: bar.update(round(100 * share) - bar.n)
-
-
-def _headline(conditions: dict) -> str:
-    """What was flown, on one line."""
-    return (
-        "{flight}: {drones} x {vehicle}, {controller} at {control_hz} Hz, {integrator} at {physics_hz} Hz, "
-        "{rotors} rotors, ".format(**conditions)
-        + f"effects: {', '.join(conditions['effects']) or 'none'}, {conditions['duration']:g} s"
-    )
 
 
 def _table(results: list[dict]) -> str:

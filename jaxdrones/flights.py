@@ -1,236 +1,103 @@
-"""The paper's four control flights (its figures 6 to 9), for any vehicle, effects and controller."""
+"""Flying the paper's control examples on either backend."""
 
-import dataclasses
 import functools
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.backends.explicit import make_step
 from jaxdrones.backends.rollout import rollout
-from jaxdrones.checks import check_choice, check_positive, check_whole
+from jaxdrones.conditions import Conditions
 from jaxdrones.control import CONTROLLERS, Setpoint, pid, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.params import Params, repeat
 from jaxdrones.record import Record
+from jaxdrones.sensing.scene import Scene, paper_obstacles
 from jaxdrones.state import State
-from jaxdrones.tasks import curves
+from jaxdrones.tasks.examples import FLIGHTS, Flight
 from jaxdrones.urdf import load_params
-
-PHYSICS_HZ = 240  # at least; raised to a multiple of the control rate
 
 _START_SPREAD = 0.01  # m; standard deviation of the start when a seed is given
 
-_DIRECTIONS = np.array([[-0.5, 1.0, 0.0], [0.0, 1.0, 0.0], [0.2, 1.0, 0.2], [0.0, 1.0, 0.5]])
-_HEADINGS = np.array([0, np.pi / 3, np.pi / 4, np.pi / 2])  # rad
 
-
-@dataclasses.dataclass(frozen=True)
-class Flight:
-    """One of the paper's flights and its defaults."""
-
-    summary: str
-    start: Callable[[int], State]  # number of drones -> state
-    target: Callable[[int, jax.Array, float], Setpoint | jax.Array]  # (drones, time, duration) -> set points or actions
-    drones: int
-    duration: float  # s
-    control_hz: int
-    effects: tuple[str, ...] = ()
-    settled: float = 2.0  # s; results are taken from here on
-    panels: tuple[str, ...] = ()  # of the figure; all when empty
-    labels: tuple[str, ...] = ()
-    adapt: Callable[[Params], Params] = lambda team: team
-    any_number: bool = True
-
-
-def _circle() -> Flight:
-    curve = curves.circle()
-
-    def yaw(n):
-        return jnp.arange(n) * (jnp.pi / 2) / n
-
-    return Flight(
-        summary="a circle at staggered heights, each drone with a heading of its own (PID)",
-        start=lambda n: State.at_rest(curve.positions(n), yaw(n)),
-        target=lambda n, t, duration: Setpoint.at(curve.positions(n, t), yaw=yaw(n)),
-        drones=4,
-        duration=12.0,
-        control_hz=120,
-    )
-
-
-def _velocity() -> Flight:
-    def start(n):
-        i = jnp.arange(n)
-        pos = jnp.stack([0.3 * i, jnp.zeros(n), jnp.full(n, 0.1)], axis=-1)
-        return State.at_rest(pos, jnp.asarray(_HEADINGS)[i % 4])
-
-    def action(n, t, duration):
-        i = jnp.arange(n) % 4
-        reverse = t >= duration * (1 / 8 + i / 6)
-        direction = jnp.asarray(_DIRECTIONS)[i] * jnp.where(reverse, -1, 1)[:, None]
-        return jnp.concatenate([direction, jnp.full((n, 1), 0.99)], axis=-1)
-
-    return Flight(
-        summary="steps of the velocity input, reversed one drone after the other",
-        start=start,
-        target=action,
-        drones=4,
-        duration=12.0,
-        control_hz=120,
-        settled=10.0,
-    )
-
-
-def _ground_effect() -> Flight:
-    curve = curves.hop()
-    return Flight(
-        summary="a take-off with and without ground effect (equation 5)",
-        start=lambda n: State.at_rest(jnp.tile(jnp.array([[0.0, 0.0, 0.014]]), (n, 1))),
-        target=lambda n, t, duration: Setpoint.at(curve.positions(n, t)),
-        drones=2,
-        duration=0.5,
-        control_hz=240,
-        effects=("ground_effect_paper",),
-        settled=0.0,
-        panels=("z", "vz", "rpm0"),
-        labels=("with ground effect", "without"),
-        adapt=lambda team: team.replace(ground_effect_coeff=team.ground_effect_coeff.at[1].set(0)),
-        any_number=False,
-    )
-
-
-def _downwash() -> Flight:
-    def curve(n):
-        return curves.crossing(n)
-
-    return Flight(
-        summary="drones that cross above each other, subject to downwash (equation 6)",
-        start=lambda n: State.at_rest(curve(n).positions(n)),
-        target=lambda n, t, duration: Setpoint.at(curve(n).positions(n, t)),
-        drones=2,
-        duration=12.0,
-        control_hz=120,
-        effects=("downwash_paper",),
-        settled=3.0,
-        panels=("x", "vx", "z", "vz", "pitch", "omega_y", "rpm0", "rpm1"),
-    )
-
-
-FLIGHTS = {"circle": _circle(), "velocity": _velocity(), "ground-effect": _ground_effect(), "downwash": _downwash()}
-
-
-def fly(
-    name: str,
-    vehicle: str = "cf2x",
-    drones: int | None = None,
-    effects: Sequence[str] | None = None,
-    controller: str | None = None,
-    control_hz: int | None = None,
-    duration: float | None = None,
-    rotors: str = "instant",
-    integrator: str = "semi_implicit_euler",
-    seed: int | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> Record:
-    """Fly one of `FLIGHTS`; what is left out is the flight's own.
+def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None = None, **options) -> Record:
+    """Fly one of the examples.
 
     Args:
-        name: `circle`, `velocity`, `ground-effect` or `downwash`.
-        vehicle: a bundled vehicle or the path of a URDF.
-        drones: number of drones.
-        effects: names of `EFFECTS` and `PAIRS`.
-        controller: a name of `CONTROLLERS`; the vehicle's own when left out.
-        control_hz: control rate, Hz; physics runs at the next multiple from 240 Hz on.
-        duration: s.
-        rotors: `instant` or `lagging`.
-        integrator: a name of `INTEGRATORS`.
-        seed: of a random start, 1 cm about the flight's own; no disturbance when left out.
+        flight: `circle`, `velocity`, `ground-effect` or `downwash`.
+        gui: watch it in Bullet's window, in real time.
         progress: is told now and then which share of the flight is flown.
+        options: the other fields of `Conditions`.
 
     Raises:
         ValueError: an unknown name or a number out of range; says what, what was given, what to do.
     """
-    check_choice("flight", name, FLIGHTS)
-    check_choice("rotors", rotors, ROTORS)
-    check_choice("integrator", integrator, INTEGRATORS)
-    flight = FLIGHTS[name]
-    n = flight.drones if drones is None else drones
-    duration = flight.duration if duration is None else duration
-    control_hz = flight.control_hz if control_hz is None else control_hz
-    effects = flight.effects if effects is None else effects
-    if controller is None:
-        controller = "pid" if name == "velocity" or vehicle in pid.VEHICLES else "geometric"
-    check_whole("drones", n)
-    check_whole("control rate (Hz)", control_hz)
-    check_positive("duration", duration, "s")
-    check_choice("controller", controller, CONTROLLERS)
-    for effect in effects:
-        check_choice("effect", effect, EFFECTS | PAIRS)
-    if n != flight.drones and not flight.any_number:
-        raise ValueError(f"drones is {n}; the {name} flight takes {flight.drones}: {', '.join(flight.labels)}")
-    if name == "velocity" and controller != "pid":
-        raise ValueError(f"controller is {controller!r}; the velocity flight is flown by 'pid'")
-
-    dt = 1 / control_hz
-    substeps = math.ceil(PHYSICS_HZ / control_hz)
-    steps = round(duration * control_hz)
-    if steps == 0:
-        raise ValueError(f"duration is {duration} s, less than half a control period; give {dt:.4g} s or more")
-    pilot, memory = _pilot(name, controller, vehicle, n, dt)
-    step = make_step(
-        effects=[EFFECTS[effect] for effect in effects if effect in EFFECTS],
-        pairs=[PAIRS[effect] for effect in effects if effect in PAIRS],
-        rotors=ROTORS[rotors],
-        integrator=INTEGRATORS[integrator],
-        dt=dt / substeps,
-        substeps=substeps,
-    )
+    conditions = Conditions(flight, **options)
+    example, n, dt, steps = FLIGHTS[flight], conditions.drones, conditions.dt, conditions.steps
+    pilot, memory = _pilot(conditions)
 
     def control(params, memory, state, k):
         if progress is not None:
             _report(k, steps, progress)
-        return jax.vmap(pilot)(params, memory, state, flight.target(n, k * dt, duration))
+        return jax.vmap(pilot)(params, memory, state, example.target(n, k * dt, conditions.duration))
 
-    @jax.jit  # all of it: one compilation instead of one for every small operation
-    def fly_all(params: Params) -> dict[str, jax.Array]:
-        team = flight.adapt(repeat(params, n))
-        _, trajectory = rollout(step, control, team, _start(flight, n, seed), memory, steps)
+    @jax.jit
+    def prepare(params: Params) -> tuple[Params, State]:
+        return example.adapt(repeat(params, n)), _start(example, n, conditions.seed)
+
+    @jax.jit
+    def finish(params: Params, trajectory: State) -> dict[str, jax.Array]:
         t = dt * jnp.arange(1, steps + 1)
-        target = jax.vmap(lambda t: flight.target(n, t, duration))(t)
-        target_pos, target_vel = _targets(target, team)
+        target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
+        target_pos, target_vel = _targets(target, params)
         rpy = jax.vmap(jax.vmap(rotation.to_rpy))(trajectory.quat)
         return dict(vars(trajectory), t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
 
-    log = jax.device_get(fly_all(load_params(vehicle)))
+    params, start = prepare(load_params(conditions.vehicle))
+    trajectory = _rollout(conditions, gui, control, params, start, memory)
+    log = jax.device_get(finish(params, trajectory))
     jax.effects_barrier()
-    conditions = dict(
-        flight=name,
-        vehicle=str(vehicle),
-        drones=n,
-        controller=controller,
-        control_hz=control_hz,
-        physics_hz=control_hz * substeps,
-        integrator=integrator,
-        rotors=rotors,
-        effects=list(effects),
-        duration=steps * dt,
-        seed=seed,
+    return Record(**log, labels=example.labels or tuple(f"drone {i}" for i in range(n)), conditions=conditions)
+
+
+def scene_of(conditions: Conditions) -> Scene:
+    """What stands around the drones of a flight."""
+    return paper_obstacles() if conditions.obstacles else Scene()
+
+
+def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: State, memory) -> State:
+    """The trajectory, on the backend that was chosen."""
+    common = dict(
+        effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
+        pairs=[PAIRS[effect] for effect in conditions.effects if effect in PAIRS],
+        rotors=ROTORS[conditions.rotors],
+        dt=conditions.dt / conditions.substeps,
+        substeps=conditions.substeps,
     )
-    return Record(**log, labels=flight.labels or tuple(f"drone {i}" for i in range(n)), conditions=conditions)
+    if conditions.backend == "explicit":
+        if gui:
+            raise ValueError("a window is asked for; only the bullet backend has one")
+        step = make_step(**common, integrator=INTEGRATORS[conditions.integrator])
+        fly = jax.jit(lambda *start: rollout(step, control, *start, conditions.steps)[1])
+        return fly(params, start, memory)
+
+    from jaxdrones.backends import bullet  # optional
+
+    with bullet.make_step(**common, scene=scene_of(conditions), gui=gui) as step:
+        step = bullet.Window(step, params, conditions.dt) if gui else step
+        return rollout(step, control, params, start, memory, conditions.steps)[1]
 
 
-def _pilot(flight: str, controller: str, vehicle: str, n: int, dt: float):
-    """The controller of one drone, and fresh memory for n."""
-    if flight == "velocity":
-        return functools.partial(velocity.control, pid.gains(vehicle), dt=dt), pid.init(n)
-    module = CONTROLLERS[controller]
-    gains = pid.gains(vehicle) if module is pid else module.gains()
-    return functools.partial(module.control, gains, dt=dt), module.init(n)
+def _pilot(conditions: Conditions) -> tuple[Callable, object]:
+    """The controller of one drone, and fresh memory for all."""
+    if conditions.flight == "velocity":
+        control = functools.partial(velocity.control, pid.gains(conditions.vehicle), dt=conditions.dt)
+        return control, pid.init(conditions.drones)
+    module = CONTROLLERS[conditions.controller]
+    gains = pid.gains(conditions.vehicle) if module is pid else module.gains()
+    return functools.partial(module.control, gains, dt=conditions.dt), module.init(conditions.drones)
 
 
 def _start(flight: Flight, n: int, seed: int | None) -> State:

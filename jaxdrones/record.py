@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxdrones.conditions import Conditions
 from jaxdrones.control.pid import rpm_to_pwm
 
 _BAND = 0.1  # share of the steady error within which a response counts as settled
@@ -27,7 +28,7 @@ class Record:
     target_pos: np.ndarray  # (K, n, 3) m; NaN where a velocity is commanded
     target_vel: np.ndarray  # (K, n, 3) m/s; NaN where a position is commanded
     labels: tuple[str, ...]  # n names
-    conditions: dict[str, object]  # what was flown: vehicle, controller, rates, effects, ...
+    conditions: Conditions
 
     def first_not_finite(self) -> tuple[float, str] | None:
         """Time and name of the first drone whose state is not a number, if any."""
@@ -70,7 +71,7 @@ class Record:
     def arrays(self, pwm: bool = False) -> dict[str, np.ndarray]:
         """The log by name, the conditions as JSON; `pwm` adds the Crazyflie's PWM beside the RPM."""
         arrays = {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
-        arrays["conditions"] = np.asarray(json.dumps(self.conditions))
+        arrays["conditions"] = np.asarray(json.dumps(self.conditions.as_dict()))
         return arrays | {"pwm": rpm_to_pwm(self.rpm)} if pwm else arrays
 
     def save_npz(self, path: Path, pwm: bool = False) -> None:
@@ -88,6 +89,26 @@ class Record:
             for k, t in enumerate(self.t):
                 for i, label in enumerate(self.labels):
                     writer.writerow([t, label, *np.concatenate([array[k, i] for array in arrays.values()])])
+
+
+def divergence(record: Record, other: Record, rows: int = 12) -> list[dict[str, float]]:
+    """How two flights of the same conditions part: the largest difference over the drones, at `rows` times."""
+    at = np.unique(np.linspace(0, len(record.t) - 1, rows).round().astype(int))
+
+    def largest(difference: np.ndarray) -> list[float]:
+        return np.linalg.norm(difference[at], axis=-1).max(axis=-1).tolist()
+
+    # |q - p| of unit quaternions is 2 sin(angle / 4), up to their sign
+    apart = np.minimum(*(np.linalg.norm(record.quat[at] - sign * other.quat[at], axis=-1) for sign in (1, -1)))
+    columns = {
+        "t_s": record.t[at].tolist(),
+        "pos_m": largest(record.pos - other.pos),
+        "vel_m_s": largest(record.vel - other.vel),
+        "angle_rad": (4 * np.arcsin(np.minimum(apart / 2, 1))).max(axis=-1).tolist(),
+        "omega_rad_s": largest(record.omega - other.omega),
+        "rpm": largest(record.rpm - other.rpm),
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _settling(t: np.ndarray, error: np.ndarray, steady: np.ndarray) -> float:

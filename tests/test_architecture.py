@@ -16,7 +16,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (NOUNS,),
     (("dynamics",), ("control",), ("sensing",)),
     (("backends",), ("tasks",)),
-    (("envs",), ("flights", "record")),
+    (("envs",), ("conditions", "flights", "record")),
     (("adapters", "learning", "render", "cli"),),
     (("",),),  # the package itself, which re-exports
 )

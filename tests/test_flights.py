@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxdrones import flights
+from jaxdrones.tasks.examples import FLIGHTS
 
 
 @pytest.fixture(scope="module")
@@ -12,7 +13,7 @@ def circle():
 
 
 def results(record):
-    return record.results(flights.FLIGHTS[record.conditions["flight"]].settled)
+    return record.results(FLIGHTS[record.conditions.flight].settled)
 
 
 def test_the_circle_is_flown_with_the_known_steady_lag(circle):
@@ -84,19 +85,19 @@ def test_progress_goes_from_nothing_to_all():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (dict(name="loop"), "unknown flight 'loop'.*circle"),
-        (dict(name="circle", vehicle="cf2"), "unknown vehicle 'cf2'; did you mean 'cf2"),
-        (dict(name="circle", drones=0), "drones is 0.*at least 1"),
-        (dict(name="circle", effects=["wind"]), "unknown effect 'wind'.*drag"),
-        (dict(name="circle", integrator="rk5"), "unknown integrator 'rk5'.*'rk4'"),
-        (dict(name="circle", rotors="slow"), "unknown rotors 'slow'.*lagging"),
-        (dict(name="circle", controller="lqr"), "unknown controller 'lqr'.*pid"),
-        (dict(name="circle", duration=-1.0), "duration is -1.0.*positive"),
-        (dict(name="circle", duration=1e-4), "duration is 0.0001 s, less than half a control period"),
-        (dict(name="circle", control_hz=0), "control rate .* is 0"),
-        (dict(name="ground-effect", drones=3), "drones is 3.*takes 2"),
-        (dict(name="velocity", controller="geometric"), "velocity flight is flown by 'pid'"),
-        (dict(name="velocity", vehicle="hb"), "no PID gains for 'hb'"),
+        (dict(flight="loop"), "unknown flight 'loop'.*circle"),
+        (dict(flight="circle", vehicle="cf2"), "unknown vehicle 'cf2'; did you mean 'cf2"),
+        (dict(flight="circle", drones=0), "drones is 0.*at least 1"),
+        (dict(flight="circle", effects=["wind"]), "unknown effect 'wind'.*drag"),
+        (dict(flight="circle", integrator="rk5"), "unknown integrator 'rk5'.*'rk4'"),
+        (dict(flight="circle", rotors="slow"), "unknown rotors 'slow'.*lagging"),
+        (dict(flight="circle", controller="lqr"), "unknown controller 'lqr'.*pid"),
+        (dict(flight="circle", duration=-1.0), "duration is -1.0.*positive"),
+        (dict(flight="circle", duration=1e-4), "duration is 0.0001 s, less than half a control period"),
+        (dict(flight="circle", control_hz=0), "control rate .* is 0"),
+        (dict(flight="ground-effect", drones=3), "drones is 3.*takes 2"),
+        (dict(flight="velocity", controller="geometric"), "velocity flight is flown by 'pid'"),
+        (dict(flight="velocity", vehicle="hb"), "no PID gains for 'hb'"),
     ],
 )
 def test_a_wrong_option_is_refused_with_what_to_do(options, message):

@@ -21,7 +21,7 @@ def test_the_python_of_the_readme_runs_from_top_to_bottom():
 
 
 def test_the_commands_of_the_readme_are_known_to_the_command_line():
-    from jaxdrones import flights
+    from jaxdrones.tasks.examples import FLIGHTS
 
     named = set(re.findall(r"jaxdrones fly ([a-z-]+)", README))
-    assert named == set(flights.FLIGHTS)
+    assert named == set(FLIGHTS)

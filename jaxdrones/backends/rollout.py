@@ -5,8 +5,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdrones.backends.explicit import Step
+from jaxdrones.backends.host import HostStep, is_traced
 from jaxdrones.checks import check_finite, check_whole
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -37,6 +39,9 @@ def rollout(
     check_finite("state", state)
     check_finite("params", params)
 
+    if isinstance(step, HostStep) and not is_traced((params, state, memory)):
+        return _loop(step, control, params, state, memory, length)
+
     def advance(carry: tuple[Any, State], k: jax.Array) -> tuple[tuple[Any, State], State]:
         memory, state = carry
         memory, rpm = control(params, memory, state, k)
@@ -45,3 +50,16 @@ def rollout(
 
     (_, final), trajectory = jax.lax.scan(advance, (memory, state), jnp.arange(length))
     return final, trajectory
+
+
+def _loop(
+    step: HostStep, control: Control, params: Params, state: State, memory: Any, length: int
+) -> tuple[State, State]:
+    """The same in Python: a step on the host is faster called than called back."""
+    control = jax.jit(control)
+    states = []
+    for k in range(length):
+        memory, rpm = control(params, memory, state, k)
+        state = step(params, state, rpm)
+        states.append(state)
+    return state, jax.tree.map(lambda *leaves: np.stack(leaves), *states)

@@ -1,4 +1,11 @@
-"""What every backend demands of a team."""
+"""What every backend demands of a team, and its parameters as one array."""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
@@ -25,3 +32,21 @@ def check_team(params: Params, state: State, rpm) -> None:
         hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
         check_shape(f"params.{name}", leaf, (n, *_SHAPES.get(name, ())), hint)
     check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")
+
+
+def flatten(params: Params) -> Float[Array, "n k"]:
+    """All numbers of a team's parameters as one array, a row per drone."""
+    return jnp.concatenate([jnp.reshape(leaf, (len(leaf), -1)) for leaf in vars(params).values()], axis=-1)
+
+
+def unflatten(flat: Float[Array, "n k"]) -> Params:
+    """The parameters that `flatten` made one array of."""
+    shapes = {field.name: _SHAPES.get(field.name, ()) for field in dataclasses.fields(Params)}
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
+    columns = jnp.split(flat, ends, axis=-1)
+    return Params(
+        **{
+            name: jnp.reshape(column, (len(flat), *shape))
+            for (name, shape), column in zip(shapes.items(), columns, strict=True)
+        }
+    )

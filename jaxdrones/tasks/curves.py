@@ -63,12 +63,12 @@ def crossing(n: int, reach: float = 0.5, period: float = 5.0, spacing: float = 0
     return Curve(point)
 
 
-def hop(height: float = 0.014, amplitude: float = 0.15, period: float = 4.0) -> Curve:
-    """The paper's take-off: a step to `height + amplitude`, from where z swings."""
+def hop(height: float = 0.014, amplitude: float = 0.15, period: float = 4.0, spacing: float = 1.0) -> Curve:
+    """The paper's take-off: a step to `height + amplitude`, from where z swings; drones `spacing` (m) apart in x."""
     check_positive("period", period, "s")
 
     def point(i, t):
         z = height + amplitude * (jnp.sin(2 * jnp.pi * t / period) + 1)
-        return jnp.stack([jnp.zeros_like(z), jnp.zeros_like(z), z])
+        return jnp.stack([i * spacing, jnp.zeros_like(z), z])
 
     return Curve(point)

@@ -1,0 +1,256 @@
+"""One Bullet world: its connection, its bodies, and the only import of pybullet."""
+
+import contextlib
+import ctypes
+import importlib.util
+import os
+import sys
+import weakref
+from types import ModuleType
+
+import numpy as np
+
+from jaxdrones.checks import check_choice
+from jaxdrones.sensing.scene import Box, Cylinder, Mesh, Obstacle, Scene, Sphere, Urdf
+
+BALLS, CYLINDER = "balls", "cylinder"
+TINY, EGL = "tiny", "egl"
+BACKGROUND, GROUND = -1, 0  # of a segmentation; drone i is 1 + i, obstacle i is 1 + number of drones + i
+_BALLS = 8
+_DISC = 0.1  # thickness of the disc, of the height of the collision cylinder
+_HUB, _FRONT, _BACK = [0.15, 0.15, 0.2, 1], [0.8, 0.15, 0.1, 1], [0.35, 0.35, 0.4, 1]  # colours
+_SHAPE, _INERTIAL = slice(0, 16), slice(16, 20)  # columns of a team
+_DRONE_FRICTION, _GROUND_FRICTION = 0.5, 1.0  # the reference's
+
+
+def import_pybullet() -> ModuleType:
+    """The pybullet module; its greeting is not printed.
+
+    Raises:
+        ImportError: it is not installed; says which extra to install, and for which Python.
+    """
+    if "pybullet" in sys.modules:
+        return sys.modules["pybullet"]
+    with _quiet():
+        try:
+            import pybullet
+        except ImportError:
+            raise ImportError(
+                'pybullet is not installed; pip install "jaxdrones[bullet]" '
+                f"(it has wheels up to CPython 3.11, this is {sys.version_info.major}.{sys.version_info.minor})"
+            ) from None
+    return pybullet
+
+
+class Client:
+    """A connection to Bullet with a scene and, once `set_team` was called, a team of drones."""
+
+    def __init__(self, scene: Scene, dt: float, damping: float, collision: str, renderer: str, gui: bool):
+        check_choice("collision shape", collision, (BALLS, CYLINDER))
+        check_choice("renderer", renderer, (TINY, EGL))
+        self.p = import_pybullet()
+        self.scene, self.drones = scene, []
+        self._damping = float(np.float32(damping))  # the reference's, Bullet's default, is in single precision
+        self._collision = collision
+        self._team = np.empty((0, 20))
+        self.id = self.p.connect(self.p.GUI if gui else self.p.DIRECT)
+        if self.id < 0:
+            raise OSError("Bullet cannot open a window; start a display (or xvfb-run), or leave the window out")
+        self._disconnect = weakref.finalize(self, _disconnect, self.p, self.id)
+        self.p.setTimeStep(dt, physicsClientId=self.id)
+        self.p.setGravity(0, 0, 0, physicsClientId=self.id)  # every drone's weight is part of its wrench
+        self.ground = self._add_ground() if scene.ground else None
+        self.obstacles = [self._add_obstacle(obstacle) for obstacle in scene.obstacles]
+        self.renderer = self.p.ER_BULLET_HARDWARE_OPENGL if gui or renderer == EGL else self.p.ER_TINY_RENDERER
+        if renderer == EGL:
+            self._load_egl()
+
+    @property
+    def closed(self) -> bool:
+        """Whether the connection is gone."""
+        return not self._disconnect.alive
+
+    def close(self) -> None:
+        """End the connection; more than once is fine."""
+        self._disconnect()
+
+    def check_open(self) -> None:
+        """Raise if the connection is gone."""
+        if self.closed:
+            raise ValueError("this Bullet step is closed; make a new one, and use it inside its `with` block")
+
+    def names(self) -> dict[int, str]:
+        """Name of every body: `ground`, `drone i`, `obstacle i`; the order is that of segmentations."""
+        ground = {} if self.ground is None else {self.ground: "ground"}
+        drones = {body: f"drone {i}" for i, body in enumerate(self.drones)}
+        return ground | drones | {body: f"obstacle {i}" for i, body in enumerate(self.obstacles)}
+
+    def set_team(self, team: np.ndarray) -> None:
+        """Give the drones these bodies.
+
+        Columns of (n, 20): collision radius, height, offset; propeller radius, rotor positions (12), for the eye;
+        mass, principal moments of inertia (3).
+        """
+        if np.array_equal(team, self._team):
+            return
+        if team.shape != self._team.shape or not np.array_equal(team[:, _SHAPE], self._team[:, _SHAPE]):
+            for drone in self.drones:
+                self.p.removeBody(drone, physicsClientId=self.id)
+            self.drones = [self._add_drone(*shape) for shape in team[:, _SHAPE].tolist()]
+        for drone, (mass, *inertia) in zip(self.drones, team[:, _INERTIAL].tolist(), strict=True):
+            self.p.changeDynamics(
+                drone,
+                -1,
+                mass=mass,
+                localInertiaDiagonal=inertia,
+                linearDamping=self._damping,
+                angularDamping=self._damping,
+                physicsClientId=self.id,
+            )
+        self._team = team.copy()
+        self.labels = self._labels()
+
+    def _labels(self) -> np.ndarray:
+        """Bullet's body -> segmentation label; the last entry, at -1, is the background."""
+        labels = np.full(max([0, *self.drones, *self.obstacles]) + 2, BACKGROUND, np.int32)
+        labels[self.drones] = 1 + np.arange(len(self.drones))
+        labels[self.obstacles] = 1 + len(self.drones) + np.arange(len(self.obstacles))
+        if self.ground is not None:
+            labels[self.ground] = GROUND
+        return labels
+
+    def matrices(self, quats: np.ndarray) -> np.ndarray:
+        """Rotation matrices (n, 3, 3) of quaternions (n, 4); in double precision, unlike `rotateVector`."""
+        return np.array([self.p.getMatrixFromQuaternion(quat) for quat in quats.tolist()]).reshape(-1, 3, 3)
+
+    def place(self, body: np.ndarray) -> None:
+        """Put the drones where (n, 13+) position, attitude, velocity and angular velocity (all world) say.
+
+        Their contact manifolds outlive a change of pose; taking a drone out of the collision world and putting it back
+        forgets them, so that what happens next does not depend on what happened before.
+        """
+        p, client = self.p, self.id
+        for drone, row in zip(self.drones, body.tolist(), strict=True):
+            p.setCollisionFilterGroupMask(drone, -1, 0, 0, physicsClientId=client)
+            p.setCollisionFilterGroupMask(drone, -1, 1, -1, physicsClientId=client)
+            p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], physicsClientId=client)
+            p.resetBaseVelocity(drone, row[7:10], row[10:13], physicsClientId=client)
+
+    def advance(self, body: np.ndarray, loads: np.ndarray) -> np.ndarray:
+        """One physics step from `body` under force and torque (n, 6+), world; the (n, 13) that follows."""
+        p, client = self.p, self.id
+        self.place(body)
+        for drone, pos, load in zip(self.drones, body[:, :3].tolist(), loads.tolist(), strict=True):
+            p.applyExternalForce(drone, -1, load[:3], pos, p.WORLD_FRAME, physicsClientId=client)
+            p.applyExternalTorque(drone, -1, load[3:6], p.WORLD_FRAME, physicsClientId=client)
+        p.stepSimulation(physicsClientId=client)
+        after = np.empty((len(self.drones), 13))
+        for row, drone in zip(after, self.drones, strict=True):
+            row[:3], row[3:7] = p.getBasePositionAndOrientation(drone, physicsClientId=client)
+            row[7:10], row[10:13] = p.getBaseVelocity(drone, physicsClientId=client)
+        return after
+
+    def _load_egl(self) -> None:
+        spec = importlib.util.find_spec("eglRenderer")
+        if spec is None or self.p.loadPlugin(spec.origin, "_eglRendererPlugin", physicsClientId=self.id) < 0:
+            raise OSError("Bullet's EGL renderer cannot be loaded; it needs a GPU and its driver, or take 'tiny'")
+
+    def _add_drone(self, radius: float, height: float, offset: float, prop_radius: float, *rotor_pos: float) -> int:
+        p = self.p
+        if self._collision == CYLINDER:
+            shapes, radii, lengths, places = [p.GEOM_CYLINDER], [radius], [height], [[0, 0, offset]]
+        else:
+            # Contact manifolds are cleared at every step. Without their memory a cylinder on a plane sinks in and
+            # spins up, and one that is hit on its side is hit at an edge and tumbles. Balls as high as the cylinder
+            # touch in points of their own, half-way up; the disc fills the rim between them.
+            ball = min(height, radius) / 2
+            ring = [(radius - ball) * np.exp(2j * np.pi * k / _BALLS) for k in range(_BALLS)]
+            shapes, radii = [p.GEOM_CYLINDER] + [p.GEOM_SPHERE] * _BALLS, [radius] + [ball] * _BALLS
+            lengths = [_DISC * height] + [0.0] * _BALLS
+            places = [[0, 0, offset]] + [[place.real, place.imag, offset] for place in ring]
+        collision = p.createCollisionShapeArray(
+            shapeTypes=shapes,
+            radii=radii,
+            lengths=lengths,
+            halfExtents=[[0, 0, 0]] * len(shapes),
+            collisionFramePositions=places,
+            physicsClientId=self.id,
+        )
+        visual = self._drone_visual(height, offset, prop_radius, np.reshape(rotor_pos, (4, 3)))
+        drone = p.createMultiBody(1.0, collision, visual, physicsClientId=self.id)
+        p.changeDynamics(
+            drone,
+            -1,
+            lateralFriction=_DRONE_FRICTION,
+            restitution=0,
+            rollingFriction=0,
+            spinningFriction=0,
+            physicsClientId=self.id,
+        )
+        return drone
+
+    def _drone_visual(self, height: float, offset: float, prop_radius: float, rotor_pos: np.ndarray) -> int:
+        """A hub and four discs, red in front."""
+        p = self.p
+        hub = np.abs(rotor_pos[:, :2]).max() / 2
+        return p.createVisualShapeArray(
+            shapeTypes=[p.GEOM_BOX] + [p.GEOM_CYLINDER] * 4,
+            halfExtents=[[hub, hub, height / 4]] + [[0, 0, 0]] * 4,
+            radii=[0.0] + [prop_radius] * 4,
+            lengths=[0.0] + [height / 5] * 4,
+            visualFramePositions=[[0, 0, offset], *(rotor_pos + np.array([0, 0, offset + height / 3])).tolist()],
+            rgbaColors=[_HUB, *(_FRONT if x > 1e-6 else _BACK for x in rotor_pos[:, 0])],
+            physicsClientId=self.id,
+        )
+
+    def _add_ground(self) -> int:
+        p = self.p
+        plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=self.id)
+        ground = p.createMultiBody(0, plane, physicsClientId=self.id)
+        p.changeDynamics(ground, -1, lateralFriction=_GROUND_FRICTION, physicsClientId=self.id)
+        return ground
+
+    def _add_obstacle(self, obstacle: Obstacle) -> int:
+        p = self.p
+        if isinstance(obstacle, Urdf):
+            with _quiet():
+                return p.loadURDF(
+                    str(obstacle.path), obstacle.pos, obstacle.quat, useFixedBase=True, physicsClientId=self.id
+                )
+        match obstacle:
+            case Box(size=size):
+                shape = dict(shapeType=p.GEOM_BOX, halfExtents=[edge / 2 for edge in size])
+            case Sphere(radius=radius):
+                shape = dict(shapeType=p.GEOM_SPHERE, radius=radius)
+            case Cylinder(radius=radius, height=height):
+                shape = dict(shapeType=p.GEOM_CYLINDER, radius=radius, height=height)
+            case Mesh(path=path, scale=scale):
+                shape = dict(shapeType=p.GEOM_MESH, fileName=str(path), meshScale=[scale] * 3)
+        collision = p.createCollisionShape(**shape, physicsClientId=self.id)
+        if "height" in shape:
+            shape["length"] = shape.pop("height")  # Bullet has two words for it
+        visual = p.createVisualShape(**shape, rgbaColor=obstacle.color, physicsClientId=self.id)
+        return p.createMultiBody(0, collision, visual, obstacle.pos, obstacle.quat, physicsClientId=self.id)
+
+
+def _disconnect(p: ModuleType, client: int) -> None:
+    with contextlib.suppress(p.error):
+        p.disconnect(client)
+
+
+@contextlib.contextmanager
+def _quiet():
+    """Keep what Bullet's C code prints off stdout, where a caller may be writing JSON, and off stderr."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with open(os.devnull, "w") as nowhere:
+        kept = {number: os.dup(number) for number in (1, 2)}
+        try:
+            for number in kept:
+                os.dup2(nowhere.fileno(), number)
+            yield
+        finally:
+            ctypes.CDLL(None).fflush(None)
+            for number, copy in kept.items():
+                os.dup2(copy, number)
+                os.close(copy)

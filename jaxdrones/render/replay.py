@@ -1,0 +1,68 @@
+"""Recorded flights of either backend, seen from outside or from on board. Needs the extra `bullet`."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from jaxdrones.backends import bullet
+from jaxdrones.params import repeat
+from jaxdrones.record import Record
+from jaxdrones.render import video
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.state import State
+from jaxdrones.urdf import load_params
+
+FPS = 24  # frames per simulated second; the paper's camera rate
+
+_DIRECTION = np.array([-0.6, -0.7, 0.4])  # from the middle of the flight to the camera
+_DISTANCE = 1.6  # of the camera, over the extent of the flight
+_LEAST_EXTENT = 0.6  # m
+
+
+def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS) -> int:
+    """Write a film of a flight from a camera that sees all of it; one frame per 1/fps of simulated time.
+
+    Args:
+        record: the flight.
+        path: .mp4 or .gif.
+        scene: what to show around the drones; a bare ground plane when left out.
+        fps: frames per second.
+
+    Returns:
+        The number of frames.
+    """
+    video.check_video(path)
+    low, high = record.pos.min(axis=(0, 1)), record.pos.max(axis=(0, 1))
+    middle = (low + high) / 2
+    eye = middle + _DIRECTION * _DISTANCE * max(_LEAST_EXTENT, np.linalg.norm(high - low))
+    with bullet.make_step(scene=scene) as step:
+        params = _params(record)
+        frames = (step.photo(params, state, eye, middle) for state in _states(record, fps))
+        return video.write(frames, path, fps)
+
+
+def save_cameras(record: Record, folder: Path, scene: Scene | None = None, fps: int = FPS) -> int:
+    """Write what every drone saw as PNG, `drone 0/00000.png` and so on; returns the number of pictures."""
+    from matplotlib.image import imsave
+
+    count = 0
+    with bullet.make_step(scene=scene) as step:
+        params = _params(record)
+        for frame, state in enumerate(_states(record, fps)):
+            for label, picture in zip(record.labels, step.camera(params, state)[0], strict=True):
+                (folder / label).mkdir(parents=True, exist_ok=True)
+                imsave(folder / label / f"{frame:05d}.png", picture)
+                count += 1
+    return count
+
+
+def _params(record: Record):
+    return repeat(load_params(record.conditions.vehicle), len(record.labels))
+
+
+def _states(record: Record, fps: int) -> Iterator[State]:
+    """The recorded state nearest to every frame's time."""
+    for time in np.arange(round(record.t[-1] * fps)) / fps:
+        k = int(np.abs(record.t - time).argmin())
+        yield State(record.pos[k], record.quat[k], record.vel[k], record.omega[k], record.rpm[k])

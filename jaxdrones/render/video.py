@@ -1,0 +1,61 @@
+"""Frames -> MP4 (extra `video`) or GIF."""
+
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+SUFFIXES = (".mp4", ".gif")
+
+
+def check_video(path: Path) -> None:
+    """Raise if no film can be written to `path`.
+
+    Raises:
+        ValueError: a suffix that is not known, or a package that is not installed; says which extra it is in.
+    """
+    try:
+        if path.suffix == ".mp4":
+            import imageio_ffmpeg  # noqa: F401
+        elif path.suffix == ".gif":
+            import PIL  # noqa: F401
+        else:
+            raise ValueError(f"{path}: films end in {' or '.join(SUFFIXES)}")
+    except ImportError as error:
+        raise ValueError(
+            f'{error.name} is not installed, so {path} cannot be written; pip install "jaxdrones[video]"'
+        ) from None
+
+
+def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
+    """Write RGB frames (height, width, 3) uint8 as a film; returns how many there were."""
+    check_video(path)
+    return (_write_mp4 if path.suffix == ".mp4" else _write_gif)(frames, path, fps)
+
+
+def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
+    import imageio_ffmpeg
+
+    writer, count = None, 0
+    try:
+        for frame in frames:
+            if writer is None:
+                writer = imageio_ffmpeg.write_frames(str(path), frame.shape[1::-1], fps=fps, quality=7)
+                with warnings.catch_warnings():  # about forking a process with threads: it becomes ffmpeg at once
+                    warnings.simplefilter("ignore", RuntimeWarning)
+                    writer.send(None)
+            writer.send(np.ascontiguousarray(frame))
+            count += 1
+    finally:
+        if writer is not None:
+            writer.close()
+    return count
+
+
+def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
+    from PIL import Image
+
+    images = [Image.fromarray(frame) for frame in frames]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+    return len(images)

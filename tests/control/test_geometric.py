@@ -2,12 +2,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_loop import always, at, control_team, distance, fly, hovering, mirrored, reaches, team_of
+from closed_loop import always, at, control_team, distance, fly, hovering, mirrored, one, reaches, team_of
 from helpers import VEHICLES, flying
+from scipy.spatial.transform import Rotation
 
 from jaxdrones import rotation
 from jaxdrones.control import attitude, geometric
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.dynamics import rotor_wrench
 
 HZ = 240
 SECONDS = 8  # the same for all flights, so that they are compiled once
@@ -62,6 +64,38 @@ def test_a_spin_is_followed_without_a_lag_if_its_rate_is_given():
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
+def test_the_rotors_produce_the_wrench_of_lee(vehicle):
+    """Equations 15 and 16 of Lee, Leok and McClamroch 2010 in matrices, with a target that turns at a constant rate."""
+    team = team_of(*20 * [vehicle])
+    state = flying(team, tilt=0.01)
+    state = state.replace(omega=0.02 * state.omega, vel=0.02 * state.vel)
+    setpoint = jax.tree.map(lambda x: 0.03 * x, wild_setpoints(20)).replace(pos=state.pos + 0.01)
+    rpm = call(team, state, setpoint)
+    free = np.asarray(jnp.all((rpm > 0) & (rpm < team.max_rpm[:, None]), axis=1))
+    assert free.mean() > 0.5
+
+    for i in np.flatnonzero(free):
+        params, s, target = one(team, i), one(state, i), one(setpoint, i)
+        k, inertia = geometric.gains(), np.diag(params.inertia)
+        r = Rotation.from_quat(s.quat).as_matrix()
+        force = target.acc + k.pos * (target.pos - s.pos) + k.vel * (target.vel - s.vel) + np.array([0, 0, 9.8])
+        z = force / np.linalg.norm(force)
+        y = np.cross(z, [np.cos(target.yaw), np.sin(target.yaw), 0])
+        wanted = np.column_stack([np.cross(y, z) / np.linalg.norm(y), y / np.linalg.norm(y), z])
+        e_r = vee(wanted.T @ r - r.T @ wanted) / 2
+        feed_forward = r.T @ wanted @ target.omega
+        e_omega = s.omega - feed_forward
+        torque = (
+            -inertia @ (k.attitude * e_r + k.rate * e_omega)
+            + np.cross(s.omega, inertia @ s.omega)
+            - inertia @ np.cross(s.omega, feed_forward)
+        )
+        wrench = rotor_wrench(params, s.replace(rpm=rpm[i]))
+        np.testing.assert_allclose(wrench.force[2], params.mass * force @ r[:, 2], rtol=1e-12)
+        np.testing.assert_allclose(wrench.torque, torque, rtol=0, atol=1e-12 * params.max_xy_torque)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
 def test_a_mirrored_drone_in_a_mirrored_world_turns_its_rotors_as_fast(vehicle):
     """y -> -y: vectors flip y, rotations the other two components, rotors change sides and spin."""
     team = team_of(*20 * [vehicle])
@@ -88,6 +122,10 @@ def test_no_rotor_is_asked_for_more_than_its_highest_speed():
     team = team_of(*VEHICLES)
     rpm = call(team, hovering(team), at(len(VEHICLES), (0, 0, 1000)))
     np.testing.assert_array_equal(rpm, np.broadcast_to(team.max_rpm[:, None], (len(VEHICLES), 4)))
+
+
+def vee(skew):
+    return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
 
 
 @jax.jit

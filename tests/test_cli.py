@@ -68,6 +68,12 @@ def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypat
         (["fly", "circle", "--duration", "-2"], "duration is -2.0"),
         (["fly", "circle", "--duration", "nan"], "duration is nan"),
         (["fly", "circle", "--vehicle", "missing.urdf"], "missing.urdf: cannot be read"),
+        (["fly", "circle", "--backend", "gazebo"], "unknown backend 'gazebo'"),
+        (["fly", "circle", "--backend", "bullet", "--integrator", "rk4"], "bullet backend integrates by itself"),
+        (["fly", "circle", "--obstacles"], "take the bullet backend"),
+        (["fly", "circle", "--gui"], "only the bullet backend has one"),
+        (["fly", "circle", "--video", "film.avi"], "films end in .mp4 or .gif"),
+        (["compare", "circle", "--backends", "explicit"], "give two"),
         (["fly"], "required: FLIGHT"),
         (["soar"], "invalid choice: 'soar'"),
     ],
@@ -96,3 +102,21 @@ def test_list_names_what_can_be_chosen(capsys):
     assert {"drag", "ground_effect", "downwash", "downwash_paper"} <= set(names["effects"])
     assert main(["list"]) == 0
     assert "integrators" in capsys.readouterr().out
+
+
+def test_compare_prints_how_the_backends_part(capsys):
+    assert main(["compare", "ground-effect", "--duration", "0.1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["backends"] == ["explicit", "bullet"] and len(report["divergence"]) == 12
+    last = report["divergence"][-1]
+    assert last["t_s"] == pytest.approx(0.1) and last["pos_m"] < 1e-6
+    assert main(["compare", "ground-effect", "--duration", "0.1"]) == 0
+    assert "attitude (rad)" in capsys.readouterr().out
+
+
+def test_a_flight_in_bullet_is_filmed(tmp_path, capsys):
+    film = tmp_path / "flight.mp4"
+    arguments = ["fly", "circle", *SHORT, "--backend", "bullet", "--obstacles", "--video", str(film), "--cameras"]
+    assert main([*arguments, "--no-figure", "--output", str(tmp_path)]) == 0
+    assert film.stat().st_size > 1000 and (tmp_path / "cameras" / "drone 0" / "00000.png").exists()
+    assert "Bullet at 240 Hz" in capsys.readouterr().out

@@ -57,5 +57,7 @@ def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+    ends = 10 * np.round(100 * np.arange(len(images) + 1) / fps)  # ms; GIF counts in hundredths of a second
+    durations = np.diff(ends).astype(int).tolist()
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
     return len(images)

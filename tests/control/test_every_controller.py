@@ -136,18 +136,18 @@ def test_gradients_of_a_closed_loop_in_the_gains_agree_with_differences(loop):
     targets = always(stay(loop, team), 60)
     gains, unravel = ravel_pytree(loop.gains())
 
+    @jax.jit
+    @jax.value_and_grad
     def cost(change):
         flown = fly(loop.control, unravel(gains * (1 + change)), team, start, loop.init(1), targets, control_hz=240)
         off = flown.pos - jnp.array([[[0, 0, 1.0]]])
         return 1e4 * jnp.mean(jnp.sum(off**2 + 0.1 * flown.vel**2, axis=-1))
 
     n, h = len(gains), 1e-4
-    changes = jnp.concatenate([jnp.zeros((1, n)), h * jnp.eye(n), -h * jnp.eye(n)])
-    costs, gradients = jax.jit(jax.vmap(jax.value_and_grad(cost)))(changes)
-    differences = (costs[1 : n + 1] - costs[n + 1 :]) / (2 * h)
-    assert jnp.sum(jnp.abs(differences) > 1e-4) >= n / 3
+    differences = np.array([cost(h * change)[0] - cost(-h * change)[0] for change in np.eye(n)]) / (2 * h)
+    assert np.sum(np.abs(differences) > 1e-4) >= n / 3
     # Central differences err by h^2 = 1e-8 relative and by rounding, 1e-16 * cost / h.
-    np.testing.assert_allclose(gradients[0], differences, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(cost(np.zeros(n))[1], differences, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.float32

@@ -60,10 +60,9 @@ def test_the_collective_is_thrust_per_mass():
         np.testing.assert_allclose(jnp.sum(params.kf * rpm**2), 12 * params.mass, rtol=1e-12)
 
 
-@pytest.mark.parametrize("hz", [120, 240])
-def test_every_vehicle_reaches_a_place_30_cm_off(hz):
-    error = reaches(rates, VEHICLES, (0.3, -0.3, 1.3), seconds=6, hz=hz)
-    assert np.all(error[3 * hz - 1] < 0.01)
+def test_every_vehicle_reaches_a_place_30_cm_off():
+    error = reaches(rates, VEHICLES, (0.3, -0.3, 1.3), seconds=6, hz=240)
+    assert np.all(error[3 * 240 - 1] < 0.01)
     assert np.all(error[-1] < 1e-4)  # m; measured: 5e-5
 
 

@@ -24,10 +24,9 @@ def test_recorded_sequences_agree_in_speeds_and_memory(name):
     np.testing.assert_allclose(memory.rpy_error, case.arrays["last_rpy_e"], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("hz", [60, 240])
-def test_a_hummingbird_reaches_a_place_30_cm_off(hz):
+def test_at_60_hz_a_hummingbird_reaches_a_place_30_cm_off():
     """A slow loop: sqrt(P / m) is 0.45 rad/s in x and y."""
-    error = fly_30_cm(hz, seconds=20)
+    error = fly_30_cm(60, seconds=20)
     assert np.max(error) < 0.6
     assert error[-1] < 0.005  # measured: 0.4 mm
 

@@ -81,11 +81,11 @@ def look(
         physicsClientId=client.id,
     )
     rgb = np.reshape(rgb, (camera.height, camera.width, 4)).astype(np.uint8)
-    depth = np.reshape(depth, (camera.height, camera.width)).astype(np.float32)
+    depth = np.reshape(depth, (camera.height, camera.width)).astype(float)
     if not raw_depth:
         depth = camera.far * near / (camera.far - (camera.far - near) * depth)
     bodies = np.reshape(bodies, depth.shape)
-    return rgb, depth, client.labels[np.where(bodies < 0, -1, bodies & _BODY_MASK)]
+    return rgb, depth.astype(np.float32), client.labels[np.where(bodies < 0, -1, bodies & _BODY_MASK)]
 
 
 def _check_outside(client: Client, drone: int, eye: np.ndarray) -> None:

@@ -53,9 +53,9 @@ class Client:
         self._damping = float(np.float32(damping))  # the reference's, Bullet's default, is in single precision
         self._collision = collision
         self._team = np.empty((0, 20))
+        if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):  # Bullet would end the process
+            raise OSError("no window can be opened without a display; start one (or use xvfb-run), or leave gui out")
         self.id = self.p.connect(self.p.GUI if gui else self.p.DIRECT)
-        if self.id < 0:
-            raise OSError("Bullet cannot open a window; start a display (or xvfb-run), or leave the window out")
         self._disconnect = weakref.finalize(self, _disconnect, self.p, self.id)
         self.p.setTimeStep(dt, physicsClientId=self.id)
         self.p.setGravity(0, 0, 0, physicsClientId=self.id)  # every drone's weight is part of its wrench

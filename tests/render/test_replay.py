@@ -1,0 +1,64 @@
+"""Films and on-board pictures of recorded flights."""
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from PIL import Image
+
+from jaxdrones import flights
+from jaxdrones.render import replay, video
+
+
+@pytest.fixture(scope="module")
+def record():
+    return flights.fly("circle", drones=2, duration=1.5)
+
+
+def read(path) -> tuple[dict, list[np.ndarray]]:
+    frames = imageio_ffmpeg.read_frames(str(path))
+    about = next(frames)
+    width, height = about["size"]
+    return about, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames]
+
+
+def test_a_film_has_a_frame_for_every_24th_of_a_simulated_second_and_moves(record, tmp_path):
+    assert replay.film(record, tmp_path / "flight.mp4") == 36
+    about, frames = read(tmp_path / "flight.mp4")
+    assert about["fps"] == 24 and len(frames) == 36
+    assert frames[0].std() > 10
+    moved = np.abs(frames[-1].astype(int) - frames[12].astype(int)).max(axis=-1) > 60
+    assert 20 < moved.sum() < 0.05 * moved.size  # the drones, not the camera
+
+
+def test_a_film_may_be_a_gif(record, tmp_path):
+    replay.film(record, tmp_path / "flight.gif", fps=8)
+    with Image.open(tmp_path / "flight.gif") as picture:
+        assert picture.n_frames == 12
+        durations = [picture.seek(frame) or picture.info["duration"] for frame in range(12)]
+    assert sum(durations) == 1500  # ms, in whole hundredths of a second
+
+
+def test_frames_are_in_step_with_simulated_time(record):
+    states = list(replay._states(record, fps=10))
+    assert len(states) == 15
+    for frame, state in enumerate(states[1:], 1):
+        k = round(frame / 10 * 120) - 1  # row k is the state at (k + 1) / 120 s
+        np.testing.assert_array_equal(state.pos, record.pos[k])
+
+
+def test_every_drone_leaves_its_pictures(record, tmp_path):
+    assert replay.save_cameras(record, tmp_path, fps=4) == 12
+    pictures = sorted((tmp_path / "drone 1").glob("*.png"))
+    assert len(pictures) == 6 and imread(pictures[0]).shape == (48, 64, 4)
+
+
+def test_an_unknown_kind_of_film_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"flight\.avi: films end in \.mp4 or \.gif"):
+        video.check_video(tmp_path / "flight.avi")
+
+
+def test_without_ffmpeg_the_error_names_the_extra(monkeypatch, tmp_path):
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    with pytest.raises(ValueError, match=r'imageio_ffmpeg is not installed.*pip install "jaxdrones\[video\]"'):
+        video.check_video(tmp_path / "flight.mp4")

@@ -114,6 +114,8 @@ def test_compare_prints_how_the_backends_part(capsys):
     assert "attitude (rad)" in capsys.readouterr().out
 
 
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_flight_in_bullet_is_filmed(tmp_path, capsys):
     film = tmp_path / "flight.mp4"
     arguments = ["fly", "circle", *SHORT, "--backend", "bullet", "--obstacles", "--video", str(film), "--cameras"]

@@ -9,6 +9,11 @@ from PIL import Image
 from jaxdrones import flights
 from jaxdrones.render import replay, video
 
+pytestmark = [  # imageio-ffmpeg leaves its pipes to the garbage collector
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
 
 @pytest.fixture(scope="module")
 def record():

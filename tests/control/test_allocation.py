@@ -17,6 +17,7 @@ from jaxdrones.dynamics import rotor_wrench
 N = 200  # wrenches in a batch, as in the recorded cases
 
 allocate = jax.jit(rpm_from_wrench)
+differentiate = jax.jit(jax.jacrev(rpm_from_wrench, argnums=(1, 2)))
 allocate_all = jax.jit(jax.vmap(rpm_from_wrench, (None, 0, 0)))
 
 MIXERS = {  # columns roll, pitch, yaw; of the reference
@@ -124,20 +125,19 @@ def test_gradients_of_the_allocation_agree_with_differences_in_and_out_of_reach(
     wrenches = jnp.column_stack([thrust, torque]) / unit[None]
     # Away from where a rotor starts or stops: there the root has no derivative.
     rpm = allocate_all(params, thrust, torque)
-    clear = jnp.all((rpm == 0) | (rpm > 0.05 * params.max_rpm), axis=1)
-    wrenches, rpm = wrenches[clear], rpm[clear]
-    assert jnp.sum(jnp.all(rpm > 0, axis=1)) >= 5 and jnp.sum(jnp.any(rpm == 0, axis=1)) >= 5
+    clear = np.asarray(jnp.all((rpm == 0) | (rpm > 0.05 * params.max_rpm), axis=1))
+    reached = np.asarray(jnp.all(rpm > 0, axis=1))
+    assert np.sum(clear & reached) >= 10 and np.sum(clear & ~reached) >= 10
 
     jacobian, differences = gradients_and_differences(params, unit, wrenches)
     # The squares are piecewise linear in the wrench, so only the rounding of 1e-16 / 1e-6 is left.
-    np.testing.assert_allclose(jacobian, differences, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(jacobian[clear], differences[clear], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("thrust", [0.0, -0.1])
 def test_gradients_of_the_allocation_are_zero_at_rest(thrust):
     params = jaxdrones.load_params("cf2x")
-    gradients = jax.jit(jax.jacrev(rpm_from_wrench, argnums=(1, 2)))(params, jnp.array(thrust), jnp.zeros(3))
-    for gradient in gradients:
+    for gradient in differentiate(params, jnp.array(thrust), jnp.zeros(3)):
         np.testing.assert_array_equal(gradient, 0)
 
 

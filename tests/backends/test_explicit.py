@@ -4,7 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import INTEGRATORS, VEHICLES, assert_close, assert_same_motion, fly, flying, make_step, name_of, tape
+from helpers import (
+    INTEGRATORS,
+    VEHICLES,
+    assert_close,
+    assert_finite,
+    assert_same_motion,
+    fly,
+    flying,
+    make_step,
+    name_of,
+    tape,
+)
 
 import jaxdrones
 from jaxdrones import (
@@ -141,6 +152,19 @@ def test_pairs_act_once_for_every_other_drone():
     end = make_step(pairs=(lift,), dt=1.0)(mixed, start, jnp.zeros((4, 4)))
     others = jnp.sum(mixed.weight) - mixed.weight
     np.testing.assert_allclose(end.vel[:, 2], others / mixed.mass - 9.8, rtol=1e-12)
+
+
+def test_a_pair_may_break_down_where_a_drone_meets_itself():
+    """A repulsion over the distance: its gradient at no distance would be not a number."""
+
+    def repel(params, state, other, other_state):
+        away = state.pos - other_state.pos
+        return Wrench.of_force(1e-3 * away / jnp.linalg.norm(away) ** 2)
+
+    team = jaxdrones.repeat(cf2x, 2)
+    start, command = flying(team), tape(team, 1)[0]
+    step = make_step(pairs=(repel,))
+    assert_finite(jax.jit(jax.grad(lambda s: jnp.sum(step(team, s, command).vel)))(start))
 
 
 def test_effects_and_pairs_add_up():

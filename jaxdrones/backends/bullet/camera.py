@@ -90,7 +90,13 @@ def look(
 
 def _check_outside(client: Client, drone: int, eye: np.ndarray) -> None:
     """Raise if the eye is inside a body: it would look through it without notice."""
-    inside = [f"obstacle {i}" for i, obstacle in enumerate(client.scene.obstacles) if contains(obstacle, eye)]
+    point = eye.tolist()
+    near = {body for body, _ in client.p.getOverlappingObjects(point, point, physicsClientId=client.id) or ()}
+    inside = [
+        f"obstacle {i}"
+        for i, (body, obstacle) in enumerate(zip(client.obstacles, client.scene.obstacles, strict=True))
+        if body in near and contains(obstacle, eye)
+    ]
     if client.ground is not None and eye[2] < 0:
         inside.append("the ground")
     if inside:

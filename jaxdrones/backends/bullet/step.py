@@ -97,6 +97,7 @@ class BulletStep(HostStep):
         self._params: Params | None = None
         self._shapes: list[tuple[int, ...]] = []
         self._flat_params: jax.Array | None = None  # one array is handed over faster than twenty
+        self._arms: np.ndarray | None = None
 
     def __enter__(self) -> BulletStep:
         return self
@@ -151,7 +152,8 @@ class BulletStep(HostStep):
         Raises:
             ValueError: a wrong shape, a closed client, a state that is not finite, or an eye inside a body.
         """
-        return of_drones(self.client, self._place(params, state), np.asarray(params.arm), camera, raw_depth)
+        team = self._place(params, state)
+        return of_drones(self.client, team, self._arms, camera, raw_depth)
 
     def photo(self, params: Params, state: State, eye, target, camera: Camera = _FILM_CAMERA) -> np.ndarray:
         """A picture of the team from `eye` towards `target` (3,) (m, world): RGB (height, width, 3) uint8."""
@@ -174,6 +176,7 @@ class BulletStep(HostStep):
             check_team(params, state, rpm)
             self._flat_params = flatten(params)
             self.client.set_team(np.asarray(_bodies(params), float))
+            self._arms = np.asarray(params.arm, float)
             self._params, self._shapes = params, shapes
         team = np.empty((len(state.pos), _COMMAND.stop))
         for name, columns in _COLUMNS.items():

@@ -1,0 +1,107 @@
+"""How many steps and frames per second does the Bullet backend make?
+
+One process, one thread of Bullet. A physics step is 1/240 s. Medians of repeats, all in one run.
+"""
+
+import argparse
+import functools
+import json
+import statistics
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdrones as jd
+from jaxdrones.backends import bullet
+from jaxdrones.control import Setpoint, pid
+from jaxdrones.sensing.scene import Box, Cylinder, Scene, Sphere
+
+EFFECTS = dict(effects=(jd.drag, jd.ground_effect), pairs=(jd.downwash,))
+PRIMITIVES = Scene(
+    tuple(Box(pos=(2.0 + 0.3 * i, 0.4 * i - 0.8, 0.5), size=(0.2, 0.2, 1.0)) for i in range(4))
+    + tuple(Sphere(pos=(3.0, 0.8 * i - 0.8, 1.2), radius=0.2) for i in range(3))
+    + tuple(Cylinder(pos=(4.0, 0.8 * i - 0.8, 0.5), radius=0.1, height=1.0) for i in range(3))
+)
+
+
+def hovering(n: int) -> tuple[jd.Params, jd.State, np.ndarray]:
+    """A team that flies above each other's shoulders, and the rotor speeds that carry it."""
+    params = jd.repeat(jd.load_params("cf2x"), n)
+    i = jnp.arange(n)
+    start = jd.State.at_rest(jnp.stack([0.3 * i, 0.0 * i, 1.0 + 0.1 * i], axis=-1))
+    return params, start, np.asarray(params.hover_rpm[:, None] * jnp.ones((1, 4)))
+
+
+def median_rate(work, count: int, repeats: int) -> float:
+    """Units of work per second: `work()` does `count` of them; the first call warms up."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return count / statistics.median(times)
+
+
+def open_loop(n: int, steps: int, repeats: int) -> float:
+    """Physics steps per second of a world with n drones and every effect, one per call."""
+    params, start, rpm = hovering(n)
+    with bullet.make_step(**EFFECTS) as step:
+
+        def work():
+            state = start
+            for _ in range(steps):
+                state = step(params, state, rpm)
+
+        return median_rate(work, steps, repeats)
+
+
+def closed_loop(steps: int, repeats: int) -> float:
+    """Physics steps per second of one drone with every effect and the PID, five physics steps per control."""
+    params, start, _ = hovering(1)
+    pilot = functools.partial(pid.control, pid.gains(), dt=5 / 240)
+    target = Setpoint.at(start.pos)
+
+    def control(params, memory, state, k):
+        return jax.vmap(pilot)(params, memory, state, target)
+
+    with bullet.make_step(**EFFECTS, substeps=5) as step:
+        work = functools.partial(jd.rollout, step, control, params, start, pid.init(1), steps)
+        return median_rate(work, 5 * steps, repeats)
+
+
+def frames(count: int, repeats: int) -> float:
+    """64 x 48 frames of RGB, depth and segmentation per second in a scene of a plane and ten primitives."""
+    params, start, _ = hovering(1)
+    with bullet.make_step(scene=PRIMITIVES) as step:
+
+        def work():
+            for _ in range(count):
+                step.camera(params, start)
+
+        return median_rate(work, count, repeats)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few steps: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    steps, repeats = (20, 1) if options.quick else (3000, 7)
+    rates = {
+        "1 drone, every effect: physics steps/s": open_loop(1, steps, repeats),
+        "1 drone, every effect, PID, 5 substeps: physics steps/s": closed_loop(steps // 5, repeats),
+        "10 drones, every effect: world steps/s": open_loop(10, steps // 4, repeats),
+        "64 x 48 RGB + depth + segmentation, ten primitives: frames/s": frames(steps // 10, repeats),
+    }
+    if options.json:
+        print(json.dumps({name: round(rate, 1) for name, rate in rates.items()}))
+    else:
+        for name, rate in rates.items():
+            print(f"{rate:10,.0f}  {name}")
+
+
+if __name__ == "__main__":
+    main()

@@ -120,7 +120,7 @@ def test_forward_and_reverse_mode_agree():
 
 
 def test_gradients_of_many_worlds_are_those_of_each():
-    step = jaxdrones.make_step((drag,))
+    step = jaxdrones.make_step()
     params, start, commands = flight()
     batch = jnp.stack([commands, 1.01 * commands, 0.98 * commands])
     together = jit(jax.vmap(slope(step), (None, None, 0)))(params, start, batch)
@@ -171,7 +171,7 @@ def test_gradients_are_finite_in_float32_too(effects):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS, ids=name_of)
 def test_integrators_and_lagging_rotors_have_finite_gradients(integrator):
-    assert_finite_everywhere(jaxdrones.make_step((drag,), rotors=lagging_rotors, integrator=integrator))
+    assert_finite_everywhere(jaxdrones.make_step(rotors=lagging_rotors, integrator=integrator))
 
 
 def test_mass_has_the_gradient_of_free_fall_and_thrust():

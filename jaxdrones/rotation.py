@@ -4,18 +4,32 @@ Every function is about one rotation, never a batch: use `jax.vmap` for more. Al
 everywhere they are defined, also at zero rotation.
 """
 
+import math
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.numerics import safe_sqrt
 
-_EXP_TERMS = 9
+_COS = [(-1) ** k / math.factorial(2 * k) for k in range(10)]
+_SINC = [(-1) ** k / math.factorial(2 * k + 1) for k in range(10)]
+_SINC_RATE = [k * coefficient for k, coefficient in enumerate(_SINC)][1:]
+
+
+def unstack(v: Float[Array, " n"]) -> list[Float[Array, ""]]:
+    """The components of a vector.
+
+    Its derivative is one concatenation. That of indexing or iterating is a sum of padded arrays, which makes the
+    backward pass of a flight slower on a CPU (by a tenth to a fifth of its kernel time).
+    """
+    return [jnp.squeeze(x, 0) for x in jax.lax.split(v, [1] * len(v))]
 
 
 def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     """Vector product a x b."""
-    ax, ay, az = a
-    bx, by, bz = b
+    ax, ay, az = unstack(a)
+    bx, by, bz = unstack(b)
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
@@ -27,21 +41,30 @@ def unit(v: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
     """Hamilton product p q: first the rotation q, then p."""
-    u, v = p[:3], q[:3]
-    vector = p[3] * v + q[3] * u + cross(u, v)
-    return jnp.append(vector, p[3] * q[3] - jnp.sum(u * v))
+    a, b, c, d = unstack(p)
+    x, y, z, w = unstack(q)
+    return jnp.stack(
+        [
+            d * x + a * w + b * z - c * y,
+            d * y - a * z + b * w + c * x,
+            d * z + a * y - b * x + c * w,
+            d * w - a * x - b * y - c * z,
+        ]
+    )
 
 
 def conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
     """The inverse rotation of a unit quaternion."""
-    return jnp.append(-q[:3], q[3])
+    x, y, z, w = unstack(q)
+    return jnp.stack([-x, -y, -z, w])
 
 
 def rotate(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
-    """R v: a vector from the body frame to the world frame."""
-    u, w = q[:3], q[3]
-    t = 2 * cross(u, v)
-    return v + w * t + cross(u, t)
+    """R v: a vector from the body frame to the world frame, v + w t + u x t with t = 2 u x v and q = (u, w)."""
+    x, y, z, w = unstack(q)
+    vx, vy, vz = unstack(v)
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return jnp.stack([vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx])
 
 
 def rotate_inverse(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -51,7 +74,7 @@ def rotate_inverse(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "
 
 def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
     """R e_z: the body z axis (thrust axis) in the world frame."""
-    x, y, z, w = q
+    x, y, z, w = unstack(q)
     return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
@@ -63,21 +86,39 @@ def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
 def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
     """The rotation by |v| rad about v.
 
-    A Taylor series in the squared half angle: no square root and no division, so it is as smooth at
-    zero as elsewhere, and faster than `sin` and `cos`. Exact to float64 up to 2 rad, to 1e-7 up to a
-    full turn; integrators stay far below (2 rad per 240 Hz step is 480 rad/s).
+    Power series in the squared half angle: no square root and no division, so it is as smooth at zero as elsewhere,
+    and faster than `sin` and `cos`. Exact to float64 up to 2 rad, to 1e-7 up to a full turn; integrators stay far
+    below (2 rad per 240 Hz step is 480 rad/s).
     """
-    s = jnp.sum(v * v) / 4
-    cos, sinc = 1.0, 1.0
-    for k in range(2 * _EXP_TERMS, 0, -2):  # Horner's scheme from the highest term
-        cos = 1 - s / ((k - 1) * k) * cos
-        sinc = 1 - s / (k * (k + 1)) * sinc
+    cos, sinc = _cos_and_sinc(jnp.sum(v * v) / 4)
     return jnp.append(v * (sinc / 2), cos)
+
+
+@jax.custom_jvp
+def _cos_and_sinc(s: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """cos(x) and sin(x)/x of s = x^2."""
+    return _polynomial(_COS, s), _polynomial(_SINC, s)
+
+
+@_cos_and_sinc.defjvp
+def _cos_and_sinc_jvp(primals, tangents):
+    # Differentiating Horner's scheme step by step makes the backward pass of a flight take 1.7 times as long.
+    (s,), (rate,) = primals, tangents
+    cos, sinc = _cos_and_sinc(s)
+    return (cos, sinc), (-sinc / 2 * rate, _polynomial(_SINC_RATE, s) * rate)
+
+
+def _polynomial(coefficients: list[float], s: Float[Array, ""]) -> Float[Array, ""]:
+    """Horner's scheme; the lowest coefficient comes first."""
+    value = jnp.full_like(s, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        value = coefficient + s * value
+    return value
 
 
 def to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """The rotation matrix R."""
-    x, y, z, w = q
+    x, y, z, w = unstack(q)
     return jnp.stack(
         [
             jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
@@ -116,7 +157,7 @@ def to_rpy(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
     Within 0.26 degrees of pitch +-90 degrees (|sin| >= 0.99999) roll is set to zero and yaw takes it up.
     """
-    x, y, z, w = q
+    x, y, z, w = unstack(q)
     sin_pitch = 2 * (w * y - x * z)
     up, down = sin_pitch >= 0.99999, sin_pitch <= -0.99999
     regular = ~(up | down)

@@ -1,0 +1,48 @@
+"""What every benchmark prints about itself, and how it takes time."""
+
+import json
+import os
+import platform
+import statistics
+import subprocess
+import time
+
+import jax
+import jaxlib
+
+
+def about() -> dict[str, object]:
+    """Versions, machine and commit: what a number means nothing without."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return {
+        "commit": commit.stdout.strip(),
+        "jax": jax.__version__,
+        "jaxlib": jaxlib.__version__,
+        "python": platform.python_version(),
+        "device": str(jax.devices()[0]),
+        "cores": os.cpu_count(),
+    }
+
+
+def compiled(function, *arguments):
+    """The compiled function and the seconds it took, the compilation cache switched off."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    start = time.perf_counter()
+    program = jax.jit(function).lower(*arguments).compile()
+    return program, time.perf_counter() - start
+
+
+def seconds(program, *arguments, repeats: int) -> dict[str, float]:
+    """Median and best seconds of a call after one that warms up."""
+    jax.block_until_ready(program(*arguments))
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(program(*arguments))
+        times.append(time.perf_counter() - start)
+    return {"median": statistics.median(times), "best": min(times)}
+
+
+def report(result: dict, as_json: bool, lines: list[str]) -> None:
+    """Print one JSON object, or the lines for people."""
+    print(json.dumps(result) if as_json else "\n".join(lines))

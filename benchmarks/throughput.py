@@ -1,0 +1,127 @@
+"""How many drone-steps per second does the explicit backend make, forward, and forward with backward?
+
+A world is one drone with constant rotor speeds of its own. One dispatch flies many steps. More worlds than a chunk
+are flown chunk after chunk, so that the state of a chunk stays in the cache.
+"""
+
+import argparse
+
+import jax
+import jax.numpy as jnp
+from common import about, compiled, report, seconds
+
+import jaxdrones as jd
+from jaxdrones.checks import check_choice
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+
+WORLDS = (1, 64, 1024, 16384, 262144)
+GRADIENT_STEPS = 100
+STEPS_OF_A_CALL = 2**24  # drone-steps of a forward measurement, about
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
+    parser.add_argument("--drones", type=int, default=1, help="drones per world")
+    parser.add_argument("--chunk", type=int, default=512, help="worlds flown at a time")
+    parser.add_argument("--effects", default="drag", help="names as in `jaxdrones list`, or none")
+    parser.add_argument("--rotors", default="instant")
+    parser.add_argument("--integrator", default="semi_implicit_euler")
+    parser.add_argument("--substeps", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--float64", action="store_true")
+    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", options.float64)
+    if options.quick:
+        options.worlds, options.repeats = (1, 32), 1
+
+    step = make_step(options)
+    rows = [measure(step, worlds, options) for worlds in options.worlds]
+    a_step = {
+        "dt": 1 / 240,
+        "substeps": options.substeps,
+        "integrator": options.integrator,
+        "rotors": options.rotors,
+        "effects": options.effects,
+        "controller": "none, constant rotor speeds",
+        "drones per world": options.drones,
+        "chunk": options.chunk,
+        "dtype": "float64" if options.float64 else "float32",
+        "gradient": f"of the mean squared final position in the rotor speeds of {GRADIENT_STEPS} steps",
+    }
+    lines = [f"{name}: {value}" for name, value in (a_step | about()).items()]
+    lines.append(
+        "   worlds | forward M/s (best) | with backward M/s | time over forward | compile s, forward and backward"
+    )
+    lines += [
+        f"{row['worlds']:9} | {row['forward']:8.1f} ({row['forward best']:6.1f})  | {row['with backward']:17.2f} |"
+        f" {row['time over forward']:17.1f} | {row['forward compile']:.2f} {row['backward compile']:.2f}"
+        for row in rows
+    ]
+    report({"step": a_step, "about": about(), "rows": rows}, options.json, lines)
+
+
+def make_step(options) -> jd.Step:
+    names = [] if options.effects == "none" else options.effects.split(",")
+    for name in names:
+        check_choice("effect", name, EFFECTS | PAIRS)
+    return jd.make_step(
+        effects=[EFFECTS[name] for name in names if name in EFFECTS],
+        pairs=[PAIRS[name] for name in names if name in PAIRS],
+        rotors=ROTORS[options.rotors],
+        integrator=INTEGRATORS[options.integrator],
+        substeps=options.substeps,
+    )
+
+
+def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
+    """Rates in million drone-steps per second; the gradient is against the forward pass of the same rollout."""
+    n, chunk = options.drones, min(options.chunk, worlds)
+    params = jd.repeat(jd.load_params("cf2x"), n)
+    i = jnp.arange(n)
+    start = jd.State.at_rest(jnp.stack([0.2 * i, 0.0 * i, 1.0 + 0.3 * i], axis=-1))
+    starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)) + 0.0, start)
+    rpm = params.hover_rpm[0] * (1 + 0.01 * jax.random.normal(jax.random.key(0), (worlds, n, 4)))
+    length = 10 if options.quick else max(GRADIENT_STEPS, min(20_000, STEPS_OF_A_CALL // worlds))
+    grad_length = 10 if options.quick else GRADIENT_STEPS
+
+    def fly(start, rpm):
+        return jax.lax.scan(lambda state, _: (step(params, state, rpm), None), start, length=length)[0].pos
+
+    def loss(start, rpms):
+        # Recomputing a step in the backward pass is faster than storing what it needs: only states are kept.
+        advance = jax.checkpoint(step)
+        final, _ = jax.lax.scan(lambda state, rpm: (advance(params, state, rpm), None), start, rpms)
+        return jnp.mean(final.pos**2)
+
+    def in_chunks(world):
+        return lambda *arguments: jax.lax.map(lambda x: world(*x), arguments, batch_size=chunk)
+
+    forward, forward_compile = compiled(in_chunks(fly), starts, rpm)
+    time = seconds(forward, starts, rpm, repeats=options.repeats)
+    steps = worlds * n * options.substeps / 1e6
+
+    few = min(
+        worlds, 16 * options.chunk
+    )  # of many worlds a part shows the same: memory grows with them, speed does not
+    starts, rpms = jax.tree.map(lambda x: x[:few], (starts, jnp.repeat(rpm[:, None], grad_length, axis=1)))
+    value, _ = compiled(in_chunks(loss), starts, rpms)
+    gradient, backward_compile = compiled(in_chunks(jax.value_and_grad(loss, 1)), starts, rpms)
+    value_time = seconds(value, starts, rpms, repeats=options.repeats)["median"]
+    gradient_time = seconds(gradient, starts, rpms, repeats=options.repeats)["median"]
+    return {
+        "worlds": worlds,
+        "steps per call": length,
+        "forward": steps * length / time["median"],
+        "forward best": steps * length / time["best"],
+        "with backward": steps * few / worlds * grad_length / gradient_time,
+        "time over forward": gradient_time / value_time,
+        "forward compile": forward_compile,
+        "backward compile": backward_compile,
+    }
+
+
+if __name__ == "__main__":
+    main()

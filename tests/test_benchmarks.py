@@ -1,0 +1,43 @@
+"""The benchmarks run and say what they measured."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+def quick(name: str) -> dict:
+    command = [sys.executable, str(BENCHMARKS / name), "--quick", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_throughput_reports_what_a_step_is_and_every_rate():
+    result = quick("throughput.py")
+    assert {"dt", "substeps", "integrator", "effects", "dtype", "chunk"} <= set(result["step"])
+    assert {"commit", "jax", "device", "cores"} <= set(result["about"])
+    assert [row["worlds"] for row in result["rows"]] == [1, 32]
+    for row in result["rows"]:
+        assert row["forward"] > 0 and row["with backward"] > 0 and row["time over forward"] > 0
+
+
+def test_startup_loads_nothing_optional():
+    result = quick("startup.py")
+    assert result["loaded"] == [] and len(result["seconds"]) == 3
+
+
+def test_bullet_reports_four_rates():
+    rates = quick("bullet.py")
+    assert len(rates) == 4 and min(rates.values()) > 0
+
+
+@pytest.mark.parametrize("name", [path.name for path in BENCHMARKS.glob("*.py") if path.name != "common.py"])
+def test_every_benchmark_explains_itself(name):
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / name), "--help"], capture_output=True, text=True, check=True
+    )
+    assert "--quick" in done.stdout and "--json" in done.stdout

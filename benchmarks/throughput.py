@@ -16,7 +16,7 @@ from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 
 WORLDS = (1, 64, 1024, 16384, 262144)
 GRADIENT_STEPS = 100
-STEPS_OF_A_CALL = 2**24  # drone-steps of a forward measurement, about
+STEPS_OF_A_CALL = 2**23  # drone-steps of a forward measurement, about
 
 
 def main() -> None:
@@ -84,7 +84,9 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     start = jd.State.at_rest(jnp.stack([0.2 * i, 0.0 * i, 1.0 + 0.3 * i], axis=-1))
     starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)) + 0.0, start)
     rpm = params.hover_rpm[0] * (1 + 0.01 * jax.random.normal(jax.random.key(0), (worlds, n, 4)))
-    length = 10 if options.quick else max(GRADIENT_STEPS, min(20_000, STEPS_OF_A_CALL // worlds))
+    length = (
+        10 if options.quick else max(GRADIENT_STEPS, min(20_000, STEPS_OF_A_CALL // (worlds * n * options.substeps)))
+    )
     grad_length = 10 if options.quick else GRADIENT_STEPS
 
     def fly(start, rpm):

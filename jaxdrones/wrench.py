@@ -6,6 +6,8 @@ import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.rotation import dot, unstack
+
 
 class Wrench(flax.struct.PyTreeNode):
     """Force and torque on one drone at its centre of mass, in its body frame."""
@@ -26,8 +28,8 @@ class Wrench(flax.struct.PyTreeNode):
     @classmethod
     def of_thrusts(cls, rotor_pos: Float[Array, "4 3"], thrust: Float[Array, "4"]) -> Wrench:
         """Forces along body z (N) at the rotors (m, body): sum of f and of r x f."""
-        x, y, _ = rotor_pos.T
-        zero = jnp.zeros_like(thrust[0])
-        force = jnp.stack([zero, zero, jnp.sum(thrust)])
-        torque = jnp.stack([jnp.sum(y * thrust), -jnp.sum(x * thrust), zero])
+        x, y, _ = unstack(rotor_pos.T)
+        zero = jnp.zeros((), thrust.dtype)
+        force = jnp.stack([zero, zero, sum(unstack(thrust))])
+        torque = jnp.stack([dot(y, thrust), -dot(x, thrust), zero])
         return cls(force, torque)

@@ -4,6 +4,7 @@
 compute what the paper's simulator does, for its figures and its recorded data.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -54,10 +55,10 @@ def ground_effect_paper(params: Params, state: State) -> Wrench:
 
 def _summed_rotor_speed(state: State) -> Float[Array, ""]:
     """rad/s."""
-    return _RADIANS_PER_SECOND * jnp.sum(state.rpm)
+    return _RADIANS_PER_SECOND * sum(rotation.unstack(state.rpm))
 
 
 def _rotor_heights(params: Params, state: State) -> Float[Array, "4"]:
     """World z of each rotor, m."""
-    up = rotation.to_matrix(state.quat)[2]
-    return state.pos[2] + jnp.sum(params.rotor_pos * up[None], axis=-1)
+    up = rotation.z_axis(rotation.conjugate(state.quat))  # the world's z axis in the body frame
+    return state.pos[2] + jax.vmap(rotation.dot, (0, None))(params.rotor_pos, up)

@@ -31,10 +31,10 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     """
     length = jnp.sqrt(2.0) * other.arm
     axis = rotation.z_axis(other_state.quat)
-    rotors = state.pos[None] + jax.vmap(rotation.rotate, (None, 0))(state.quat, params.rotor_pos)  # (4, 3), world
+    rotors = jax.vmap(rotation.rotate, (None, 0))(state.quat, params.rotor_pos) + state.pos[None]  # (4, 3), world
     down = other_state.pos[None] - rotors
-    z = jnp.sum(axis[None] * down, axis=-1)
-    off_axis = jnp.sum(down**2, axis=-1) - z**2
+    z = jax.vmap(rotation.dot, (None, 0))(axis, down)
+    off_axis = jax.vmap(rotation.dot)(down, down) - z**2
 
     depth = jnp.maximum(z, 0) / length + _JET_ORIGIN
     width = _JET_WIDTH * depth * length
@@ -42,7 +42,7 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     onset = jnp.clip(z / length, 0, 1)
     speed = _induced_speed(other, other_state) * _JET_SPEED / depth * profile * onset**2 * (3 - 2 * onset)
 
-    inflow = speed * jnp.sum(axis * rotation.z_axis(state.quat))
+    inflow = speed * rotation.dot(axis, rotation.z_axis(state.quat))
     return Wrench.of_thrusts(params.rotor_pos, -params.inflow_loss * inflow * thrust(params, state))
 
 
@@ -66,4 +66,4 @@ def downwash_paper(params: Params, state: State, other: Params, other_state: Sta
 def _induced_speed(params: Params, state: State):
     """Air speed through the rotor discs in hover by momentum theory, m/s: the mean of sqrt(F_i / (2 rho A))."""
     area = jnp.pi * params.prop_radius**2
-    return jnp.mean(jnp.abs(state.rpm)) * jnp.sqrt(params.kf / (2 * params.air_density * area))
+    return sum(rotation.unstack(jnp.abs(state.rpm))) / 4 * jnp.sqrt(params.kf / (2 * params.air_density * area))

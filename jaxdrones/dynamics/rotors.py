@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.params import Params
+from jaxdrones.rotation import dot
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
@@ -32,5 +33,6 @@ def thrust(params: Params, state: State) -> Float[Array, "4"]:
 def rotor_wrench(params: Params, state: State) -> Wrench:
     """Thrusts at the rotors and reaction torques about body z: T = sum of spin_i k_T P_i^2."""
     wrench = Wrench.of_thrusts(params.rotor_pos, thrust(params, state))
-    yaw_torque = params.km * jnp.sum(params.rotor_spin * state.rpm**2)
-    return wrench.replace(torque=wrench.torque.at[2].add(yaw_torque))
+    yaw_torque = params.km * dot(params.rotor_spin, state.rpm**2)
+    zero = jnp.zeros_like(yaw_torque)
+    return wrench + Wrench(jnp.zeros_like(wrench.force), jnp.stack([zero, zero, yaw_torque]))

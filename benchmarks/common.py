@@ -10,6 +10,8 @@ import time
 import jax
 import jaxlib
 
+_SHORTEST = 0.02  # s, of a measurement
+
 
 def about() -> dict[str, object]:
     """Versions, machine and commit: what a number means nothing without."""
@@ -33,13 +35,17 @@ def compiled(function, *arguments):
 
 
 def seconds(program, *arguments, repeats: int) -> dict[str, float]:
-    """Median and best seconds of a call after one that warms up."""
-    jax.block_until_ready(program(*arguments))
-    times = []
-    for _ in range(repeats):
+    """Median and best seconds of a call, after calls that warm up; short calls are timed many at a time."""
+
+    def of_calls(calls: int) -> float:
         start = time.perf_counter()
-        jax.block_until_ready(program(*arguments))
-        times.append(time.perf_counter() - start)
+        for _ in range(calls):
+            jax.block_until_ready(program(*arguments))
+        return (time.perf_counter() - start) / calls
+
+    of_calls(1)
+    calls = 1 + int(_SHORTEST / of_calls(1))
+    times = [of_calls(calls) for _ in range(repeats)]
     return {"median": statistics.median(times), "best": min(times)}
 
 

@@ -93,9 +93,7 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         return jax.lax.scan(lambda state, _: (step(params, state, rpm), None), start, length=length)[0].pos
 
     def loss(start, rpms):
-        # Recomputing a step in the backward pass is faster than storing what it needs: only states are kept.
-        advance = jax.checkpoint(step)
-        final, _ = jax.lax.scan(lambda state, rpm: (advance(params, state, rpm), None), start, rpms)
+        final, _ = jax.lax.scan(lambda state, rpm: (step(params, state, rpm), None), start, rpms)
         return jnp.mean(final.pos**2)
 
     def in_chunks(world):

@@ -11,6 +11,9 @@ from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.sensing.scene import contains
 
 _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the body; those above name the link
+# TinyRenderer does not return when a vertex lies less than 1e-8 m, but not 0, behind the plane of the eye. Numbers
+# such as 1e-17 in a pose that should be 0 lead there; they are rounded away, to a micrometre and a microradian.
+_DIGITS = 6
 _AWAY = [0.0, 0.0, -1e4]  # m; where a drone waits while its own camera looks
 _AHEAD = 1000.0  # m; how far in front of the eye the camera's target is
 
@@ -51,9 +54,9 @@ def of_drones(
     """
     p = client.p
     frames = []
-    forward = client.matrices(body[:, 3:7])[:, :, 0]
+    forward = np.round(client.matrices(body[:, 3:7])[:, :, 0], _DIGITS)
     for drone, row, arm, x in zip(client.drones, body, arms, forward, strict=True):
-        eye = row[:3] + np.array([0, 0, arm])
+        eye = np.round(row[:3] + np.array([0, 0, arm]), _DIGITS)
         p.resetBasePositionAndOrientation(drone, _AWAY, [0, 0, 0, 1], physicsClientId=client.id)
         _check_outside(client, drone, eye)
         near = arm if camera.near is None else camera.near

@@ -135,3 +135,12 @@ def test_the_eye_is_one_arm_above_the_drone_and_world_up_stays_up():
     np.testing.assert_allclose(level, rolled, rtol=1e-5)  # a roll about the viewing axis does not turn the picture
     steep = np.tan(np.radians(30)) * 23.5 / 24  # of the lowest row of pixels, below the horizon
     np.testing.assert_allclose(level[-1, 32], (1 + float(CRAZYFLIE.arm[0])) / steep, rtol=0.03)
+
+
+def test_an_eye_that_is_off_the_plane_of_a_face_by_rounding_sees_all_the_same():
+    """TinyRenderer does not return from such a picture; the face is at x = 0."""
+    box = Box(pos=(-0.5, -2.5, 0.5), size=(1, 1, 1))
+    with bullet.make_step(scene=Scene((box,))) as step:
+        exact = step.camera(CRAZYFLIE, at([0, 0, 0.1]))[1]
+        for x in (1e-17, 1e-9):
+            np.testing.assert_array_equal(step.camera(CRAZYFLIE, at([x, 0, 0.1]))[1], exact)

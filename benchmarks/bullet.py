@@ -27,10 +27,10 @@ PRIMITIVES = Scene(
 
 
 def hovering(n: int) -> tuple[jd.Params, jd.State, np.ndarray]:
-    """A team that flies above each other's shoulders, and the rotor speeds that carry it."""
+    """A team in a slanted row, high enough to stay in the air, and the rotor speeds of hover."""
     params = jd.repeat(jd.load_params("cf2x"), n)
     i = jnp.arange(n)
-    start = jd.State.at_rest(jnp.stack([0.3 * i, 0.0 * i, 1.0 + 0.1 * i], axis=-1))
+    start = jd.State.at_rest(jnp.stack([0.3 * i, 0.0 * i, 50.0 + 0.1 * i], axis=-1))
     return params, start, np.asarray(params.hover_rpm[:, None] * jnp.ones((1, 4)))
 
 
@@ -74,7 +74,7 @@ def closed_loop(steps: int, repeats: int) -> float:
 
 def frames(count: int, repeats: int) -> float:
     """64 x 48 frames of RGB, depth and segmentation per second in a scene of a plane and ten primitives."""
-    params, start, _ = hovering(1)
+    params, start = jd.repeat(jd.load_params("cf2x"), 1), jd.State.at_rest([[0, 0, 1]])
     with bullet.make_step(scene=PRIMITIVES) as step:
 
         def work():

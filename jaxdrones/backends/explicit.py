@@ -56,14 +56,14 @@ def make_step(
     def step(params: Params, state: State, rpm: jax.Array) -> State:
         rpm = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
         check_team(params, state, rpm)
-        rpm = _stored(rpm)
         speed, _ = jax.vmap(rotors)(params, state.rpm, rpm)
         state = state.replace(rpm=speed)
 
         # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
         @jax.checkpoint
         def substep(state: State, _: None) -> tuple[State, None]:
-            return integrator(lambda s: derivative(params, s, rpm), _stored(state), dt), None
+            start, command = _stored((state, rpm))
+            return integrator(lambda s: derivative(params, s, command), start, dt), None
 
         return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, length=substeps)[0]
 

@@ -15,7 +15,7 @@ from jaxdrones.checks import check_shape, check_whole
 class Params(flax.struct.PyTreeNode):
     """Constants of one drone, or of a team with a leading drone axis on every array.
 
-    Surroundings that somebody else drives (wind, air density) are here too and may be set anew each step.
+    Surroundings that somebody else drives (wind, air density, a push) are here too and may be set anew each step.
     """
 
     mass: Array
@@ -42,6 +42,8 @@ class Params(flax.struct.PyTreeNode):
     """() kg/m^3."""
     wind: Array
     """(3,) velocity of the air, m/s, world."""
+    push: Array
+    """(3,) force of somebody else on the centre of mass, N, world; acts through the effect `external_push`."""
     drag_coeff: Array
     """(3,) rotor drag per axis, N per m/s of air speed and rad/s of summed rotor speed."""
     ground_effect_coeff: Array

@@ -19,6 +19,10 @@ class HostStep(abc.ABC):
     def __call__(self, params: Params, state: State, rpm: jax.Array) -> State:
         """Advance a team."""
 
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Give back what the step holds; it cannot be called any more."""
+
 
 def is_traced(tree: Any) -> bool:
     """Whether some array of a pytree is being traced, so that it has no value yet."""

@@ -16,6 +16,7 @@ _SHAPES = {
     "rotor_pos": (4, 3),
     "rotor_spin": (4,),
     "wind": (3,),
+    "push": (3,),
     "drag_coeff": (3,),
     "downwash_coeff": (3,),
 }

@@ -1,4 +1,4 @@
-"""Aerodynamic effects on one drone: drag (paper, equation 4) and ground effect (equation 5).
+"""Effects of the surroundings on one drone: drag (paper, equation 4), ground effect (equation 5), a push.
 
 `drag` and `ground_effect` are the smooth, physical ones; `drag_world_axes` and `ground_effect_paper`
 compute what the paper's simulator does, for its figures and its recorded data.
@@ -51,6 +51,11 @@ def ground_effect_paper(params: Params, state: State) -> Wrench:
     roll, pitch, _ = rotation.to_rpy(state.quat)
     upright = (jnp.abs(roll) < jnp.pi / 2) & (jnp.abs(pitch) < jnp.pi / 2)
     return Wrench.of_thrusts(params.rotor_pos, jnp.where(upright, gain * thrust(params, state), 0))
+
+
+def external_push(params: Params, state: State) -> Wrench:
+    """The force `push` of somebody else, through the centre of mass."""
+    return Wrench.of_force(rotation.rotate_inverse(state.quat, params.push))
 
 
 def _summed_rotor_speed(state: State) -> Float[Array, ""]:

@@ -1,0 +1,9 @@
+"""Environments: tasks, steps, action types and observations put together."""
+
+from jaxdrones.envs.actions import ACTIONS, Action
+from jaxdrones.envs.autoreset import AutoReset, autoreset
+from jaxdrones.envs.env import Env
+from jaxdrones.envs.observations import OBSERVATIONS
+from jaxdrones.envs.registry import TASKS, make
+
+__all__ = ["ACTIONS", "OBSERVATIONS", "TASKS", "Action", "AutoReset", "Env", "autoreset", "make"]

@@ -1,0 +1,205 @@
+"""An environment: a task, a step, an action type and an observation, as two pure functions."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdrones.backends.explicit import Step
+from jaxdrones.backends.host import HostStep
+from jaxdrones.checks import check_finite, check_positive, check_shape
+from jaxdrones.envs.actions import Action
+from jaxdrones.envs.randomize import Disturbance, Law, Noise, delayed, draw
+from jaxdrones.envs.vision import Vision
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.tasks.task import Part, Task, World
+
+DISTURB, NOISE, START, LAWS, RESET = range(5)  # what a key is folded with: only the draws that are used cost time
+
+Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
+
+
+class Env:
+    """`reset(key) -> obs, world` and `step(key, world, action) -> obs, world, reward, terminated, truncated, info`.
+
+    Both are pure: use `jax.jit`, `jax.vmap` for many worlds, `jax.grad` on the explicit backend. Nothing is reset
+    when an episode ends; `autoreset` does that.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        params: Params,
+        step: Step,
+        *,
+        dt: float,
+        action: Action,
+        observation: Sequence[Part],
+        laws: Sequence[Law] = (),
+        noise: Noise | None = None,
+        disturb: Disturbance | None = None,
+        delay: float = 0.0,
+        vision: Vision | None = None,
+    ):
+        """Put an environment together; `jaxdrones.make` does it by name.
+
+        Args:
+            task: what is to be done.
+            params: nominal parameters of the team.
+            step: of either backend, for one control period.
+            dt: control period, s.
+            action: action type.
+            observation: parts that are put side by side.
+            laws: draw the parameters of every episode from the nominal ones.
+            noise: of the sensors.
+            disturb: sets wind and pushes before every control step.
+            delay: between action and command, s.
+            vision: cameras; only with the Bullet backend.
+        """
+        check_positive("dt", dt, "s")
+        check_shape("params.mass", params.mass, (task.drones,), f"the task {task.name} has {task.drones} drones")
+        if not (math.isfinite(delay) and delay >= 0):
+            raise ValueError(f"delay is {delay}; give a number of at least 0 (s)")
+        if not observation:
+            raise ValueError("observation is empty; name at least one part")
+        self.task, self.params, self.dt, self.drones = task, params, dt, task.drones
+        self.action, self.action_size = action, action.size
+        self.steps = round(task.duration / dt) + task.overtime
+        self._parts, self._laws, self._noise, self._disturb = tuple(observation), tuple(laws), noise, disturb
+        self._delay = _nearly_whole(delay / dt)
+        self._history = max(math.ceil(self._delay) + 1, *(part.history for part in observation))
+        self.physics, self.vision = step, vision
+        self._before, self._after, self._start = jax.jit(self._before), jax.jit(self._after), jax.jit(self._start)
+        widths = self._widths()
+        bound = [np.broadcast_to(part.bound, (width,)) for part, width in zip(self._parts, widths, strict=True)]
+        self.observation_bound = np.concatenate(bound).astype(np.float32)
+        """(d,) largest magnitude of every entry of the observation."""
+        self.observation_size = len(self.observation_bound)
+
+    def reset(self, key: jax.Array) -> tuple[Obs, World]:
+        """The first observation, and the world at the start of an episode."""
+        world, obs = self._start(key)
+        if self.vision:
+            world = world.replace(images=self.vision.look(world.params, world.drones))
+        return self._seen(obs, world), world
+
+    def step(
+        self, key: jax.Array, world: World, action: Float[Array, "n a"]
+    ) -> tuple[Obs, World, Float[Array, " n"], Array, Array, dict[str, Any]]:
+        """One control step.
+
+        Args:
+            key: for noise and disturbances.
+            world: as `reset` or `step` returned it.
+            action: (n, a), cut to [-1, 1].
+
+        Returns:
+            The observation; the world; the reward (n,); terminated (), whether the episode ended for good; truncated
+            (), whether it was cut; and info: `rewards` by name (n,), `metrics` by name (n,), `ends` by name ().
+
+        Raises:
+            ValueError: wrong shape, or not a number (where it can be looked at).
+        """
+        check_shape("action", action, (self.drones, self.action_size), "one row of the action type's size per drone")
+        check_finite("action", action)
+        world, rpm = self._before(key, world, action)
+        drones = self.physics(world.params, world.drones, rpm)
+        obs, world, *outcome = self._after(key, world, drones)
+        if self.vision:
+            world = world.replace(images=self.vision.next(world))
+        return self._seen(obs, world), world, *outcome
+
+    def close(self) -> None:
+        """End the connection of a backend that has one."""
+        if isinstance(self.physics, HostStep):
+            self.physics.close()
+
+    def __enter__(self) -> Env:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def _start(self, key: jax.Array) -> tuple[World, Array]:
+        params = draw(self._laws, jax.random.fold_in(key, LAWS), self.params)
+        drones, variables = self.task.start(jax.random.fold_in(key, START), self.params)
+        world = World(
+            params=params,
+            drones=drones,
+            variables=variables,
+            memory=self.action.init(self.drones),
+            actions=jnp.zeros((self.drones, self._history, self.action_size), drones.pos.dtype),
+            step=jnp.zeros((), jnp.int32),
+            dt=self.dt,
+        )
+        return world, self._observe(jax.random.fold_in(key, NOISE), world)
+
+    def _before(self, key: jax.Array, world: World, action: Array) -> tuple[World, Array]:
+        """What the rotors are commanded, and the surroundings they meet."""
+        action = jnp.clip(jnp.asarray(action, world.actions.dtype), -1, 1)
+        actions = jnp.concatenate([world.actions[:, 1:], action[:, None]], axis=1)
+        params = world.params
+        if self._disturb:
+            params = self._disturb(jax.random.fold_in(key, DISTURB), params, self.dt)
+        world = world.replace(actions=actions, params=params)
+        target = self.task.target_now(world)
+
+        def rpm(params, memory, state, action, setpoint):
+            return self.action.rpm(params, memory, state, action, setpoint, self.dt)
+
+        command = delayed(actions, self._delay)
+        memory, rpm = jax.vmap(rpm)(self.params, world.memory, world.drones, command, target)
+        return world.replace(memory=memory), rpm
+
+    def _after(self, key: jax.Array, world: World, drones: State):
+        """What came of it."""
+        task = self.task
+        world = world.replace(drones=drones, step=world.step + 1)
+        world = world.replace(variables=task.advance(world))
+        rewards = {name: scale * term(world) for name, (scale, term) in task.rewards.items()}
+        ends = {name: jnp.any(condition(world)) for name, condition in task.ends.items()}
+        limits = {name: jnp.any(condition(world)) for name, condition in task.limits.items()}
+        metrics = {name: metric(world) for name, metric in task.metrics.items()}
+        terminated = _any(ends.values())
+        truncated = _any(limits.values()) | (world.step >= self.steps)
+        info = {"rewards": rewards, "metrics": metrics, "ends": ends | limits}
+        obs = self._observe(jax.random.fold_in(key, NOISE), world)
+        return obs, world, sum(rewards.values()), terminated, truncated, info
+
+    def _observe(self, key: jax.Array, world: World) -> Array:
+        if self._noise:
+            world = world.replace(drones=self._noise(key, world.drones))
+        parts = [part.observe(self.task, world) for part in self._parts]
+        return jnp.concatenate([_cut(x, part.bound) for x, part in zip(parts, self._parts, strict=True)], axis=-1)
+
+    def _widths(self) -> list[int]:
+        def parts(key):
+            world, _ = self._start(key)
+            return [part.observe(self.task, world) for part in self._parts]
+
+        return [x.shape[-1] for x in jax.eval_shape(parts, jax.random.key(0))]
+
+    def _seen(self, obs: Array, world: World) -> Obs:
+        return obs if self.vision is None else {"state": obs, **world.images}
+
+
+def _any(conditions) -> Array:
+    return functools.reduce(jnp.logical_or, conditions, jnp.zeros((), bool))
+
+
+def _cut(x: Array, bound: float | tuple[float, ...]) -> Array:
+    limit = jnp.broadcast_to(jnp.asarray(bound, x.dtype), x.shape[-1:])[None]
+    return jnp.clip(x, -limit, limit)
+
+
+def _nearly_whole(steps: float) -> float:
+    """Control steps of a delay; 0.02 s at 100 Hz are two, whatever the rounding."""
+    return float(round(steps)) if math.isclose(steps, round(steps), abs_tol=1e-6) else steps

@@ -1,0 +1,135 @@
+"""What makes training robust: parameters drawn per episode, sensor noise, wind and pushes. All compose."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_choice
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+Law = Callable[[jax.Array, Params], Params]
+"""(key, params) of one drone -> its parameters in this episode."""
+Noise = Callable[[jax.Array, State], State]
+"""(key, state) of a team -> what its sensors show."""
+Disturbance = Callable[[jax.Array, Params, float], Params]
+"""(key, params, control period) of a team -> the surroundings in the next control step."""
+
+
+def _check_range(field: str, low: float, high: float) -> None:
+    if not low <= high:
+        raise ValueError(f"the range of {field} is ({low}, {high}); give the lower bound first")
+
+
+def scaled(field: str, low: float, high: float) -> Law:
+    """The nominal value times U(low, high), one factor for the whole array.
+
+    Raises:
+        ValueError: unknown field, or `low` above `high`.
+    """
+    check_choice("parameter", field, Params.__dataclass_fields__)
+    _check_range(field, low, high)
+
+    def law(key: jax.Array, params: Params) -> Params:
+        value = getattr(params, field)
+        return params.replace(**{field: value * jax.random.uniform(key, (), value.dtype, low, high)})
+
+    return law
+
+
+def shifted(field: str, low: float, high: float) -> Law:
+    """The nominal value plus U(low, high), drawn for each entry of the array.
+
+    Raises:
+        ValueError: unknown field, or `low` above `high`.
+    """
+    check_choice("parameter", field, Params.__dataclass_fields__)
+    _check_range(field, low, high)
+
+    def law(key: jax.Array, params: Params) -> Params:
+        value = getattr(params, field)
+        return params.replace(**{field: value + jax.random.uniform(key, value.shape, value.dtype, low, high)})
+
+    return law
+
+
+def constant_wind(speed: float) -> Law:
+    """Wind U(-speed, speed) (m/s) along x and y, a quarter of that along z, the whole episode through."""
+
+    def law(key: jax.Array, params: Params) -> Params:
+        wind = jax.random.uniform(key, (3,), params.wind.dtype, -speed, speed)
+        return params.replace(wind=wind * jnp.array([1, 1, 0.25], wind.dtype))
+
+    return law
+
+
+def draw(laws: Sequence[Law], key: jax.Array, params: Params) -> Params:
+    """Apply all laws to every drone of a team, each with a key of its own."""
+    n = len(params.mass)
+    for law, law_key in zip(laws, jax.random.split(key, max(len(laws), 1)), strict=False):
+        params = jax.vmap(law)(jax.random.split(law_key, n), params)
+    return params
+
+
+def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, omega: float = 0.02) -> Noise:
+    """White noise: standard deviations in m, m/s, rad and rad/s.
+
+    The defaults for position and velocity are those of Huang et al.'s swarm simulator; angle and rates of an
+    attitude filter on the Crazyflie are of this size (L2F: 1 mrad and 2 mrad/s; DiffAero: 2.4e-2 rad/s).
+    """
+
+    def noise(key: jax.Array, state: State) -> State:
+        n = len(state.pos)
+        x = jax.random.normal(key, (n, 12), state.pos.dtype)
+        turn = jax.vmap(rotation.exp)(angle * x[:, 6:9])
+        return state.replace(
+            pos=state.pos + pos * x[:, :3],
+            vel=state.vel + vel * x[:, 3:6],
+            quat=jax.vmap(rotation.multiply)(state.quat, turn),
+            omega=state.omega + omega * x[:, 9:],
+        )
+
+    return noise
+
+
+def pushes(force: float, every: float = 1.0, lasting: float = 0.1) -> Disturbance:
+    """Pushes of random direction and up to `force` (share of the weight), one in `every` seconds on average.
+
+    Each lasts `lasting` seconds on average: a push comes and goes by chance, whatever came before.
+    """
+
+    def disturb(key: jax.Array, params: Params, dt: float) -> Params:
+        n = len(params.mass)
+        u = jax.random.uniform(key, (n, 4), params.push.dtype)
+        fresh = force * params.weight[:, None] * (2 * u[:, 1:] - 1)
+        begins, ends = u[:, :1] < dt / every, u[:, :1] > 1 - dt / lasting
+        return params.replace(push=jnp.where(begins, fresh, jnp.where(ends, 0, params.push)))
+
+    return disturb
+
+
+def delayed(actions: Array, steps: float) -> Array:
+    """The command that arrives when the newest of (n, h, a) actions was given, `steps` control steps late.
+
+    A fraction mixes two neighbours: the mean of what is in force during the control step.
+    """
+    whole = int(steps)
+    share = steps - whole
+    newest = actions[:, -1 - whole]
+    return newest if share == 0 else (1 - share) * newest + share * actions[:, -2 - whole]
+
+
+REALISTIC_LAWS: tuple[Law, ...] = (
+    scaled("mass", 0.9, 1.1),
+    scaled("inertia", 0.8, 1.2),
+    scaled("kf", 0.9, 1.1),
+    scaled("km", 0.8, 1.2),
+    scaled("rotor_pos", 0.95, 1.05),
+    scaled("drag_coeff", 0.5, 1.5),
+    scaled("rotor_rise_time", 0.8, 1.2),
+    scaled("rotor_fall_time", 0.8, 1.2),
+)
+REALISTIC_DELAY = 0.02  # s

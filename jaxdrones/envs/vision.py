@@ -1,0 +1,54 @@
+"""The drones' cameras as an observation (paper, equation 9)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdrones.backends.host import is_traced
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.tasks.task import World
+
+IMAGES = {"rgb": (np.uint8, 4), "depth": (np.float32, None), "segmentation": (np.int32, None)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Vision:
+    """Images of every drone's camera: `rgb` (n, 48, 64, 4), `depth` (n, 48, 64) (m), `segmentation` (n, 48, 64)."""
+
+    physics: Any
+    """A Bullet step."""
+    every: int = 1
+    """Control steps between pictures; the last one is shown in between."""
+    images: tuple[str, ...] = ("rgb",)
+    """Which of `rgb`, `depth`, `segmentation`."""
+
+    def look(self, params: Params, drones: State) -> dict[str, Any]:
+        """Take pictures now."""
+
+        def take(params, drones):
+            rgb, depth, segmentation = self.physics.camera(params, drones)
+            pictures = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
+            return {name: pictures[name] for name in self.images}
+
+        if not is_traced((params, drones)):
+            return take(params, drones)
+        n = len(drones.pos)
+        shapes = {}
+        for name in self.images:
+            dtype, channels = IMAGES[name]
+            shapes[name] = jax.ShapeDtypeStruct((n, 48, 64) + ((channels,) if channels else ()), dtype)
+        return jax.pure_callback(take, shapes, params, drones, vmap_method="sequential")
+
+    def next(self, world: World) -> dict[str, Any]:
+        """The pictures after a control step."""
+        due = world.step % self.every == 0
+        if self.every == 1:
+            return self.look(world.params, world.drones)
+        if not is_traced((world.drones, due)):
+            return self.look(world.params, world.drones) if due else world.images
+        return jax.lax.cond(due, lambda: self.look(world.params, world.drones), lambda: world.images)

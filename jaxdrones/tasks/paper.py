@@ -1,0 +1,215 @@
+"""The tasks of the paper, and those of today's version of its simulator (`hover_v2`, `multi_hover`).
+
+Rewards, ends and starts are the reference's. Its clock is read before the step, so rewards that follow a moving point
+lag one control step behind, and an episode of T seconds has two steps more than T / dt.
+"""
+
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.tasks.starts import hovering, on_diagonal
+from jaxdrones.tasks.task import Task, World, norm, square
+
+_DURATION, _DURATION_V2 = 5.0, 8.0  # s
+_SOLVED = 0.05  # m, at the end of an episode
+_TUNE_RATE = 0.288  # rad/s: the reference's 0.006 rad per control step at 48 Hz
+_TILT = 0.4  # rad of roll or pitch, at which today's version gives up
+
+Starts = Float[Array, "n 3"]  # where the drones started, m: the variables of all tasks here
+Target = Callable[[Starts, Array], Setpoint]
+Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]  # of targets and the world after a step
+
+
+def hover(drones: int = 1) -> Task:
+    """Equation 12: the negative squared distance from (0, 0, 1)."""
+    return _task("paper-hover", "hover at z = 1 m (equation 12)", drones, _at(0.0, 0.0, 1.0), _squared_distance)
+
+
+def takeoff(drones: int = 1) -> Task:
+    """Get off the ground: -5 below 2 cm, else -1 / (10 z)."""
+
+    def cost(target, world):
+        z = world.drones.pos[:, 2]
+        low = z < 0.02
+        return jnp.where(low, 5, 1 / (10 * jnp.where(low, 1, z)))
+
+    return _task("takeoff", "climb from the ground", drones, _at(0.0, 0.0, 1.0), cost)
+
+
+def fly_through_gate(drones: int = 1) -> Task:
+    """Follow a point that moves through the gate at (0, -1, 0.75) in the five seconds of an episode."""
+
+    def target(starts, t):
+        zero = jnp.zeros_like(t)
+        return _everywhere(starts, [zero, -2 * t / _DURATION, zero + 0.75], vel=[zero, zero - 2 / _DURATION, zero])
+
+    def cost(target, world):
+        return 10 * _squared_distance(target, world)
+
+    return _task("fly-through-gate", "fly through the gate at y = -1 m", drones, target, cost)
+
+
+def tune(drones: int = 1) -> Task:
+    """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m."""
+
+    def target(starts, t):
+        zero, angle = jnp.zeros_like(t), _TUNE_RATE * t
+        return _everywhere(
+            starts, [zero, 4 * jnp.cos(angle), zero + 1], vel=[zero, -4 * _TUNE_RATE * jnp.sin(angle), zero]
+        )
+
+    def cost(target, world):
+        return norm(target - world.drones.pos)
+
+    return _task("tune", "tune the gains of the PID in flight", drones, target, cost, action="pid_gains")
+
+
+def leader_follower(drones: int = 2) -> Task:
+    """Equation 13: the leader, drone 0, hovers at (0, 0, 0.5); the others are to be as high as the leader."""
+
+    def cost(target, world):
+        pos = world.drones.pos
+        follower = (pos[:, 2] - pos[0, 2]) ** 2 / len(pos)
+        return _first_then(square(pos - jnp.array([[0, 0, 0.5]], pos.dtype)), follower)
+
+    summary = "follow the leader's height (equation 13)"
+    return _task("leader-follower", summary, drones, _at_height(0.5), cost, minimum=2)
+
+
+def flock(drones: int = 2) -> Task:
+    """The first drone hovers at (0, 0, 1); every other one is to be as high as the one before it."""
+
+    def cost(target, world):
+        pos = world.drones.pos
+        return _first_then(square(pos - jnp.array([[0, 0, 1.0]], pos.dtype)), (jnp.roll(pos, 1, 0) - pos)[:, 2] ** 2)
+
+    return _task("flock", "fly at the height of the drone before", drones, _at_height(1.0), cost, minimum=2)
+
+
+def meetup(drones: int = 2) -> Task:
+    """Drone i and drone n - 1 - i are to meet."""
+
+    def target(starts, t):
+        return Setpoint.at((starts + starts[::-1]) / 2)
+
+    def cost(target, world):
+        return square(world.drones.pos - world.drones.pos[::-1])
+
+    return _task("meetup", "meet the partner half-way", drones, target, cost, action="velocity", minimum=2)
+
+
+def hover_v2(drones: int = 1) -> Task:
+    """Hover at (0, 0, 1), rewarded by max(0, 2 - d^4)."""
+    return _task_v2("hover-v2", "hover at z = 1 m, bounded reward", drones, _at(0.0, 0.0, 1.0), box=1.5)
+
+
+def multi_hover(drones: int = 2) -> Task:
+    """Drone i hovers 1 / (i + 1) m above its start; the reference's reward is the sum over the team."""
+
+    def target(starts, t):
+        return Setpoint.at(starts.at[:, 2].add(1 / (1 + jnp.arange(len(starts), dtype=starts.dtype))))
+
+    return _task_v2("multi-hover", "every drone hovers at a height of its own", drones, target, box=2.0)
+
+
+def _task(
+    name: str, summary: str, drones: int, target: Target, cost: Cost, action: str = "one_d_rpm", minimum: int = 1
+) -> Task:
+    check_whole(f"number of drones of {name}", drones, minimum)
+
+    def term(world: World) -> Float[Array, " n"]:
+        return cost(target(world.variables, world.time - world.dt).pos, world)
+
+    return Task(
+        name=name,
+        summary=summary,
+        drones=drones,
+        duration=_DURATION,
+        start=_start,
+        target=target,
+        rewards={"cost": (-1.0, term)},
+        success=_close_at_the_end,
+        contact=True,
+        action=action,
+        observation=("normalized_kinematics",),
+        overtime=2,
+    )
+
+
+def _task_v2(name: str, summary: str, drones: int, target: Target, box: float) -> Task:
+    check_whole(f"number of drones of {name}", drones)
+
+    def error(world: World) -> Float[Array, " n"]:
+        return norm(target(world.variables, world.time).pos - world.drones.pos)
+
+    def closeness(world: World) -> Float[Array, " n"]:
+        return jnp.maximum(0, 2 - error(world) ** 4)
+
+    def arrived(world: World):
+        return jnp.broadcast_to(jnp.sum(error(world)) < 1e-4, len(world.drones.pos))
+
+    def out_of_box(world: World):
+        x, y, z = world.drones.pos.T
+        return (jnp.abs(x) > box) | (jnp.abs(y) > box) | (z > 2.0)
+
+    def tilted(world: World):
+        roll, pitch, _ = jax.vmap(rotation.to_rpy)(world.drones.quat).T
+        return (jnp.abs(roll) > _TILT) | (jnp.abs(pitch) > _TILT)
+
+    return Task(
+        name=name,
+        summary=summary,
+        drones=drones,
+        duration=_DURATION_V2,
+        start=_start,
+        target=target,
+        rewards={"closeness": (1.0, closeness)},
+        ends={"arrived": arrived},
+        limits={"out_of_box": out_of_box, "tilted": tilted},
+        success=_close_at_the_end,
+        contact=True,
+        action="one_d_rpm",
+        observation=("kinematics_v2", "last_actions_v2"),
+        overtime=2,
+    )
+
+
+def _start(key: jax.Array, params: Params) -> tuple[State, Starts]:
+    """The reference's: on a diagonal, 0.1 m above the ground, with the rotors standing still."""
+    pos = on_diagonal(params)
+    return hovering(params, pos).replace(rpm=jnp.zeros((len(pos), 4), pos.dtype)), pos
+
+
+def _at(x: float, y: float, z: float) -> Target:
+    return lambda starts, t: Setpoint.at(jnp.broadcast_to(jnp.array([x, y, z], starts.dtype), starts.shape))
+
+
+def _at_height(z: float) -> Target:
+    """Every drone above its start, except that the first is to be above the origin."""
+    return lambda starts, t: Setpoint.at(starts.at[:, 2].set(z).at[0, :2].set(0))
+
+
+def _everywhere(starts: Starts, pos: list[Array], vel: list[Array]) -> Setpoint:
+    """The same target for every drone."""
+    pos, vel = (jnp.broadcast_to(jnp.stack(v).astype(starts.dtype), starts.shape) for v in (pos, vel))
+    return Setpoint.at(pos, vel=vel)
+
+
+def _squared_distance(target: Float[Array, "n 3"], world: World) -> Float[Array, " n"]:
+    return square(target - world.drones.pos)
+
+
+def _first_then(first: Float[Array, " n"], rest: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.concatenate([first[:1], rest[1:]])
+
+
+def _close_at_the_end(metrics: Mapping[str, Array], dt: float) -> Array:
+    return metrics["error"][-1] < _SOLVED

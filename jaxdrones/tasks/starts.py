@@ -1,0 +1,55 @@
+"""How episodes start."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+CLEARANCE = 0.1  # m between the ground and the reference's drones at the start
+_GRID = 4.0  # arms between neighbours in x and in y
+
+
+def hovering(params: Params, pos: Float[Array, "n 3"]) -> State:
+    """Level and at rest, with the rotors at hover speed."""
+    zero = jnp.zeros_like(pos)
+    quat = jnp.broadcast_to(jnp.array([0, 0, 0, 1], pos.dtype), (len(pos), 4))
+    return State(pos, quat, zero, zero, jnp.broadcast_to(params.hover_rpm[:, None], (len(pos), 4)))
+
+
+def on_diagonal(params: Params) -> Float[Array, "n 3"]:
+    """The reference's places: four arms apart in x and in y, 0.1 m above the ground."""
+    i = jnp.arange(len(params.mass))
+    across = _GRID * params.arm * i
+    return jnp.stack([across, across, standing_height(params) + CLEARANCE], axis=-1)
+
+
+def standing_height(params: Params) -> Float[Array, " n"]:
+    """Height (z) of a drone that stands on the ground, m."""
+    return params.collision_height / 2 - params.collision_offset
+
+
+def thrown(
+    key: jax.Array, params: Params, pos: Float[Array, "n 3"], *, reach, speed: float, omega: float, tilt: float
+) -> State:
+    """Anywhere near `pos`, in any motion, with the rotors at hover speed.
+
+    Args:
+        key: random key.
+        params: of the team.
+        pos: (n, 3) centres, m.
+        reach: pos + U(-reach, reach) along each axis, m: a number or one per axis.
+        speed: vel U(-speed, speed) along each axis, m/s.
+        omega: U(-omega, omega) about each axis, rad/s.
+        tilt: attitude: about any axis by U(0, tilt), rad.
+    """
+    n, dtype = len(pos), pos.dtype
+    u = jax.random.uniform(key, (n, 12), dtype, -1, 1)
+    cos, angle = u[:, 9], jnp.pi * u[:, 10]  # of the axis: height and longitude of a point on the unit sphere
+    sin = jnp.sqrt(1 - cos**2)
+    axis = jnp.stack([sin * jnp.cos(angle), sin * jnp.sin(angle), cos], axis=-1)
+    quat = jax.vmap(rotation.exp)(tilt * (u[:, 11:] + 1) / 2 * axis)
+    rpm = jnp.broadcast_to(params.hover_rpm[:, None], (n, 4))
+    return State(pos + jnp.asarray(reach, dtype) * u[:, :3], quat, speed * u[:, 3:6], omega * u[:, 6:9], rpm)

@@ -1,0 +1,142 @@
+"""What a task is: what to start from, where to be, what is rewarded, when it ends."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxdrones import rotation
+from jaxdrones.control import Setpoint
+from jaxdrones.numerics import safe_sqrt
+from jaxdrones.params import Params
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.state import State
+
+
+class World(flax.struct.PyTreeNode):
+    """All there is between two control steps of an episode. Arrays of the team have a leading drone axis."""
+
+    params: Params
+    """Of the team, as drawn for this episode; action types and policies do not see it."""
+    drones: State
+    variables: Any
+    """The task's own: goals, the next gate, a random curve."""
+    memory: Any
+    """Of the action type's controller."""
+    actions: Array
+    """(n, h, a) the last h actions, the newest last; zeros before the first."""
+    step: Array
+    """() control steps since the start."""
+    dt: float = flax.struct.field(pytree_node=False)
+    """Control period, s."""
+    images: Any = None
+    """What the cameras saw last, if there are any."""
+
+    @property
+    def time(self) -> Array:
+        """() s since the start."""
+        return self.step * jnp.asarray(self.dt, self.drones.pos.dtype)
+
+    @property
+    def action(self) -> Array:
+        """(n, a) the newest action."""
+        return self.actions[:, -1]
+
+
+Term = Callable[[World], Float[Array, " n"]]
+Condition = Callable[[World], Bool[Array, " n"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One part of an observation."""
+
+    observe: Callable[[Task, World], Float[Array, "n d"]]
+    """Of the world as the sensors show it."""
+    bound: float | tuple[float, ...]
+    """Largest magnitude, of all entries or of each; what is beyond is cut off."""
+    history: int = 2
+    """Past actions that must be kept for it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What to start from, where to be, what is rewarded, when it ends; all functions of one world.
+
+    An episode is the whole team's: it ends when an end is true for one drone.
+    """
+
+    name: str
+    summary: str
+    drones: int
+    duration: float
+    """s, after which an episode is truncated."""
+    start: Callable[[jax.Array, Params], tuple[State, Any]]
+    """(key, params) -> the team at the start, and the task's variables."""
+    target: Callable[[Any, Array], Setpoint]
+    """(variables, time in s) -> where every drone should be, also later than now."""
+    rewards: Mapping[str, tuple[float, Term]]
+    """name -> (scale, term); the reward is the sum of scale times term."""
+    ends: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
+    """Name -> condition that terminates: what follows has no value."""
+    limits: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
+    """Name -> condition that truncates: the episode is cut, though it could go on."""
+    advance: Callable[[World], Any] = lambda world: world.variables
+    """The task's variables after a step, from the world with the variables before it."""
+    metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)
+    """What is reported but not rewarded; every task has `error` (m) and `speed` (m/s)."""
+    success: Callable[[Mapping[str, Array], float], Array] | None = None
+    """(metrics over an episode (T, n), control period) -> (n,): whether a drone did what it should."""
+    senses: Mapping[str, Part] = dataclasses.field(default_factory=dict)
+    """Parts of an observation that only this task has."""
+    scene: Scene = dataclasses.field(default_factory=Scene)
+    contact: bool = False
+    """Whether drones touch the ground and each other on purpose: adds contact forces to the explicit backend."""
+    action: str = "rpm"
+    observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
+    overtime: int = 0
+    """Control steps an episode goes on after `duration`; 2 in the reference, which looks at the clock late."""
+
+    def __post_init__(self):
+        standard = {"error": lambda world: distance(self, world), "speed": lambda world: norm(world.drones.vel)}
+        object.__setattr__(self, "metrics", standard | dict(self.metrics))
+
+    def target_now(self, world: World) -> Setpoint:
+        """Where every drone should be at this moment."""
+        return self.target(world.variables, world.time)
+
+
+def norm(v: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Length of every row, with a zero gradient at zero."""
+    return safe_sqrt(jax.vmap(rotation.dot)(v, v))
+
+
+def square(v: Float[Array, "n k"]) -> Float[Array, " n"]:
+    """Squared length of every row."""
+    return jax.vmap(rotation.dot)(v, v)
+
+
+def distance(task: Task, world: World) -> Float[Array, " n"]:
+    """Distance of every drone from its target, m."""
+    return norm(world.drones.pos - task.target_now(world).pos)
+
+
+def upright(world: World) -> Float[Array, " n"]:
+    """Cosine of the tilt: 1 level, 0 on edge, -1 upside down."""
+    return jax.vmap(rotation.z_axis)(world.drones.quat)[:, 2]
+
+
+def far_from(center: tuple[float, float, float], reach: float) -> Condition:
+    """Further than `reach` (m) from `center` along some axis, or lost: not a number."""
+
+    def condition(world: World) -> Bool[Array, " n"]:
+        x, y, z = (jnp.abs(a - c) for a, c in zip(world.drones.pos.T, center, strict=True))
+        return ~((x < reach) & (y < reach) & (z < reach))
+
+    return condition

@@ -58,18 +58,20 @@ def fly_through_gate(drones: int = 1) -> Task:
 
 
 def tune(drones: int = 1) -> Task:
-    """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m."""
+    """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m.
+
+    The velocity asked for is the reference's: a difference over the last 1/48 s.
+    """
+
+    def y(t):
+        return 4 * jnp.cos(_TUNE_RATE * t)
 
     def target(starts, t):
-        zero, angle = jnp.zeros_like(t), _TUNE_RATE * t
-        return _everywhere(
-            starts, [zero, 4 * jnp.cos(angle), zero + 1], vel=[zero, -4 * _TUNE_RATE * jnp.sin(angle), zero]
-        )
+        zero = jnp.zeros_like(t)
+        return _everywhere(starts, [zero, y(t), zero + 1], vel=[zero, 48 * (y(t) - y(t - 1 / 48)), zero])
 
-    def cost(target, world):
-        return norm(target - world.drones.pos)
-
-    return _task("tune", "tune the gains of the PID in flight", drones, target, cost, action="pid_gains")
+    summary = "tune the gains of the PID in flight"
+    return _task("tune", summary, drones, target, _squared_distance, action="pid_gains")
 
 
 def leader_follower(drones: int = 2) -> Task:

@@ -15,7 +15,7 @@ from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.envs.randomize import REALISTIC_DELAY, REALISTIC_LAWS, Disturbance, Law, Noise, sensor_noise
 from jaxdrones.envs.vision import IMAGES, Vision
 from jaxdrones.params import Params, repeat
-from jaxdrones.tasks import hover, paper
+from jaxdrones.tasks import gates, hover, paper, swap, tracking
 from jaxdrones.tasks.task import Part, Task
 from jaxdrones.urdf import load_params
 
@@ -23,6 +23,9 @@ TASKS: dict[str, Callable[..., Task]] = {
     "hover": hover.hover,
     "recovery": hover.recovery,
     "landing": hover.landing,
+    "tracking": tracking.tracking,
+    "gates": gates.gates,
+    "swap-goals": swap.swap_goals,
     "paper-hover": paper.hover,
     "takeoff": paper.takeoff,
     "fly-through-gate": paper.fly_through_gate,
@@ -50,8 +53,8 @@ def make(
     pairs: Sequence[str | Callable] = (),
     rotors: str | None = None,
     integrator: str = "semi_implicit_euler",
-    control_hz: float = 100.0,
-    substeps: int = 5,
+    control_hz: float | None = None,
+    substeps: int | None = None,
     laws: Sequence[Law] | None = None,
     noise: Noise | None = None,
     disturb: Disturbance | None = None,
@@ -73,8 +76,8 @@ def make(
         pairs: names of `PAIRS` or functions.
         rotors: `instant` or `lagging`.
         integrator: a name of `INTEGRATORS`; Bullet has its own.
-        control_hz: control steps per second.
-        substeps: physics steps per control step.
+        control_hz: control steps per second; the task's own when left out.
+        substeps: physics steps per control step; the task's own when left out.
         laws: draw each episode's parameters from the nominal ones.
         noise: of the sensors.
         disturb: wind and pushes.
@@ -86,9 +89,11 @@ def make(
         ImportError: the Bullet backend is asked for and pybullet is not installed.
     """
     check_choice("backend", backend, BACKENDS)
+    task = _task(task, options)
+    control_hz = task.control_hz if control_hz is None else control_hz
+    substeps = task.substeps if substeps is None else substeps
     check_positive("control_hz", control_hz, "1/s")
     check_whole("substeps", substeps)
-    task = _task(task, options)
     dt = 1 / control_hz
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
 
@@ -118,7 +123,7 @@ def make(
         dt=dt,
         action=action if isinstance(action, Action) else action(),
         observation=parts,
-        laws=preset["laws"] if laws is None else laws,
+        laws=(*task.laws, *(preset["laws"] if laws is None else laws)),
         noise=preset["noise"] if noise is None else noise,
         disturb=disturb,
         delay=preset["delay"] if delay is None else delay,

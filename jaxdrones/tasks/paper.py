@@ -142,6 +142,7 @@ def _task(
         contact=True,
         action=action,
         observation=("normalized_kinematics",),
+        control_hz=48.0,
         overtime=2,
     )
 
@@ -180,6 +181,8 @@ def _task_v2(name: str, summary: str, drones: int, target: Target, box: float) -
         contact=True,
         action="one_d_rpm",
         observation=("kinematics_v2", "last_actions_v2"),
+        control_hz=30.0,
+        substeps=8,
         overtime=2,
     )
 

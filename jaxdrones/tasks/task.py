@@ -95,6 +95,12 @@ class Task:
     """(metrics over an episode (T, n), control period) -> (n,): whether a drone did what it should."""
     senses: Mapping[str, Part] = dataclasses.field(default_factory=dict)
     """Parts of an observation that only this task has."""
+    laws: tuple[Callable[[jax.Array, Params], Params], ...] = ()
+    """(key, params) of one drone -> its parameters in an episode: what varies as part of the task."""
+    control_hz: float = 100.0
+    """Control steps per second, unless the environment says otherwise."""
+    substeps: int = 5
+    """Physics steps per control step, unless the environment says otherwise."""
     scene: Scene = dataclasses.field(default_factory=Scene)
     contact: bool = False
     """Whether drones touch the ground and each other on purpose: adds contact forces to the explicit backend."""

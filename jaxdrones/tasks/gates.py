@@ -1,0 +1,188 @@
+"""Race through gates: the track of lsy_drone_racing, nominal, randomised or drawn anew."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.sensing.scene import Cylinder, Scene, gate
+from jaxdrones.state import State
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.starts import hovering, standing_height
+from jaxdrones.tasks.task import Part, Task, World, far_from, norm, square
+
+# x, y, z (m) and heading (rad) in which each gate is crossed, in this order
+GATES = np.array([(0.5, 0.25, 0.7, -0.78), (1.05, 0.75, 1.2, 2.35), (-1.0, -0.25, 0.7, 3.14), (0.0, -0.75, 1.2, 0.0)])
+POLES = np.array([(0.0, 0.75), (1.0, 0.25), (-1.5, -0.25), (-0.5, -0.75)])  # x, y, m
+START = np.array([-1.5, 0.75])
+OPENING, OUTER = 0.40, 0.72  # m, edges of the square hole and of the frame
+POLE_RADIUS, POLE_HEIGHT = 0.015, 1.52  # m
+LEVELS = (0, 1, 2, 3)
+
+_GATE_RANGE = np.array([0.15, 0.15, 0.1, 0.2])  # m, m, m, rad: level 2 moves gates by U(-range, range)
+_POLE_RANGE = 0.15  # m
+_INERTIA_RANGE = 0.2  # share: level 1 on
+
+
+def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: bool = False) -> Task:
+    """One lap through four gates.
+
+    In Bullet gates and poles stand where levels 0 and 1 have them; where they are moved, hits are seen by geometry.
+
+    Args:
+        drones: number of drones; they start 0.5 m apart in y, and do not see each other.
+        level: 0 nominal; 1 inertia randomised; 2 also gates and poles; 3 random tracks without poles.
+        duration: of an episode, s.
+        anywhere: start in the air before any of the gates, for training; else on the ground at the start.
+    """
+    if level not in LEVELS:
+        raise ValueError(f"level is {level!r}; give one of {', '.join(map(str, LEVELS))}")
+
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        track_key, pole_key, gate_key, place_key = jax.random.split(key, 4)
+        n, dtype = len(params.mass), params.mass.dtype
+        variables = {"gates": _track(track_key, level, dtype), "poles": _poles(pole_key, level, dtype)}
+        x, y = START
+        pos = jnp.stack([jnp.full(n, x, dtype), y + 0.5 * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1)
+        index = jnp.zeros(n, jnp.int32)
+        if anywhere:
+            index = jax.random.randint(gate_key, (n,), 0, len(GATES))
+            ahead = variables["gates"][index]
+            pos = ahead[:, :3] - 0.7 * _normal(ahead) + jax.random.uniform(place_key, (n, 3), dtype, -0.3, 0.3)
+        lap = {
+            "index": index,
+            "before": index,
+            "hit": jnp.zeros(n, bool),
+            "pos": pos,
+            "came_nearer": jnp.zeros(n, dtype),
+        }
+        return hovering(params, pos), variables | lap | {"lap_time": jnp.zeros(n, dtype)}
+
+    def target(variables, t) -> Setpoint:
+        return Setpoint.at(_gate(variables)[:, :3])
+
+    def crashed(world: World):
+        fell = world.drones.pos[:, 2] < standing_height(world.params) - 0.01
+        return world.variables["hit"] | fell
+
+    def finished(world: World):
+        return jnp.broadcast_to(jnp.all(world.variables["index"] >= len(GATES)), (drones,))
+
+    def passed(world: World):
+        return world.variables["index"] - world.variables["before"]
+
+    def as_number(condition):
+        return lambda world: condition(world).astype(world.drones.pos.dtype)
+
+    return Task(
+        name="gates",
+        summary="race through four gates, level 0 to 3",
+        drones=drones,
+        duration=duration,
+        start=start,
+        target=target,
+        rewards={
+            "progress": (10.0, lambda world: world.variables["came_nearer"]),
+            "passed": (5.0, as_number(passed)),
+            "crashed": (-10.0, as_number(crashed)),
+            "omega": (-0.002, shaping.turning),
+            "action_change": (-0.02, shaping.action_change),
+        },
+        ends={"finished": finished, "crashed": crashed, "lost": far_from((0, 0, 1), 3.0)},
+        advance=_advance,
+        metrics={
+            "gates": as_number(lambda world: world.variables["index"]),
+            "lap_time": lambda world: world.variables["lap_time"],
+        },
+        success=lambda metrics, dt: metrics["gates"][-1] == len(GATES),
+        laws=() if level == 0 else (_other_inertia,),
+        senses={"gates": Part(_see_gates, 20.0)},
+        scene=_scene() if level < 2 else Scene(),
+        contact=True,
+        observation=("position", "gates", "rotation_matrix", "velocity", "omega", "last_action"),
+    )
+
+
+def _advance(world: World) -> dict[str, Array]:
+    """Which gates are passed and what is hit, from where a drone was to where it is."""
+    variables, params, pos = world.variables, world.params, world.drones.pos
+    gate = _gate(variables)
+    before, after = _in_gate(gate, variables["pos"]), _in_gate(gate, pos)
+    crosses = (before[:, 0] < 0) & (after[:, 0] >= 0)
+    share = -before[:, 0] / jnp.where(crosses, after[:, 0] - before[:, 0], 1)
+    _, y, z = jnp.abs(before + share[:, None] * (after - before)).T
+    radius, half = params.collision_radius, params.collision_height / 2
+    inside = (y < OPENING / 2 - radius) & (z < OPENING / 2 - half)
+    frame = (y < OUTER / 2 + radius) & (z < OUTER / 2 + half) & ~inside
+
+    away = square((pos[:, None, :2] - variables["poles"][None]).reshape(-1, 2)).reshape(len(pos), -1)
+    pole = jnp.any(away < (POLE_RADIUS + radius[:, None]) ** 2, axis=-1) & (pos[:, 2] < POLE_HEIGHT + half)
+
+    index = variables["index"]
+    racing = index < len(GATES)
+    return variables | {
+        "index": index + (racing & crosses & inside),
+        "before": index,
+        "hit": pole | (racing & crosses & frame),
+        "pos": pos,
+        "came_nearer": racing * (norm(variables["pos"] - gate[:, :3]) - norm(pos - gate[:, :3])),
+        "lap_time": jnp.where(racing, world.time, variables["lap_time"]),
+    }
+
+
+def _track(key: jax.Array, level: int, dtype) -> Float[Array, "4 4"]:
+    u = jax.random.uniform(key, GATES.shape, dtype, -1, 1)
+    if level < 2:
+        return jnp.asarray(GATES, dtype)
+    if level == 2:
+        return jnp.asarray(GATES, dtype) + jnp.asarray(_GATE_RANGE, dtype) * u
+    quarter = jnp.asarray([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype)  # one gate in each, so that they keep apart
+    place = quarter * jnp.asarray([1.3, 0.9], dtype) + 0.25 * u[:, :2]
+    heading = jnp.arctan2(quarter[:, 0], -quarter[:, 1]) + 0.6 * u[:, 3]  # counter-clockwise, 34 degrees off
+    return jnp.concatenate([place, 0.95 + 0.25 * u[:, 2:3], heading[:, None]], axis=-1)
+
+
+def _poles(key: jax.Array, level: int, dtype) -> Float[Array, "4 2"]:
+    poles = jnp.asarray(POLES, dtype)
+    if level == 2:
+        return poles + jax.random.uniform(key, POLES.shape, dtype, -_POLE_RANGE, _POLE_RANGE)
+    return poles + (100.0 if level == 3 else 0.0)  # m: out of the way
+
+
+def _other_inertia(key: jax.Array, params: Params) -> Params:
+    factor = jax.random.uniform(key, params.inertia.shape, params.inertia.dtype, 1 - _INERTIA_RANGE, 1 + _INERTIA_RANGE)
+    return params.replace(inertia=params.inertia * factor)
+
+
+def _gate(variables: dict[str, Array], later: int = 0) -> Float[Array, "n 4"]:
+    """The gate that every drone is to cross next, or one `later`; the last one when there is none."""
+    return variables["gates"][jnp.minimum(variables["index"] + later, len(GATES) - 1)]
+
+
+def _normal(gate: Float[Array, "n 4"]) -> Float[Array, "n 3"]:
+    """The direction in which a gate is crossed."""
+    yaw = gate[:, 3]
+    return jnp.stack([jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)], axis=-1)
+
+
+def _in_gate(gate: Float[Array, "n 4"], pos: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Places in the frame of a gate: through it, to its left, up; m."""
+    dx, dy, dz = (pos - gate[:, :3]).T
+    cos, sin = jnp.cos(gate[:, 3]), jnp.sin(gate[:, 3])
+    return jnp.stack([cos * dx + sin * dy, cos * dy - sin * dx, dz], axis=-1)
+
+
+def _see_gates(task: Task, world: World) -> Float[Array, "n 12"]:
+    """Centre relative to the drone (m) and direction of the next gate and of the one after, world axes."""
+    ahead = [_gate(world.variables, later) for later in (0, 1)]
+    return jnp.concatenate([x for gate in ahead for x in (gate[:, :3] - world.drones.pos, _normal(gate))], axis=-1)
+
+
+def _scene() -> Scene:
+    frames = [gate((x, y, z), yaw) for x, y, z, yaw in GATES.tolist()]
+    poles = [Cylinder(pos=(x, y, POLE_HEIGHT / 2), radius=POLE_RADIUS, height=POLE_HEIGHT) for x, y in POLES.tolist()]
+    return Scene((*(beam for frame in frames for beam in frame), *poles))

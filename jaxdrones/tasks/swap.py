@@ -1,0 +1,81 @@
+"""A swarm in which drones change places without touching."""
+
+import math
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.task import Task, World, far_from, norm
+
+HEIGHT = 2.0  # m
+_APART = 0.6  # m between neighbours on the ring, at least
+_CLOSE = 0.4  # m: nearer costs
+_NOWHERE = 1e3  # m
+
+
+def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
+    """Drones on a ring are sent to each other's places, all in a random order; collisions cost.
+
+    Args:
+        drones: number of drones, at least two.
+        duration: of an episode, s.
+    """
+    check_whole("number of drones of swap-goals", drones, 2)
+    radius = max(1.0, _APART * drones / (2 * math.pi))
+
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        start_key, order_key = jax.random.split(key)
+        angle = 2 * jnp.pi * jnp.arange(drones, dtype=params.mass.dtype) / drones
+        ring = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.full_like(angle, HEIGHT)], axis=-1)
+        state = thrown(start_key, params, ring, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
+        order = jax.random.permutation(order_key, drones)
+        return state, {"goal": ring[order], "collisions": jnp.zeros(drones, params.mass.dtype)}
+
+    def target(variables, t) -> Setpoint:
+        return Setpoint.at(variables["goal"])
+
+    def advance(world: World) -> dict[str, Array]:
+        touching = _nearest(world) < 2 * world.params.collision_radius
+        return world.variables | {"collisions": world.variables["collisions"] + touching}
+
+    def crowding(world: World) -> Float[Array, " n"]:
+        """Square of how far the nearest neighbour is inside 0.4 m, as a share."""
+        return jnp.maximum(1 - _nearest(world) / _CLOSE, 0) ** 2
+
+    return Task(
+        name="swap-goals",
+        summary="a swarm changes places without touching",
+        drones=drones,
+        duration=duration,
+        start=start,
+        target=target,
+        rewards=shaping.reach_and_stay(target) | {"crowding": (-5.0, crowding)},
+        ends={"lost": far_from((0, 0, HEIGHT), radius + 4.0)},
+        advance=advance,
+        metrics={"collisions": lambda world: world.variables["collisions"], "nearest": _nearest},
+        success=_arrived_untouched,
+        observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "neighbours"),
+    )
+
+
+def _nearest(world: World) -> Float[Array, " n"]:
+    """Distance of the nearest other drone, m."""
+    pos = world.drones.pos
+    own = jnp.eye(len(pos), dtype=bool)
+
+    def distances(pos_i, own_i):
+        return norm(jnp.where(own_i[:, None], _NOWHERE, pos - pos_i[None]))
+
+    return jnp.min(jax.vmap(distances)(pos, own), axis=-1)
+
+
+def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+    return (metrics["error"][-1] < 0.1) & (metrics["collisions"][-1] == 0)

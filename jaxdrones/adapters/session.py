@@ -1,0 +1,95 @@
+"""One episode at a time on the host: NumPy in and out, one compiled call per control step."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdrones.backends.host import HostStep
+from jaxdrones.envs import Env
+from jaxdrones.tasks.task import World
+
+SEEDS = 2**32  # a seed counts modulo this
+
+
+class Session:
+    """A world that stays on the device; what is seen of it comes in fresh arrays."""
+
+    def __init__(self, env: Env):
+        self.env = env
+        self.world: World | None = None
+        self.running = False
+        """Whether an episode has begun and not ended."""
+        compile = (lambda f: f) if isinstance(env.physics, HostStep) else jax.jit  # a host step is called as it is
+        self._reset, self._step = compile(self._reset), compile(self._step)
+
+    def reset(self, seed: int) -> Any:
+        """Start an episode; returns the observation."""
+        self._key, self.world, obs = self._reset(np.uint32(seed % SEEDS))
+        self.running = True
+        return _numpy(obs)
+
+    def step(self, action: np.ndarray) -> tuple[Any, np.ndarray, bool, bool, dict[str, Any]]:
+        """One control step.
+
+        Args:
+            action: (n, a), checked.
+
+        Returns:
+            Observation, reward (n,), terminated, truncated and info, as the environment gives them.
+        """
+        self.world, outcome = self._step(self._key, self.world, action)
+        obs, reward, terminated, truncated, info = _numpy(outcome)
+        terminated, truncated = bool(terminated), bool(truncated)
+        self.running = not (terminated or truncated)
+        info["ends"] = {name: bool(end) for name, end in info["ends"].items()}
+        return obs, reward, terminated, truncated, info
+
+    def photo(self) -> np.ndarray:
+        """A picture of the team from the side: RGB (height, width, 3) uint8; taken by Bullet, whatever the backend.
+
+        Raises:
+            ImportError: pybullet is not installed; says which extra to install.
+        """
+        pos = np.asarray(self.world.drones.pos, float)
+        center = pos.mean(axis=0)
+        reach = 1.0 + np.abs(pos - center).max()  # m
+        eye = center + reach * np.array([0.9, -1.2, 0.6])
+        return self._photographer.photo(self.world.params, self.world.drones, eye, center)
+
+    def close(self) -> None:
+        """End what is connected to Bullet; the session cannot go on."""
+        self.running = False
+        self.env.close()
+        if "_photographer" in vars(self):
+            self._photographer.close()
+
+    @functools.cached_property
+    def _photographer(self):
+        if isinstance(self.env.physics, HostStep):
+            return self.env.physics
+        from jaxdrones.backends import bullet  # an optional library behind it
+
+        return bullet.make_step(scene=self.env.task.scene)
+
+    def _reset(self, seed: jax.Array):
+        return begin(self.env, seed)
+
+    def _step(self, key: jax.Array, world: World, action: np.ndarray):
+        obs, world, *rest = self.env.step(jax.random.fold_in(key, world.step), world, action)
+        return world, (obs, *rest)
+
+
+def begin(env, seed: jax.Array) -> tuple[jax.Array, World, Any]:
+    """The key of an episode's steps, the world at its start, and what is seen of it."""
+    key, start = jax.random.split(jax.random.PRNGKey(seed))
+    obs, world = env.reset(start)
+    return key, world, obs
+
+
+def _numpy(tree: Any) -> Any:
+    """Arrays of one's own, in single precision where they are real."""
+    return jax.tree.map(lambda x: np.array(x, np.float32 if x.dtype == np.float64 else None), tree)

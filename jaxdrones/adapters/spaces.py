@@ -1,0 +1,109 @@
+"""Gymnasium's spaces of an environment, and how the drones of a team are laid out in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+
+from jaxdrones.checks import check_shape
+from jaxdrones.envs import Env
+
+_FAR = 1001.0  # m; the cameras see 1000 m far, give or take rounding
+
+
+def observation_of_drone(env: Env) -> spaces.Space:
+    """What one drone sees."""
+    state = spaces.Box(-env.observation_bound, env.observation_bound, dtype=np.float32)
+    if env.vision is None:
+        return state
+    return spaces.Dict({"state": state} | {name: _image(env, name) for name in env.vision.images})
+
+
+def action_of_drone(env: Env) -> spaces.Box:
+    """What one drone is told."""
+    return spaces.Box(-1, 1, (env.action_size,), np.float32)
+
+
+def stacked(space: spaces.Space, n: int) -> spaces.Space:
+    """The space of n side by side, with a leading axis."""
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({name: stacked(part, n) for name, part in space.items()})
+    low, high = (np.broadcast_to(x, (n, *space.shape)) for x in (space.low, space.high))
+    return spaces.Box(low, high, dtype=space.dtype)
+
+
+class Layout:
+    """A lone drone without its axis; a team with it, or as a dict by drone."""
+
+    def __init__(self, env: Env, names: Sequence[str] | None):
+        n = env.drones
+        self.drones, self.size, self.names = n, env.action_size, names
+        if names:
+            self.observation = spaces.Dict({name: observation_of_drone(env) for name in names})
+            self.action = spaces.Dict({name: action_of_drone(env) for name in names})
+        elif n == 1:
+            self.observation, self.action = observation_of_drone(env), action_of_drone(env)
+        else:
+            self.observation = stacked(observation_of_drone(env), n)
+            self.action = stacked(action_of_drone(env), n)
+
+    def arrange(self, tree: Any, axis: int = 0) -> Any:
+        """Arrays with all drones along `axis`, laid out."""
+        if self.names:
+            return {name: _pick(tree, i, axis) for i, name in enumerate(self.names)}
+        return _pick(tree, 0, axis) if self.drones == 1 else tree
+
+    def gather(self, action: Any, batch: tuple[int, ...] = ()) -> Any:
+        """The array (*batch, n, a) of an action that is laid out.
+
+        Raises:
+            ValueError: a drone without an action, a wrong shape, or not a number (in a NumPy array).
+        """
+        if not self.names:
+            alone = self.drones == 1
+            meaning = f"{self.size} numbers" if alone else f"{self.size} numbers for each of {self.drones} drones"
+            shape = (*batch, self.size) if alone else (*batch, self.drones, self.size)
+            action = _check(action, "action", shape, meaning)
+            return action[..., None, :] if alone else action
+        if not isinstance(action, Mapping) or set(action) != set(self.names):
+            given = ", ".join(map(str, action)) if isinstance(action, Mapping) else repr(action)
+            raise ValueError(f"action is for {given or 'no drone'}; give a dict with one each for {self._who}")
+        parts = [_check(action[name], f"action of {name}", (*batch, self.size), "") for name in self.names]
+        stack = np.stack if isinstance(parts[0], np.ndarray) else jnp.stack
+        return stack(parts, axis=len(batch))
+
+    @property
+    def _who(self) -> str:
+        return ", ".join(self.names)
+
+
+def _check(action: Any, name: str, shape: tuple[int, ...], meaning: str) -> Any:
+    if not isinstance(action, jax.Array):
+        action = np.asarray(action, np.float32)
+        if not np.isfinite(action).all():
+            raise ValueError(f"{name} is not finite in {_where(action)}; give numbers in [-1, 1]")
+    if action.shape != shape:
+        check_shape(name, action, shape, meaning)
+    return action
+
+
+def _where(action: np.ndarray) -> str:
+    bad = np.argwhere(~np.isfinite(action))
+    return f"{len(bad)} of {action.size} entries, the first at {tuple(map(int, bad[0]))}"
+
+
+def _pick(tree: Any, i: int, axis: int) -> Any:
+    return jax.tree.map(lambda x: x[(slice(None),) * axis + (i,)], tree)
+
+
+def _image(env: Env, name: str) -> spaces.Box:
+    if name == "rgb":
+        return spaces.Box(0, 255, (48, 64, 4), np.uint8)
+    if name == "depth":
+        return spaces.Box(0, _FAR, (48, 64), np.float32)
+    return spaces.Box(-1, env.drones + len(env.task.scene.obstacles), (48, 64), np.int32)

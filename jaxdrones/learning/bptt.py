@@ -1,0 +1,108 @@
+"""Backpropagation through time: the gradient of the flown rewards, through physics and policy."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array
+
+from jaxdrones.checks import check_choice
+from jaxdrones.envs import Env
+from jaxdrones.learning import collect
+from jaxdrones.learning.gradients import GRADIENTS, linked, with_gradient
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import Statistics
+from jaxdrones.learning.result import Result, scan_updates
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
+
+    updates: int = 300
+    worlds: int = 256
+    horizon: int = 64
+    """Control steps that a gradient goes back through."""
+    sizes: tuple[int, ...] = (64, 64)
+    per_role: bool = False
+    learning_rate: float = 1e-2
+    """At the start; falls to zero along a cosine."""
+    discount: float = 1.0
+    clip: float = 1.0
+    """Largest norm of the gradient."""
+    restart: float = 0.2
+    """Share of the worlds that start afresh before an update; the others fly on."""
+    gradient: str = "exact"
+    """A name of `GRADIENTS`."""
+    decay: float = 0.98
+    """Of the gradient, per control step, with `gradient="decay"`."""
+    surrogate: Any = None
+    """Step of the backward pass with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+
+    def __post_init__(self):
+        check_choice("gradient", self.gradient, GRADIENTS)
+
+
+class TrainState(flax.struct.PyTreeNode):
+    """All that training needs to go on."""
+
+    key: Array
+    policy: Policy
+    optimiser: optax.OptState
+    worlds: collect.Worlds
+
+
+def init(key: jax.Array, env: Env, config: Config) -> TrainState:
+    """Before the first update."""
+    key, policy_key, world_key = jax.random.split(key, 3)
+    worlds = collect.begin(world_key, env, config.worlds)
+    statistics = Statistics.of(worlds.obs)
+    policy = Policy.init(policy_key, statistics, env.drones, env.action_size, config.sizes, config.per_role)
+    return TrainState(key, policy, _optimiser(config).init(policy.params), worlds)
+
+
+def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
+    """One flight of all worlds and one step along its gradient."""
+    key, restart_key, fly_key = jax.random.split(state.key, 3)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart)
+    env = with_gradient(env, config)
+
+    def loss(params):
+        policy = state.policy.replace(params=params)
+        after, flight = collect.fly(
+            fly_key, env, lambda key, obs: (policy(obs), None), worlds, config.horizon, linked(config)
+        )
+        return -jnp.mean(discounted(flight, config.discount)), (after, flight)
+
+    (_, (worlds, flight)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
+    step, optimiser = _optimiser(config).update(gradient, state.optimiser)
+    policy = state.policy.replace(
+        params=optax.apply_updates(state.policy.params, step), statistics=state.policy.statistics.update(flight.obs)
+    )
+    metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient)}
+    return TrainState(key, policy, optimiser, worlds), metrics
+
+
+def train(key: jax.Array, env: Env, config: Config) -> Result:
+    """All updates as one program."""
+    return scan_updates(update, env, config, init(key, env, config))
+
+
+def discounted(flight: collect.Flight, discount: float) -> Array:
+    """(t, w, n) rewards, discounted from the start of the flight or of the episode."""
+
+    def forwards(weight, x):
+        reward, ended = x
+        return jnp.where(ended, 1, weight * discount), weight[:, None] * reward
+
+    return jax.lax.scan(forwards, jnp.ones_like(flight.reward[0, :, 0]), (flight.reward, flight.ended))[1]
+
+
+def _optimiser(config: Config) -> optax.GradientTransformation:
+    rate = optax.cosine_decay_schedule(config.learning_rate, config.updates)
+    return optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(rate))

@@ -1,0 +1,66 @@
+"""What a gradient goes through, and how long.
+
+A long flight of an unstable drone has gradients that grow or shrink with every control step. Three ways:
+
+- `exact`: the derivative of what was simulated.
+- `decay`: every control step back multiplies it by a factor below one, which bounds how far back an error is blamed.
+- `surrogate`: physics is simulated as it is, but differentiated as a simpler step, one rigid body step per control
+  period by default: cheaper, and smooth where the simulated physics is not. The gradient is biased.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxdrones.backends.explicit import Step, make_step
+from jaxdrones.envs import Env
+
+GRADIENTS = ("exact", "decay", "surrogate")
+
+
+def with_gradient(env: Env, config) -> Env:
+    """The environment, differentiated as the settings say."""
+    if config.gradient != "surrogate":
+        return env
+    changed = copy.copy(env)
+    changed.physics = differentiated_as(env.physics, config.surrogate or make_step(dt=env.dt))
+    return changed
+
+
+def linked(config) -> Callable:
+    """What happens to the gradient of worlds between two control steps."""
+    if config.gradient == "decay":
+        return lambda worlds: scale_gradient(worlds, config.decay)
+    return lambda worlds: worlds
+
+
+def scale_gradient(tree, factor: float):
+    """The same numbers, with a gradient multiplied by `factor`."""
+
+    def scale(x):
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        return jax.lax.stop_gradient(x) + factor * (x - jax.lax.stop_gradient(x))
+
+    return jax.tree.map(scale, tree)
+
+
+def differentiated_as(step: Step, simple: Step) -> Step:
+    """A step with the values of one and the derivatives of another, at the same state."""
+
+    @jax.custom_vjp
+    def mixed(params, state, rpm):
+        return step(params, state, rpm)
+
+    def forward(params, state, rpm):
+        return step(params, state, rpm), (params, state, rpm)
+
+    def backward(saved, cotangent):
+        return jax.vjp(simple, *saved)[1](cotangent)
+
+    mixed.defvjp(forward, backward)
+    return mixed

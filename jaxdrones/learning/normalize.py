@@ -1,0 +1,48 @@
+"""Running mean and variance of what is observed."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_LARGEST = 10.0  # standard deviations
+_SMALLEST = 1e-2  # standard deviation; an entry that hardly moves is not blown up
+
+
+class Statistics(flax.struct.PyTreeNode):
+    """Of all vectors seen so far."""
+
+    mean: Array
+    """(d,)"""
+    var: Array
+    """(d,)"""
+    count: Array
+    """() vectors seen."""
+
+    @classmethod
+    def of(cls, obs: Float[Array, "*batch d"]) -> Statistics:
+        """Of the vectors along the last axis."""
+        obs = jnp.reshape(obs, (-1, obs.shape[-1]))
+        mean = jnp.mean(obs, axis=0)
+        return cls(mean, jnp.mean((obs - mean[None]) ** 2, axis=0), jnp.asarray(len(obs), obs.dtype))
+
+    def update(self, obs: Float[Array, "*batch d"], memory: float = jnp.inf) -> Statistics:
+        """With more vectors, joined as by Chan et al. (1983).
+
+        Args:
+            obs: new vectors along the last axis.
+            memory: largest weight of the old ones, in vectors; so that early ones are forgotten.
+        """
+        new = Statistics.of(obs)
+        old = jnp.minimum(self.count, memory)
+        count = old + new.count
+        step = new.mean - self.mean
+        var = (old * self.var + new.count * new.var) / count + step**2 * (old * new.count / count**2)
+        return Statistics(self.mean + step * (new.count / count), var, count)
+
+    def normalize(self, obs: Float[Array, "*batch d"]) -> Array:
+        """In standard deviations from the mean, cut at ten."""
+        scale = 1 / jnp.maximum(jnp.sqrt(self.var), _SMALLEST)
+        shape = (1,) * (obs.ndim - 1) + self.mean.shape
+        return jnp.clip((obs - self.mean.reshape(shape)) * scale.reshape(shape), -_LARGEST, _LARGEST)

@@ -11,6 +11,7 @@ from jaxdrones.dynamics import (
     drag_world_axes,
     drone_contact,
     euler,
+    external_push,
     ground_contact,
     ground_effect,
     ground_effect_paper,
@@ -20,6 +21,7 @@ from jaxdrones.dynamics import (
     rk4,
     semi_implicit_euler,
 )
+from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
@@ -38,6 +40,7 @@ __all__ = [
     "drag_world_axes",
     "drone_contact",
     "euler",
+    "external_push",
     "ground_contact",
     "ground_effect",
     "ground_effect_paper",
@@ -45,6 +48,7 @@ __all__ = [
     "instant_rotors",
     "lagging_rotors",
     "load_params",
+    "make",
     "make_step",
     "repeat",
     "rk4",

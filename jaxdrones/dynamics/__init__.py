@@ -1,13 +1,15 @@
 """Wrenches and how they move a drone. The tables below are what the command line knows by name."""
 
-from jaxdrones.dynamics.aero import drag, drag_world_axes, ground_effect, ground_effect_paper
+from jaxdrones.dynamics.aero import drag, drag_world_axes, external_push, ground_effect, ground_effect_paper
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_paper
 from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors, rotor_wrench
 
-EFFECTS = {f.__name__: f for f in (drag, drag_world_axes, ground_effect, ground_effect_paper, ground_contact)}
+EFFECTS = {
+    f.__name__: f for f in (drag, drag_world_axes, ground_effect, ground_effect_paper, ground_contact, external_push)
+}
 PAIRS = {f.__name__: f for f in (downwash, downwash_paper, drone_contact)}
 ROTORS = {"instant": instant_rotors, "lagging": lagging_rotors}
 INTEGRATORS = {f.__name__: f for f in (semi_implicit_euler, euler, rk4, implicit_midpoint)}
@@ -23,6 +25,7 @@ __all__ = [
     "drag_world_axes",
     "drone_contact",
     "euler",
+    "external_push",
     "ground_contact",
     "ground_effect",
     "ground_effect_paper",

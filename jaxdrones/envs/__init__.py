@@ -2,8 +2,20 @@
 
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.autoreset import AutoReset, autoreset
+from jaxdrones.envs.check import ContractError, check_env
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.envs.registry import TASKS, make
 
-__all__ = ["ACTIONS", "OBSERVATIONS", "TASKS", "Action", "AutoReset", "Env", "autoreset", "make"]
+__all__ = [
+    "ACTIONS",
+    "OBSERVATIONS",
+    "TASKS",
+    "Action",
+    "AutoReset",
+    "ContractError",
+    "Env",
+    "autoreset",
+    "check_env",
+    "make",
+]

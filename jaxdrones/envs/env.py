@@ -60,7 +60,7 @@ class Env:
             observation: parts that are put side by side.
             laws: draw the parameters of every episode from the nominal ones.
             noise: of the sensors.
-            disturb: sets wind and pushes before every control step.
+            disturb: sets the surroundings before every control step: pushes.
             delay: between action and command, s.
             vision: cameras; only with the Bullet backend.
         """

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 
 from jaxdrones.backends.explicit import make_step
 from jaxdrones.checks import check_choice, check_positive, check_whole
-from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
-from jaxdrones.dynamics.contact import drone_contact, ground_contact
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS, drone_contact, external_push, ground_contact
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
@@ -80,7 +79,7 @@ def make(
         substeps: physics steps per control step; the task's own when left out.
         laws: draw each episode's parameters from the nominal ones.
         noise: of the sensors.
-        disturb: wind and pushes.
+        disturb: pushes.
         delay: between action and command, s.
         **options: of the task, for example `drones`.
 
@@ -100,6 +99,8 @@ def make(
     preset = _REALISTIC if realistic else _PLAIN
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = [_named("effect", effect, EFFECTS) for effect in (preset["effects"] if effects is None else effects)]
+    if disturb is not None:
+        effects = [*effects, external_push]
     pairs = [_named("pair effect", pair, PAIRS) for pair in pairs]
     physics = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
     if backend == "bullet":

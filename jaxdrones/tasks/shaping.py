@@ -10,6 +10,7 @@ from jaxdrones.control import Setpoint
 from jaxdrones.tasks.task import Term, World, square
 
 _NEAR = 0.02  # m; below, the position term is a parabola
+_SLOW = 0.1  # m/s; the same for the velocity term
 
 
 def reach_and_stay(target: Callable[[Any, Array], Setpoint]) -> dict[str, tuple[float, Term]]:
@@ -23,13 +24,14 @@ def reach_and_stay(target: Callable[[Any, Array], Setpoint]) -> dict[str, tuple[
         return jnp.sqrt(error + _NEAR**2) - _NEAR
 
     def velocity(world: World) -> Float[Array, " n"]:
-        return square(world.drones.vel - target(world.variables, world.time).vel)
+        error = square(world.drones.vel - target(world.variables, world.time).vel)
+        return jnp.sqrt(error + _SLOW**2) - _SLOW
 
     return {
         "alive": (1.0, alive),
         "position": (-1.0, position),
-        "velocity": (-0.05, velocity),
-        "omega": (-0.002, turning),
+        "velocity": (-0.1, velocity),
+        "omega": (-0.005, turning),
         "action_change": (-0.02, action_change),
     }
 

@@ -52,4 +52,5 @@ def thrown(
     axis = jnp.stack([sin * jnp.cos(angle), sin * jnp.sin(angle), cos], axis=-1)
     quat = jax.vmap(rotation.exp)(tilt * (u[:, 11:] + 1) / 2 * axis)
     rpm = jnp.broadcast_to(params.hover_rpm[:, None], (n, 4))
-    return State(pos + jnp.asarray(reach, dtype) * u[:, :3], quat, speed * u[:, 3:6], omega * u[:, 6:9], rpm)
+    reach = jnp.broadcast_to(jnp.asarray(reach, dtype), (3,))
+    return State(pos + reach[None] * u[:, :3], quat, speed * u[:, 3:6], omega * u[:, 6:9], rpm)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.sensing.collisions import collisions
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
@@ -43,7 +44,7 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         return Setpoint.at(variables["goal"])
 
     def advance(world: World) -> dict[str, Array]:
-        touching = _nearest(world) < 2 * world.params.collision_radius
+        touching = collisions(world.params, world.drones).drones
         return world.variables | {"collisions": world.variables["collisions"] + touching}
 
     def crowding(world: World) -> Float[Array, " n"]:

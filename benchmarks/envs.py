@@ -1,0 +1,103 @@
+"""How many environment steps per second, with observation, reward and a fresh reset of every episode that ends?
+
+Inside one compiled program; through gymnasium's `make_vec` with NumPy in and out; and one gymnasium environment.
+"""
+
+import argparse
+import time
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import about, compiled, report, seconds
+
+import jaxdrones.adapters.gymnasium  # noqa: F401 (registers the environments)
+from jaxdrones.envs import autoreset, make
+
+STEPS = 50  # of a compiled call
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, default=4096)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    if options.quick:
+        options.worlds, options.repeats = 16, 1
+
+    swarm = dict(drones=8, pairs=("downwash",))
+    rows = {
+        "hover, in jit: env-steps/s": in_jit(make("hover"), options),
+        "hover, realistic, in jit: env-steps/s": in_jit(make("hover", realistic=True), options),
+        "8 drones, downwash, in jit: drone-steps/s": 8 * in_jit(make("swap-goals", **swarm), options),
+        "hover, make_vec, NumPy in and out: env-steps/s": vector(options),
+        "hover, one gymnasium environment: steps/s": single(options),
+    }
+    a_step = {"worlds": options.worlds, "control": "100 Hz", "substeps": 5, "integrator": "semi_implicit_euler"}
+    lines = [f"{name}: {value}" for name, value in (a_step | about()).items()]
+    lines += [f"{rate:14,.0f}  {name}" for name, rate in rows.items()]
+    report({"step": a_step, "about": about(), "rates": rows}, options.json, lines)
+
+
+def in_jit(env, options) -> float:
+    """Environment steps per second with random actions and autoreset; episodes start out of step."""
+    env = autoreset(env)
+    keys = jax.random.split(jax.random.key(0), options.worlds)
+    _, episodes = jax.jit(jax.vmap(env.reset))(keys)
+    age = jax.random.randint(jax.random.key(1), (options.worlds,), 0, env.env.steps)
+    episodes = episodes.replace(world=episodes.world.replace(step=age))
+    actions = jax.random.uniform(
+        jax.random.key(2), (options.worlds, env.env.drones, env.env.action_size), minval=-0.1, maxval=0.1
+    )
+
+    def fly(episodes, key):
+        def advance(carry, key):
+            episodes, seen = carry
+            keys = jax.random.split(key, options.worlds)
+            obs, episodes, reward, *_ = jax.vmap(env.step)(keys, episodes, actions)
+            return (episodes, seen + jnp.sum(reward) + jnp.sum(obs)), None
+
+        return jax.lax.scan(advance, (episodes, 0.0), jax.random.split(key, STEPS))[0]
+
+    program, _ = compiled(fly, episodes, jax.random.key(3))
+    return options.worlds * STEPS / seconds(program, episodes, jax.random.key(3), repeats=options.repeats)["median"]
+
+
+def vector(options) -> float:
+    """Steps per second of all environments of a gymnasium VectorEnv."""
+    envs = gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=options.worlds)
+    envs.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-0.1, 0.1, envs.action_space.shape).astype(np.float32)
+    return options.worlds * _rate(lambda: envs.step(actions), options)
+
+
+def single(options) -> float:
+    """Steps per second of one gymnasium environment, resets included."""
+    env = gymnasium.make("jaxdrones/Hover-v0")
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+
+    def step():
+        if any(env.step(action)[2:4]):
+            env.reset()
+
+    return _rate(step, options)
+
+
+def _rate(step, options) -> float:
+    """Calls per second: the median of repeats of 100 calls."""
+    step()
+    rates = []
+    for _ in range(options.repeats):
+        start = time.perf_counter()
+        for _ in range(100):
+            step()
+        rates.append(100 / (time.perf_counter() - start))
+    return float(np.median(rates))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""The contract of an environment, as a test that ships with the package."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.backends.host import HostStep
+from jaxdrones.envs.env import Env
+
+
+class ContractError(AssertionError):
+    """An environment breaks its contract; the message says where."""
+
+
+def check_env(env: Env, steps: int = 5) -> None:
+    """Fly a few steps with random actions and look at everything that comes back.
+
+    Shapes, types and bounds; that the same key gives the same episode; that nothing given is changed; that the reward
+    is the sum of its named terms; that wrong actions are refused; on the explicit backend also that `jax.jit` and
+    `jax.vmap` give what plain calls give.
+
+    Args:
+        env: the environment.
+        steps: control steps to fly.
+
+    Raises:
+        ContractError: what is broken, and where.
+    """
+    key = jax.random.key(0)
+    obs, world = env.reset(key)
+    _check_obs(env, obs, "after reset")
+    _check_equal(env.reset(key), (obs, world), "two resets with the same key")
+    keys, actions = _tape(env, steps)
+    flown = []
+    for k in range(steps):
+        before = jax.tree.map(np.array, world)
+        answer = env.step(keys[k], world, actions[k])
+        _check_equal(world, before, f"the world given to step {k}, before and after")
+        _check_answer(env, answer, f"at step {k}")
+        flown.append(answer)
+        world = answer[1]
+    _check_refusals(env, key, world)
+    if not isinstance(env.physics, HostStep):
+        _check_transformations(env, keys, actions, flown)
+
+
+def _tape(env: Env, steps: int) -> tuple[jax.Array, jax.Array]:
+    key = jax.random.key(1)
+    shape = (steps, env.drones, env.action_size)
+    return jax.random.split(key, steps), jax.random.uniform(key, shape, float, -0.3, 0.3)
+
+
+def _check_obs(env: Env, obs: Any, where: str) -> None:
+    state = obs["state"] if isinstance(obs, dict) else obs
+    _demand(state.shape == (env.drones, env.observation_size), f"obs has shape {state.shape} {where}")
+    _demand(np.all(np.isfinite(state)), f"obs is not finite {where}: {state}")
+    _demand(np.all(np.abs(state) <= env.observation_bound), f"obs is beyond observation_bound {where}: {state}")
+
+
+def _check_answer(env: Env, answer: tuple, where: str) -> None:
+    obs, world, reward, terminated, truncated, info = answer
+    _check_obs(env, obs, where)
+    _demand(reward.shape == (env.drones,), f"reward has shape {reward.shape} {where}; expected ({env.drones},)")
+    _demand(np.all(np.isfinite(reward)), f"reward is not finite {where}: {reward}")
+    for name, flag in ("terminated", terminated), ("truncated", truncated):
+        _demand(flag.shape == () and flag.dtype == bool, f"{name} is not one boolean {where}: {flag}")
+    terms = sum(info["rewards"].values())
+    _demand(np.allclose(terms, reward, rtol=1e-5, atol=1e-6), f"the terms sum up to {terms}, not to {reward} {where}")
+    for name, metric in info["metrics"].items():
+        _demand(metric.shape == (env.drones,), f"metric {name!r} has shape {metric.shape} {where}")
+    for leaf in jax.tree.leaves(world.drones):
+        _demand(np.all(np.isfinite(leaf)), f"the state of the drones is not finite {where}")
+
+
+def _check_refusals(env: Env, key: jax.Array, world: Any) -> None:
+    shape = (env.drones, env.action_size)
+    for bad, why in (jnp.zeros((shape[0] + 1, shape[1])), "one row too many"), (jnp.full(shape, jnp.nan), "NaN"):
+        try:
+            env.step(key, world, bad)
+        except ValueError:
+            continue
+        raise ContractError(f"an action with {why} is not refused")
+
+
+def _check_transformations(env: Env, keys: jax.Array, actions: jax.Array, flown: list) -> None:
+    def episode(key):
+        def advance(world, tape):
+            obs, world, reward, *_ = env.step(tape[0], world, tape[1])
+            return world, (obs, reward)
+
+        return jax.lax.scan(advance, env.reset(key)[1], (keys, actions))[1]
+
+    key = jax.random.key(0)
+    expected = (jnp.stack([answer[0] for answer in flown]), jnp.stack([answer[2] for answer in flown]))
+    _check_close(jax.jit(episode)(key), expected, "an episode in jit and out")
+    pair = jax.jit(jax.vmap(episode))(jnp.stack([jax.random.key(7), key]))
+    _check_close(jax.tree.map(lambda x: x[1], pair), expected, "an episode in vmap and alone")
+
+
+def _check_equal(actual, expected, what: str) -> None:
+    same = jax.tree.map(np.array_equal, jax.tree.map(_plain, actual), jax.tree.map(_plain, expected))
+    _demand(all(jax.tree.leaves(same)), f"{what} differ")
+
+
+def _check_close(actual, expected, what: str) -> None:
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        tolerance = 1e-3 if a.dtype == np.float32 else 1e-9
+        _demand(np.allclose(a, b, rtol=tolerance, atol=tolerance), f"{what} differ by {np.max(np.abs(a - b))}")
+
+
+def _plain(x):
+    return jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+
+
+def _demand(condition, message: str) -> None:
+    if not condition:
+        raise ContractError(message)

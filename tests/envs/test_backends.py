@@ -1,0 +1,87 @@
+"""Environments on Bullet: the same contract, the same numbers in free flight, pictures, no gradients."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close
+
+from jaxdrones.envs import TASKS, check_env, make
+
+KEY = jax.random.key(3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_keeps_the_contract_on_bullet(task):
+    with make(task, backend="bullet") as env:
+        check_env(env, steps=2)
+
+
+@pytest.mark.parametrize("task", ["hover", "tracking", "swap-goals", "hover-v2"])
+def test_in_free_flight_both_backends_see_and_reward_the_same(task):
+    options = dict(effects=("drag",), pairs=("downwash",))
+    explicit = make(task, **options)
+    with make(task, backend="bullet", **options) as bullet:
+        seen = [fly(env) for env in (explicit, bullet)]
+    assert_close(*seen, 1e-9)
+
+
+def fly(env):
+    _, world = env.reset(KEY)
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(20):
+        action = rng.uniform(-0.1, 0.1, (env.drones, env.action_size))
+        obs, world, reward, *_ = env.step(KEY, world, action)
+        seen.append((np.asarray(obs), np.asarray(reward)))
+    return seen
+
+
+def test_pictures_come_beside_the_state_at_their_own_rate():
+    with make("hover", backend="bullet", vision=("rgb", "depth"), vision_hz=25) as env:
+        obs, world = env.reset(KEY)
+        assert obs["rgb"].shape == (1, 48, 64, 4) and obs["rgb"].dtype == np.uint8
+        assert obs["depth"].shape == (1, 48, 64) and obs["state"].shape == (1, env.observation_size)
+        depths = []
+        for _ in range(8):
+            obs, world, *_ = env.step(KEY, world, jnp.full((1, 4), -0.5))
+            depths.append(obs["depth"])
+        changes = [not np.array_equal(a, b) for a, b in itertools.pairwise(depths)]
+        assert changes == [False, False, True, False, False, False, True]
+
+
+def test_pictures_are_the_same_in_a_compiled_program():
+    with make("hover", backend="bullet", vision=("segmentation",), vision_hz=50) as env:
+        _, world = env.reset(KEY)
+        action = jnp.zeros((1, 4))
+        step = jax.jit(env.step)
+        for _ in range(2):
+            plain, compiled = env.step(KEY, world, action), step(KEY, world, action)
+            np.testing.assert_array_equal(plain[0]["segmentation"], compiled[0]["segmentation"])
+            world = plain[1]
+
+
+def test_a_rate_of_pictures_that_does_not_divide_the_control_rate_is_refused():
+    with pytest.raises(ValueError, match="vision_hz is 30; give a divisor of the control rate, 100"):
+        make("hover", backend="bullet", vision=("rgb",), vision_hz=30)
+
+
+def test_a_gradient_through_bullet_is_refused():
+    with make("hover", backend="bullet") as env:
+        _, world = env.reset(KEY)
+        with pytest.raises(TypeError, match="the Bullet backend has no gradient"):
+            jax.grad(lambda action: env.step(KEY, world, action)[2].sum())(jnp.zeros((1, 4)))
+
+
+def test_an_integrator_is_refused_on_bullet():
+    with pytest.raises(ValueError, match="the bullet backend integrates by itself"):
+        make("hover", backend="bullet", integrator="rk4")
+
+
+def test_a_closed_environment_says_so():
+    env = make("hover", backend="bullet")
+    _, world = env.reset(KEY)
+    env.close()
+    with pytest.raises(ValueError, match="closed"):
+        env.step(KEY, world, jnp.zeros((1, 4)))

@@ -1,0 +1,193 @@
+"""The contract of environments, on every task, action type and observation, and its errors."""
+
+import dataclasses
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close
+
+from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS, ContractError, check_env, make
+from jaxdrones.tasks.starts import standing_height
+
+KEY = jax.random.key(3)
+OTHER = jax.random.key(4)
+make_env = lru_cache(make)
+
+
+def zeros(env):
+    return jnp.zeros((env.drones, env.action_size))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_keeps_the_contract(task):
+    check_env(make_env(task))
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_every_action_type_keeps_the_contract(action):
+    check_env(make("leader-follower", action=action))
+
+
+def test_all_observations_together_keep_the_contract():
+    env = make("leader-follower", drones=3, observation=tuple(OBSERVATIONS))
+    check_env(env)
+    assert env.observation_size > 100
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("task", ["hover", "tracking", "gates"])
+def test_the_contract_holds_in_single_precision_and_realistic(task):
+    check_env(make(task, realistic=True))
+
+
+def test_the_check_sees_a_broken_contract():
+    env = make("hover")
+    broken = dataclasses.replace(env.task, rewards={"nan": (1.0, lambda world: world.drones.pos[:, 0] * jnp.nan)})
+    with pytest.raises(ContractError, match="reward is not finite"):
+        check_env(make(broken))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_starts_are_valid(task):
+    """No drone below the ground or in another one."""
+    env = make_env(task)
+    worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(KEY, 256))[1]
+    pos, radius = np.asarray(worlds.drones.pos), float(env.params.collision_radius[0])
+    assert np.all(pos[..., 2] >= standing_height(env.params)[0] - 1e-9)
+    for i in range(env.drones):
+        for j in range(i):
+            assert np.min(np.linalg.norm(pos[:, i] - pos[:, j], axis=-1)) > 2 * radius
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_different_keys_start_differently_or_the_task_has_one_start(task):
+    env = make_env(task)
+    same = all(
+        np.array_equal(a, b)
+        for a, b in zip(*(jax.tree.leaves(env.reset(key)[1].drones) for key in (KEY, OTHER)), strict=True)
+    )
+    assert same == (
+        env.task.name
+        in {
+            "paper-hover",
+            "takeoff",
+            "fly-through-gate",
+            "tune",
+            "leader-follower",
+            "flock",
+            "meetup",
+            "hover-v2",
+            "multi-hover",
+            "gates",
+        }
+    )
+
+
+def test_an_episode_is_cut_after_its_duration_and_not_before():
+    env = make("hover", duration=0.05)
+    _, world = env.reset(KEY)
+    flags = []
+    for _ in range(5):
+        _, world, _, terminated, truncated, _ = env.step(KEY, world, zeros(env))
+        flags.append(bool(truncated))
+        assert not terminated
+    assert flags == [False] * 4 + [True]
+
+
+def test_a_drone_that_is_lost_ends_the_episode_for_good():
+    env = make_env("hover")
+    _, world = env.reset(KEY)
+    world = world.replace(drones=world.drones.replace(pos=world.drones.pos + 100.0))
+    *_, terminated, truncated, info = env.step(KEY, world, zeros(env))
+    assert terminated and not truncated and info["ends"]["lost"]
+
+
+def test_a_state_that_is_not_a_number_ends_the_episode():
+    env = make_env("hover")
+    _, world = env.reset(KEY)
+    world = world.replace(drones=world.drones.replace(vel=world.drones.vel * jnp.nan))
+    assert env.step(KEY, world, zeros(env))[3]
+
+
+@pytest.mark.parametrize("task", sorted(set(TASKS) - {"gates"}))
+def test_gradients_of_the_return_equal_central_differences(task):
+    """In the actions, ten steps from a random start, for every task (that of gates below)."""
+    env = make_env(task)
+    check_gradient(env, env.reset(KEY)[1])
+
+
+def test_gradients_of_the_return_equal_central_differences_before_a_gate():
+    env = make_env("gates")
+    world = env.reset(KEY)[1]
+    up = world.drones.pos.at[:, 2].add(0.5)
+    check_gradient(env, world.replace(drones=world.drones.replace(pos=up), variables=world.variables | {"pos": up}))
+
+
+def check_gradient(env, world, steps=10, eps=1e-6):
+    rng = np.random.default_rng(0)
+    actions = jnp.array(rng.uniform(-0.4, 0.4, (steps, env.drones, env.action_size)))
+    direction = jnp.array(rng.normal(size=actions.shape))
+
+    def returned(actions):
+        def advance(world, action):
+            _, world, reward, *_ = env.step(KEY, world, action)
+            return world, jnp.sum(reward)
+
+        return jnp.sum(jax.lax.scan(advance, world, actions)[1])
+
+    slope = jnp.sum(jax.jit(jax.grad(returned))(actions) * direction)
+    difference = (jax.jit(returned)(actions + eps * direction) - returned(actions - eps * direction)) / (2 * eps)
+    np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-7)
+    assert np.isfinite(slope)
+
+
+MISTAKES = [
+    (dict(task="hoover"), "unknown task 'hoover'; did you mean 'hover'"),
+    (dict(task="hover", action="rpms"), "unknown action 'rpms'; did you mean 'rpm'"),
+    (dict(task="hover", observation=("omeg",)), "unknown observation 'omeg'; did you mean 'omega'"),
+    (dict(task="hover", observation=()), "observation is empty"),
+    (dict(task="hover", backend="mujoco"), "unknown backend 'mujoco'"),
+    (dict(task="hover", hight=3.0), "unknown option of hover 'hight'; did you mean 'height'"),
+    (dict(task="hover", delay=-0.1), "delay is -0.1; give a number of at least 0"),
+    (dict(task="hover", control_hz=0), "control_hz is 0; give a positive number"),
+    (dict(task="hover", substeps=2.5), "substeps is 2.5; give a whole number"),
+    (dict(task="hover", vision=("rgb",)), "the explicit backend has no cameras"),
+    (dict(task="hover", vision=("grey",)), "unknown image 'grey'"),
+    (dict(task="hover", effects=("drga",)), "unknown effect 'drga'; did you mean 'drag'"),
+    (
+        dict(task="leader-follower", drones=1),
+        "number of drones of leader-follower is 1; give a whole number of at least 2",
+    ),
+    (dict(task="gates", level=4), "level is 4; give one of 0, 1, 2, 3"),
+    (dict(task="tracking", curve="square"), "unknown curve 'square'"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), MISTAKES, ids=[m[1][:30] for m in MISTAKES])
+def test_a_mistake_is_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        make(options.pop("task"), **options) if (options := dict(options)) else None
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros((1, 3)), r"action has shape \(1, 3\); expected \(1, 4\)"),
+        (np.zeros(4), r"action has shape \(4,\); expected \(1, 4\)"),
+        (np.full((1, 4), np.nan), "action is not finite"),
+    ],
+)
+def test_a_wrong_action_is_refused(action, message):
+    env = make_env("hover")
+    _, world = env.reset(KEY)
+    with pytest.raises(ValueError, match=message):
+        env.step(KEY, world, action)
+
+
+def test_actions_beyond_one_are_cut():
+    env = make_env("hover")
+    _, world = env.reset(KEY)
+    assert_close(env.step(KEY, world, zeros(env) + 5)[1].drones, env.step(KEY, world, zeros(env) + 1)[1].drones, 0)

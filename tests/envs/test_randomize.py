@@ -1,0 +1,123 @@
+"""Parameter laws, sensor noise, delay, wind and pushes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close
+
+import jaxdrones as jd
+from jaxdrones.envs import make
+from jaxdrones.envs.randomize import constant_wind, delayed, draw, pushes, scaled, sensor_noise, shifted
+
+KEY = jax.random.key(5)
+TEAM = jd.repeat(jd.load_params("cf2x"), 200)
+
+
+def test_a_scaled_parameter_stays_in_its_range_and_fills_it():
+    mass = draw([scaled("mass", 0.9, 1.1)], KEY, TEAM).mass / TEAM.mass
+    assert 0.9 <= mass.min() < 0.91 and 1.09 < mass.max() <= 1.1
+
+
+def test_an_array_is_scaled_by_one_factor_and_shifted_entry_by_entry():
+    inertia = draw([scaled("inertia", 0.5, 1.5)], KEY, TEAM).inertia / TEAM.inertia
+    np.testing.assert_allclose(inertia, jnp.broadcast_to(inertia[:, :1], inertia.shape), rtol=1e-12)
+    wind = draw([shifted("wind", -1.0, 1.0)], KEY, TEAM).wind
+    assert np.ptp(np.asarray(wind), axis=1).min() > 0
+
+
+def test_laws_compose_and_draw_independently():
+    both = draw([scaled("mass", 0.9, 1.1), scaled("kf", 0.9, 1.1)], KEY, TEAM)
+    correlation = np.corrcoef(both.mass / TEAM.mass, both.kf / TEAM.kf)[0, 1]
+    assert abs(correlation) < 0.25
+    assert_close(both.replace(mass=TEAM.mass, kf=TEAM.kf), TEAM, 0)
+
+
+def test_what_a_law_draws_is_hidden_from_the_action_type():
+    """A heavier drone is not given more thrust; a nominal one hovers at zero action, whatever its mass."""
+    env = make("hover", laws=(scaled("mass", 1.5, 1.5),), tilt=0.0, speed=0.0, omega=0.0)
+    _, world = env.reset(KEY)
+    zero = jnp.zeros((1, 4))
+    assert env.step(KEY, world, zero)[1].drones.vel[0, 2] < world.drones.vel[0, 2] - 0.03
+    heavy = make("hover", vehicle=jd.load_params("cf2x").replace(mass=0.04), tilt=0.0, speed=0.0, omega=0.0)
+    _, world = heavy.reset(KEY)
+    np.testing.assert_allclose(heavy.step(KEY, world, zero)[1].drones.vel, world.drones.vel, atol=1e-9)
+
+
+def test_noise_has_the_standard_deviations_it_is_given():
+    state = jd.State.at_rest(jnp.zeros((4000, 3)))
+    seen = sensor_noise(pos=0.01, vel=0.02, angle=0.03, omega=0.04)(KEY, state)
+    angle = 2 * seen.quat[:, :3]
+    for x, sigma in (seen.pos, 0.01), (seen.vel, 0.02), (angle, 0.03), (seen.omega, 0.04):
+        np.testing.assert_allclose(jnp.std(x, axis=0), sigma, rtol=0.05)
+    np.testing.assert_allclose(jnp.sum(seen.quat**2, axis=-1), 1, rtol=1e-12)
+
+
+def test_noise_is_seen_and_does_not_move_the_drone():
+    plain, noisy = make("hover"), make("hover", noise=sensor_noise())
+    _, world = plain.reset(KEY)
+    _, noisy_world = noisy.reset(KEY)
+    assert_close(noisy_world.drones, world.drones, 0)
+    zero = jnp.zeros((1, 4))
+    seen, flown, *_ = noisy.step(KEY, world, zero)
+    expected, undisturbed, *_ = plain.step(KEY, world, zero)
+    assert_close(flown.drones, undisturbed.drones, 0)
+    assert 0 < jnp.abs(seen - expected).max() < 0.2
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(0, 5.0), (1, 4.0), (2, 3.0), (0.25, 4.75), (1.5, 3.5)])
+def test_a_delay_takes_an_older_action_or_mixes_two(steps, expected):
+    actions = jnp.arange(6.0)[None, :, None]
+    np.testing.assert_allclose(delayed(actions, steps), expected)
+
+
+def test_a_delayed_action_reaches_the_rotors_late():
+    env = make("hover", delay=0.02)
+    _, world = env.reset(KEY)
+    commanded = []
+    for k in range(4):
+        world = env.step(KEY, world, jnp.full((1, 4), 0.5 if k == 0 else 0.0))[1]
+        commanded.append(float(world.drones.rpm[0, 0]))
+    hover = float(env.params.hover_rpm[0])
+    np.testing.assert_allclose(commanded[:2] + commanded[3:], hover)
+    assert commanded[2] > 1.2 * hover
+
+
+def test_wind_blows_a_drone_with_drag_away():
+    env = make("hover", effects=("drag",), laws=(constant_wind(3.0),), tilt=0.0, speed=0.0, omega=0.0)
+    _, world = env.reset(KEY)
+    wind = world.params.wind[0]
+    for _ in range(20):
+        world = env.step(KEY, world, jnp.zeros((1, 4)))[1]
+    assert jnp.dot(world.drones.vel[0], wind) > 0
+
+
+def test_pushes_come_as_often_and_last_as_long_as_asked():
+    disturb = pushes(0.5, every=1.0, lasting=0.1)
+    team = TEAM
+
+    def advance(team, key):
+        team = disturb(key, team, 0.01)
+        return team, team.push
+
+    push = np.asarray(jax.lax.scan(advance, team, jax.random.split(KEY, 2000))[1])
+    active = np.any(push != 0, axis=-1)
+    begins = np.sum(active[1:] & ~active[:-1])
+    np.testing.assert_allclose(begins / (200 * 20.0), 1.0, rtol=0.15)
+    np.testing.assert_allclose(active.mean(), 0.1, rtol=0.15)
+    assert np.abs(push).max() <= 0.5 * float(team.weight[0])
+
+
+def test_a_push_accelerates_as_newton_says():
+    env = make("hover", effects=("external_push",), tilt=0.0, speed=0.0, omega=0.0)
+    _, world = env.reset(KEY)
+    world = world.replace(params=world.params.replace(push=jnp.array([[0.027, 0, 0]])))
+    vel = env.step(KEY, world, jnp.zeros((1, 4)))[1].drones.vel
+    np.testing.assert_allclose(vel[0, 0] - world.drones.vel[0, 0], 1.0 * env.dt, rtol=1e-9)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(ValueError, match="unknown parameter 'mas'; did you mean 'mass'"):
+        scaled("mas", 0.9, 1.1)
+    with pytest.raises(ValueError, match=r"the range of mass is \(1.1, 0.9\); give the lower bound first"):
+        scaled("mass", 1.1, 0.9)

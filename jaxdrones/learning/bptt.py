@@ -16,7 +16,6 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import collect
 from jaxdrones.learning.gradients import GRADIENTS, linked, with_gradient
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.normalize import Statistics
 from jaxdrones.learning.result import Result, scan_updates
 
 
@@ -59,11 +58,9 @@ class TrainState(flax.struct.PyTreeNode):
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     """Before the first update."""
-    key, policy_key, world_key = jax.random.split(key, 3)
-    worlds = collect.begin(world_key, env, config.worlds)
-    statistics = Statistics.of(worlds.obs)
-    policy = Policy.init(policy_key, statistics, env.drones, env.action_size, config.sizes, config.per_role)
-    return TrainState(key, policy, _optimiser(config).init(policy.params), worlds)
+    key, policy_key = jax.random.split(key)
+    policy = Policy.init(policy_key, env, config.sizes, config.per_role)
+    return TrainState(key, policy, _optimiser(config).init(policy.params), collect.idle(env, config.worlds))
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
@@ -75,7 +72,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     def loss(params):
         policy = state.policy.replace(params=params)
         after, flight = collect.fly(
-            fly_key, env, lambda key, obs: (policy(obs), None), worlds, config.horizon, linked(config)
+            fly_key, env, lambda key, obs: (policy(obs), None), worlds, config.horizon, reset=False, link=linked(config)
         )
         return -jnp.mean(discounted(flight, config.discount)), (after, flight)
 
@@ -94,13 +91,9 @@ def train(key: jax.Array, env: Env, config: Config) -> Result:
 
 
 def discounted(flight: collect.Flight, discount: float) -> Array:
-    """(t, w, n) rewards, discounted from the start of the flight or of the episode."""
-
-    def forwards(weight, x):
-        reward, ended = x
-        return jnp.where(ended, 1, weight * discount), weight[:, None] * reward
-
-    return jax.lax.scan(forwards, jnp.ones_like(flight.reward[0, :, 0]), (flight.reward, flight.ended))[1]
+    """(t, w, n) rewards until the episode ends, discounted from the start of the flight."""
+    weight = discount ** jnp.arange(len(flight.reward), dtype=flight.reward.dtype)
+    return jnp.where(flight.over[..., None], 0, weight[:, None, None] * flight.reward)
 
 
 def _optimiser(config: Config) -> optax.GradientTransformation:

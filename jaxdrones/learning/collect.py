@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.envs import Env, autoreset
+from jaxdrones.envs import AutoReset, Env, autoreset
 from jaxdrones.envs.autoreset import Episode
 
 Act = Callable[[jax.Array, Array], tuple[Array, Any]]
@@ -23,6 +23,8 @@ class Worlds(flax.struct.PyTreeNode):
     episodes: Episode
     obs: Array
     """(w, n, d) what is seen now."""
+    ended: Array
+    """(w,) whether the episode is over, and a new one has to be started."""
 
 
 class Flight(flax.struct.PyTreeNode):
@@ -46,6 +48,8 @@ class Flight(flax.struct.PyTreeNode):
     """(t, w, n) sum of rewards of the episode so far."""
     error: Array
     """(t, w, n) distance from the target, m."""
+    over: Array
+    """(t, w) the episode was over before the step, which does not count; never so where episodes are reset."""
 
     @property
     def ended(self) -> Array:
@@ -53,23 +57,31 @@ class Flight(flax.struct.PyTreeNode):
         return self.terminated | self.truncated
 
 
-def begin(key: jax.Array, env: Env, worlds: int) -> Worlds:
-    """Worlds at the start of their first episodes."""
-    obs, episodes = jax.vmap(autoreset(env).reset)(jax.random.split(key, worlds))
-    return Worlds(episodes, obs)
+def idle(env: Env, worlds: int) -> Worlds:
+    """Worlds in which nothing has begun yet."""
+    obs, episodes = jax.eval_shape(jax.vmap(autoreset(env).reset), jax.random.split(jax.random.key(0), worlds))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
+    return Worlds(*nothing, ended=jnp.ones(worlds, bool))
 
 
-def restart(key: jax.Array, env: Env, worlds: Worlds, share: float) -> Worlds:
-    """A fresh episode in some worlds, each with probability `share`: so that they are not all of the same age."""
+def restart(key: jax.Array, env: Env, worlds: Worlds, share: float = 0.0) -> Worlds:
+    """A fresh episode where one is over, and with probability `share` elsewhere: so that not all are of an age."""
     start_key, choice_key = jax.random.split(key)
     w = len(worlds.obs)
-    chosen = jax.random.bernoulli(choice_key, share, (w,))
-    fresh = begin(start_key, env, w)
+    chosen = worlds.ended | jax.random.bernoulli(choice_key, share, (w,))
+    obs, episodes = jax.vmap(autoreset(env).reset)(jax.random.split(start_key, w))
+    fresh = Worlds(episodes, obs, jnp.zeros_like(chosen))
     return jax.tree.map(lambda new, old: jnp.where(_rows(chosen, old), new, old), fresh, worlds)
 
 
 def fly(
-    key: jax.Array, env: Env, act: Act, worlds: Worlds, length: int, link: Callable = lambda worlds: worlds
+    key: jax.Array,
+    env: Env,
+    act: Act,
+    worlds: Worlds,
+    length: int,
+    reset: bool = True,
+    link: Callable = lambda worlds: worlds,
 ) -> tuple[Worlds, Flight]:
     """Fly on.
 
@@ -79,9 +91,11 @@ def fly(
         act: the pilot of all worlds.
         worlds: in flight.
         length: control steps.
+        reset: start a new episode in the step in which one ends; else that is left to `restart`, the drones fly on, and
+            everything from there on is marked as ended.
         link: applied to the worlds between steps; changes their gradients, not their values.
     """
-    step = jax.vmap(autoreset(env).step)
+    step = jax.vmap((autoreset(env) if reset else _Endless(env)).step)
 
     def control_step(worlds: Worlds, key: jax.Array) -> tuple[Worlds, Flight]:
         act_key, step_key = jax.random.split(key)
@@ -99,20 +113,38 @@ def fly(
             final_obs=info["final_obs"],
             returned=info["episode"]["return"],
             error=info["metrics"]["error"],
+            over=worlds.ended,
         )
-        return Worlds(episodes, obs), flown
+        ended = worlds.ended if reset else worlds.ended | terminated | truncated
+        return Worlds(episodes, obs, ended), flown
 
     return jax.lax.scan(control_step, worlds, jax.random.split(key, length))
 
 
+class _Endless(AutoReset):
+    """Episodes that are not reset."""
+
+    def step(self, key: jax.Array, episode: Episode, action: Array):
+        obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
+        episode = Episode(world, episode.returned + reward, episode.length + 1)
+        info = info | {"final_obs": obs, "episode": {"return": episode.returned, "length": episode.length}}
+        return obs, episode, reward, terminated, truncated, info
+
+
 def progress(flight: Flight) -> dict[str, Array]:
-    """What a learner reports of a flight: reward per step, mean error (m), share of steps that crashed."""
-    ended = flight.ended[..., None]
+    """What a learner reports of a flight, over the steps that count.
+
+    Reward per step, error (m), share of steps in which a drone crashed, and the return of the episodes that ended.
+    """
+    counts = ~flight.over
+    ended = flight.ended & counts
     return {
-        "reward": jnp.mean(flight.reward),
-        "error": jnp.mean(flight.error),
-        "crashes": jnp.mean(flight.terminated.astype(flight.reward.dtype)),
-        "return": jnp.sum(flight.returned * ended) / jnp.maximum(jnp.sum(ended * flight.returned.shape[-1]), 1),
+        "reward": jnp.mean(flight.reward, where=counts[..., None]),
+        "error": jnp.mean(flight.error, where=counts[..., None]),
+        "crashes": jnp.mean(flight.terminated.astype(flight.reward.dtype), where=counts),
+        "return": jnp.sum(flight.returned, where=ended[..., None])
+        / jnp.maximum(jnp.sum(ended), 1)
+        / flight.reward.shape[2],
     }
 
 

@@ -116,5 +116,3 @@ def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, flo
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     low, high = (centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)
     return max(0.0, float(low)), min(1.0, float(high))
-
-

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.envs import Env
 from jaxdrones.learning.normalize import Statistics
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
@@ -42,22 +43,18 @@ class Policy(flax.struct.PyTreeNode):
     per_role: bool = flax.struct.field(pytree_node=False, default=False)
 
     @classmethod
-    def init(
-        cls, key: jax.Array, statistics: Statistics, drones: int, outputs: int, sizes: Sequence[int], per_role: bool
-    ) -> Policy:
-        """A policy that hovers, nearly.
+    def init(cls, key: jax.Array, env: Env, sizes: Sequence[int], per_role: bool = False) -> Policy:
+        """A policy whose actions are nearly zero, which with most action types is to hover.
 
         Args:
             key: random key.
-            statistics: of observations.
-            drones: in the team.
-            outputs: numbers per action.
+            env: what it is to fly.
             sizes: of the hidden layers.
             per_role: a network for every drone, else one for all.
         """
-        network = MLP(tuple(sizes), outputs, scale=0.01)
-        params = init_params(key, network, len(statistics.mean), drones if per_role else None)
-        return cls(params, statistics, network, per_role)
+        network = MLP(tuple(sizes), env.action_size, scale=0.01)
+        params = init_params(key, network, env.observation_size, env.drones if per_role else None)
+        return cls(params, Statistics.none(env.observation_size), network, per_role)
 
     def __call__(self, obs: Float[Array, "*batch n d"]) -> Float[Array, "*batch n a"]:
         """The action, in (-1, 1)."""

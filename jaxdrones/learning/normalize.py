@@ -21,6 +21,11 @@ class Statistics(flax.struct.PyTreeNode):
     """() vectors seen."""
 
     @classmethod
+    def none(cls, size: int) -> Statistics:
+        """Before anything was seen: mean 0, variance 1, which the first vectors replace."""
+        return cls(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
+
+    @classmethod
     def of(cls, obs: Float[Array, "*batch d"]) -> Statistics:
         """Of the vectors along the last axis."""
         obs = jnp.reshape(obs, (-1, obs.shape[-1]))

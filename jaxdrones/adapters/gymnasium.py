@@ -1,7 +1,7 @@
 """Gymnasium: importing this registers `jaxdrones/Hover-v0`, ... one id per task.
 
-`gymnasium.make(id, **options)` gives one environment, `gymnasium.make_vec(id, num_envs, **options)` many in one compiled
-step; the options are those of `jaxdrones.make`.
+`gymnasium.make(id, **options)` gives one environment, `gymnasium.make_vec(id, num_envs, **options)` many of them in one
+compiled step; the options are those of `jaxdrones.make`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from jaxdrones import envs
-from jaxdrones.adapters.session import SEEDS, Session, begin
+from jaxdrones.adapters.session import SEEDS, Session, begin, made
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.checks import check_whole
 from jaxdrones.tasks.task import Task
@@ -46,7 +46,7 @@ class Env(gymnasium.Env):
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
-        self.env, self.render_mode = _made(task, options), render_mode
+        self.env, self.render_mode = made(task, options), render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / self.env.dt)}
         self._layout = _layout(self.env, dict_spaces)
         self.observation_space, self.action_space = self._layout.observation, self._layout.action
@@ -70,7 +70,9 @@ class Env(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("step is called before reset or after the end of an episode; call reset")
         obs, reward, terminated, truncated, info = self._session.step(self._layout.gather(action))
         if self.env.drones == 1:
-            info["rewards"], info["metrics"] = ({k: v.item() for k, v in info[x].items()} for x in ("rewards", "metrics"))
+            info["rewards"], info["metrics"] = (
+                {k: v.item() for k, v in info[x].items()} for x in ("rewards", "metrics")
+            )
         return self._layout.arrange(obs), float(reward.sum()), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
@@ -127,11 +129,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             ValueError: as of `jaxdrones.make`.
         """
         check_whole("num_envs", num_envs)
-        self.env, self.num_envs, self._numpy = _made(task, options), num_envs, numpy
+        self.env, self.num_envs, self._numpy = made(task, options), num_envs, numpy
         if max_episode_steps is not None:
             check_whole("max_episode_steps", max_episode_steps)
             if self.env is task:
-                raise ValueError("max_episode_steps is given beside an environment; set its `steps` before its first step")
+                raise ValueError(
+                    "max_episode_steps is given beside an environment; set its `steps` before its first step"
+                )
             self.env.steps = max_episode_steps
         self._layout = _layout(self.env, dict_spaces)
         self.single_observation_space, self.single_action_space = self._layout.observation, self._layout.action
@@ -210,14 +214,6 @@ def ids() -> dict[str, str]:
 
 def _camel_case(name: str) -> str:
     return "".join(word.capitalize() for word in name.split("-"))
-
-
-def _made(task: str | Task | envs.Env, options: dict[str, Any]) -> envs.Env:
-    if not isinstance(task, envs.Env):
-        return envs.make(task, **options)
-    if options:
-        raise ValueError(f"options {', '.join(options)} are given beside an environment; give them to jaxdrones.make")
-    return task
 
 
 def _layout(env: envs.Env, by_drone: bool) -> Layout:

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from jaxdrones.backends.host import HostStep
-from jaxdrones.envs import Env
-from jaxdrones.tasks.task import World
+from jaxdrones.envs import AutoReset, Env, make
+from jaxdrones.tasks.task import Task, World
 
 SEEDS = 2**32  # a seed counts modulo this
 
@@ -23,12 +23,12 @@ class Session:
         self.world: World | None = None
         self.running = False
         """Whether an episode has begun and not ended."""
-        compile = (lambda f: f) if isinstance(env.physics, HostStep) else jax.jit  # a host step is called as it is
-        self._reset, self._step = compile(self._reset), compile(self._step)
+        on_host = isinstance(env.physics, HostStep)  # is called as it is, and compiles what is around it by itself
+        self._begin, self._advance = (begin, _advance) if on_host else (_begin_compiled, _advance_compiled)
 
     def reset(self, seed: int) -> Any:
         """Start an episode; returns the observation."""
-        self._key, self.world, obs = self._reset(np.uint32(seed % SEEDS))
+        self._key, self.world, obs = self._begin(self.env, np.uint32(seed % SEEDS))
         self.running = True
         return _numpy(obs)
 
@@ -41,7 +41,7 @@ class Session:
         Returns:
             Observation, reward (n,), terminated, truncated and info, as the environment gives them.
         """
-        self.world, outcome = self._step(self._key, self.world, action)
+        self.world, outcome = self._advance(self.env, self._key, self.world, action)
         obs, reward, terminated, truncated, info = _numpy(outcome)
         terminated, truncated = bool(terminated), bool(truncated)
         self.running = not (terminated or truncated)
@@ -75,19 +75,34 @@ class Session:
 
         return bullet.make_step(scene=self.env.task.scene)
 
-    def _reset(self, seed: jax.Array):
-        return begin(self.env, seed)
 
-    def _step(self, key: jax.Array, world: World, action: np.ndarray):
-        obs, world, *rest = self.env.step(jax.random.fold_in(key, world.step), world, action)
-        return world, (obs, *rest)
+def made(task: str | Task | Env, options: dict[str, Any]) -> Env:
+    """The environment that is meant by a name, a task, or an environment.
+
+    Raises:
+        ValueError: as of `jaxdrones.make`, or options beside an environment.
+    """
+    if not isinstance(task, Env):
+        return make(task, **options)
+    if options:
+        raise ValueError(f"options {', '.join(options)} are given beside an environment; give them to jaxdrones.make")
+    return task
 
 
-def begin(env, seed: jax.Array) -> tuple[jax.Array, World, Any]:
+def begin(env: Env | AutoReset, seed: jax.Array) -> tuple[jax.Array, World, Any]:
     """The key of an episode's steps, the world at its start, and what is seen of it."""
     key, start = jax.random.split(jax.random.PRNGKey(seed))
     obs, world = env.reset(start)
     return key, world, obs
+
+
+def _advance(env: Env, key: jax.Array, world: World, action: np.ndarray) -> tuple[World, Any]:
+    obs, world, *rest = env.step(jax.random.fold_in(key, world.step), world, action)
+    return world, (obs, *rest)
+
+
+_begin_compiled = jax.jit(begin, static_argnums=0)  # once for an environment, however many sessions it has
+_advance_compiled = jax.jit(_advance, static_argnums=0)
 
 
 def _numpy(tree: Any) -> Any:

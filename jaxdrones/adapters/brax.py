@@ -1,0 +1,212 @@
+"""Brax: an environment for its trainers, which need `wrap_for_training` and, from jax 0.10 on, `trainers`.
+
+from jaxdrones.adapters import brax
+from brax.training.agents.ppo import train as ppo
+
+env = jd.make("hover")
+with brax.trainers():
+    ppo.train(brax.wrap(env), episode_length=env.steps, wrap_env_fn=brax.wrap_for_training, ...)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxdrones import envs
+from jaxdrones.checks import check_whole
+
+try:
+    with contextlib.redirect_stdout(sys.stderr):  # mujoco prints what it could not import
+        from brax.envs import base
+except ImportError as error:
+    raise ImportError('brax is not installed; pip install "jaxdrones[brax]"') from error
+
+_NEXT = np.uint32(2**32 - 1)  # what the key is folded with for the next episode: no episode has that many steps
+
+
+def wrap(env: envs.Env) -> Env:
+    """An environment as brax wants it."""
+    return Env(env)
+
+
+class Env(base.Env):
+    """One world; a team acts and sees as one, side by side, and its reward is the mean over the drones.
+
+    As for all of brax's environments, the time limit is the trainer's `episode_length`; take `env.steps`.
+    `info["time_out"]` is 1 where the task cut the episode, though it could go on.
+    """
+
+    def __init__(self, env: envs.Env):
+        """Wrap an environment.
+
+        Raises:
+            ValueError: it has cameras.
+        """
+        if env.vision is not None:
+            raise ValueError(
+                "the environment has cameras, which brax's trainers have no use for; make it without vision"
+            )
+        self.env = env
+
+    @property
+    def observation_size(self) -> int:
+        """Of all drones together."""
+        return self.env.drones * self.env.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Of all drones together."""
+        return self.env.drones * self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        """Not one of brax's."""
+        return "jaxdrones"
+
+    def reset(self, rng: jax.Array) -> base.State:
+        """Start an episode."""
+        key, start = jax.random.split(rng)
+        obs, world = self.env.reset(start)
+        zero = jnp.zeros((), jnp.float32)
+        shapes = jax.eval_shape(self.env.step, key, world, jnp.zeros((self.env.drones, self.env.action_size)))
+        metrics = jax.tree.map(lambda _: zero, self._metrics(shapes[-1], lambda x: x))
+        return base.State((world, key), self._flat(obs), zero, zero, metrics, {"time_out": zero})
+
+    def step(self, state: base.State, action: jax.Array) -> base.State:
+        """One control step."""
+        world, key = state.pipeline_state
+        action = jnp.reshape(action, (self.env.drones, self.env.action_size))
+        obs, world, reward, terminated, _, info = self.env.step(jax.random.fold_in(key, world.step), world, action)
+        cut = jnp.zeros((), bool)
+        for name in self.env.task.limits:
+            cut |= info["ends"][name]
+        return state.replace(
+            pipeline_state=(world, key),
+            obs=self._flat(obs),
+            reward=_mean(reward),
+            done=_float(terminated | cut),
+            metrics=state.metrics | self._metrics(info, _mean),
+            info=state.info | {"time_out": _float(cut & ~terminated)},
+        )
+
+    def _flat(self, obs: jax.Array) -> jax.Array:
+        return jnp.ravel(obs).astype(jnp.float32)
+
+    def _metrics(self, info: dict[str, Any], mean) -> dict[str, jax.Array]:
+        rewards = {f"reward_{name}": mean(x) for name, x in info["rewards"].items()}
+        return rewards | {name: mean(x) for name, x in info["metrics"].items()}
+
+
+class _Training(base.Wrapper):
+    """Many worlds; where an episode ends, a new one begins, from a start that was not seen before."""
+
+    def __init__(self, env: Env, episode_length: int):
+        super().__init__(env)
+        self.episode_length = episode_length
+
+    def reset(self, rng: jax.Array) -> base.State:
+        state = jax.vmap(self.env.reset)(rng)
+        zero = jnp.zeros_like(state.done)
+        sums = {name: zero for name in ("sum_reward", "length", *state.metrics)}
+        info = {"steps": zero, "truncation": zero, "episode_done": zero, "episode_metrics": sums}
+        return state.replace(info=state.info | info)
+
+    def step(self, state: base.State, action: jax.Array) -> base.State:
+        return jax.vmap(self._step)(state, action)
+
+    def _step(self, state: base.State, action: jax.Array) -> base.State:
+        again = 1 - state.done  # 0 where this is the first step of an episode
+        info = state.info
+        after = self.env.step(state, action)
+        steps = again * info["steps"] + 1
+        cut = after.info["time_out"] > 0
+        terminated = (after.done > 0) & ~cut
+        truncated = (cut | (steps >= self.episode_length)) & ~terminated
+        done = terminated | truncated
+
+        now = {"sum_reward": after.reward, "length": jnp.ones_like(steps), **after.metrics}
+        sums = {name: again * total + now[name] for name, total in info["episode_metrics"].items()}
+        info = after.info | {
+            "steps": steps,
+            "truncation": _float(truncated),
+            "time_out": _float(truncated),
+            "episode_done": _float(done),
+            "episode_metrics": sums,
+        }
+        _, key = after.pipeline_state
+        fresh = self.env.reset(jax.random.fold_in(key, _NEXT))
+        place, obs = jax.tree.map(
+            lambda new, old: jnp.where(done, new, old),
+            (fresh.pipeline_state, fresh.obs),
+            (after.pipeline_state, after.obs),
+        )
+        return after.replace(pipeline_state=place, obs=obs, done=_float(done), info=info)
+
+
+def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> base.Wrapper:
+    """The trainers' `wrap_env_fn`: many worlds, each episode from a fresh start, time limits told from ends.
+
+    Brax's own starts every episode of a world from the same cached state. `info["truncation"]` and
+    `info["time_out"]` are 1 where an episode was cut, by `episode_length` or by the task.
+
+    Args:
+        env: from `wrap`.
+        episode_length: control steps.
+        action_repeat: 1; make the environment with a lower `control_hz` to hold actions longer.
+        randomization_fn: none; make the environment with `laws` to draw parameters in every episode.
+
+    Raises:
+        ValueError: an argument that is not of that kind.
+    """
+    check_whole("episode_length", episode_length)
+    if action_repeat != 1:
+        raise ValueError(
+            f"action_repeat is {action_repeat}; leave it at 1 and make the environment with a lower control_hz"
+        )
+    if randomization_fn is not None:
+        raise ValueError("randomization_fn is given; leave it out and make the environment with laws")
+    return _Training(env, episode_length)
+
+
+@contextlib.contextmanager
+def trainers() -> Iterator[None]:
+    """Within this, brax 0.14.2's trainers run on jax 0.10 and later, and print nothing to stdout when imported.
+
+    They call `jax.device_put_replicated`, which jax 0.10 took away (google/brax issue 671). It is put back, and taken
+    away again at the end.
+    """
+    missing = not hasattr(jax, "device_put_replicated")
+    if missing:
+        jax.device_put_replicated = _device_put_replicated
+    try:
+        yield
+    finally:
+        if missing:
+            del jax.device_put_replicated
+
+
+def _device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
+    """A copy of every array on every device, along a new leading axis."""
+    sharding = NamedSharding(Mesh(np.array(devices), ("device",)), PartitionSpec("device"))
+
+    def put(x):
+        copies = jnp.broadcast_to(jnp.asarray(x)[None], (len(devices), *jnp.shape(x)))
+        return jax.device_put(copies, sharding)
+
+    return jax.tree.map(put, tree)
+
+
+def _mean(x: jax.Array) -> jax.Array:
+    return jnp.mean(x).astype(jnp.float32)
+
+
+def _float(x: jax.Array) -> jax.Array:
+    return x.astype(jnp.float32)

@@ -1,0 +1,131 @@
+"""PettingZoo: a team as a `ParallelEnv`, one agent per drone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from jaxdrones.adapters.session import SEEDS, Session, made
+from jaxdrones.adapters.spaces import Layout
+from jaxdrones.envs import Env
+from jaxdrones.tasks.task import Task
+
+try:
+    import pettingzoo
+except ImportError as error:
+    raise ImportError('pettingzoo is not installed; pip install "jaxdrones[pettingzoo]"') from error
+
+
+def parallel_env(task: str | Task | Env, **options) -> ParallelEnv:
+    """A team whose agents are `drone_0`, `drone_1`, ...; the options are those of `jaxdrones.make`."""
+    return ParallelEnv(task, **options)
+
+
+class ParallelEnv(pettingzoo.ParallelEnv):
+    """One world; an episode begins and ends for all agents at once."""
+
+    def __init__(self, task: str | Task | Env, *, render_mode: str | None = None, **options):
+        """Wrap an environment.
+
+        Args:
+            task: a name, a task, or an environment.
+            render_mode: `rgb_array` or nothing; pictures are taken by pybullet, on both backends.
+            **options: of `jaxdrones.make`.
+
+        Raises:
+            ValueError: as of `jaxdrones.make`.
+        """
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
+        self.env = made(task, options)
+        self.render_mode = render_mode
+        self.metadata = {
+            "name": f"jaxdrones/{self.env.task.name}",
+            "is_parallelizable": True,
+            "render_modes": ["rgb_array"],
+            "render_fps": round(1 / self.env.dt),
+        }
+        self.possible_agents = [f"drone_{i}" for i in range(self.env.drones)]
+        self.agents: list[str] = []
+        self._layout = Layout(self.env, self.possible_agents)
+        self.observation_spaces = dict(self._layout.observation.items())
+        self.action_spaces = dict(self._layout.action.items())
+        bound = np.tile(self.env.observation_bound, self.env.drones)
+        self.state_space = gymnasium.spaces.Box(-bound, bound, dtype=np.float32)
+        self._session = Session(self.env)
+        self._seeds = np.random.default_rng()
+
+    def observation_space(self, agent: str) -> gymnasium.Space:
+        """What an agent sees."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gymnasium.Space:
+        """What an agent does."""
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Start an episode; the same seed starts the same one, and the same ones after it. There are no options."""
+        if seed is not None:
+            self._seeds = np.random.default_rng(seed)
+        self.agents = list(self.possible_agents)
+        obs = self._session.reset(int(self._seeds.integers(SEEDS)) if seed is None else seed)
+        return self._observed(obs), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, np.ndarray]):
+        """One control step.
+
+        Raises:
+            ValueError: an agent without an action, an action of wrong shape or with NaN, or there is no episode.
+        """
+        if not self._session.running:
+            raise ValueError("step is called before reset or after the end of an episode; call reset")
+        obs, reward, terminated, truncated, info = self._session.step(self._layout.gather(actions))
+        agents = self.agents
+        if not self._session.running:
+            self.agents = []
+        return (
+            self._observed(obs),
+            dict(zip(agents, reward.tolist(), strict=True)),
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            {agent: _of_drone(info, i) for i, agent in enumerate(agents)},
+        )
+
+    def state(self) -> np.ndarray:
+        """What all agents see, one after the other (without pictures): for critics that see everything.
+
+        Raises:
+            ValueError: no episode has begun.
+        """
+        if self._session.world is None:
+            raise ValueError("state is called before reset; call reset")
+        return self._state.copy()
+
+    def render(self) -> np.ndarray | None:
+        """A picture (height, width, 3) of the team from the side, if made with `render_mode="rgb_array"`.
+
+        Raises:
+            ImportError: pybullet is not installed; says which extra to install.
+            ValueError: no episode has begun.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
+            return None
+        if self._session.world is None:
+            raise ValueError("render is called before reset; call reset")
+        return self._session.photo()
+
+    def close(self) -> None:
+        """End what is connected to Bullet."""
+        self._session.close()
+
+    def _observed(self, obs: Any) -> dict[str, Any]:
+        self._state = (obs["state"] if isinstance(obs, dict) else obs).ravel()
+        return self._layout.arrange(obs)
+
+
+def _of_drone(info: dict[str, Any], i: int) -> dict[str, Any]:
+    rewards, metrics = ({name: x[i].item() for name, x in info[group].items()} for group in ("rewards", "metrics"))
+    return {"rewards": rewards, "metrics": metrics, "ends": dict(info["ends"])}

@@ -1,0 +1,102 @@
+"""Stable-Baselines3: many worlds in one compiled step as its `VecEnv`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.adapters import gymnasium
+from jaxdrones.envs import Env
+from jaxdrones.tasks.task import Task
+
+try:
+    from stable_baselines3.common import vec_env
+except ImportError as error:
+    raise ImportError('stable-baselines3 is not installed; pip install "jaxdrones[sb3]"') from error
+
+
+class VecEnv(vec_env.VecEnv):
+    """Many worlds; `infos[i]` of an episode's last step has what SB3 looks for, the others are empty.
+
+    That is `terminal_observation`, `TimeLimit.truncated`, and `episode` (return `r`, length `l`) for its log.
+    """
+
+    def __init__(self, task: str | Task | Env, num_envs: int, *, seed: int | None = None, **options):
+        """Make the worlds.
+
+        Args:
+            task: a name, a task, or an environment.
+            num_envs: how many.
+            seed: of the first reset; SB3's algorithms set it too.
+            **options: of `jaxdrones.make`.
+
+        Raises:
+            ValueError: as of `jaxdrones.make`.
+        """
+        self.envs = gymnasium.VectorEnv(task, num_envs, **options)
+        self.render_mode = None
+        super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
+        self._seed, self._actions = seed, None
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the next reset."""
+        self._seed = seed
+        return [None if seed is None else seed + i for i in range(self.num_envs)]
+
+    def reset(self):
+        """Start an episode in every world."""
+        obs, _ = self.envs.reset(seed=self._seed)
+        self._seed = None
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Take actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self):
+        """One control step in every world."""
+        obs, reward, terminated, truncated, info = self.envs.step(self._actions)
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(done):
+            final, episode = info["final_obs"], info["final_info"]["episode"]
+            infos[i] = {
+                "terminal_observation": {k: x[i] for k, x in final.items()} if isinstance(final, dict) else final[i],
+                "TimeLimit.truncated": bool(truncated[i] & ~terminated[i]),
+                "episode": {"r": float(episode["r"][i]), "l": int(episode["l"][i])},
+            }
+        return obs, reward, done, infos
+
+    def close(self) -> None:
+        """End what is connected to Bullet."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices=None) -> list[Any]:
+        """The same attribute for every world asked for."""
+        return [getattr(self.envs, attr_name) for _ in self._chosen(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
+        """The worlds are one; they cannot be set apart.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(f"attribute {attr_name} cannot be set in a compiled environment; give it as an option")
+
+    def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list[Any]:
+        """The worlds are one; they have no methods of their own.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(f"method {method_name} cannot be called: the environments are one compiled step")
+
+    def env_is_wrapped(self, wrapper_class: type, indices=None) -> list[bool]:
+        """No world is wrapped."""
+        return [False for _ in self._chosen(indices)]
+
+    def _chosen(self, indices: int | Iterable[int] | None) -> Iterable[int]:
+        return self._get_indices(indices)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 
+from jaxdrones import rotation
 from jaxdrones.dynamics import rotor_wrench
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -14,6 +15,7 @@ Effect = Callable[[Params, State], Wrench]
 Pair = Callable[[Params, State, Params, State], Wrench]
 
 _OUT_OF_REACH = 1e3  # m
+_SHORT = 32  # terms
 _EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}
 
 
@@ -44,19 +46,51 @@ def make_total_wrench(effects: Sequence[Effect], pairs: Sequence[Pair]) -> Calla
 
 
 def _from_others(pair: Pair, params: Params, state: State) -> Wrench:
-    """The sum of a pair effect over all other drones, for every drone of the team."""
+    """The sum of a pair effect over all other drones, for every drone of the team.
+
+    Sums are taken component by component, over an axis in front of that of the drones acted on: so XLA's CPU compiler
+    vectorises a pair along the latter (eight drones, 4,096 worlds, downwash: 18 M drone-steps/s instead of 3 M).
+    """
     index = jnp.arange(len(state.pos))
+    state = jax.tree.map(_stored, state)
 
-    def on(i, own_params, own_state):
-        def because_of(j, other, other_state):
-            # A drone is not its own neighbour. Its copy is moved out of reach before it is masked, so that
-            # neither value nor gradient of a pair is ever taken at zero distance.
-            itself = i == j
-            other_state = other_state.replace(pos=other_state.pos + jnp.where(itself, _OUT_OF_REACH, 0))
-            wrench = pair(own_params, own_state, other, other_state)
-            return jax.tree.map(lambda x: jnp.where(itself, 0, x), wrench)
+    def because_of(j, other, other_state, i, own_params, own_state):
+        # A drone is not its own neighbour. Its copy is moved out of reach before it is masked, so that
+        # neither value nor gradient of a pair is ever taken at zero distance.
+        itself = i == j
+        away = jnp.where(itself, _OUT_OF_REACH, 0)
+        pos = jnp.stack([x + away for x in rotation.unstack(other_state.pos)])
+        wrench = pair(own_params, own_state, other, other_state.replace(pos=pos))
+        components = rotation.unstack(wrench.force) + rotation.unstack(wrench.torque)
+        return [jnp.where(itself, 0, x) for x in components]
 
-        wrenches = jax.vmap(because_of)(index, params, state)
-        return jax.tree.map(lambda x: jnp.sum(x, axis=0), wrenches)
+    on_each = jax.vmap(because_of, in_axes=(None, None, None, 0, 0, 0))
+    from_each = jax.vmap(on_each, in_axes=(0, 0, 0, None, None, None))
+    components = [_stored(_sum(x)) for x in from_each(index, params, state, index, params, state)]
+    force, torque = components[:3], components[3:]
+    return Wrench(jnp.stack(force, axis=-1), jnp.stack(torque, axis=-1))
 
-    return jax.vmap(on)(index, params, state)
+
+def _sum(x: jax.Array) -> jax.Array:
+    """The sum over the first axis; written out where it is short, like `rotation.dot`."""
+    return sum(rotation.unstack(x)) if len(x) <= _SHORT else jnp.sum(x, axis=0)
+
+
+def _stored(x: jax.Array) -> jax.Array:
+    """The same numbers of a team (n, ...), with a hint to XLA's CPU compiler to store each component by itself.
+
+    It would otherwise compute them anew in every expression that they go into, and read them at strides of 3 or 4,
+    which it does not vectorise. A quotient that is used several times is stored; one by a constant would not be.
+    """
+    if x.ndim == 1:
+        return _divided_by_one(x)
+    return jnp.stack([_stored(jnp.squeeze(c, 1)) for c in jax.lax.split(x, [1] * x.shape[1], axis=1)], axis=1)
+
+
+@jax.custom_jvp
+def _divided_by_one(x: jax.Array) -> jax.Array:
+    """x, with the derivative of x."""
+    return x / (1 + 0 * x)
+
+
+_divided_by_one.defjvp(lambda primals, tangents: (_divided_by_one(*primals), *tangents))

@@ -1,10 +1,8 @@
 """What one drone does to another through the air: downwash (paper, equation 6)."""
 
-import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
-from jaxdrones.dynamics.rotors import thrust
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
@@ -31,19 +29,22 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     """
     length = jnp.sqrt(2.0) * other.arm
     axis = rotation.z_axis(other_state.quat)
-    rotors = jax.vmap(rotation.rotate, (None, 0))(state.quat, params.rotor_pos) + state.pos[None]  # (4, 3), world
-    down = other_state.pos[None] - rotors
-    z = jax.vmap(rotation.dot, (None, 0))(axis, down)
-    off_axis = jax.vmap(rotation.dot)(down, down) - z**2
-
-    depth = jnp.maximum(z, 0) / length + _JET_ORIGIN
-    width = _JET_WIDTH * depth * length
-    profile = 1 / (1 + (jnp.sqrt(2.0) - 1) * off_axis / width**2) ** 2
-    onset = jnp.clip(z / length, 0, 1)
-    speed = _induced_speed(other, other_state) * _JET_SPEED / depth * profile * onset**2 * (3 - 2 * onset)
-
-    inflow = speed * rotation.dot(axis, rotation.z_axis(state.quat))
-    return Wrench.of_thrusts(params.rotor_pos, -params.inflow_loss * inflow * thrust(params, state))
+    down = _minus(other_state.pos, state.pos)
+    speed = _JET_SPEED * _induced_speed(other, other_state)
+    loss = params.inflow_loss * params.kf * rotation.dot(axis, rotation.z_axis(state.quat))
+    thrusts = []
+    # Rotor by rotor, in components and with one quotient each: XLA's compiler vectorises that (1 ns instead of 4 a jet).
+    for rotor, rpm in zip(rotation.unstack(params.rotor_pos), rotation.unstack(state.rpm), strict=True):
+        below = _minus(down, rotation.rotate(state.quat, rotor))
+        along = rotation.dot(axis, below)
+        off_axis = rotation.dot(below, below) - along**2
+        z = along / length
+        depth = jnp.maximum(z, 0) + _JET_ORIGIN
+        width = (_JET_WIDTH * depth * length) ** 2
+        spread = width + (jnp.sqrt(2.0) - 1) * off_axis
+        onset = jnp.clip(z, 0, 1)
+        thrusts.append(-speed * width**2 * onset**2 * (3 - 2 * onset) * loss * rpm**2 / (depth * spread**2))
+    return Wrench.of_thrusts(params.rotor_pos, jnp.stack(thrusts))
 
 
 def downwash_paper(params: Params, state: State, other: Params, other_state: State) -> Wrench:
@@ -61,6 +62,10 @@ def downwash_paper(params: Params, state: State, other: Params, other_state: Sta
     strength = jnp.where((dz > 0) & (off_axis < _CUTOFF**2), strength, 0)
     zero = jnp.zeros_like(strength)
     return Wrench.of_force(jnp.stack([zero, zero, -strength]))
+
+
+def _minus(a, b):
+    return jnp.stack([x - y for x, y in zip(rotation.unstack(a), rotation.unstack(b), strict=True)])
 
 
 def _induced_speed(params: Params, state: State):

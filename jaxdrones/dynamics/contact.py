@@ -13,7 +13,7 @@ do with more. Friction is Coulomb's, and viscous at low speed. All forces are in
 of numbers serves every vehicle.
 
 The numbers are for `semi_implicit_euler` with steps of up to 1/240 s: what is damped at a rate above 1/dt overshoots,
-at one above 2/dt it gains energy. The price is depth: what lands at 1 m/s sinks in 7 mm, at 5 m/s 3 cm, and is back
+at one above 2/dt it gains energy. The price is depth: what lands at 1 m/s sinks in 8 mm, at 5 m/s 3 cm, and is back
 after 0.1 s.
 """
 
@@ -33,12 +33,12 @@ from jaxdrones.wrench import Wrench
 _BALLS = 8  # as in Bullet
 _ANGLES = 2 * np.pi / _BALLS * np.arange(_BALLS)
 
-_ONSET = 1e-3  # m, d: half of the damping is there; a drone at rest is 0.94 mm deep
-_PUSH = 15.0  # m/s^2, a: with c x one and a half times gravity at 1 mm, so that a drone rests near the surface
+_ONSET = 2.5e-3  # m, d: half of the damping is there; a drone at rest is 1.5 mm deep; 1 mm makes gradients noisier
+_PUSH = 20.0  # m/s^2, a: about twice gravity, so that a drone rests near the surface
 _DAMPING = 120.0  # 1/s, a b: half of 1/dt for a drone that heaves; the tilting of a level hb is 3.3 times as fast
-_STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; with the damping just above critical, so that nothing bounces
+_STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; with the damping just above critical, so that little bounces
 _GRIP = 400.0  # 1/s: the fastest at which friction slows a point of the rim, for all ways it can move together
-_GRIP_ON_DRONE = 40.0  # 1/s: the same of two drones; they touch at places with more leverage
+_GRIP_ON_DRONE = 15.0  # 1/s: the same at one of 16 points between drones, so that one below another does not shake
 _SHARE_ON_DRONE = 4.0  # share of the push for one point over that of its lever: three that share it stay below 2/dt
 _SLOW = 0.01  # m/s: friction is viscous below, however light the touch; a drone's weight makes it 0.05 (cf2x)
 _ON_GROUND = 0.5  # friction coefficient: the reference's drone 0.5 times its plane 1.0

@@ -16,7 +16,7 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import collect
 from jaxdrones.learning.gradients import GRADIENTS, linked, with_gradient
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.result import Result, scan_updates
+from jaxdrones.learning.result import Result, descent, scan_updates
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,5 +97,4 @@ def discounted(flight: collect.Flight, discount: float) -> Array:
 
 
 def _optimiser(config: Config) -> optax.GradientTransformation:
-    rate = optax.cosine_decay_schedule(config.learning_rate, config.updates)
-    return optax.chain(optax.clip_by_global_norm(config.clip), optax.adam(rate))
+    return descent(config.learning_rate, config.updates, config.clip)

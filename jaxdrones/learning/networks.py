@@ -29,8 +29,13 @@ class MLP(nn.Module):
     def __call__(self, x: Float[Array, "*batch d"]) -> Array:
         """(*batch, outputs)."""
         for size in self.sizes:
-            x = ACTIVATIONS[self.activation](nn.Dense(size, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
-        return nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.scale))(x)
+            x = ACTIVATIONS[self.activation](nn.Dense(size, kernel_init=_init(1.0))(x))
+        return nn.Dense(self.outputs, kernel_init=_init(self.scale))(x)
+
+
+def _init(scale: float):
+    """Normally distributed, so that outputs have the inputs' variance times `scale`^2; compiles fast."""
+    return nn.initializers.variance_scaling(scale**2, "fan_in", "normal")
 
 
 class Policy(flax.struct.PyTreeNode):

@@ -1,4 +1,4 @@
-"""What training gives back."""
+"""What all learners share: the descent, the loop, and what training gives back."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import flax.struct
 import jax
+import optax
 from jaxtyping import Array
 
 from jaxdrones.envs import Env
@@ -27,3 +28,18 @@ def scan_updates(update: Callable, env: Env, config, state) -> Result:
     """Make all updates of a learner, in one program."""
     state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=config.updates)
     return Result(state.policy, state, history)
+
+
+def descent(rate: float, steps: int, clip: float, last: float = 0.0) -> optax.GradientTransformation:
+    """Adam on gradients of bounded norm, with a rate that falls along a cosine.
+
+    All parameters are one vector, which compiles faster.
+
+    Args:
+        rate: at the start.
+        steps: until the end.
+        clip: largest norm of a gradient.
+        last: rate in the end, as a share of that at the start.
+    """
+    falling = optax.cosine_decay_schedule(rate, steps, last)
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(clip), optax.adam(falling)))

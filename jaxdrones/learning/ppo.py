@@ -1,0 +1,198 @@
+"""Proximal policy optimisation (Schulman et al. 2017), for teams and many worlds."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array
+
+from jaxdrones.envs import Env
+from jaxdrones.learning import collect
+from jaxdrones.learning.networks import MLP, Policy, apply, central, init_params
+from jaxdrones.learning.result import Result, descent, scan_updates
+from jaxdrones.learning.returns import advantages
+
+_HALF_LOG_2_PI = 0.9189385332
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
+
+    updates: int = 150
+    worlds: int = 1024
+    horizon: int = 32
+    """Control steps of an update."""
+    epochs: int = 4
+    """Times that every step is learnt from."""
+    batches: int = 8
+    """Parts of the flown steps, each of which makes one gradient step; cut out of the worlds."""
+    sizes: tuple[int, ...] = (64, 64)
+    critic_sizes: tuple[int, ...] = (64, 64)
+    per_role: bool = False
+    """A policy and a value function for every drone, else one of each for all."""
+    central_critic: bool = False
+    """Values are of all drones' observations and of the others' actions, else of a drone's own observation."""
+    learning_rate: float = 2e-3
+    """At the start; falls along a cosine."""
+    last_rate: float = 0.05
+    """Share of it that is left in the end."""
+    discount: float = 0.98
+    trace: float = 0.95
+    """Lambda of the advantages."""
+    ratio_clip: float = 0.2
+    """Largest change of an action's probability that is rewarded."""
+    entropy: float = 0.0
+    """Reward for the spread of actions."""
+    value_weight: float = 0.5
+    spread: float = 0.4
+    """Standard deviation of actions at the start."""
+    clip: float = 0.5
+    """Largest norm of the gradient."""
+
+
+class TrainState(flax.struct.PyTreeNode):
+    """All that training needs to go on."""
+
+    key: Array
+    policy: Policy
+    log_std: Array
+    """(a,), or (n, a) with `per_role`: logarithm of the spread of actions."""
+    critic: Any
+    """Parameters of the value function."""
+    optimiser: optax.OptState
+    worlds: collect.Worlds
+
+
+class Sample(flax.struct.PyTreeNode):
+    """What is learnt from; leading axes (steps, n)."""
+
+    obs: Array
+    action: Array
+    log_prob: Array
+    critic_obs: Array
+    advantage: Array
+    target: Array
+
+
+def init(key: jax.Array, env: Env, config: Config) -> TrainState:
+    """Before the first update."""
+    key, policy_key, critic_key, world_key = jax.random.split(key, 4)
+    policy = Policy.init(policy_key, env, config.sizes, config.per_role)
+    n, d, a = env.drones, env.observation_size, env.action_size
+    log_std = jnp.full((n, a) if config.per_role else (a,), jnp.log(config.spread))
+    inputs = n * d + (n - 1) * a if config.central_critic else d
+    critic = init_params(critic_key, _critic(config), inputs, n if config.per_role else None)
+    optimiser = _descent(config).init((policy.params, log_std, critic))
+    worlds = collect.restart(world_key, env, collect.idle(env, config.worlds))
+    return TrainState(key, policy, log_std, critic, optimiser, worlds)
+
+
+def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
+    """Fly, then learn from what was flown."""
+    key, fly_key, learn_key = jax.random.split(state.key, 3)
+
+    def act(key, obs):
+        mean = state.policy(obs)
+        std = jnp.broadcast_to(jnp.exp(state.log_std), mean.shape)
+        action = mean + std * jax.random.normal(key, mean.shape, mean.dtype)
+        return action, log_prob(action, mean, state.log_std)
+
+    worlds, flight = collect.fly(fly_key, env, act, state.worlds, config.horizon)
+    sample = _judged(config, state, flight)
+    learnt, optimiser, losses = _learn(learn_key, config, state, sample)
+    params, log_std, critic = learnt
+    policy = state.policy.replace(params=params, statistics=state.policy.statistics.update(flight.obs))
+    metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std))}
+    return TrainState(key, policy, log_std, critic, optimiser, worlds), metrics
+
+
+def train(key: jax.Array, env: Env, config: Config) -> Result:
+    """All updates as one program."""
+    return scan_updates(update, env, config, init(key, env, config))
+
+
+def log_prob(action: Array, mean: Array, log_std: Array) -> Array:
+    """(*batch, n) logarithm of the density of (*batch, n, a) actions, normally distributed about their means."""
+    log_std = jnp.broadcast_to(log_std, mean.shape)
+    terms = -(((action - mean) * jnp.exp(-log_std)) ** 2) / 2 - log_std - _HALF_LOG_2_PI
+    return jnp.sum(terms, axis=-1)
+
+
+def loss(config: Config, policy: Policy, log_std: Array, critic: Any, sample: Sample) -> tuple[Array, dict[str, Array]]:
+    """What PPO descends: the clipped surrogate of the return, the error of the values, minus entropy."""
+    ratio = jnp.exp(log_prob(sample.action, policy(sample.obs), log_std) - sample.log_prob)
+    clipped = jnp.clip(ratio, 1 - config.ratio_clip, 1 + config.ratio_clip)
+    gain = jnp.mean(jnp.minimum(ratio * sample.advantage, clipped * sample.advantage))
+    miss = (1 - config.discount) * (_value(config, critic, sample.critic_obs) - sample.target)
+    value_loss = jnp.mean(miss**2)
+    entropy = jnp.mean(jnp.sum(log_std + 0.5 + _HALF_LOG_2_PI, axis=-1))
+    total = -gain + config.value_weight * value_loss - config.entropy * entropy
+    return total, {"value_loss": value_loss, "clipped": jnp.mean((ratio != clipped).astype(ratio.dtype))}
+
+
+def _judged(config: Config, state: TrainState, flight: collect.Flight) -> Sample:
+    """The flown steps with their advantages."""
+    policy = state.policy
+
+    def seen(obs, action):
+        normal = policy.statistics.normalize(obs)
+        return central(normal, action) if config.central_critic else normal
+
+    critic_obs = seen(flight.obs, flight.action)
+    final_obs = seen(flight.final_obs, policy(flight.final_obs) if config.central_critic else None)
+    value = _value(config, state.critic, critic_obs)
+    next_value = _value(config, state.critic, final_obs)
+    terminated, truncated = (
+        jnp.broadcast_to(x[..., None], value.shape) for x in (flight.terminated, flight.truncated)
+    )
+    advantage = advantages(flight.reward, value, next_value, terminated, truncated, config.discount, config.trace)
+    target = value + advantage
+    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
+    return Sample(flight.obs, flight.action, flight.kept, critic_obs, advantage, target)
+
+
+def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
+    """Some epochs of gradient steps, each on the steps of some of the worlds."""
+    t, w = sample.advantage.shape[:2]
+
+    def cost(learnt, batch):
+        params, log_std, critic = learnt
+        return loss(config, state.policy.replace(params=params), log_std, critic, batch)
+
+    def step(carry, batch):
+        learnt, optimiser = carry
+        (_, losses), gradient = jax.value_and_grad(cost, has_aux=True)(learnt, batch)
+        change, optimiser = _descent(config).update(gradient, optimiser)
+        return (optax.apply_updates(learnt, change), optimiser), losses
+
+    def epoch(carry, key):
+        order = jax.random.permutation(key, w)
+
+        def batches(x):
+            x = x[:, order].reshape(t, config.batches, w // config.batches, *x.shape[2:])
+            return jnp.moveaxis(x, 1, 0).reshape(config.batches, -1, *x.shape[3:])
+
+        return jax.lax.scan(step, carry, jax.tree.map(batches, sample))
+
+    carry = ((state.policy.params, state.log_std, state.critic), state.optimiser)
+    (learnt, optimiser), losses = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
+    return learnt, optimiser, jax.tree.map(jnp.mean, losses)
+
+
+def _critic(config: Config) -> MLP:
+    return MLP(config.critic_sizes, 1)
+
+
+def _value(config: Config, critic: Any, critic_obs: Array) -> Array:
+    """(*batch, n) discounted sum of rewards to come; the network's output is a mean reward."""
+    return apply(_critic(config), critic, critic_obs, config.per_role)[..., 0] / (1 - config.discount)
+
+
+def _descent(config: Config) -> optax.GradientTransformation:
+    return descent(config.learning_rate, config.updates * config.epochs * config.batches, config.clip, config.last_rate)

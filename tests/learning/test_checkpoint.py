@@ -1,0 +1,59 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones import envs
+from jaxdrones.learning import bptt, checkpoint
+from jaxdrones.learning.networks import Policy
+
+
+@pytest.fixture(scope="module")
+def env():
+    return envs.make("paper-hover")
+
+
+CONFIG = bptt.Config(updates=4, worlds=3, horizon=2, sizes=(4,))
+
+
+def test_a_policy_flies_on_as_it_was_saved(env, tmp_path):
+    policy = Policy.init(jax.random.key(0), env, (8, 8))
+    checkpoint.save(tmp_path / "new" / "policy", policy, env="paper-hover", config=CONFIG)
+    loaded = checkpoint.load(tmp_path / "new" / "policy")
+    obs = jax.random.normal(jax.random.key(1), (1, 12))
+    np.testing.assert_array_equal(loaded(obs), policy(obs))
+    assert jax.tree.structure(loaded) == jax.tree.structure(policy)
+    kept = checkpoint.about(tmp_path / "new" / "policy")
+    assert kept["env"] == "paper-hover" and kept["config"]["horizon"] == 2 and "jax" in kept["versions"]
+
+
+@pytest.mark.float32
+def test_training_goes_on_bit_for_bit(env, tmp_path):
+    step = jax.jit(lambda state: bptt.update(env, CONFIG, state)[0])
+    state = step(bptt.init(jax.random.key(3), env, CONFIG))
+    checkpoint.save_tree(tmp_path / "state", state)
+    like = jax.eval_shape(lambda: bptt.init(jax.random.key(0), env, CONFIG))
+    again = checkpoint.load_tree(tmp_path / "state", like)
+    for a, b in zip(jax.tree.leaves(step(again)), jax.tree.leaves(step(state)), strict=True):
+        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+            a, b = jax.random.key_data(a), jax.random.key_data(b)
+        np.testing.assert_array_equal(a, b)
+
+
+def test_errors_say_what_is_wrong(env, tmp_path):
+    path = tmp_path / "policy"
+    with pytest.raises(FileNotFoundError, match="no checkpoint at"):
+        checkpoint.load(path)
+    policy = Policy.init(jax.random.key(0), env, (8, 8))
+    checkpoint.save(path, policy)
+    with pytest.raises(ValueError, match=r"kernel.* is float64\[12, 8\], expected float64\[12, 4\]"):
+        checkpoint.load_tree(path, Policy.init(jax.random.key(0), env, (4, 8)))
+    (tmp_path / "policy.msgpack").write_bytes(b"nonsense")
+    with pytest.raises(ValueError, match="damaged"):
+        checkpoint.load(path)
+    (tmp_path / "policy.msgpack").unlink()
+    with pytest.raises(FileNotFoundError, match=r"policy\.msgpack does not exist"):
+        checkpoint.load(path)
+    (tmp_path / "policy.json").write_text("{}")
+    with pytest.raises(ValueError, match="format None"):
+        checkpoint.load(path)

@@ -1,0 +1,121 @@
+import contextlib
+import dataclasses
+import functools
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+pytest.importorskip("brax")
+from jaxdrones.adapters import brax
+from jaxdrones.envs import TASKS, make
+from jaxdrones.tasks.hover import hover
+
+with contextlib.redirect_stdout(sys.stderr):
+    from brax.envs.wrappers import training
+
+pytestmark = pytest.mark.float32
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_step_returns_what_it_was_given_as_the_trainers_scan_over_it(task, env_of):
+    env = brax.wrap(env_of(task))
+    batch = training.EvalWrapper(brax.wrap_for_training(env, episode_length=5))
+    keys = jax.ShapeDtypeStruct((3, 2), jnp.uint32)
+    start = jax.eval_shape(batch.reset, keys)
+    after = jax.eval_shape(batch.step, start, jax.ShapeDtypeStruct((3, env.action_size), jnp.float32))
+    assert start.obs.shape == (3, env.observation_size)
+    assert jax.tree.structure(start) == jax.tree.structure(after)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), start) == jax.tree.map(lambda x: (x.shape, x.dtype), after)
+    assert all(x.shape == (3,) and x.dtype == jnp.float32 for x in (after.reward, after.done))
+
+
+@functools.cache
+def two_ends():
+    """Above 2.2 m the episode is terminated, below 1.8 m it is cut."""
+    plain = hover(reach=0.0, speed=0.0, omega=0.0, tilt=0.0)
+    return make(
+        dataclasses.replace(
+            plain,
+            ends={"high": lambda world: world.drones.pos[:, 2] > 2.2},
+            limits={"low": lambda world: world.drones.pos[:, 2] < 1.8},
+        )
+    )
+
+
+def flown(env, wrapped, actions, steps):
+    """What brax sees over some steps, each world with a constant action for all motors."""
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), len(actions)))
+    held = jnp.broadcast_to(jnp.asarray(actions)[:, None], (len(actions), env.action_size))
+
+    def step(state, _):
+        state = wrapped.step(state, held)
+        return state, (state.done, state.info["truncation"], state.info["time_out"], state.info["steps"], state.obs)
+
+    return [np.asarray(x) for x in jax.jit(lambda s: jax.lax.scan(step, s, length=steps))(state)[1]]
+
+
+def test_a_cut_is_told_from_an_end():
+    env = brax.wrap(two_ends())
+    wrapped = brax.wrap_for_training(env, episode_length=60)
+    done, truncation, time_out, steps, _ = flown(env, wrapped, [1.0, -1.0, 0.0], 60)
+    first = done.argmax(axis=0)
+    assert done.max() == 1 and first[0] < 59 and first[1] < 59 and first[2] == 59
+    assert truncation[first, [0, 1, 2]].tolist() == [0, 1, 1]
+    np.testing.assert_array_equal(truncation, time_out)
+    assert steps[first[0] + 1, 0] == 1  # of the next episode
+
+
+def test_every_episode_starts_anew(env_of):
+    env = brax.wrap(env_of("hover"))
+    done, truncation, _, _, obs = flown(env, brax.wrap_for_training(env, episode_length=4), [0.0, 0.0], 12)
+    np.testing.assert_array_equal(done, np.tile([[0], [0], [0], [1]], (3, 2)))
+    np.testing.assert_array_equal(done, truncation)
+    starts = np.concatenate(obs[3::4])  # what is seen after the last step is the next episode
+    assert len(np.unique(starts, axis=0)) == len(starts)
+
+
+def test_episode_metrics_are_sums_over_the_episode(env_of):
+    env = brax.wrap(env_of("hover"))
+    wrapped = brax.wrap_for_training(env, episode_length=4)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    step, rewards = jax.jit(wrapped.step), []
+    for _ in range(6):
+        state = step(state, jnp.zeros((2, 4)))
+        rewards.append(state.reward)
+    metrics = state.info["episode_metrics"]
+    np.testing.assert_allclose(metrics["sum_reward"], rewards[4] + rewards[5], rtol=1e-5)
+    np.testing.assert_array_equal(metrics["length"], 2)
+
+
+def test_a_team_acts_and_sees_as_one(env_of):
+    plain = env_of("leader-follower")
+    env = brax.wrap(plain)
+    assert (env.observation_size, env.action_size) == (2 * plain.observation_size, 2 * plain.action_size)
+
+
+def test_arguments_that_the_environment_takes_instead_are_refused(env_of):
+    env = brax.wrap(env_of("hover"))
+    with pytest.raises(ValueError, match="action_repeat is 2"):
+        brax.wrap_for_training(env, episode_length=5, action_repeat=2)
+    with pytest.raises(ValueError, match="make the environment with laws"):
+        brax.wrap_for_training(env, episode_length=5, randomization_fn=lambda sys: sys)
+
+
+def test_what_the_trainers_miss_is_there_for_a_while():
+    assert not hasattr(jax, "device_put_replicated")
+    with pytest.raises(KeyError), brax.trainers():
+        copies = jax.device_put_replicated({"a": jnp.arange(3.0)}, jax.local_devices()[:1])
+        np.testing.assert_array_equal(copies["a"], [[0, 1, 2]])
+        raise KeyError
+    assert not hasattr(jax, "device_put_replicated")
+
+
+def test_importing_it_prints_nothing_to_stdout():
+    done = subprocess.run(
+        [sys.executable, "-c", "import jaxdrones.adapters.brax"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == ""

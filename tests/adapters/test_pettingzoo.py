@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+pytest.importorskip("pettingzoo")
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+from jaxdrones.adapters.pettingzoo import parallel_env
+from jaxdrones.envs import TASKS
+
+pytestmark = pytest.mark.float32
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_pettingzoos_own_tests_pass(task, env_of):
+    parallel_api_test(parallel_env(env_of(task)), num_cycles=20)
+    parallel_seed_test(lambda: parallel_env(env_of(task)), num_cycles=5)
+
+
+def test_agents_are_drones_and_all_end_at_once(env_of):
+    env = parallel_env(env_of("hover", drones=2, duration=0.05))
+    assert env.possible_agents == ["drone_0", "drone_1"] and env.agents == []
+    assert env.observation_spaces["drone_0"] is env.observation_space("drone_0")
+    env.reset(seed=0)
+    for k in range(5):
+        obs, reward, terminated, truncated, infos = env.step({agent: np.zeros(4) for agent in env.agents})
+        assert set(obs) == set(reward) == set(terminated) == set(infos) == set(env.possible_agents)
+        assert truncated == dict.fromkeys(env.possible_agents, k == 4)
+    assert env.agents == []
+    for agent in env.possible_agents:
+        assert reward[agent] == pytest.approx(sum(infos[agent]["rewards"].values()), rel=1e-5)
+    with pytest.raises(ValueError, match="after the end of an episode"):
+        env.step({})
+
+
+def test_the_state_is_what_all_agents_see(env_of):
+    env = parallel_env(env_of("hover", drones=2, duration=0.05))
+    with pytest.raises(ValueError, match="before reset"):
+        env.state()
+    obs, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(env.state(), np.concatenate([obs["drone_0"], obs["drone_1"]]))
+    assert env.state() in env.state_space
+
+
+def test_mistakes_are_named(env_of):
+    env = parallel_env(env_of("hover", drones=2, duration=0.05))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action is for drone_0; give a dict with one each for drone_0, drone_1"):
+        env.step({"drone_0": np.zeros(4)})
+    with pytest.raises(ValueError, match=r"action of drone_1 has shape \(3,\); expected \(4,\)"):
+        env.step({"drone_0": np.zeros(4), "drone_1": np.zeros(3)})
+    with pytest.raises(ValueError, match="action of drone_1 is not finite"):
+        env.step({"drone_0": np.zeros(4), "drone_1": np.full(4, np.nan)})
+    with pytest.raises(ValueError, match="unknown option"):
+        parallel_env("leader-follower", colour="red")

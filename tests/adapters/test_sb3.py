@@ -1,0 +1,41 @@
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+from jaxdrones.adapters.sb3 import VecEnv
+
+pytestmark = pytest.mark.float32
+
+
+def test_the_last_step_of_an_episode_tells_what_sb3_looks_for(env_of):
+    envs = VecEnv(env_of("hover", duration=0.05), 2, seed=0)
+    first = envs.reset()
+    total = 0
+    for _ in range(5):
+        obs, reward, done, infos = envs.step(np.zeros((2, 4), np.float32))
+        total += reward
+    assert done.tolist() == [True, True] and obs.shape == first.shape == (2, 22)
+    for i, info in enumerate(infos):
+        assert info["TimeLimit.truncated"] is True
+        assert info["terminal_observation"] in envs.observation_space
+        assert not np.array_equal(info["terminal_observation"], obs[i])
+        assert info["episode"]["l"] == 5 and info["episode"]["r"] == pytest.approx(total[i], rel=1e-5)
+    assert envs.step(np.zeros((2, 4), np.float32))[-1] == [{}, {}]
+
+
+def test_a_seed_fixes_the_start(env_of):
+    envs = VecEnv(env_of("hover", duration=0.05), 2)
+    envs.seed(3)
+    first = envs.reset()
+    other = envs.reset()
+    envs.seed(3)
+    np.testing.assert_array_equal(first, envs.reset())
+    assert not np.array_equal(first, other)
+
+
+def test_worlds_cannot_be_treated_one_by_one(env_of):
+    envs = VecEnv(env_of("hover", duration=0.05), 2)
+    assert envs.get_attr("num_envs", indices=[0]) == [2]
+    assert envs.env_is_wrapped(object) == [False, False]
+    with pytest.raises(ValueError, match="give it as an option"):
+        envs.set_attr("height", 2.0)

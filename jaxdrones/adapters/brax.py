@@ -194,8 +194,8 @@ def trainers() -> Iterator[None]:
 
 
 def _device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
-    """A copy of every array on every device, along a new leading axis."""
-    sharding = NamedSharding(Mesh(np.array(devices), ("device",)), PartitionSpec("device"))
+    """A copy of every array on every device, along a new leading axis; laid out as what a `pmap` over "i" returns."""
+    sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
 
     def put(x):
         copies = jnp.broadcast_to(jnp.asarray(x)[None], (len(devices), *jnp.shape(x)))

@@ -119,3 +119,38 @@ def test_importing_it_prints_nothing_to_stdout():
         [sys.executable, "-c", "import jaxdrones.adapters.brax"], capture_output=True, text=True, check=True
     )
     assert done.stdout == ""
+
+
+@pytest.mark.slow
+def test_braxs_ppo_learns_to_hover():
+    from brax.training.agents.ppo import networks
+    from brax.training.agents.ppo import train as ppo
+
+    env = make("hover", action="thrust_and_rates", reach=0.5, speed=0.3, omega=0.3, tilt=15.0)
+    returns = []
+    with brax.trainers(), jax.numpy_rank_promotion("allow"):  # which brax relies on
+        ppo.train(
+            brax.wrap(env),
+            num_timesteps=4_000_000,
+            episode_length=env.steps,
+            wrap_env_fn=brax.wrap_for_training,
+            use_pmap_on_reset=True,
+            num_envs=256,
+            unroll_length=20,
+            batch_size=256,
+            num_minibatches=8,
+            num_updates_per_batch=4,
+            learning_rate=1e-3,
+            entropy_cost=1e-3,
+            discounting=0.98,
+            reward_scaling=0.1,
+            normalize_observations=True,
+            num_evals=2,
+            num_eval_envs=32,
+            network_factory=functools.partial(
+                networks.make_ppo_networks, policy_hidden_layer_sizes=(64, 64), value_hidden_layer_sizes=(64, 64)
+            ),
+            progress_fn=lambda steps, metrics: returns.append(float(metrics["eval/episode_reward"])),
+        )
+    before, after = returns
+    assert after > 0 > before  # of at most 500; without control it drifts away, about -380

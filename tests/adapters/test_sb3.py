@@ -39,3 +39,38 @@ def test_worlds_cannot_be_treated_one_by_one(env_of):
     assert envs.env_is_wrapped(object) == [False, False]
     with pytest.raises(ValueError, match="give it as an option"):
         envs.set_attr("height", 2.0)
+
+
+def episode_return(model, envs):
+    """Mean over the worlds, of one episode without exploration."""
+    envs.seed(0)
+    obs, total, running = envs.reset(), np.zeros(envs.num_envs), np.ones(envs.num_envs, bool)
+    while running.any():
+        action, _ = model.predict(obs, deterministic=True)
+        obs, reward, done, _ = envs.step(action)
+        total += reward * running
+        running &= ~done
+    return total.mean()
+
+
+@pytest.mark.slow
+def test_sb3s_ppo_learns_to_hover(env_of):
+    from stable_baselines3 import PPO
+
+    env = env_of("hover", action="thrust_and_rates", reach=0.5, speed=0.3, omega=0.3, tilt=15.0)
+    test = VecEnv(env, 32)
+    model = PPO(
+        "MlpPolicy",
+        VecEnv(env, 128),
+        n_steps=32,
+        batch_size=1024,
+        n_epochs=5,
+        gamma=0.98,
+        learning_rate=1e-3,
+        policy_kwargs={"net_arch": [64, 64], "log_std_init": -1},
+        seed=0,
+        device="cpu",
+    )
+    before = episode_return(model, test)
+    model.learn(750_000)
+    assert episode_return(model, test) > 0 > before  # of at most 500; without control it drifts away, about -700

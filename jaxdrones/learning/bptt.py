@@ -27,12 +27,18 @@ class Config:
     worlds: int = 256
     horizon: int = 64
     """Control steps that a gradient goes back through."""
-    sizes: tuple[int, ...] = (64, 64)
+    sizes: tuple[int, ...] = (32, 32)
+    memory: float = 1e9
+    """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
+    settle: float = 0.2
+    """Share of the updates after which the statistics stay as they are."""
     per_role: bool = False
     learning_rate: float = 1e-2
     """At the start; falls to zero along a cosine."""
     discount: float = 1.0
-    clip: float = 1.0
+    b2: float = 0.95
+    """How long Adam remembers the squares of gradients; those of a flight shrink by orders of magnitude."""
+    clip: float = 0.3
     """Largest norm of the gradient."""
     restart: float = 0.2
     """Share of the worlds that start afresh before an update; the others fly on."""
@@ -50,6 +56,8 @@ class Config:
 class TrainState(flax.struct.PyTreeNode):
     """All that training needs to go on."""
 
+    step: Array
+    """() updates made."""
     key: Array
     policy: Policy
     optimiser: optax.OptState
@@ -60,7 +68,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     """Before the first update."""
     key, policy_key = jax.random.split(key)
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
-    return TrainState(key, policy, _optimiser(config).init(policy.params), collect.idle(env, config.worlds))
+    return TrainState(jnp.zeros((), jnp.int32), key, policy, _optimiser(config).init(policy.params), collect.idle(env, config.worlds))
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
@@ -79,10 +87,10 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     (_, (worlds, flight)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     step, optimiser = _optimiser(config).update(gradient, state.optimiser)
     policy = state.policy.replace(
-        params=optax.apply_updates(state.policy.params, step), statistics=state.policy.statistics.update(flight.obs)
+        params=optax.apply_updates(state.policy.params, step), statistics=collect.remember(state.policy.statistics, flight, config, state.step)
     )
     metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient)}
-    return TrainState(key, policy, optimiser, worlds), metrics
+    return TrainState(state.step + 1, key, policy, optimiser, worlds), metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
@@ -97,4 +105,4 @@ def discounted(flight: collect.Flight, discount: float) -> Array:
 
 
 def _optimiser(config: Config) -> optax.GradientTransformation:
-    return descent(config.learning_rate, config.updates, config.clip)
+    return descent(config.learning_rate, config.updates, config.clip, b2=config.b2)

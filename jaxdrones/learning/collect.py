@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from jaxdrones.envs import AutoReset, Env, autoreset
 from jaxdrones.envs.autoreset import Episode
+from jaxdrones.learning.normalize import Statistics
 
 Act = Callable[[jax.Array, Array], tuple[Array, Any]]
 """(key, observations (w, n, d)) -> actions (w, n, a), and what is to be kept of the decision."""
@@ -146,6 +147,20 @@ def progress(flight: Flight) -> dict[str, Array]:
         / jnp.maximum(jnp.sum(ended), 1)
         / flight.reward.shape[2],
     }
+
+
+def remember(statistics: Statistics, flight: Flight, config, step: Array) -> Statistics:
+    """The statistics of observations with those of a flight, until they are settled.
+
+    Args:
+        statistics: so far.
+        flight: new.
+        config: settings: `memory` in flights, `settle` as a share of `updates`.
+        step: () updates made.
+    """
+    new = statistics.update(flight.obs, memory=config.memory * flight.reward.size)
+    settling = step < config.settle * config.updates
+    return jax.tree.map(lambda new, old: jnp.where(settling, new, old), new, statistics)
 
 
 def _rows(chosen: Array, leaf: Array) -> Array:

@@ -68,26 +68,28 @@ def _fly(env: Env, policy: Callable, keys: jax.Array):
 
 
 def _episode(env: Env, policy: Callable, key: jax.Array) -> dict:
-    """One episode, frozen where it ended."""
+    """One episode, frozen where it ended; positions that are not numbers at any time are no success."""
     start_key, key = jax.random.split(key)
     obs, world = env.reset(start_key)
     first = jax.eval_shape(env.step, key, world, jnp.zeros((env.drones, env.action_size)))[-1]
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (first["metrics"], first["ends"]))
 
     def control_step(carry, key):
-        obs, world, done, outcome, returned, length = carry
+        obs, world, lost, done, outcome, returned, length = carry
         obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
         now = (info["metrics"], info["ends"])
         outcome = jax.tree.map(lambda new, old: jnp.where(done, old, new), now, outcome)
         returned = returned + jnp.where(done, 0, reward)
         length = length + ~done
-        return (obs, world, done | terminated | truncated, outcome, returned, length), outcome[0]
+        lost = lost | ~jnp.all(jnp.isfinite(world.drones.pos))
+        return (obs, world, lost, done | terminated | truncated, outcome, returned, length), outcome[0]
 
     zero = jnp.zeros(env.drones, obs.dtype)
-    carry = (obs, world, jnp.zeros((), bool), nothing, zero, jnp.zeros((), jnp.int32))
+    no = jnp.zeros((), bool)
+    carry = (obs, world, no, no, nothing, zero, jnp.zeros((), jnp.int32))
     carry, metrics = jax.lax.scan(control_step, carry, jax.random.split(key, env.steps))
-    _, _, _, (final, ends), returned, length = carry
-    success = jnp.zeros((), bool) if env.task.success is None else jnp.all(env.task.success(metrics, env.dt))
+    _, _, lost, _, (final, ends), returned, length = carry
+    success = no if env.task.success is None else jnp.all(env.task.success(metrics, env.dt)) & ~lost
     rms = jnp.sqrt(jnp.mean(metrics["error"][env.steps // 5 :] ** 2, axis=0))
     return dict(success=success, final=final, ends=ends, returned=returned, length=length, rms=rms)
 

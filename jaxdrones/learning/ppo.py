@@ -18,6 +18,7 @@ from jaxdrones.learning.result import Result, descent, scan_updates
 from jaxdrones.learning.returns import advantages
 
 _HALF_LOG_2_PI = 0.9189385332
+_LARGEST_CHANGE = 10.0  # of a logarithm, far beyond what is rewarded; its exponential stays finite
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +35,10 @@ class Config:
     """Parts of the flown steps, each of which makes one gradient step; cut out of the worlds."""
     sizes: tuple[int, ...] = (64, 64)
     critic_sizes: tuple[int, ...] = (64, 64)
+    memory: float = 10.0
+    """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
+    settle: float = 0.5
+    """Share of the updates after which the statistics stay as they are."""
     per_role: bool = False
     """A policy and a value function for every drone, else one of each for all."""
     central_critic: bool = False
@@ -59,6 +64,8 @@ class Config:
 class TrainState(flax.struct.PyTreeNode):
     """All that training needs to go on."""
 
+    step: Array
+    """() updates made."""
     key: Array
     policy: Policy
     log_std: Array
@@ -90,7 +97,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     critic = init_params(critic_key, _critic(config), inputs, n if config.per_role else None)
     optimiser = _descent(config).init((policy.params, log_std, critic))
     worlds = collect.restart(world_key, env, collect.idle(env, config.worlds))
-    return TrainState(key, policy, log_std, critic, optimiser, worlds)
+    return TrainState(jnp.zeros((), jnp.int32), key, policy, log_std, critic, optimiser, worlds)
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
@@ -107,9 +114,9 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     sample = _judged(config, state, flight)
     learnt, optimiser, losses = _learn(learn_key, config, state, sample)
     params, log_std, critic = learnt
-    policy = state.policy.replace(params=params, statistics=state.policy.statistics.update(flight.obs))
+    policy = state.policy.replace(params=params, statistics=collect.remember(state.policy.statistics, flight, config, state.step))
     metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std))}
-    return TrainState(key, policy, log_std, critic, optimiser, worlds), metrics
+    return TrainState(state.step + 1, key, policy, log_std, critic, optimiser, worlds), metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
@@ -126,7 +133,8 @@ def log_prob(action: Array, mean: Array, log_std: Array) -> Array:
 
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, sample: Sample) -> tuple[Array, dict[str, Array]]:
     """What PPO descends: the clipped surrogate of the return, the error of the values, minus entropy."""
-    ratio = jnp.exp(log_prob(sample.action, policy(sample.obs), log_std) - sample.log_prob)
+    change = log_prob(sample.action, policy(sample.obs), log_std) - sample.log_prob
+    ratio = jnp.exp(jnp.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE))
     clipped = jnp.clip(ratio, 1 - config.ratio_clip, 1 + config.ratio_clip)
     gain = jnp.mean(jnp.minimum(ratio * sample.advantage, clipped * sample.advantage))
     miss = (1 - config.discount) * (_value(config, critic, sample.critic_obs) - sample.target)

@@ -7,6 +7,7 @@ from typing import Any
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
@@ -30,7 +31,7 @@ def scan_updates(update: Callable, env: Env, config, state) -> Result:
     return Result(state.policy, state, history)
 
 
-def descent(rate: float, steps: int, clip: float, last: float = 0.0) -> optax.GradientTransformation:
+def descent(rate: float, steps: int, clip: float, last: float = 0.0, b2: float = 0.999) -> optax.GradientTransformation:
     """Adam on gradients of bounded norm, with a rate that falls along a cosine.
 
     All parameters are one vector, which compiles faster.
@@ -40,6 +41,19 @@ def descent(rate: float, steps: int, clip: float, last: float = 0.0) -> optax.Gr
         steps: until the end.
         clip: largest norm of a gradient.
         last: rate in the end, as a share of that at the start.
+        b2: how long Adam remembers the squares of gradients.
     """
     falling = optax.cosine_decay_schedule(rate, steps, last)
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(clip), optax.adam(falling)))
+    return optax.flatten(optax.chain(_bounded(clip), optax.adam(falling, b2=b2)))
+
+
+def _bounded(clip: float) -> optax.GradientTransformation:
+    """Norm at most `clip`; a gradient that is not finite counts as zero, so that one wild flight ruins nothing."""
+
+    def update(gradient, state, params=None):
+        norm = optax.global_norm(gradient)
+        finite = jnp.isfinite(norm)
+        scale = jnp.where(finite, jnp.minimum(1, clip / jnp.where(norm > 0, norm, 1)), 0)
+        return jax.tree.map(lambda g: jnp.where(finite, g, 0) * scale.astype(g.dtype), gradient), state
+
+    return optax.GradientTransformation(lambda params: optax.EmptyState(), update)

@@ -29,21 +29,29 @@ class Config:
     worlds: int = 256
     horizon: int = 32
     """Control steps that a gradient goes back through."""
-    sizes: tuple[int, ...] = (64, 64)
-    critic_sizes: tuple[int, ...] = (64, 64)
+    sizes: tuple[int, ...] = (32, 32)
+    critic_sizes: tuple[int, ...] = (32, 32)
+    memory: float = 1e9
+    """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
+    settle: float = 0.2
+    """Share of the updates after which the statistics stay as they are."""
     per_role: bool = False
-    learning_rate: float = 1e-2
+    learning_rate: float = 5e-3
     """Of the policy, at the start; falls to zero along a cosine."""
     critic_rate: float = 5e-3
     """The same of the critic."""
-    critic_steps: int = 8
+    critic_steps: int = 16
     """Gradient steps of the critic in an update, each with as many of the flown steps as there are worlds times four."""
+    trust: float = 0.3
+    """Share of the updates in which the value of the end grows from nothing to its full weight."""
     discount: float = 0.99
     trace: float = 0.95
     """Lambda of the critic's targets."""
     target_speed: float = 0.2
     """Share of the way that the target critic moves towards the critic in an update."""
-    clip: float = 1.0
+    b2: float = 0.95
+    """How long Adam remembers the squares of gradients; those of a flight shrink by orders of magnitude."""
+    clip: float = 0.3
     """Largest norm of a gradient."""
     restart: float = 0.1
     """Share of the worlds that start afresh before an update; the others fly on."""
@@ -61,6 +69,8 @@ class Config:
 class TrainState(flax.struct.PyTreeNode):
     """All that training needs to go on."""
 
+    step: Array
+    """() updates made."""
     key: Array
     policy: Policy
     optimiser: optax.OptState
@@ -78,6 +88,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
     critic = init_params(critic_key, _critic(config), env.observation_size)
     return TrainState(
+        jnp.zeros((), jnp.int32),
         key,
         policy,
         _actor_descent(config).init(policy.params),
@@ -94,6 +105,8 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     worlds = collect.restart(restart_key, env, state.worlds, config.restart)
     env = with_gradient(env, config)
 
+    trust = jnp.minimum(state.step / (config.trust * config.updates), 1)
+
     def value(params, obs):
         """In mean rewards: the sum times one minus the discount."""
         return _critic(config).apply(params, state.policy.statistics.normalize(obs))[..., 0] / (1 - config.discount)
@@ -103,7 +116,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         after, flight = collect.fly(
             fly_key, env, lambda key, obs: (policy(obs), None), worlds, config.horizon, False, linked(config)
         )
-        ahead = config.discount * value(state.target, flight.final_obs)
+        ahead = trust * config.discount * value(state.target, flight.final_obs)
         last = flight.truncated.at[-1].set(~flight.terminated[-1])
         reward = flight.reward + jnp.where(last[..., None], ahead, 0)
         worth = jnp.mean(jnp.sum(discounted(flight.replace(reward=reward), config.discount), axis=0))
@@ -114,10 +127,10 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     critic, critic_optimiser, critic_loss = _fit(critic_key, config, state, value, flight)
     target = optax.incremental_update(critic, state.target, config.target_speed)
     policy = state.policy.replace(
-        params=optax.apply_updates(state.policy.params, step), statistics=state.policy.statistics.update(flight.obs)
+        params=optax.apply_updates(state.policy.params, step), statistics=collect.remember(state.policy.statistics, flight, config, state.step)
     )
     metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient), "critic_loss": critic_loss}
-    return TrainState(key, policy, optimiser, critic, target, critic_optimiser, worlds), metrics
+    return TrainState(state.step + 1, key, policy, optimiser, critic, target, critic_optimiser, worlds), metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
@@ -158,7 +171,7 @@ def _critic(config: Config) -> MLP:
 
 
 def _actor_descent(config: Config) -> optax.GradientTransformation:
-    return descent(config.learning_rate, config.updates, config.clip)
+    return descent(config.learning_rate, config.updates, config.clip, b2=config.b2)
 
 
 def _critic_descent(config: Config) -> optax.GradientTransformation:

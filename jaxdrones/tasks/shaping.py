@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 from jaxdrones.control import Setpoint
 from jaxdrones.tasks.task import Term, World, square
 
-_NEAR = 0.02  # m; below, the position term is a parabola
-_SLOW = 0.1  # m/s; the same for the velocity term
+_NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
+_SLOW = 0.1  # m/s; below, the velocity term is a parabola
+_CALM = 1.0  # rad/s; the same for the body rates
 
 
 def reach_and_stay(target: Callable[[Any, Array], Setpoint]) -> dict[str, tuple[float, Term]]:
@@ -20,27 +21,31 @@ def reach_and_stay(target: Callable[[Any, Array], Setpoint]) -> dict[str, tuple[
         return jnp.ones_like(world.drones.pos[:, 0])
 
     def position(world: World) -> Float[Array, " n"]:
-        error = square(world.drones.pos - target(world.variables, world.time).pos)
-        return jnp.sqrt(error + _NEAR**2) - _NEAR
+        distance = _length(world.drones.pos - target(world.variables, world.time).pos, _NEAR)
+        return distance / (1 + distance / _FAR)
 
     def velocity(world: World) -> Float[Array, " n"]:
-        error = square(world.drones.vel - target(world.variables, world.time).vel)
-        return jnp.sqrt(error + _SLOW**2) - _SLOW
+        return _length(world.drones.vel - target(world.variables, world.time).vel, _SLOW)
 
     return {
-        "alive": (1.0, alive),
+        "alive": (2.0, alive),
         "position": (-1.0, position),
         "velocity": (-0.1, velocity),
-        "omega": (-0.005, turning),
+        "omega": (-0.02, turning),
         "action_change": (-0.02, action_change),
     }
 
 
 def turning(world: World) -> Float[Array, " n"]:
-    """Squared body rates, (rad/s)^2."""
-    return square(world.drones.omega)
+    """Body rates, rad/s; squared where they are small."""
+    return _length(world.drones.omega, _CALM)
 
 
 def action_change(world: World) -> Float[Array, " n"]:
     """Squared difference of the last two actions."""
     return square(world.actions[:, -1] - world.actions[:, -2])
+
+
+def _length(v: Float[Array, "n 3"], small: float) -> Float[Array, " n"]:
+    """Length of every row, but a parabola where it is below `small`."""
+    return jnp.sqrt(square(v) + small**2) - small

@@ -28,7 +28,8 @@ def test_a_policy_flies_on_as_it_was_saved(env, tmp_path):
 
 
 @pytest.mark.float32
-def test_training_goes_on_bit_for_bit(env, tmp_path):
+def test_training_goes_on_bit_for_bit(tmp_path):
+    env = envs.make("paper-hover")
     step = jax.jit(lambda state: bptt.update(env, CONFIG, state)[0])
     state = step(bptt.init(jax.random.key(3), env, CONFIG))
     checkpoint.save_tree(tmp_path / "state", state)

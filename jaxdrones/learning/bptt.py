@@ -23,7 +23,7 @@ from jaxdrones.learning.result import Result, descent, scan_updates
 class Config:
     """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
 
-    updates: int = 300
+    updates: int = 180
     worlds: int = 256
     horizon: int = 64
     """Control steps that a gradient goes back through."""
@@ -33,7 +33,7 @@ class Config:
     settle: float = 0.2
     """Share of the updates after which the statistics stay as they are."""
     per_role: bool = False
-    learning_rate: float = 1e-2
+    learning_rate: float = 2e-2
     """At the start; falls to zero along a cosine."""
     discount: float = 1.0
     b2: float = 0.95

@@ -14,10 +14,11 @@ from jaxtyping import Array
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect
 from jaxdrones.learning.networks import MLP, Policy, apply, central, init_params
-from jaxdrones.learning.result import Result, descent, scan_updates
+from jaxdrones.learning.result import Result, bounded, scan_updates
 from jaxdrones.learning.returns import advantages
 
 _HALF_LOG_2_PI = 0.9189385332
+_PACE = 1.2  # the learning rate grows or falls by
 _LARGEST_CHANGE = 10.0  # of a logarithm, far beyond what is rewarded; its exponential stays finite
 
 
@@ -25,16 +26,16 @@ _LARGEST_CHANGE = 10.0  # of a logarithm, far beyond what is rewarded; its expon
 class Config:
     """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
 
-    updates: int = 150
+    updates: int = 300
     worlds: int = 1024
-    horizon: int = 32
+    horizon: int = 24
     """Control steps of an update."""
     epochs: int = 4
     """Times that every step is learnt from."""
-    batches: int = 8
+    batches: int = 4
     """Parts of the flown steps, each of which makes one gradient step; cut out of the worlds."""
-    sizes: tuple[int, ...] = (64, 64)
-    critic_sizes: tuple[int, ...] = (64, 64)
+    sizes: tuple[int, ...] = (32, 32)
+    critic_sizes: tuple[int, ...] = (32, 32)
     memory: float = 10.0
     """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
     settle: float = 0.5
@@ -44,9 +45,14 @@ class Config:
     central_critic: bool = False
     """Values are of all drones' observations and of the others' actions, else of a drone's own observation."""
     learning_rate: float = 2e-3
-    """At the start; falls along a cosine."""
-    last_rate: float = 0.05
-    """Share of it that is left in the end."""
+    """At the start; follows how much the policy changes in a gradient step."""
+    change: float = 0.01
+    """That is aimed at: divergence (KL) of the policy from the one that flew. The rate falls above twice of it and
+    grows below half of it, within `slowest` and `fastest`."""
+    slowest: float = 1e-5
+    fastest: float = 5e-3
+    cool: float = 0.3
+    """Share of the updates, the last ones, in which the largest rate falls to the slowest, straight in its logarithm."""
     discount: float = 0.98
     trace: float = 0.95
     """Lambda of the advantages."""
@@ -73,6 +79,8 @@ class TrainState(flax.struct.PyTreeNode):
     critic: Any
     """Parameters of the value function."""
     optimiser: optax.OptState
+    rate: Array
+    """() learning rate."""
     worlds: collect.Worlds
 
 
@@ -96,8 +104,9 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     inputs = n * d + (n - 1) * a if config.central_critic else d
     critic = init_params(critic_key, _critic(config), inputs, n if config.per_role else None)
     optimiser = _descent(config).init((policy.params, log_std, critic))
+    rate = jnp.asarray(config.learning_rate, log_std.dtype)
     worlds = collect.restart(world_key, env, collect.idle(env, config.worlds))
-    return TrainState(jnp.zeros((), jnp.int32), key, policy, log_std, critic, optimiser, worlds)
+    return TrainState(jnp.zeros((), jnp.int32), key, policy, log_std, critic, optimiser, rate, worlds)
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
@@ -112,11 +121,11 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
 
     worlds, flight = collect.fly(fly_key, env, act, state.worlds, config.horizon)
     sample = _judged(config, state, flight)
-    learnt, optimiser, losses = _learn(learn_key, config, state, sample)
+    learnt, optimiser, rate, losses = _learn(learn_key, config, state, sample)
     params, log_std, critic = learnt
     policy = state.policy.replace(params=params, statistics=collect.remember(state.policy.statistics, flight, config, state.step))
-    metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std))}
-    return TrainState(state.step + 1, key, policy, log_std, critic, optimiser, worlds), metrics
+    metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std)), "rate": rate}
+    return TrainState(state.step + 1, key, policy, log_std, critic, optimiser, rate, worlds), metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
@@ -141,7 +150,8 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, sample: Sa
     value_loss = jnp.mean(miss**2)
     entropy = jnp.mean(jnp.sum(log_std + 0.5 + _HALF_LOG_2_PI, axis=-1))
     total = -gain + config.value_weight * value_loss - config.entropy * entropy
-    return total, {"value_loss": value_loss, "clipped": jnp.mean((ratio != clipped).astype(ratio.dtype))}
+    kl = jnp.mean(ratio - 1 - change)
+    return total, {"value_loss": value_loss, "kl": kl}
 
 
 def _judged(config: Config, state: TrainState, flight: collect.Flight) -> Sample:
@@ -173,11 +183,17 @@ def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
         params, log_std, critic = learnt
         return loss(config, state.policy.replace(params=params), log_std, critic, batch)
 
+    last = jnp.clip((1 - state.step / config.updates) / config.cool, 0, 1)
+    fastest = config.slowest * (config.fastest / config.slowest) ** last
+
     def step(carry, batch):
-        learnt, optimiser = carry
+        learnt, optimiser, rate = carry
         (_, losses), gradient = jax.value_and_grad(cost, has_aux=True)(learnt, batch)
-        change, optimiser = _descent(config).update(gradient, optimiser)
-        return (optax.apply_updates(learnt, change), optimiser), losses
+        step, optimiser = _descent(config).update(gradient, optimiser)
+        slower, faster = losses["kl"] > 2 * config.change, losses["kl"] < config.change / 2
+        rate = jnp.clip(rate * jnp.where(slower, 1 / _PACE, jnp.where(faster, _PACE, 1)), config.slowest, fastest)
+        learnt = jax.tree.map(lambda x, s: x - rate.astype(x.dtype) * s, learnt, step)
+        return (learnt, optimiser, rate), losses
 
     def epoch(carry, key):
         order = jax.random.permutation(key, w)
@@ -188,9 +204,9 @@ def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
 
         return jax.lax.scan(step, carry, jax.tree.map(batches, sample))
 
-    carry = ((state.policy.params, state.log_std, state.critic), state.optimiser)
-    (learnt, optimiser), losses = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
-    return learnt, optimiser, jax.tree.map(jnp.mean, losses)
+    carry = ((state.policy.params, state.log_std, state.critic), state.optimiser, state.rate)
+    (learnt, optimiser, rate), losses = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
+    return learnt, optimiser, rate, jax.tree.map(jnp.mean, losses)
 
 
 def _critic(config: Config) -> MLP:
@@ -203,4 +219,4 @@ def _value(config: Config, critic: Any, critic_obs: Array) -> Array:
 
 
 def _descent(config: Config) -> optax.GradientTransformation:
-    return descent(config.learning_rate, config.updates * config.epochs * config.batches, config.clip, config.last_rate)
+    return optax.flatten(optax.chain(bounded(config.clip), optax.scale_by_adam()))

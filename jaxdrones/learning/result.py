@@ -44,10 +44,10 @@ def descent(rate: float, steps: int, clip: float, last: float = 0.0, b2: float =
         b2: how long Adam remembers the squares of gradients.
     """
     falling = optax.cosine_decay_schedule(rate, steps, last)
-    return optax.flatten(optax.chain(_bounded(clip), optax.adam(falling, b2=b2)))
+    return optax.flatten(optax.chain(bounded(clip), optax.adam(falling, b2=b2)))
 
 
-def _bounded(clip: float) -> optax.GradientTransformation:
+def bounded(clip: float) -> optax.GradientTransformation:
     """Norm at most `clip`; a gradient that is not finite counts as zero, so that one wild flight ruins nothing."""
 
     def update(gradient, state, params=None):

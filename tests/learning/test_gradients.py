@@ -1,0 +1,87 @@
+"""Gradient options change the gradient as they say, and never what is simulated."""
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdrones as jd
+from jaxdrones import envs
+from jaxdrones.learning import bptt, collect
+from jaxdrones.learning.gradients import differentiated_as, linked, scale_gradient, with_gradient
+
+CONFIG = bptt.Config(updates=2, worlds=2, horizon=6, sizes=(4,))
+
+
+def test_scaling_a_gradient_keeps_the_value():
+    value, gradient = jax.value_and_grad(lambda x: scale_gradient({"x": x}, 0.5)["x"] ** 2)(3.0)
+    assert value == 9 and gradient == 3
+
+
+def test_a_surrogate_has_the_values_of_one_step_and_the_derivative_of_the_other():
+    fine, coarse = jd.make_step(dt=1 / 500, substeps=5), jd.make_step(dt=1 / 100)
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    state, rpm = jd.State.at_rest(jnp.zeros((1, 3))), jnp.full((1, 4), 15000.0)
+
+    def height(step, rpm):
+        return step(params, state, rpm).pos[0, 2]
+
+    mixed = differentiated_as(fine, coarse)
+    assert height(mixed, rpm) == height(fine, rpm)
+    mine, theirs = (jax.grad(height, 1)(step, rpm) for step in (mixed, coarse))
+    np.testing.assert_allclose(mine, theirs, rtol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """Final mean reward and its gradient in the policy's parameters, for each option."""
+    env = envs.make("hover")
+    state = bptt.init(jax.random.key(0), env, CONFIG)
+    worlds = collect.restart(jax.random.key(1), env, state.worlds)
+
+    def flown(params, **options):
+        config = bptt.Config(**vars(CONFIG) | options)
+        policy = state.policy.replace(params=params)
+        _, flight = collect.fly(
+            jax.random.key(2),
+            with_gradient(env, config),
+            lambda key, obs: (policy(obs), None),
+            worlds,
+            config.horizon,
+            reset=False,
+            link=linked(config),
+        )
+        return jnp.mean(flight.reward[-1])
+
+    def both(**options):
+        value, gradient = jax.jit(jax.value_and_grad(lambda params: flown(params, **options)))(state.policy.params)
+        return value, jax.flatten_util.ravel_pytree(gradient)[0]
+
+    return {
+        "exact": both(gradient="exact"),
+        "no decay": both(gradient="decay", decay=1.0),
+        "decay": both(gradient="decay", decay=0.5),
+        "surrogate": both(gradient="surrogate"),
+    }
+
+
+def test_no_option_changes_the_flight(flights):
+    for name, (value, _) in flights.items():
+        np.testing.assert_allclose(value, flights["exact"][0], rtol=1e-12, err_msg=name)
+
+
+def test_a_decay_of_one_is_exact_and_a_smaller_one_shrinks_what_is_long_ago(flights):
+    np.testing.assert_allclose(flights["no decay"][1], flights["exact"][1], rtol=1e-9, atol=1e-12)
+    assert jnp.linalg.norm(flights["decay"][1]) < 0.5 * jnp.linalg.norm(flights["exact"][1])
+
+
+def test_a_surrogate_points_nearly_where_the_exact_gradient_does(flights):
+    a, b = flights["surrogate"][1], flights["exact"][1]
+    cosine = a @ b / jnp.linalg.norm(a) / jnp.linalg.norm(b)
+    assert 0.9 < cosine < 1 - 1e-9
+
+
+def test_unknown_options_are_named():
+    with pytest.raises(ValueError, match="surrogate"):
+        bptt.Config(gradient="surogate")

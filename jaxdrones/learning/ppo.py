@@ -36,9 +36,9 @@ class Config:
     """Parts of the flown steps, each of which makes one gradient step; cut out of the worlds."""
     sizes: tuple[int, ...] = (32, 32)
     critic_sizes: tuple[int, ...] = (32, 32)
-    memory: float = 10.0
+    memory: float = 1e9
     """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
-    settle: float = 0.5
+    settle: float = 0.1
     """Share of the updates after which the statistics stay as they are."""
     per_role: bool = False
     """A policy and a value function for every drone, else one of each for all."""

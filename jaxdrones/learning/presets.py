@@ -1,0 +1,37 @@
+"""Settings that were found to work, by task and learner."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import ModuleType
+from typing import Any
+
+from jaxdrones.checks import check_choice
+from jaxdrones.envs import Env, make
+from jaxdrones.envs.observations import last_actions
+from jaxdrones.learning import bptt, ppo, shac
+
+ALGORITHMS: dict[str, ModuleType] = {"bptt": bptt, "ppo": ppo, "shac": shac}
+
+_DELAYED = ("position_error", "rotation_matrix", "velocity_error", "omega", last_actions(3))
+"""With delay, what was done and has not shown yet is part of the state."""
+
+_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {}
+_REALISTIC: dict[tuple[str, str], dict[str, Any]] = {}
+
+
+def preset(task: str, algorithm: str, realistic: bool = False, **options) -> tuple[Env, Any]:
+    """An environment and the settings to learn it with.
+
+    Args:
+        task: a name of `jaxdrones.envs.TASKS`.
+        algorithm: bptt, ppo or shac.
+        realistic: lag, drag, delay, noise and parameter ranges; the policy then sees its last three actions.
+        **options: of `jaxdrones.envs.make`.
+    """
+    check_choice("algorithm", algorithm, ALGORITHMS)
+    if realistic and task in ("hover", "recovery", "landing"):
+        options = {"observation": _DELAYED} | options
+    env = make(task, realistic=realistic, **options)
+    found = _CONFIGS.get((task, algorithm), {}) | (_REALISTIC.get((task, algorithm), {}) if realistic else {})
+    return env, dataclasses.replace(ALGORITHMS[algorithm].Config(), **found)

@@ -1,0 +1,189 @@
+"""Learners on problems with a known answer, and what all of them promise."""
+
+import dataclasses
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones import envs
+from jaxdrones.learning import bptt, collect, ppo, shac
+from jaxdrones.learning.networks import MLP, Policy
+from jaxdrones.learning.normalize import Statistics
+
+SMALL = {
+    bptt: bptt.Config(updates=3, worlds=4, horizon=4, sizes=(8,)),
+    shac: shac.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_sizes=(8,), critic_steps=2),
+    ppo: ppo.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_sizes=(8,), epochs=2, batches=2),
+}
+LEARNERS = pytest.mark.parametrize("learner", SMALL, ids=lambda module: module.__name__.rpartition(".")[2])
+
+
+class PointWorld(flax.struct.PyTreeNode):
+    drones: "Point"
+    step: jax.Array
+
+
+class Point(flax.struct.PyTreeNode):
+    pos: jax.Array
+
+
+class DoubleIntegrator:
+    """x'' = u from x, v in [-0.5, 0.5], cost x^2 + 0.1 v^2 + 0.1 u^2 per step; all a learner needs of an environment."""
+
+    drones, action_size, observation_size, dt, steps = 1, 1, 2, 0.1, 50
+
+    def reset(self, key):
+        x = jax.random.uniform(key, (1, 2), minval=-0.5, maxval=0.5)
+        return x, PointWorld(Point(x), jnp.zeros((), jnp.int32))
+
+    def step(self, key, world, action):
+        a, b = dynamics()
+        x = world.drones.pos
+        cost = x[:, 0] ** 2 + 0.1 * x[:, 1] ** 2 + 0.1 * action[:, 0] ** 2
+        x = x @ jnp.asarray(a.T, x.dtype) + action * jnp.asarray(b.T, x.dtype)
+        world = PointWorld(Point(x), world.step + 1)
+        info = {"metrics": {"error": jnp.abs(x[:, 0])}}
+        return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+
+def dynamics():
+    dt = DoubleIntegrator.dt
+    return np.array([[1, dt], [0, 1]]), np.array([[dt**2 / 2], [dt]])
+
+
+def best_cost(starts):
+    """Mean cost of an episode under the optimal gains of the finite problem, by the Riccati recursion."""
+    a, b = dynamics()
+    q, r, p = np.diag([1, 0.1]), np.array([[0.1]]), np.zeros((2, 2))
+    for _ in range(DoubleIntegrator.steps):
+        gain = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
+        p = q + a.T @ p @ (a - b @ gain)
+    return np.mean(np.einsum("wi,ij,wj->w", starts, p, starts))
+
+
+def flown_cost(env, policy, starts):
+    worlds = jax.vmap(lambda x: PointWorld(Point(x[None]), jnp.zeros((), jnp.int32)))(starts)
+
+    def step(worlds, _):
+        _, worlds, reward, *_ = jax.vmap(env.step, (None, 0, 0))(None, worlds, policy(worlds.drones.pos))
+        return worlds, reward
+
+    return -jnp.mean(jnp.sum(jax.lax.scan(step, worlds, length=env.steps)[1], axis=0))
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize(
+    "learner, config, within",
+    [
+        (bptt, bptt.Config(updates=200, worlds=64, horizon=50, restart=1.0, sizes=(16,)), 1.02),
+        (shac, shac.Config(updates=300, worlds=64, horizon=10, sizes=(16,), critic_sizes=(32, 32)), 1.05),
+        (ppo, ppo.Config(updates=150, worlds=128, horizon=25, sizes=(16,), critic_sizes=(32, 32), discount=0.95), 1.15),
+    ],
+    ids=["bptt", "shac", "ppo"],
+)
+def test_a_double_integrator_is_flown_nearly_as_cheaply_as_by_lqr(learner, config, within):
+    env = DoubleIntegrator()
+    policy = jax.jit(lambda key: learner.train(key, env, config).policy)(jax.random.key(0))
+    starts = jax.random.uniform(jax.random.key(1), (200, 2), minval=-0.5, maxval=0.5)
+    best = best_cost(np.asarray(starts, float))
+    assert 0.999 * best < jax.jit(flown_cost, static_argnums=0)(env, policy, starts) < within * best
+
+
+@LEARNERS
+@pytest.mark.float32
+def test_the_same_key_gives_the_same_result_and_seeds_by_vmap_are_the_seeds_alone(learner):
+    env = envs.make("paper-hover")
+
+    def params(key):
+        return learner.train(key, env, SMALL[learner]).policy.params
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    alone, train = [], jax.jit(params)
+    for key in keys:
+        alone.append(train(key))
+        for a, b in zip(jax.tree.leaves(alone[-1]), jax.tree.leaves(train(key)), strict=True):
+            np.testing.assert_array_equal(a, b)
+    together = jax.jit(jax.vmap(params))(keys)
+    for i in range(2):
+        for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone[i]), strict=True):
+            np.testing.assert_allclose(a[i], b, atol=2e-4)
+
+
+@pytest.mark.float32
+def test_learning_rates_can_be_mapped():
+    env = envs.make("paper-hover")
+
+    def change(rate):
+        config = dataclasses.replace(SMALL[bptt], learning_rate=rate)
+        state = bptt.init(jax.random.key(0), env, config)
+        after, _ = bptt.update(env, config, state)
+        return optax_norm(jax.tree.map(jnp.subtract, after.policy.params, state.policy.params))
+
+    small, large = jax.jit(jax.vmap(change))(jnp.array([1e-3, 1e-2]))
+    np.testing.assert_allclose(large, 10 * small, rtol=1e-2)
+
+
+def optax_norm(tree):
+    return jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree)))
+
+
+@pytest.mark.float32
+def test_a_central_critic_learns_with_a_policy_per_role():
+    env = envs.make("leader-follower")
+    config = dataclasses.replace(SMALL[ppo], per_role=True, central_critic=True)
+    state = ppo.init(jax.random.key(0), env, config)
+    kernel = state.critic["params"]["Dense_0"]["kernel"]
+    assert kernel.shape == (2, 25, 8)
+    after, metrics = jax.jit(lambda state: ppo.update(env, config, state))(state)
+    assert all(jnp.all(jnp.isfinite(x)) for x in metrics.values())
+    change = after.critic["params"]["Dense_0"]["kernel"] - kernel
+    assert jnp.all(jnp.any(change != 0, axis=(1, 2)))
+
+
+@pytest.mark.float32
+def test_episodes_that_ended_do_not_count_until_they_are_restarted():
+    env = envs.make("hover", duration=0.05)  # five steps
+    worlds = collect.restart(jax.random.key(0), env, collect.idle(env, 2))
+
+    def hover(key, obs):
+        return jnp.zeros((2, 1, 4)), None
+
+    worlds, flight = jax.jit(lambda w: collect.fly(jax.random.key(1), env, hover, w, 7, reset=False))(worlds)
+    np.testing.assert_array_equal(flight.over[:, 0], [False] * 5 + [True] * 2)
+    assert jnp.all(worlds.ended)
+    assert jnp.all(bptt.discounted(flight, 1.0)[5:] == 0)
+    again = collect.restart(jax.random.key(2), env, worlds)
+    assert jnp.all(again.episodes.length == 0) and not jnp.any(again.ended)
+
+
+def test_the_logarithm_of_a_probability_is_that_of_a_normal_distribution():
+    rng = np.random.default_rng(0)
+    action, mean, log_std = rng.normal(size=(5, 2, 3)), rng.normal(size=(5, 2, 3)), rng.normal(size=(3,))
+    std = np.exp(log_std)
+    density = np.exp(-((action - mean) ** 2) / (2 * std**2)) / (std * np.sqrt(2 * np.pi))
+    np.testing.assert_allclose(ppo.log_prob(action, mean, jnp.asarray(log_std)), np.log(density).sum(-1), rtol=1e-12)
+
+
+def test_ppo_at_the_policy_that_flew_has_the_plain_policy_gradient():
+    config = ppo.Config(value_weight=0.0, discount=0.9)
+    rng = np.random.default_rng(0)
+    network = MLP((4,), 2)
+    policy = Policy(network.init(jax.random.key(0), jnp.zeros(3)), Statistics.none(3), network)
+    critic = MLP(config.critic_sizes, 1).init(jax.random.key(1), jnp.zeros(3))
+    obs, action, advantage = rng.normal(size=(20, 1, 3)), rng.normal(size=(20, 1, 2)), rng.normal(size=(20, 1))
+    log_std = jnp.zeros(2)
+    flown = ppo.log_prob(action, policy(obs), log_std)
+    sample = ppo.Sample(obs, action, flown, obs, advantage, jnp.zeros((20, 1)))
+
+    def clipped(params):
+        return ppo.loss(config, policy.replace(params=params), log_std, critic, sample)[0]
+
+    def plain(params):
+        return -jnp.mean(ppo.log_prob(action, policy.replace(params=params)(obs), log_std) * advantage)
+
+    mine, theirs = jax.grad(clipped)(policy.params), jax.grad(plain)(policy.params)
+    for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)

@@ -13,8 +13,7 @@ do with more. Friction is Coulomb's, and viscous at low speed. All forces are in
 of numbers serves every vehicle.
 
 The numbers are for `semi_implicit_euler` with steps of up to 1/240 s: what is damped at a rate above 1/dt overshoots,
-at one above 2/dt it gains energy. The price is depth: what lands at 1 m/s sinks in 8 mm, at 5 m/s 3 cm, and is back
-after 0.1 s.
+at one above 2/dt it gains energy. The price is depth: what lands at 1 m/s sinks in 8 mm, at 5 m/s 3 cm.
 """
 
 from typing import NamedTuple

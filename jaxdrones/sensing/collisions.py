@@ -19,7 +19,7 @@ from jaxdrones.rotation import cross, dot, unit, unstack
 from jaxdrones.sensing.scene import Box, Cylinder, Obstacle, Scene, Sphere
 from jaxdrones.state import State
 
-_MARGIN = 1e-3  # m; a drone at rest is 0.01 mm (Bullet) or 0.94 mm (`ground_contact`) inside the ground
+_MARGIN = 1e-3  # m; a drone at rest is 0.01 mm (Bullet) or 1.5 mm (`ground_contact`) inside the ground
 _PROJECTIONS = 8  # to and fro; of random pairs of cf2x within 0.2 m 0.5 % then touch up to 6 mm too early
 _BARE = Scene()
 

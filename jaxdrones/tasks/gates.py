@@ -13,7 +13,7 @@ from jaxdrones.sensing.scene import Cylinder, Scene, gate
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import hovering, standing_height
-from jaxdrones.tasks.task import Part, Task, World, far_from, norm, square
+from jaxdrones.tasks.task import Part, Task, World, out_of_control, norm, square
 
 # x, y, z (m) and heading (rad) in which each gate is crossed, in this order
 GATES = np.array([(0.5, 0.25, 0.7, -0.78), (1.05, 0.75, 1.2, 2.35), (-1.0, -0.25, 0.7, 3.14), (0.0, -0.75, 1.2, 0.0)])
@@ -92,7 +92,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
             "omega": (-0.002, shaping.turning),
             "action_change": (-0.02, shaping.action_change),
         },
-        ends={"finished": finished, "crashed": crashed, "lost": far_from((0, 0, 1), 3.0)},
+        ends={"finished": finished, "crashed": crashed} | out_of_control((0, 0, 1), 3.0),
         advance=_advance,
         metrics={
             "gates": as_number(lambda world: world.variables["index"]),

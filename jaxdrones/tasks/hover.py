@@ -12,7 +12,7 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import standing_height, thrown
-from jaxdrones.tasks.task import Task, World, far_from, upright
+from jaxdrones.tasks.task import Task, World, out_of_control, upright
 
 SPACING = 3.0  # m between the goals of neighbours, further than they are thrown apart
 
@@ -50,7 +50,7 @@ def hover(
         start=start,
         target=_stay,
         rewards=shaping.reach_and_stay(_stay),
-        ends={"lost": far_from((0, 0, height), 5.0 + SPACING * drones)},
+        ends=out_of_control((0, 0, height), 5.0 + SPACING * drones),
         success=settled,
     )
 
@@ -80,7 +80,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
         start=start,
         target=target,
         rewards=shaping.reach_and_stay(target) | {"upright": (0.1, upright)},
-        ends={"lost": far_from((0, 0, height), 5.0 + SPACING * drones)},
+        ends=out_of_control((0, 0, height), 5.0 + SPACING * drones),
         advance=advance,
         metrics={
             "altitude_lost": lambda world: world.variables["start"] - world.variables["lowest"],
@@ -112,7 +112,7 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         start=start,
         target=_stay,
         rewards=shaping.reach_and_stay(_stay) | {"descent": (-1.0, descent)},
-        ends={"lost": far_from((0, 0, height), 5.0 + SPACING * drones), "crashed": _upside_down},
+        ends=out_of_control((0, 0, height), 5.0 + SPACING * drones) | {"crashed": _upside_down},
         metrics={"upright": upright},
         success=_landed,
         contact=True,

@@ -14,7 +14,7 @@ from jaxdrones.sensing.collisions import collisions
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, World, far_from, norm
+from jaxdrones.tasks.task import Task, World, out_of_control, norm
 
 HEIGHT = 2.0  # m
 _APART = 0.6  # m between neighbours on the ring, at least
@@ -59,7 +59,7 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         start=start,
         target=target,
         rewards=shaping.reach_and_stay(target) | {"crowding": (-5.0, crowding)},
-        ends={"lost": far_from((0, 0, HEIGHT), radius + 4.0)},
+        ends=out_of_control((0, 0, HEIGHT), radius + 4.0),
         advance=advance,
         metrics={"collisions": lambda world: world.variables["collisions"], "nearest": _nearest},
         success=_arrived_untouched,

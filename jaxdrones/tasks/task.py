@@ -49,6 +49,8 @@ class World(flax.struct.PyTreeNode):
         return self.actions[:, -1]
 
 
+_SPINNING = 100.0  # rad/s
+
 Term = Callable[[World], Float[Array, " n"]]
 Condition = Callable[[World], Bool[Array, " n"]]
 
@@ -138,11 +140,21 @@ def upright(world: World) -> Float[Array, " n"]:
     return jax.vmap(rotation.z_axis)(world.drones.quat)[:, 2]
 
 
-def far_from(center: tuple[float, float, float], reach: float) -> Condition:
-    """Further than `reach` (m) from `center` along some axis, or lost: not a number."""
+def out_of_control(center: tuple[float, float, float], reach: float) -> dict[str, Condition]:
+    """The ends of a flight that cannot be saved, or is not a number any more.
 
-    def condition(world: World) -> Bool[Array, " n"]:
-        x, y, z = (jnp.abs(a - c) for a, c in zip(world.drones.pos.T, center, strict=True))
-        return ~((x < reach) & (y < reach) & (z < reach))
+    `lost` is further than `reach` (m) from `center` along some axis, `spinning` faster than 100 rad/s about some axis.
+    """
 
-    return condition
+    def lost(world: World) -> Bool[Array, " n"]:
+        return _beyond(world.drones.pos - jnp.asarray(center, world.drones.pos.dtype)[None], reach)
+
+    def spinning(world: World) -> Bool[Array, " n"]:
+        return _beyond(world.drones.omega, _SPINNING)
+
+    return {"lost": lost, "spinning": spinning}
+
+
+def _beyond(v: Float[Array, "n 3"], limit: float) -> Bool[Array, " n"]:
+    x, y, z = (jnp.abs(column) < limit for column in v.T)  # false where it is not a number
+    return ~(x & y & z)

@@ -14,7 +14,7 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, far_from
+from jaxdrones.tasks.task import Task, out_of_control
 
 HEIGHT = 2.0  # m
 SPACING = 4.0  # m between the centres of neighbours' curves
@@ -108,7 +108,7 @@ def tracking(
         start=start,
         target=target,
         rewards=shaping.reach_and_stay(target),
-        ends={"lost": far_from((0, 0, HEIGHT), 4.0 + SPACING * drones)},
+        ends=out_of_control((0, 0, HEIGHT), 4.0 + SPACING * drones),
         success=_close_throughout,
         observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "preview"),
     )

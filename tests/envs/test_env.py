@@ -105,6 +105,14 @@ def test_a_drone_that_is_lost_ends_the_episode_for_good():
     assert terminated and not truncated and info["ends"]["lost"]
 
 
+def test_a_drone_that_spins_ends_the_episode_for_good():
+    env = make_env("hover")
+    _, world = env.reset(KEY)
+    world = world.replace(drones=world.drones.replace(omega=jnp.array([[0.0, 0.0, 200.0]])))
+    *_, terminated, truncated, info = env.step(KEY, world, zeros(env))
+    assert terminated and not truncated and info["ends"]["spinning"]
+
+
 def test_a_state_that_is_not_a_number_ends_the_episode():
     env = make_env("hover")
     _, world = env.reset(KEY)

@@ -26,7 +26,7 @@ _LARGEST_CHANGE = 10.0  # of a logarithm, far beyond what is rewarded; its expon
 class Config:
     """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
 
-    updates: int = 300
+    updates: int = 400
     worlds: int = 1024
     horizon: int = 24
     """Control steps of an update."""
@@ -53,7 +53,7 @@ class Config:
     fastest: float = 5e-3
     cool: float = 0.3
     """Share of the updates, the last ones, in which the largest rate falls to the slowest, straight in its logarithm."""
-    discount: float = 0.98
+    discount: float = 0.99
     trace: float = 0.95
     """Lambda of the advantages."""
     ratio_clip: float = 0.2
@@ -63,6 +63,10 @@ class Config:
     value_weight: float = 0.5
     spread: float = 0.4
     """Standard deviation of actions at the start."""
+    narrowest: float = 0.1
+    """The least it may become; what is tried next to the mean is what a policy learns from."""
+    restart: float = 0.05
+    """Share of the worlds that start afresh before an update, so that not all are of an age."""
     clip: float = 0.5
     """Largest norm of the gradient."""
 
@@ -97,7 +101,7 @@ class Sample(flax.struct.PyTreeNode):
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     """Before the first update."""
-    key, policy_key, critic_key, world_key = jax.random.split(key, 4)
+    key, policy_key, critic_key = jax.random.split(key, 3)
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
     n, d, a = env.drones, env.observation_size, env.action_size
     log_std = jnp.full((n, a) if config.per_role else (a,), jnp.log(config.spread))
@@ -105,13 +109,14 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     critic = init_params(critic_key, _critic(config), inputs, n if config.per_role else None)
     optimiser = _descent(config).init((policy.params, log_std, critic))
     rate = jnp.asarray(config.learning_rate, log_std.dtype)
-    worlds = collect.restart(world_key, env, collect.idle(env, config.worlds))
+    worlds = collect.idle(env, config.worlds)
     return TrainState(jnp.zeros((), jnp.int32), key, policy, log_std, critic, optimiser, rate, worlds)
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Fly, then learn from what was flown."""
-    key, fly_key, learn_key = jax.random.split(state.key, 3)
+    key, restart_key, fly_key, learn_key = jax.random.split(state.key, 4)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart)
 
     def act(key, obs):
         mean = state.policy(obs)
@@ -119,10 +124,11 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         action = mean + std * jax.random.normal(key, mean.shape, mean.dtype)
         return action, log_prob(action, mean, state.log_std)
 
-    worlds, flight = collect.fly(fly_key, env, act, state.worlds, config.horizon)
+    worlds, flight = collect.fly(fly_key, env, act, worlds, config.horizon)
     sample = _judged(config, state, flight)
     learnt, optimiser, rate, losses = _learn(learn_key, config, state, sample)
     params, log_std, critic = learnt
+    log_std = jnp.maximum(log_std, jnp.log(config.narrowest))
     policy = state.policy.replace(params=params, statistics=collect.remember(state.policy.statistics, flight, config, state.step))
     metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std)), "rate": rate}
     return TrainState(state.step + 1, key, policy, log_std, critic, optimiser, rate, worlds), metrics

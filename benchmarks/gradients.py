@@ -1,0 +1,89 @@
+"""How large is the gradient of a flight, and how noisy, against its length, by what it goes through?
+
+The gradient of the mean reward of the first h control steps in the policy's parameters, world by world: the norm of
+its mean over worlds, and the root mean square distance from that mean (the noise of a single world). For a policy as
+it is at the start, and after training by BPTT.
+"""
+
+import argparse
+import dataclasses
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+from common import about, report
+
+from jaxdrones.learning import bptt, collect, presets
+from jaxdrones.learning.gradients import linked, with_gradient
+
+HORIZONS = (8, 16, 32, 64, 128, 256)
+OPTIONS = ("exact", "decay", "surrogate")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="hover")
+    parser.add_argument("--realistic", action="store_true")
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--decay", type=float, default=0.98)
+    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    env, config = presets.preset(options.task, "bptt", realistic=options.realistic)
+    horizons = HORIZONS
+    if options.quick:
+        horizons, options.worlds = (2, 4), 4
+        config = dataclasses.replace(config, updates=2, worlds=4, horizon=4)
+
+    result = jax.jit(lambda key: bptt.train(key, env, config))(jax.random.key(0))
+    start = bptt.init(jax.random.key(0), env, config).policy
+    policies = {"at the start": start.replace(statistics=result.policy.statistics), "trained": result.policy}
+    rows = []
+    for option in OPTIONS:
+        chosen = dataclasses.replace(config, gradient=option, decay=options.decay)
+        measure = jax.jit(lambda policy, chosen=chosen: norms(env, chosen, policy, options.worlds, horizons))
+        for name, policy in policies.items():
+            mean, noise = (x.tolist() for x in measure(policy))
+            rows.append({"gradient": option, "policy": name, "norm": mean, "noise": noise})
+    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines.append("gradient  | policy       | " + " | ".join(f"{h:>9} steps" for h in horizons) + "  (norm, noise)")
+    lines += [
+        f"{row['gradient']:9} | {row['policy']:12} | "
+        + " | ".join(f"{a:7.3g} {b:7.3g}" for a, b in zip(row["norm"], row["noise"], strict=True))
+        for row in rows
+    ]
+    report({"horizons": horizons, "rows": rows, "about": about()}, options.json, lines)
+
+
+def norms(env, config, policy, worlds: int, horizons) -> tuple[jax.Array, jax.Array]:
+    """(horizons,) norm of the mean gradient, and noise."""
+
+    def rewards(params, key):
+        """Mean rewards of one world, up to each horizon."""
+        flown = policy.replace(params=params)
+        start_key, fly_key = jax.random.split(key)
+        world = collect.restart(start_key, env, collect.idle(env, 1))
+        _, flight = collect.fly(
+            fly_key,
+            with_gradient(env, config),
+            lambda key, obs: (flown(obs), None),
+            world,
+            max(horizons),
+            reset=False,
+            link=linked(config),
+        )
+        sums = jnp.cumsum(jnp.mean(bptt.discounted(flight, 1.0), axis=(1, 2)))
+        return jnp.stack([sums[h - 1] / h for h in horizons])
+
+    def gradients(key):
+        flat, unflatten = jax.flatten_util.ravel_pytree(policy.params)
+        return jax.jacrev(lambda x: rewards(unflatten(x), key))(flat)
+
+    each = jax.vmap(gradients)(jax.random.split(jax.random.key(1), worlds))  # (worlds, horizons, parameters)
+    mean = jnp.mean(each, axis=0)
+    noise = jnp.sqrt(jnp.mean(jnp.sum((each - mean[None]) ** 2, axis=-1), axis=0))
+    return jnp.linalg.norm(mean, axis=-1), noise
+
+
+if __name__ == "__main__":
+    main()

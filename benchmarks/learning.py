@@ -11,7 +11,6 @@ import time
 import jax
 from common import about, report
 
-import jaxdrones.envs
 from jaxdrones.checks import check_choice
 from jaxdrones.learning import COMPILER_OPTIONS, bptt, evaluate, ppo, presets, shac
 

@@ -68,7 +68,9 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     """Before the first update."""
     key, policy_key = jax.random.split(key)
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
-    return TrainState(jnp.zeros((), jnp.int32), key, policy, _optimiser(config).init(policy.params), collect.idle(env, config.worlds))
+    return TrainState(
+        jnp.zeros((), jnp.int32), key, policy, _optimiser(config).init(policy.params), collect.idle(env, config.worlds)
+    )
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
@@ -87,7 +89,8 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     (_, (worlds, flight)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     step, optimiser = _optimiser(config).update(gradient, state.optimiser)
     policy = state.policy.replace(
-        params=optax.apply_updates(state.policy.params, step), statistics=collect.remember(state.policy.statistics, flight, config, state.step)
+        params=optax.apply_updates(state.policy.params, step),
+        statistics=collect.remember(state.policy.statistics, flight, config, state.step),
     )
     metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient)}
     return TrainState(state.step + 1, key, policy, optimiser, worlds), metrics

@@ -13,11 +13,20 @@ from jaxdrones.learning import bptt, ppo, shac
 
 ALGORITHMS: dict[str, ModuleType] = {"bptt": bptt, "ppo": ppo, "shac": shac}
 
-_DELAYED = ("position_error", "rotation_matrix", "velocity_error", "omega", last_actions(3))
-"""With delay, what was done and has not shown yet is part of the state."""
+_DELAYED = ("position_error", "rotation_matrix", "velocity_error", "omega", "rotor_speed", last_actions(3))
+"""With delay and lag, what was done and has not shown yet is part of the state."""
 
-_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {}
-_REALISTIC: dict[tuple[str, str], dict[str, Any]] = {}
+_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
+    ("tracking", "bptt"): dict(updates=250),
+    ("recovery", "bptt"): dict(updates=250),
+    ("paper-hover", "bptt"): dict(updates=150, worlds=64, horizon=100, restart=0.3, learning_rate=1e-2),
+    ("leader-follower", "ppo"): dict(
+        updates=150, worlds=128, horizon=96, trace=0.99, per_role=True, central_critic=True, sizes=(64, 64)
+    ),
+}
+_REALISTIC: dict[tuple[str, str], dict[str, Any]] = {
+    ("hover", "bptt"): dict(updates=450),
+}
 
 
 def preset(task: str, algorithm: str, realistic: bool = False, **options) -> tuple[Env, Any]:
@@ -26,7 +35,7 @@ def preset(task: str, algorithm: str, realistic: bool = False, **options) -> tup
     Args:
         task: a name of `jaxdrones.envs.TASKS`.
         algorithm: bptt, ppo or shac.
-        realistic: lag, drag, delay, noise and parameter ranges; the policy then sees its last three actions.
+        realistic: lag, drag, delay, noise and parameter ranges; the policy then sees rotors and its last three actions.
         **options: of `jaxdrones.envs.make`.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)

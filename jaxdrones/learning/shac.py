@@ -1,4 +1,4 @@
-"""Short-horizon actor-critic (Xu et al. 2022): backpropagation through short flights, with a learned value at the end."""
+"""Short-horizon actor-critic (Xu et al. 2022): backpropagation through short flights, a value at the end."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from jaxdrones.learning.returns import advantages
 class Config:
     """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
 
-    updates: int = 400
+    updates: int = 220
     worlds: int = 256
-    horizon: int = 32
+    horizon: int = 64
     """Control steps that a gradient goes back through."""
     sizes: tuple[int, ...] = (32, 32)
     critic_sizes: tuple[int, ...] = (32, 32)
@@ -36,15 +36,15 @@ class Config:
     settle: float = 0.2
     """Share of the updates after which the statistics stay as they are."""
     per_role: bool = False
-    learning_rate: float = 5e-3
+    learning_rate: float = 2e-2
     """Of the policy, at the start; falls to zero along a cosine."""
     critic_rate: float = 5e-3
     """The same of the critic."""
-    critic_steps: int = 16
-    """Gradient steps of the critic in an update, each with as many of the flown steps as there are worlds times four."""
-    trust: float = 0.3
+    critic_steps: int = 8
+    """Gradient steps of the critic in an update, each with four times as many flown steps as there are worlds."""
+    trust: float = 0.9
     """Share of the updates in which the value of the end grows from nothing to its full weight."""
-    discount: float = 0.99
+    discount: float = 0.98
     trace: float = 0.95
     """Lambda of the critic's targets."""
     target_speed: float = 0.2
@@ -53,7 +53,7 @@ class Config:
     """How long Adam remembers the squares of gradients; those of a flight shrink by orders of magnitude."""
     clip: float = 0.3
     """Largest norm of a gradient."""
-    restart: float = 0.1
+    restart: float = 0.2
     """Share of the worlds that start afresh before an update; the others fly on."""
     gradient: str = "exact"
     """A name of `GRADIENTS`."""
@@ -127,7 +127,8 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     critic, critic_optimiser, critic_loss = _fit(critic_key, config, state, value, flight)
     target = optax.incremental_update(critic, state.target, config.target_speed)
     policy = state.policy.replace(
-        params=optax.apply_updates(state.policy.params, step), statistics=collect.remember(state.policy.statistics, flight, config, state.step)
+        params=optax.apply_updates(state.policy.params, step),
+        statistics=collect.remember(state.policy.statistics, flight, config, state.step),
     )
     metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient), "critic_loss": critic_loss}
     return TrainState(state.step + 1, key, policy, optimiser, critic, target, critic_optimiser, worlds), metrics
@@ -141,7 +142,10 @@ def train(key: jax.Array, env: Env, config: Config) -> Result:
 def _fit(key, config: Config, state: TrainState, value, flight: collect.Flight):
     """The critic after some steps towards the TD(lambda) returns of the flight."""
     now, later = value(state.target, flight.obs), value(state.target, flight.final_obs)
-    team = jnp.broadcast_to(flight.terminated[..., None], now.shape), jnp.broadcast_to(flight.truncated[..., None], now.shape)
+    team = (
+        jnp.broadcast_to(flight.terminated[..., None], now.shape),
+        jnp.broadcast_to(flight.truncated[..., None], now.shape),
+    )
     goal = now + advantages(flight.reward, now, later, *team, config.discount, config.trace)
     counts = jnp.broadcast_to(~flight.over[..., None], now.shape)
     rows = jax.tree.map(
@@ -167,7 +171,7 @@ def _fit(key, config: Config, state: TrainState, value, flight: collect.Flight):
 
 
 def _critic(config: Config) -> MLP:
-    return MLP(config.critic_sizes, 1)
+    return MLP(config.critic_sizes, 1, scale=0.01)
 
 
 def _actor_descent(config: Config) -> optax.GradientTransformation:

@@ -10,6 +10,7 @@ from jaxdrones import assets
 from jaxdrones.conditions import BACKENDS
 from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights import fly, scene_of
 from jaxdrones.record import Record, divergence
 from jaxdrones.render import plots, video
@@ -121,7 +122,9 @@ def _add_compare(commands) -> None:
 
 
 def _add_list(commands) -> None:
-    parser = commands.add_parser("list", help="vehicles, effects, controllers, ... to choose from", allow_abbrev=False)
+    parser = commands.add_parser(
+        "list", help="vehicles, effects, tasks, actions, ... to choose from", allow_abbrev=False
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=_list)
 
@@ -211,6 +214,9 @@ def _list(options: argparse.Namespace) -> int:
         "rotors": list(ROTORS),
         "integrators": list(INTEGRATORS),
         "backends": list(BACKENDS),
+        "tasks": list(TASKS),
+        "actions": list(ACTIONS),
+        "observations": list(OBSERVATIONS),
     }
     if options.json:
         print(json.dumps(names))

@@ -110,9 +110,10 @@ def make(
             raise ValueError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
         step = bullet.make_step(**physics, scene=task.scene)
     else:
-        if task.contact:
+        if "ground" in task.contact:
             physics["effects"] = [*effects, ground_contact]
-            physics["pairs"] = [*pairs, drone_contact] if task.drones > 1 else pairs
+        if "drones" in task.contact:
+            physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
     action = _named("action", task.action if action is None else action, ACTIONS)

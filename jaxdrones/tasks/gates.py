@@ -13,7 +13,7 @@ from jaxdrones.sensing.scene import Cylinder, Scene, gate
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import hovering, standing_height
-from jaxdrones.tasks.task import Part, Task, World, out_of_control, norm, square
+from jaxdrones.tasks.task import Part, Task, World, norm, out_of_control, square
 
 # x, y, z (m) and heading (rad) in which each gate is crossed, in this order
 GATES = np.array([(0.5, 0.25, 0.7, -0.78), (1.05, 0.75, 1.2, 2.35), (-1.0, -0.25, 0.7, 3.14), (0.0, -0.75, 1.2, 0.0)])
@@ -102,7 +102,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
         laws=() if level == 0 else (_other_inertia,),
         senses={"gates": Part(_see_gates, 20.0)},
         scene=_scene() if level < 2 else Scene(),
-        contact=True,
+        contact=("ground",),
         observation=("position", "gates", "rotation_matrix", "velocity", "omega", "last_action"),
     )
 

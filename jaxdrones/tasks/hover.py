@@ -115,7 +115,7 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         ends=out_of_control((0, 0, height), 5.0 + SPACING * drones) | {"crashed": _upside_down},
         metrics={"upright": upright},
         success=_landed,
-        contact=True,
+        contact=("ground",),
     )
 
 

@@ -4,6 +4,7 @@ Rewards, ends and starts are the reference's. Its clock is read before the step,
 lag one control step behind, and an episode of T seconds has two steps more than T / dt.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 
 import jax
@@ -105,7 +106,8 @@ def meetup(drones: int = 2) -> Task:
     def cost(target, world):
         return square(world.drones.pos - world.drones.pos[::-1])
 
-    return _task("meetup", "meet the partner half-way", drones, target, cost, action="velocity", minimum=2)
+    task = _task("meetup", "meet the partner half-way", drones, target, cost, action="velocity", minimum=2)
+    return dataclasses.replace(task, contact=("ground", "drones"))
 
 
 def hover_v2(drones: int = 1) -> Task:
@@ -139,7 +141,7 @@ def _task(
         target=target,
         rewards={"cost": (-1.0, term)},
         success=_close_at_the_end,
-        contact=True,
+        contact=("ground",),
         action=action,
         observation=("normalized_kinematics",),
         control_hz=48.0,
@@ -178,7 +180,7 @@ def _task_v2(name: str, summary: str, drones: int, target: Target, box: float) -
         ends={"arrived": arrived},
         limits={"out_of_box": out_of_box, "tilted": tilted},
         success=_close_at_the_end,
-        contact=True,
+        contact=("ground",),
         action="one_d_rpm",
         observation=("kinematics_v2", "last_actions_v2"),
         control_hz=30.0,

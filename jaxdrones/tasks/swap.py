@@ -14,7 +14,7 @@ from jaxdrones.sensing.collisions import collisions
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, World, out_of_control, norm
+from jaxdrones.tasks.task import Task, World, norm, out_of_control
 
 HEIGHT = 2.0  # m
 _APART = 0.6  # m between neighbours on the ring, at least

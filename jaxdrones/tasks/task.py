@@ -104,8 +104,8 @@ class Task:
     substeps: int = 5
     """Physics steps per control step, unless the environment says otherwise."""
     scene: Scene = dataclasses.field(default_factory=Scene)
-    contact: bool = False
-    """Whether drones touch the ground and each other on purpose: adds contact forces to the explicit backend."""
+    contact: tuple[str, ...] = ()
+    """What drones touch on purpose, `ground` or `drones`: adds those forces to the explicit backend."""
     action: str = "rpm"
     observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
     overtime: int = 0

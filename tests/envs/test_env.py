@@ -139,6 +139,7 @@ def check_gradient(env, world, steps=10, eps=1e-6):
     actions = jnp.array(rng.uniform(-0.4, 0.4, (steps, env.drones, env.action_size)))
     direction = jnp.array(rng.normal(size=actions.shape))
 
+    @jax.jit
     def returned(actions):
         def advance(world, action):
             _, world, reward, *_ = env.step(KEY, world, action)
@@ -147,7 +148,7 @@ def check_gradient(env, world, steps=10, eps=1e-6):
         return jnp.sum(jax.lax.scan(advance, world, actions)[1])
 
     slope = jnp.sum(jax.jit(jax.grad(returned))(actions) * direction)
-    difference = (jax.jit(returned)(actions + eps * direction) - returned(actions - eps * direction)) / (2 * eps)
+    difference = (returned(actions + eps * direction) - returned(actions - eps * direction)) / (2 * eps)
     np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-7)
     assert np.isfinite(slope)
 

@@ -83,15 +83,13 @@ def load_tree(path: str | os.PathLike, like: Any) -> Any:
             )
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), wanted)
     numbers = flax.serialization.from_state_dict(zeros, _restored(path))
-    return jax.tree.map(
-        lambda x, l: (
-            jax.random.wrap_key_data(x, impl=jax.random.key_impl(jnp.empty((), l.dtype)))
-            if _is_key(l)
-            else jnp.asarray(x)
-        ),
-        numbers,
-        like,
-    )
+
+    def restored(x, like):
+        if not _is_key(like):
+            return jnp.asarray(x)
+        return jax.random.wrap_key_data(x, impl=jax.random.key_impl(jnp.empty((), like.dtype)))
+
+    return jax.tree.map(restored, numbers, like)
 
 
 def about(path: str | os.PathLike) -> dict[str, Any]:

@@ -74,26 +74,17 @@ def flown_cost(env, policy, starts):
     return -jnp.mean(jnp.sum(jax.lax.scan(step, worlds, length=env.steps)[1], axis=0))
 
 
+TOY = {
+    "bptt": (bptt, dict(updates=300, worlds=64, horizon=50, restart=1.0, learning_rate=1e-2), 1.02),
+    "shac": (shac, dict(updates=300, worlds=64, horizon=10, trust=0.3, discount=0.99, learning_rate=5e-3), 1.05),
+    "ppo": (ppo, dict(updates=150, worlds=128, horizon=25, discount=0.95, trace=0.95, narrowest=0.02), 1.15),
+}
+
+
 @pytest.mark.float32
-@pytest.mark.parametrize(
-    "learner, config, within",
-    [
-        (bptt, bptt.Config(updates=300, worlds=64, horizon=50, restart=1.0, sizes=(16,), learning_rate=1e-2), 1.02),
-        (
-            shac,
-            shac.Config(updates=300, worlds=64, horizon=10, sizes=(16,), trust=0.3, discount=0.99, learning_rate=5e-3),
-            1.05,
-        ),
-        (
-            ppo,
-            ppo.Config(updates=150, worlds=128, horizon=25, sizes=(16,), discount=0.95, trace=0.95, narrowest=0.02),
-            1.15,
-        ),
-    ],
-    ids=["bptt", "shac", "ppo"],
-)
-def test_a_double_integrator_is_flown_nearly_as_cheaply_as_by_lqr(learner, config, within):
-    env = DoubleIntegrator()
+@pytest.mark.parametrize("learner, settings, within", TOY.values(), ids=TOY)
+def test_a_double_integrator_is_flown_nearly_as_cheaply_as_by_lqr(learner, settings, within):
+    env, config = DoubleIntegrator(), learner.Config(sizes=(16,), **settings)
     policy = jax.jit(lambda key: learner.train(key, env, config).policy)(jax.random.key(0))
     starts = jax.random.uniform(jax.random.key(1), (200, 2), minval=-0.1, maxval=0.1)
     best = best_cost(np.asarray(starts, float))

@@ -47,7 +47,7 @@ def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypat
     record = flights.fly("circle", drones=2, duration=0.25)
     pos = np.array(record.pos)
     pos[12:, 1] = np.nan
-    monkeypatch.setattr("jaxdrones.cli.fly", lambda *_, **__: dataclasses.replace(record, pos=pos))
+    monkeypatch.setattr("jaxdrones.cli.conditions.fly", lambda *_, **__: dataclasses.replace(record, pos=pos))
     assert main(["fly", "circle", "--no-figure", "--json", "--output", str(tmp_path)]) == 1
     captured = capsys.readouterr()
     assert "the state of drone 1 is not finite from t = 0.108 s on" in captured.err

@@ -46,7 +46,10 @@ def descent(rate: float, steps: int, clip: float, last: float = 0.0, b2: float =
         last: rate in the end, as a share of that at the start.
         b2: how long Adam remembers the squares of gradients.
     """
-    falling = optax.cosine_decay_schedule(rate, steps, last)
+
+    def falling(step):  # optax.cosine_decay_schedule, for a number of steps that may be traced
+        return rate * (last + (1 - last) * 0.5 * (1 + jnp.cos(jnp.pi * jnp.minimum(step, steps) / steps)))
+
     return optax.flatten(optax.chain(bounded(clip), optax.adam(falling, b2=b2)))
 
 

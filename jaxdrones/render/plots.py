@@ -74,3 +74,39 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
     figure.suptitle(title, fontsize="medium")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.savefig(path, dpi=120)
+
+
+def save_curves(histories: dict[str, list[dict[str, float]]], path: Path, title: str) -> None:
+    """Draw how training went: one line per run, over the control steps flown.
+
+    Args:
+        histories: label -> lines of progress.csv, as `learning.runs.Run.history` returns them.
+        path: of the picture.
+        title: above the figure.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True).ravel()
+    panels = {
+        "reward": "reward per step, in training",
+        "evaluated_return": "return of an episode, evaluated",
+        "success": "success, evaluated",
+        "evaluated_error": "median error in the end (m), evaluated",
+    }
+    for axis, (name, label) in zip(axes, panels.items(), strict=True):
+        for run, rows in histories.items():
+            points = [(row["steps"], row[name]) for row in rows if name in row and np.isfinite(row[name])]
+            marker = "o" if len(points) < len(rows) else None
+            axis.plot(*(zip(*points, strict=True) if points else ((), ())), linewidth=1, marker=marker, ms=3, label=run)
+            if name == "evaluated_error" and points and min(y for _, y in points) > 0:
+                axis.set_yscale("log")
+        axis.set_ylabel(label, fontsize="small")
+        axis.grid(linewidth=0.3)
+    axes[2].set_ylim(-0.03, 1.03)
+    for axis in axes[2:]:
+        axis.set_xlabel("control steps flown")
+    figure.suptitle(title, fontsize="medium")
+    if len(histories) > 1:
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
+    figure.savefig(path, dpi=120)

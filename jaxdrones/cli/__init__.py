@@ -1,0 +1,33 @@
+"""The command line: `jaxdrones fly`, `train`, `eval`, `compare`, `list`; a file per command."""
+
+import argparse
+
+from jaxdrones.cli import compare, evaluate, fly, names, train
+from jaxdrones.cli.common import Parser, complain
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command.
+
+    Returns:
+        The exit code: 0 done, 1 the flight broke or training diverged, 2 a mistake in what was asked, 130 interrupted.
+    """
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    try:
+        return options.run(options)
+    except KeyboardInterrupt:
+        return complain("interrupted", 130)
+    except OSError as error:
+        unwritable = f"{error.filename}: {error.strerror}; choose another --output"
+        return complain(unwritable if error.filename else str(error))
+    except (ValueError, ImportError) as error:
+        return complain(str(error))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog="jaxdrones", description="Simulate teams of quadrotors.", allow_abbrev=False)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
+    for command in (fly, train, evaluate, compare, names):
+        command.add(commands)
+    return parser

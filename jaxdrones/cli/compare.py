@@ -1,0 +1,36 @@
+"""`jaxdrones compare`."""
+
+import argparse
+import json
+
+from jaxdrones.cli.common import table
+from jaxdrones.cli.conditions import add_conditions, flown
+from jaxdrones.conditions import BACKENDS
+from jaxdrones.record import divergence
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "compare",
+        help="fly an example on both backends and print how they part",
+        description="Fly an example on two backends from the same start and print their divergence over time.",
+        allow_abbrev=False,
+    )
+    add_conditions(parser)
+    parser.add_argument("--backends", default="explicit,bullet", metavar="A,B", help="two of " + ", ".join(BACKENDS))
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    parser.set_defaults(run=_compare)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    names = options.backends.split(",")
+    if len(names) != 2:
+        raise ValueError(f"--backends is {options.backends!r}; give two, for example explicit,bullet")
+    rows = divergence(*(flown(options, backend=name) for name in names))
+    if options.json:
+        print(json.dumps({"flight": options.flight, "backends": names, "divergence": rows}))
+    else:
+        print(f"{options.flight}: {names[0]} against {names[1]}, largest difference over the drones")
+        print(table(rows))
+    return 0

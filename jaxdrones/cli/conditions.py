@@ -1,0 +1,58 @@
+"""Options of `jaxdrones fly` and `jaxdrones compare`: what is to be flown."""
+
+import argparse
+import contextlib
+
+from jaxdrones import assets
+from jaxdrones.cli.common import bar
+from jaxdrones.control import CONTROLLERS
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.flights import fly
+from jaxdrones.record import Record
+from jaxdrones.tasks.examples import FLIGHTS
+
+
+def add_conditions(parser: argparse.ArgumentParser) -> None:
+    """What is to be flown."""
+    parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
+    parser.add_argument("--drones", type=int, metavar="N", help="number of drones")
+    parser.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
+    parser.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
+    parser.add_argument("--controller", help=f"{', '.join(CONTROLLERS)} (the vehicle's own)")
+    parser.add_argument("--control-hz", type=int, metavar="HZ", help="control rate; physics runs at 240 Hz or above")
+    parser.add_argument("--duration", type=float, metavar="S", help="simulated time in seconds")
+    parser.add_argument("--rotors", default="instant", help=f"{', '.join(ROTORS)} (instant)")
+    parser.add_argument("--integrator", default="semi_implicit_euler", help=f"{', '.join(INTEGRATORS)}")
+    parser.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
+
+
+def flown(options: argparse.Namespace, **more) -> Record:
+    """The flight that was asked for, behind a progress bar."""
+    with _progress() as progress:
+        return fly(
+            options.flight,
+            vehicle=options.vehicle,
+            drones=options.drones,
+            effects=_names(options.effects),
+            controller=options.controller,
+            control_hz=options.control_hz,
+            duration=options.duration,
+            rotors=options.rotors,
+            integrator=options.integrator,
+            seed=options.seed,
+            progress=progress,
+            **more,
+        )
+
+
+def _names(text: str | None) -> list[str] | None:
+    if text is None:
+        return None
+    return [] if text == "none" else [name.strip() for name in text.split(",")]
+
+
+@contextlib.contextmanager
+def _progress():
+    """A progress bar that is told of the share that is done; silent without tqdm or a terminal."""
+    with bar(100, "flying", "%") as shown:
+        yield None if shown is None else lambda share: shown.update(round(100 * share) - shown.n)

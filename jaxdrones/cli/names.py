@@ -1,0 +1,44 @@
+"""`jaxdrones list`."""
+
+import argparse
+import json
+
+from jaxdrones import assets
+from jaxdrones.conditions import BACKENDS
+from jaxdrones.control import CONTROLLERS
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
+from jaxdrones.tasks.examples import FLIGHTS
+
+ALGORITHMS = ("bptt", "ppo", "shac")  # of jaxdrones.learning, which takes long to import
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "list", help="vehicles, effects, tasks, actions, ... to choose from", allow_abbrev=False
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(run=_list)
+
+
+def _list(options: argparse.Namespace) -> int:
+    names = {
+        "flights": list(FLIGHTS),
+        "vehicles": list(assets.vehicles()),
+        "effects": list(EFFECTS | PAIRS),
+        "controllers": list(CONTROLLERS),
+        "rotors": list(ROTORS),
+        "integrators": list(INTEGRATORS),
+        "backends": list(BACKENDS),
+        "tasks": list(TASKS),
+        "actions": list(ACTIONS),
+        "observations": list(OBSERVATIONS),
+        "algorithms": list(ALGORITHMS),
+    }
+    if options.json:
+        print(json.dumps(names))
+    else:
+        for kind, known in names.items():
+            print(f"{kind:12} {', '.join(known)}")
+    return 0

@@ -1,0 +1,214 @@
+"""A training run as a folder: what is trained and how, checkpoints, progress.
+
+    best, last       policies: the one that did best in an evaluation, and the newest
+    state            all that training needs to go on, bit for bit
+    progress.csv     a line per update; the same as an event file for TensorBoard
+    report.json      how the best policy flies, and what it took
+
+Each checkpoint is a .msgpack and a .json that says what it is.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxdrones.checks import check_choice, check_whole
+from jaxdrones.envs import TASKS, Env
+from jaxdrones.learning import checkpoint
+from jaxdrones.learning.evaluation import Report
+from jaxdrones.learning.events import PREFIX, EventFile
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.presets import ALGORITHMS, preset
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """What is trained, on what, with which settings."""
+
+    task: str
+    algorithm: str
+    realistic: bool
+    options: dict[str, Any]
+    """Of `jaxdrones.make`."""
+    config: Any
+    """Settings of the learner."""
+
+    @classmethod
+    def of(cls, task: str, algorithm: str = "bptt", realistic: bool = False, **changes) -> Recipe:
+        """A preset with changes.
+
+        Args:
+            task: a name of `jaxdrones.envs.TASKS`.
+            algorithm: bptt, ppo or shac.
+            realistic: see `preset`.
+            **changes: settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
+
+        Raises:
+            ValueError: an unknown name, or a value of the wrong kind.
+        """
+        check_choice("task", task, TASKS)
+        check_choice("algorithm", algorithm, ALGORITHMS)
+        known = {field.name for field in dataclasses.fields(ALGORITHMS[algorithm].Config)}
+        options = {name: x for name, x in changes.items() if name not in known}
+        try:
+            _, config = preset(task, algorithm, realistic, **options)
+        except TypeError as error:
+            raise ValueError(f"options {options} do not fit {task}: {error}") from None
+        settings = {name: _checked(name, x, getattr(config, name)) for name, x in changes.items() if name in known}
+        config = dataclasses.replace(config, **settings)
+        for name in ("updates", "worlds", "horizon"):
+            check_whole(name, getattr(config, name))
+        return cls(task, algorithm, realistic, options, config)
+
+    def env(self, **options) -> Env:
+        """The environment; options of `jaxdrones.make` replace those of the recipe."""
+        return preset(self.task, self.algorithm, self.realistic, **self.options | options)[0]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        plain = {name: x for name, x in dataclasses.asdict(self.config).items() if x is not None}
+        return dataclasses.asdict(self) | {"config": plain}
+
+    @classmethod
+    def from_dict(cls, kept: dict[str, Any]) -> Recipe:
+        """What `as_dict` gave."""
+        check_choice("algorithm", kept["algorithm"], ALGORITHMS)
+        config = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["config"].items()}
+        return cls(**kept | {"config": ALGORITHMS[kept["algorithm"]].Config(**config)})
+
+
+def _checked(name: str, value, now):
+    """A setting of the kind that it has now."""
+    if isinstance(now, float) and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if now is not None and type(value) is not type(now):
+        raise ValueError(f"{name} is {value!r}; give a {type(now).__name__} such as {now}")
+    return value
+
+
+class Run:
+    """The folder of one seed."""
+
+    def __init__(self, folder: str | os.PathLike):
+        """Look at a folder; nothing is read or made yet."""
+        self.folder = Path(folder)
+
+    def prepare(self, size: int) -> None:
+        """Make the folder and see that `size` bytes can be written to it.
+
+        Raises:
+            OSError: they cannot; says where and why.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        probe = self.folder / ".probe"
+        try:
+            probe.write_bytes(bytes(size))
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.folder)) from error
+        finally:
+            probe.unlink(missing_ok=True)
+
+    def clear(self) -> None:
+        """Remove what an earlier run left, and nothing else."""
+        names = [f"{name}.{suffix}" for name in ("best", "last", "state") for suffix in ("msgpack", "json")]
+        for file in (*map(self.folder.joinpath, [*names, "progress.csv", "report.json"]), *self._events()):
+            file.unlink(missing_ok=True)
+
+    def about(self, name: str = "best") -> dict[str, Any]:
+        """What is known of the checkpoint `best`, `last` or `state`."""
+        return checkpoint.about(self.folder / name)
+
+    def recipe(self) -> Recipe:
+        """What was trained here."""
+        about = self.about()
+        if "recipe" not in about:
+            raise ValueError(f"{self.folder / 'best.json'} names no recipe; it is not of `jaxdrones train`")
+        return Recipe.from_dict(about["recipe"])
+
+    def policy(self, name: str = "best") -> Policy:
+        """The policy `best` or `last`."""
+        return checkpoint.load(self.folder / name)
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a training state to go on from."""
+        return (self.folder / "state.json").exists()
+
+    def save_policy(self, name: str, policy: Policy, **about) -> None:
+        """Write `best` or `last`."""
+        checkpoint.save(self.folder / name, policy, **about)
+
+    def save_state(self, state, **about) -> None:
+        """Write the training state."""
+        checkpoint.save_tree(self.folder / "state", state, **about)
+
+    def load_state(self, like):
+        """The training state; `like` has its shapes."""
+        return checkpoint.load_tree(self.folder / "state", like)
+
+    def save_report(self, report: dict[str, Any]) -> None:
+        """Write report.json."""
+        (self.folder / "report.json").write_text(json.dumps(report, indent=2))
+
+    def report(self) -> dict[str, Any] | None:
+        """What `save_report` wrote; `None` of a run that did not finish."""
+        file = self.folder / "report.json"
+        return json.loads(file.read_text()) if file.exists() else None
+
+    def history(self) -> list[dict[str, float]]:
+        """The lines of progress.csv; numbers that were not measured in an update are left out."""
+        with (self.folder / "progress.csv").open(newline="") as file:
+            return [{name: float(x) for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
+
+    def _events(self) -> list[Path]:
+        return sorted(self.folder.glob(f"{PREFIX}.*.jaxdrones"))
+
+
+class Progress:
+    """progress.csv and the event file of a run, open for more lines."""
+
+    def __init__(self, run: Run, columns: list[str], update: int):
+        """Go on after an update; later lines, of a run that was killed, are dropped."""
+        rows = [row for row in run.history() if row["update"] <= update] if update else []
+        for file in run._events():
+            file.unlink()
+        self._columns = columns
+        self._file = (run.folder / "progress.csv").open("w", newline="")
+        self._csv = csv.DictWriter(self._file, columns)
+        self._csv.writeheader()
+        self._events = EventFile(run.folder)
+        self.add(rows)
+
+    def add(self, rows: list[dict[str, float]]) -> None:
+        """Write lines; each has at least `update`."""
+        for row in rows:
+            self._csv.writerow(row)
+            self._events.add(int(row["update"]), {name: x for name, x in row.items() if name != "update"})
+        self._file.flush()
+        self._events.flush()
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._file.close()
+        self._events.close()
+
+
+def as_dict(report: Report) -> dict[str, Any]:
+    """An evaluation for JSON."""
+    kept = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
+    return kept | {"error_percentiles": {str(q): x for q, x in report.error_percentiles.items()}}
+
+
+def size_of(tree) -> int:
+    """Bytes of a tree of arrays, or of their shapes."""
+    leaves = jax.tree.leaves(tree)
+    return sum(leaf.size * (leaf.dtype.itemsize) for leaf in leaves)

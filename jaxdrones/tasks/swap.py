@@ -1,5 +1,6 @@
 """A swarm in which drones change places without touching."""
 
+import functools
 import math
 from collections.abc import Mapping
 
@@ -10,20 +11,20 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing.collisions import collisions
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, World, norm, out_of_control
+from jaxdrones.tasks.task import Task, Term, World, norm, out_of_control
 
 HEIGHT = 2.0  # m
 _APART = 0.6  # m between neighbours on the ring, at least
 _CLOSE = 0.4  # m: nearer costs
-_NOWHERE = 1e3  # m
 
 
 def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
-    """Drones on a ring are sent to each other's places, all in a random order; collisions cost.
+    """Drones on a ring are sent to each other's places, all as many places on; crowding costs.
+
+    Two drones collide when their centres are nearer than two collision radii.
 
     Args:
         drones: number of drones, at least two.
@@ -37,19 +38,20 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         angle = 2 * jnp.pi * jnp.arange(drones, dtype=params.mass.dtype) / drones
         ring = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.full_like(angle, HEIGHT)], axis=-1)
         state = thrown(start_key, params, ring, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
-        order = jax.random.permutation(order_key, drones)
-        return state, {"goal": ring[order], "collisions": jnp.zeros(drones, params.mass.dtype)}
+        goal = jnp.roll(ring, jax.random.randint(order_key, (), 1, drones), axis=0)
+        return state, {"goal": goal, "nearest": _nearest(state.pos), "collisions": jnp.zeros(drones, goal.dtype)}
 
     def target(variables, t) -> Setpoint:
         return Setpoint.at(variables["goal"])
 
     def advance(world: World) -> dict[str, Array]:
-        touching = collisions(world.params, world.drones).drones
-        return world.variables | {"collisions": world.variables["collisions"] + touching}
+        nearest = _nearest(world.drones.pos)
+        touching = nearest < 2 * world.params.collision_radius
+        return world.variables | {"nearest": nearest, "collisions": world.variables["collisions"] + touching}
 
     def crowding(world: World) -> Float[Array, " n"]:
         """Square of how far the nearest neighbour is inside 0.4 m, as a share."""
-        return jnp.maximum(1 - _nearest(world) / _CLOSE, 0) ** 2
+        return jnp.maximum(1 - world.variables["nearest"] / _CLOSE, 0) ** 2
 
     return Task(
         name="swap-goals",
@@ -61,21 +63,20 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         rewards=shaping.reach_and_stay(target) | {"crowding": (-5.0, crowding)},
         ends=out_of_control((0, 0, HEIGHT), radius + 4.0),
         advance=advance,
-        metrics={"collisions": lambda world: world.variables["collisions"], "nearest": _nearest},
+        metrics={name: _variable(name) for name in ("collisions", "nearest")},
         success=_arrived_untouched,
         observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "neighbours"),
     )
 
 
-def _nearest(world: World) -> Float[Array, " n"]:
+def _nearest(pos: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Distance of the nearest other drone, m."""
-    pos = world.drones.pos
-    own = jnp.eye(len(pos), dtype=bool)
+    apart = [norm(jnp.roll(pos, k, axis=0) - pos) for k in range(1, len(pos))]
+    return functools.reduce(jnp.minimum, apart)
 
-    def distances(pos_i, own_i):
-        return norm(jnp.where(own_i[:, None], _NOWHERE, pos - pos_i[None]))
 
-    return jnp.min(jax.vmap(distances)(pos, own), axis=-1)
+def _variable(name: str) -> Term:
+    return lambda world: world.variables[name]
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:

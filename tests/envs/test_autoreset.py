@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from helpers import assert_close
 
 from jaxdrones.envs import autoreset, make
 
@@ -46,3 +47,37 @@ def test_statistics_are_those_of_the_episode():
         info = ROWS[last][5]
         assert info["episode"]["length"] == 5
         np.testing.assert_allclose(info["episode"]["return"], sum(row[3] for row in ROWS[first : last + 1]), rtol=1e-12)
+
+
+def test_of_many_worlds_those_that_end_start_as_each_would_alone():
+    """A few at once, and all at once."""
+    keys = jax.random.split(jax.random.key(1), 130)
+    _, episodes = jax.jit(jax.vmap(auto.reset))(keys)
+    step = jax.jit(auto.step)
+    for ending in ([7, 100], range(130)):
+        age = jnp.zeros(130, jnp.int32).at[jnp.array(list(ending))].set(env.steps - 1)
+        aged = episodes.replace(world=episodes.world.replace(step=age))
+        zeros = jnp.zeros((130, 1, 4))
+        together = jax.jit(jax.vmap(auto.step))(keys, aged, zeros)
+        np.testing.assert_array_equal(np.flatnonzero(together[4]), list(ending))
+        for i in (7, 8, 100):
+            alone = step(keys[i], jax.tree.map(lambda x, i=i: x[i], aged), zeros[i])
+            assert_close(jax.tree.map(lambda x, i=i: x[i], together[:5]), alone[:5], 1e-12)
+
+
+def test_gradients_pass_through_autoreset_the_same_way_in_and_out_of_vmap():
+    keys = jax.random.split(jax.random.key(1), 70)
+    _, episodes = jax.vmap(auto.reset)(keys)
+
+    def returned(action, key, episode):
+        def advance(episode, k):
+            _, episode, reward, *_ = auto.step(jax.random.fold_in(key, k), episode, action)
+            return episode, jnp.sum(reward)
+
+        return jnp.sum(jax.lax.scan(advance, episode, jnp.arange(7))[1])
+
+    actions = 0.1 * jax.random.normal(jax.random.key(2), (70, 1, 4))
+    inside = jax.jit(jax.vmap(jax.grad(returned)))(actions, keys, episodes)
+    outside = jax.jit(jax.grad(lambda a: jnp.sum(jax.vmap(returned)(a, keys, episodes))))(actions)
+    assert_close(inside, outside, 1e-12)
+    assert np.abs(inside).max() > 1e-3

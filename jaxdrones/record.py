@@ -30,6 +30,11 @@ class Record:
     labels: tuple[str, ...]  # n names
     conditions: Conditions
 
+    @property
+    def error(self) -> np.ndarray:
+        """(K, n, 1) distance to the target position, m."""
+        return np.linalg.norm(self.pos - self.target_pos, axis=-1, keepdims=True)
+
     def first_not_finite(self) -> tuple[float, str] | None:
         """Time and name of the first drone whose state is not a number, if any."""
         broken = ~np.isfinite(self.pos).all(-1)

@@ -7,6 +7,7 @@ from jaxdrones.cli.common import table
 from jaxdrones.cli.conditions import add_conditions, flown
 from jaxdrones.conditions import BACKENDS
 from jaxdrones.record import divergence
+from jaxdrones.tasks.examples import FLIGHTS
 
 
 def add(commands) -> None:
@@ -17,6 +18,7 @@ def add(commands) -> None:
         description="Fly an example on two backends from the same start and print their divergence over time.",
         allow_abbrev=False,
     )
+    parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
     add_conditions(parser)
     parser.add_argument("--backends", default="explicit,bullet", metavar="A,B", help="two of " + ", ".join(BACKENDS))
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")

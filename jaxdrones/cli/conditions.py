@@ -9,12 +9,10 @@ from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights import fly
 from jaxdrones.record import Record
-from jaxdrones.tasks.examples import FLIGHTS
 
 
 def add_conditions(parser: argparse.ArgumentParser) -> None:
-    """What is to be flown."""
-    parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
+    """What is to be flown, but for the flight itself."""
     parser.add_argument("--drones", type=int, metavar="N", help="number of drones")
     parser.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
     parser.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
@@ -28,7 +26,7 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
 
 def flown(options: argparse.Namespace, **more) -> Record:
     """The flight that was asked for, behind a progress bar."""
-    with _progress() as progress:
+    with progress() as tell:
         return fly(
             options.flight,
             vehicle=options.vehicle,
@@ -40,7 +38,7 @@ def flown(options: argparse.Namespace, **more) -> Record:
             rotors=options.rotors,
             integrator=options.integrator,
             seed=options.seed,
-            progress=progress,
+            progress=tell,
             **more,
         )
 
@@ -52,7 +50,7 @@ def _names(text: str | None) -> list[str] | None:
 
 
 @contextlib.contextmanager
-def _progress():
+def progress():
     """A progress bar that is told of the share that is done; silent without tqdm or a terminal."""
     with bar(100, "flying", "%") as shown:
         yield None if shown is None else lambda share: shown.update(round(100 * share) - shown.n)

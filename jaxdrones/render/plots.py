@@ -26,6 +26,8 @@ PANELS = {
     "rpm2": ("rpm", 2, "P2 (RPM)"),
     "rpm3": ("rpm", 3, "P3 (RPM)"),
 }
+ERROR = {"error": ("error", 0, "error (m)")}
+POLICY_PANELS = ("x", "rpm0", "y", "rpm1", "z", "rpm2", "error", "rpm3")
 
 
 def check_matplotlib() -> None:
@@ -49,7 +51,7 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
         record: the flight.
         path: of the picture; its suffix chooses the format.
         title: above the figure.
-        panels: names of `PANELS`; all when empty.
+        panels: names of `PANELS`, or `error`; all `PANELS` when empty.
     """
     from matplotlib.figure import Figure  # the one import of matplotlib; it takes half a second
 
@@ -60,7 +62,7 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     targets = {"pos": record.target_pos, "vel": record.target_vel}
     for axis, name in zip(axes, panels, strict=False):
-        array, column, label = PANELS[name]
+        array, column, label = (PANELS | ERROR)[name]
         for i, drone in enumerate(record.labels):
             (line,) = axis.plot(record.t, getattr(record, array)[:, i, column], linewidth=1, label=drone)
             if array in targets and np.isfinite(targets[array]).any():

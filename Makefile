@@ -2,10 +2,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fly test test-slow lint
+.PHONY: fly train test test-slow lint
 
 fly: .venv/installed  ## four Crazyflies on the paper's circle
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
+
+train: .venv/installed  ## full four-motor hover, by the gradient of the simulation; then one flight of it
+	$(BIN)/jaxdrones train hover --output runs/hover
+	$(BIN)/jaxdrones fly --policy runs/hover
 
 test: .venv/installed
 	$(BIN)/pytest -n 2 -m "not slow"

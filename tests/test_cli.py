@@ -9,6 +9,7 @@ import pytest
 
 from jaxdrones import flights
 from jaxdrones.cli import main
+from jaxdrones.learning import presets
 
 SHORT = ["--duration", "0.25", "--drones", "2"]
 
@@ -100,6 +101,7 @@ def test_list_names_what_can_be_chosen(capsys):
     names = json.loads(capsys.readouterr().out)
     assert {"cf2x", "cf2p", "hb", "racer"} == set(names["vehicles"])
     assert {"drag", "ground_effect", "downwash", "downwash_paper"} <= set(names["effects"])
+    assert names["algorithms"] == list(presets.ALGORITHMS)
     assert main(["list"]) == 0
     assert "integrators" in capsys.readouterr().out
 

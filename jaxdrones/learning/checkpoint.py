@@ -143,8 +143,12 @@ def _plain(x):
 def _write(file: Path, content: bytes) -> None:
     """Beside it first, so that a crash or a full disk leaves what was there."""
     new = file.with_name(file.name + ".new")
-    new.write_bytes(content)
-    os.replace(new, file)
+    try:
+        new.write_bytes(content)
+        os.replace(new, file)
+    except OSError as error:  # of a full disk, which names no file
+        new.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(file)) from error
 
 
 def _numbers(path: Path) -> Path:

@@ -71,6 +71,10 @@ class Config:
     clip: float = 0.5
     """Largest norm of the gradient."""
 
+    def __post_init__(self):
+        if self.worlds % self.batches:
+            raise ValueError(f"worlds is {self.worlds}; give a multiple of batches, {self.batches}")
+
 
 class TrainState(flax.struct.PyTreeNode):
     """All that training needs to go on."""

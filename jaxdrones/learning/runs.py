@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import inspect
 import json
 import os
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Any
 import jax
 
 from jaxdrones.checks import check_choice, check_whole
-from jaxdrones.envs import TASKS, Env
+from jaxdrones.envs import TASKS, Env, make
 from jaxdrones.learning import checkpoint
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.events import PREFIX, EventFile
@@ -56,6 +57,9 @@ class Recipe:
         check_choice("task", task, TASKS)
         check_choice("algorithm", algorithm, ALGORITHMS)
         known = {field.name for field in dataclasses.fields(ALGORITHMS[algorithm].Config)}
+        environment = {*inspect.signature(make).parameters, *inspect.signature(TASKS[task]).parameters}
+        for name in changes:
+            check_choice("setting", name, (known | environment) - {"task", "backend", "realistic", "options", "vision"})
         options = {name: x for name, x in changes.items() if name not in known}
         try:
             _, config = preset(task, algorithm, realistic, **options)
@@ -89,7 +93,7 @@ def _checked(name: str, value, now):
     if isinstance(now, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if now is not None and type(value) is not type(now):
-        raise ValueError(f"{name} is {value!r}; give a {type(now).__name__} such as {now}")
+        raise ValueError(f"{name} is {value!r}; give something like {now!r}")
     return value
 
 
@@ -189,7 +193,7 @@ class Progress:
     def add(self, rows: list[dict[str, float]]) -> None:
         """Write lines; each has at least `update`."""
         for row in rows:
-            self._csv.writerow(row)
+            self._csv.writerow(row | {name: int(row[name]) for name in ("update", "steps") if name in row})
             self._events.add(int(row["update"]), {name: x for name, x in row.items() if name != "update"})
         self._file.flush()
         self._events.flush()

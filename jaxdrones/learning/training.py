@@ -135,7 +135,7 @@ class Trainer:
                     took = time.perf_counter() - start
                     bad = _unbroken(metrics, bad)
                     if bad >= min(_PATIENCE, config.updates) or not _finite(after):
-                        raise Diverged(f"not finite from update {update + length} or a little before")
+                        raise Diverged(f"numbers that are not finite at update {update + length} or a little before")
                     rows = [
                         {"update": update + i + 1, "steps": (update + i + 1) * per_update}
                         | {"seconds": spent + took * (i + 1) / length}
@@ -145,6 +145,10 @@ class Trainer:
                     spent += took
                     if update + length in points:
                         rows[-1] |= judge(after.policy, update + length)
+                        if bad and not math.isfinite(rows[-1]["evaluated_return"]):
+                            raise Diverged(
+                                f"what is flown in training and in evaluation is not finite at update {update + length}"
+                            )
                     progress.add(rows)
                     state, update = after, update + length
                     if update in points or time.perf_counter() - saved > _SAVE:

@@ -35,6 +35,16 @@ def test_bullet_reports_four_rates():
     assert len(rates) == 4 and min(rates.values()) > 0
 
 
+def test_envs_reports_five_rates():
+    result = quick("envs.py")
+    assert len(result["rates"]) == 5 and min(result["rates"].values()) > 0
+
+
+def test_learning_reports_every_seed():
+    rows = quick("learning.py")["rows"]
+    assert rows and all(0 <= row["success"] <= 1 for row in rows)
+
+
 @pytest.mark.parametrize("name", [path.name for path in BENCHMARKS.glob("*.py") if path.name != "common.py"])
 def test_every_benchmark_explains_itself(name):
     done = subprocess.run(

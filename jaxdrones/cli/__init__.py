@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdrones.cli import compare, evaluate, fly, names, train
-from jaxdrones.cli.common import Parser, complain
+from jaxdrones.cli.common import INTERRUPTED, Parser, complain
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -17,7 +17,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return options.run(options)
     except KeyboardInterrupt:
-        return complain("interrupted", 130)
+        return complain("interrupted", INTERRUPTED)
     except OSError as error:
         unwritable = f"{error.filename}: {error.strerror}; choose another --output"
         return complain(unwritable if error.filename else str(error))

@@ -4,6 +4,8 @@ import argparse
 import contextlib
 import sys
 
+INTERRUPTED = 130  # exit code
+
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
     "rms_error_m": ("rms (m)", "{:.4f}"),
@@ -36,7 +38,7 @@ class Parser(argparse.ArgumentParser):
 
 def complain(message: str, code: int = 2) -> int:
     """One line on stderr; returns the exit code."""
-    print(f"jaxdrones: error: {message}", file=sys.stderr)
+    print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{message}", file=sys.stderr)
     return code
 
 

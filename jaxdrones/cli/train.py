@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from jaxdrones.cli.common import bar, complain
+from jaxdrones.cli.common import INTERRUPTED, bar, complain
 from jaxdrones.cli.evaluate import described, evaluation_table
 from jaxdrones.cli.names import ALGORITHMS
 from jaxdrones.envs import TASKS
@@ -78,7 +78,7 @@ def _train(options: argparse.Namespace) -> int:
         if not options.resume:
             run.clear()
     say = _quiet if options.json else print
-    say(_headline(recipe))
+    say(f"{_headline(recipe)}; compiling")
     trainer.compile()
     if seconds is not None and not options.resume:
         trainer.fit(seconds - (time.perf_counter() - begin))
@@ -96,7 +96,7 @@ def _train(options: argparse.Namespace) -> int:
             again = f"jaxdrones train {options.task} --output {output} --resume"
             again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
             return complain(
-                f"interrupted at update {run.about('state')['update']}; {_kept(run)}; go on with: {again}", 130
+                f"interrupted at update {run.about('state')['update']}; {_kept(run)}; go on with: {again}", INTERRUPTED
             )
         except Diverged as error:
             _draw(options, {seed: run}, run.folder)

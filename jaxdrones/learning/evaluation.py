@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxdrones.checks import check_whole
 from jaxdrones.envs import Env
+from jaxdrones.learning.result import COMPILER_OPTIONS
 
 _CHUNK = 1000  # episodes flown at a time
 
@@ -58,7 +59,7 @@ def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -
     return _report(env, jax.tree.map(np.asarray, flown))
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
 def _fly_policy(env, policy, keys):
     return _fly(env, policy, keys)
 

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.learning.evaluation import evaluate
+from jaxdrones.learning.evaluation import Report, evaluate
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.presets import ALGORITHMS
 from jaxdrones.learning.result import COMPILER_OPTIONS
 from jaxdrones.learning.runs import Progress, Recipe, Run, as_dict, size_of
@@ -22,6 +23,8 @@ _CALL = 0.3  # s that a call takes about; Ctrl-C waits for it
 _SAVE = 30.0  # s between training states, at most
 _PATIENCE = 10  # updates in a row that are not finite
 _PROBE = 4  # times the size of the training state that must fit on the disk
+_CHOICE, _REPORT = 1, 2  # what a seed's key is folded with
+_EVALUATED = ("success", "evaluated_return", "evaluated_error")
 
 Tell = Callable[[int, dict[str, float]], None]
 """Is told the number of updates made and the newest numbers."""
@@ -45,12 +48,13 @@ class Trainer:
         self.env, self.learner = recipe.env(), ALGORITHMS[recipe.algorithm]
         self.compile_seconds = 0.0
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
+        self.metrics = sorted(jax.eval_shape(self._one, self.shapes)[1])
 
     def compile(self) -> None:
         """Compile what trains; once."""
         start = time.perf_counter()
         count = jnp.zeros((), jnp.int32)
-        self._start = jax.jit(self._init).lower(jax.random.key(0)).compile(COMPILER_OPTIONS)
+        self.start = jax.jit(self._init).lower(jax.random.key(0)).compile(COMPILER_OPTIONS)
         self._advance = jax.jit(self._updates).lower(self.shapes, count, count).compile(COMPILER_OPTIONS)
         self.compile_seconds = time.perf_counter() - start
 
@@ -64,7 +68,7 @@ class Trainer:
 
     def fit(self, seconds: float) -> None:
         """Choose the number of updates that take about so many seconds."""
-        state, _ = self.advance(self._start(jax.random.key(0)), 1)
+        state, _ = self.advance(self.start(jax.random.key(0)), 1)
         start = time.perf_counter()
         self.advance(state, 3)
         pace = (time.perf_counter() - start) / 3
@@ -78,7 +82,7 @@ class Trainer:
         return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
 
     def train(self, run: Run, seed: int, tell: Tell) -> None:
-        """Train to the end, from the start or from the state that the run holds.
+        """Train to the end, from the start or from the state that the run holds; evaluate the best policy.
 
         Args:
             run: a folder that was prepared.
@@ -89,84 +93,13 @@ class Trainer:
             Diverged: numbers that are not finite; the best policy so far is kept.
             KeyboardInterrupt: as it came; the state is saved.
         """
-        config, about = self.recipe.config, {"recipe": self.recipe.as_dict(), "seed": seed}
-        key = jax.random.key(seed)
-        if run.started:
-            state, best = run.load_state(self.shapes), tuple(run.about("best")["score"])
-            spent = run.about("state")["seconds"]
-        else:
-            state, best, spent = self._start(key), None, 0.0
-        update = int(state.step)
-        per_update = config.worlds * config.horizon * self.env.drones
-        points = {config.updates * (i + 1) // EVALUATIONS for i in range(EVALUATIONS)} | {config.updates}
-        names = sorted(jax.eval_shape(self._one, self.shapes)[1])
-        columns = ["update", "steps", "seconds", *names, "success", "evaluated_return", "evaluated_error"]
-        bad, saved, length, evaluating = 0, time.perf_counter(), 1, 0.0
-
-        def save():
-            run.save_policy("last", state.policy, **about, update=update)
-            run.save_state(state, **about, update=update, seconds=spent)
-
-        def judge(policy, update: int) -> dict[str, float]:
-            nonlocal best, evaluating
-            start = time.perf_counter()
-            report = evaluate(self.env, policy, jax.random.fold_in(key, 1), self.episodes)
-            score = (report.success, report.returned if math.isfinite(report.returned) else -math.inf)
-            if best is None or score > best:
-                best = score
-                run.save_policy("best", policy, **about, update=update, score=score)
-            evaluating += time.perf_counter() - start
-            return {
-                "success": report.success,
-                "evaluated_return": report.returned,
-                "evaluated_error": report.error_percentiles[50],
-            }
-
-        if best is None:
-            judge(state.policy, update)
-            save()
-        with Progress(run, columns, update) as progress:
-            try:
-                while update < config.updates:
-                    upto = min(point for point in points if point > update)
-                    length = min(length, upto - update, _LONGEST_CALL)
-                    start = time.perf_counter()
-                    after, metrics = self.advance(state, length)
-                    took = time.perf_counter() - start
-                    bad = _unbroken(metrics, bad)
-                    if bad >= min(_PATIENCE, config.updates) or not _finite(after):
-                        raise Diverged(f"numbers that are not finite at update {update + length} or a little before")
-                    rows = [
-                        {"update": update + i + 1, "steps": (update + i + 1) * per_update}
-                        | {"seconds": spent + took * (i + 1) / length}
-                        | {name: float(x[i]) for name, x in metrics.items()}
-                        for i in range(length)
-                    ]
-                    spent += took
-                    if update + length in points:
-                        rows[-1] |= judge(after.policy, update + length)
-                        if bad and not math.isfinite(rows[-1]["evaluated_return"]):
-                            raise Diverged(
-                                f"what is flown in training and in evaluation is not finite at update {update + length}"
-                            )
-                    progress.add(rows)
-                    state, update = after, update + length
-                    if update in points or time.perf_counter() - saved > _SAVE:
-                        save()
-                        saved = time.perf_counter()
-                    tell(update, rows[-1] | {"steps_per_s": length * per_update / took})
-                    length = max(1, round(_CALL / took * length))
-            except KeyboardInterrupt:
-                save()
-                raise
-        start = time.perf_counter()
-        report = evaluate(self.env, run.policy(), jax.random.fold_in(key, 2), self.episodes)
-        evaluating += time.perf_counter() - start
-        run.save_report(
-            {"seed": seed, "best_update": run.about()["update"], "updates": update, "evaluation": as_dict(report)}
-            | {"seconds": {"training": spent, "compiling": self.compile_seconds, "evaluating": evaluating}}
-            | {"recipe": self.recipe.as_dict()}
-        )
+        course = _Course(self, run, seed)
+        try:
+            course.go(tell)
+        except KeyboardInterrupt:
+            course.save()
+            raise
+        course.finish()
 
     def _init(self, key: jax.Array):
         return self.learner.init(key, self.env, self.recipe.config)
@@ -189,6 +122,113 @@ class Trainer:
             return state, jax.tree.map(lambda all, x: all.at[i].set(x), metrics, new)
 
         return jax.lax.fori_loop(0, count, one, (state, metrics))
+
+
+class _Course:
+    """One seed's training: where it is, and what it has come to."""
+
+    def __init__(self, trainer: Trainer, run: Run, seed: int):
+        """At the start, or where the run stopped."""
+        self.trainer, self.run, self.config = trainer, run, trainer.recipe.config
+        self.key = jax.random.key(seed)
+        self.about = {"recipe": trainer.recipe.as_dict(), "seed": seed}
+        self.evaluating = 0.0  # s
+        self.unbroken = 0  # updates in a row that were not finite
+        self.best = None  # score
+        if run.started:
+            self.state, self.seconds = run.load_state(trainer.shapes), run.about("state")["seconds"]
+            self.best = tuple(run.about("best")["score"])
+            self.update = int(self.state.step)
+        else:
+            self.state, self.seconds, self.update = trainer.start(self.key), 0.0, 0
+            self.judge(self.state.policy, 0)
+            self.save()
+
+    def go(self, tell: Tell) -> None:
+        """Make all updates that are left."""
+        updates, saved, length = self.config.updates, time.perf_counter(), 1
+        points = {updates * (i + 1) // EVALUATIONS for i in range(EVALUATIONS)}
+        with Progress(self.run, self._columns(), self.update) as progress:
+            while self.update < updates:
+                length = min(length, min(point for point in points if point > self.update) - self.update, _LONGEST_CALL)
+                state, rows, took = self.fly(length)
+                self.seconds += took
+                if self.update + length in points:
+                    rows[-1] |= self.judge(state.policy, self.update + length)
+                    if self.unbroken and not math.isfinite(rows[-1]["evaluated_return"]):
+                        raise _diverged(self.update + length)
+                progress.add(rows)
+                self.state, self.update = state, self.update + length
+                if self.update in points or time.perf_counter() - saved > _SAVE:
+                    self.save()
+                    saved = time.perf_counter()
+                tell(self.update, rows[-1] | {"steps_per_s": length * self._steps / took})
+                length = max(1, round(_CALL / took * length))
+
+    def fly(self, length: int):
+        """The state after some updates, a line of progress for each, and the seconds they took; checked."""
+        start = time.perf_counter()
+        state, metrics = self.trainer.advance(self.state, length)
+        took = time.perf_counter() - start
+        self.unbroken = _unbroken(metrics, self.unbroken)
+        if self.unbroken >= min(_PATIENCE, self.config.updates) or not _finite(state):
+            raise _diverged(self.update + length)
+        rows = [
+            {
+                "update": self.update + i,
+                "steps": (self.update + i) * self._steps,
+                "seconds": self.seconds + took * i / length,
+                **{name: float(x[i - 1]) for name, x in metrics.items()},
+            }
+            for i in range(1, length + 1)
+        ]
+        return state, rows, took
+
+    def judge(self, policy: Policy, update: int) -> dict[str, float]:
+        """Evaluate a policy, always on the same episodes; keep it if it is the best."""
+        report = self._evaluate(policy, _CHOICE)
+        score = (report.success, report.returned if math.isfinite(report.returned) else -math.inf)
+        if self.best is None or score > self.best:
+            self.best = score
+            self.run.save_policy("best", policy, **self.about, update=update, score=score)
+        return dict(zip(_EVALUATED, (report.success, report.returned, report.error_percentiles[50]), strict=True))
+
+    def save(self) -> None:
+        """Write the newest policy and the training state."""
+        self.run.save_policy("last", self.state.policy, **self.about, update=self.update)
+        self.run.save_state(self.state, **self.about, update=self.update, seconds=self.seconds)
+
+    def finish(self) -> None:
+        """Evaluate the best policy on other episodes than it was chosen by, and write the report."""
+        report = self._evaluate(self.run.policy(), _REPORT)
+        seconds = {
+            "training": self.seconds,
+            "compiling": self.trainer.compile_seconds,
+            "evaluating": self.evaluating,
+        }
+        self.run.save_report(
+            self.about
+            | {"best_update": self.run.about()["update"], "updates": self.update, "seconds": seconds}
+            | {"evaluation": as_dict(report)}
+        )
+
+    @property
+    def _steps(self) -> int:
+        """Control steps of an update, of all drones."""
+        return self.config.worlds * self.config.horizon * self.trainer.env.drones
+
+    def _columns(self) -> list[str]:
+        return ["update", "steps", "seconds", *self.trainer.metrics, *_EVALUATED]
+
+    def _evaluate(self, policy: Policy, purpose: int) -> Report:
+        start = time.perf_counter()
+        report = evaluate(self.trainer.env, policy, jax.random.fold_in(self.key, purpose), self.trainer.episodes)
+        self.evaluating += time.perf_counter() - start
+        return report
+
+
+def _diverged(update: int) -> Diverged:
+    return Diverged(f"numbers that are not finite at update {update}, or shortly before")
 
 
 def _finite(state) -> bool:

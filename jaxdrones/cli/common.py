@@ -42,13 +42,14 @@ def complain(message: str, code: int = 2) -> int:
     return code
 
 
-def bar(total: int, what: str, unit: str):
+def bar(total: int, what: str, unit: str, initial: int = 0):
     """A progress bar on stderr; nothing without a terminal, `None` without tqdm."""
     try:
         from tqdm import tqdm
     except ImportError:
         return contextlib.nullcontext()
-    return tqdm(total=total, desc=what, unit=unit, leave=False, disable=None, file=sys.stderr, dynamic_ncols=True)
+    look = dict(leave=False, disable=None, file=sys.stderr, dynamic_ncols=True)
+    return tqdm(total=total, desc=what, unit=unit, initial=initial, **look)
 
 
 def table(results: list[dict]) -> str:

@@ -30,8 +30,9 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     check_whole("episodes", options.episodes)
     run, name = Run(options.policy), "last" if options.last else "best"
-    recipe, policy, about = run.recipe(), run.policy(name), run.about(name)
-    report = as_dict(evaluate(recipe.env(), policy, jax.random.key(1_000_000 + options.seed), options.episodes))
+    recipe, about = run.recipe(), run.about(name)
+    env = recipe.env()
+    report = as_dict(evaluate(env, run.policy(name, env), jax.random.key(1_000_000 + options.seed), options.episodes))
     if options.json:
         kept = {"run": str(options.policy), "policy": name, "update": about["update"], "seed": options.seed}
         print(json.dumps(kept | {"recipe": recipe.as_dict(), "evaluation": report}))

@@ -82,11 +82,11 @@ def _fly_policy(options: argparse.Namespace) -> int:
 
     check_choice("backend", options.backend, BACKENDS)
     run, seed = Run(options.policy), options.seed or 0
-    recipe, policy = run.recipe(), run.policy()
+    recipe = run.recipe()
     output = options.output or options.policy / "flight"
     output.mkdir(parents=True, exist_ok=True)
     with recipe.env(backend=options.backend) as env, progress() as tell:
-        episode = fly_episode(env, policy, jax.random.key(seed), tell or (lambda share: None))
+        episode = fly_episode(env, run.policy(env=env), jax.random.key(seed), tell or (lambda share: None))
     conditions = PolicyFlight(
         str(options.policy),
         recipe.task,

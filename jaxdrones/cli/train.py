@@ -2,6 +2,7 @@
 
 import argparse
 import ast
+import contextlib
 import json
 import sys
 import time
@@ -49,7 +50,7 @@ def add(commands) -> None:
         metavar="NAME=VALUE",
         help="setting of the learner (worlds, horizon, learning_rate) or of the environment (vehicle, period, drones)",
     )
-    parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="of every evaluation (1000)")
+    parser.add_argument("--episodes", type=int, metavar="N", help="of every evaluation (1000)")
     parser.add_argument("--output", type=Path, metavar="DIR", help="folder of the run (runs/TASK)")
     parser.add_argument("--resume", action="store_true", help="go on with the run in --output, as it was asked for")
     parser.add_argument("--overwrite", action="store_true", help="replace a run in --output that did not finish")
@@ -60,20 +61,20 @@ def add(commands) -> None:
 
 def _train(options: argparse.Namespace) -> int:
     from jaxdrones.checks import check_whole
+    from jaxdrones.learning.runs import Run
     from jaxdrones.learning.training import Diverged, Trainer
 
     begin = time.perf_counter()
     if not options.no_figure:
         plots.check_matplotlib()
     check_whole("seeds", options.seeds)
-    check_whole("episodes", options.episodes)
     output = options.output or Path("runs") / options.task
     updates, seconds = _budget(options.budget)
     asked = _asked(options, updates)
     runs = _runs(options, output)
-    recipe = _resumed(options, runs, asked) if options.resume else _fresh(options, runs, asked)
-    trainer = Trainer(recipe, options.episodes)
-    for run in runs.values():
+    recipe = _resumed(options, runs, asked) if options.resume else _fresh(options, runs, output, asked)
+    trainer = Trainer(recipe, _episodes(options, runs))
+    for run in (*runs.values(), Run(output)):
         trainer.prepare(run)
         if not options.resume:
             run.clear()
@@ -82,7 +83,7 @@ def _train(options: argparse.Namespace) -> int:
     trainer.compile()
     if seconds is not None and not options.resume:
         trainer.fit(seconds - (time.perf_counter() - begin))
-    say(f"compiled in {trainer.compile_seconds:.1f} s; {trainer.recipe.config.updates} updates")
+    say(f"compiled in {trainer.compile_seconds:.1f} s; updates: {trainer.recipe.config.updates}")
 
     for seed, run in runs.items():
         if options.resume and run.report() is not None:
@@ -92,6 +93,8 @@ def _train(options: argparse.Namespace) -> int:
             with shown:
                 trainer.train(run, seed, shown.tell)
         except KeyboardInterrupt:
+            if not run.started:
+                return complain("interrupted before the first update; there is nothing to go on with", INTERRUPTED)
             _draw(options, {seed: run}, run.folder)
             again = f"jaxdrones train {options.task} --output {output} --resume"
             again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
@@ -135,34 +138,31 @@ def _finish(options: argparse.Namespace, runs: dict, output: Path, trainer) -> i
     return 0
 
 
-class _Shown:
-    """A live bar, and a line for every evaluation."""
+class _Shown(contextlib.ExitStack):
+    """A live bar from the first news on, and a line for every evaluation."""
 
     def __init__(self, total: int, what: str, say):
-        self._context, self._say, self._total = bar(total, what, "update"), say, total
-
-    def __enter__(self):
-        self._bar = self._context.__enter__()
-        return self
-
-    def __exit__(self, *error):
-        self._context.__exit__(*error)
+        super().__init__()
+        self._total, self._what, self._say = total, what, say
+        self._bar, self._evaluated, self._begun = None, "", False
 
     def tell(self, update: int, now: dict[str, float]) -> None:
         """Move the bar; say what an evaluation came to."""
+        if not self._begun:
+            self._begun = True
+            self._bar = self.enter_context(bar(self._total, self._what, "update", initial=update))
         pace = f"{now['steps_per_s'] / 1e6:.2f} M steps/s"
         if "success" in now:
-            self._last = f"return {now['evaluated_return']:.1f}, success {now['success']:.3f}"
-            line = f"update {update:4}/{self._total}  {self._last}, median error {now['evaluated_error']:.3f} m, {pace}"
-            line += f", {now['seconds']:.1f} s"
-            self._say(line) if self._bar is None or self._bar.disable else self._bar.write(line, file=_out(self._say))
+            self._evaluated = f"return {now['evaluated_return']:.1f}, success {now['success']:.3f}"
+            line = f"{self._what}: update {update:4}/{self._total}  {self._evaluated}, "
+            line += f"median error {now['evaluated_error']:.3f} m, {pace}, {now['seconds']:.1f} s"
+            if self._bar is None or self._bar.disable:
+                self._say(line)
+            else:
+                self._bar.write(line, file=sys.stderr if self._say is _quiet else sys.stdout)
         if self._bar is not None:
             self._bar.update(update - self._bar.n)
-            self._bar.set_postfix_str(f"{getattr(self, '_last', '')} reward {now['reward']:.3f}, {pace}")
-
-
-def _out(say):
-    return sys.stderr if say is _quiet else sys.stdout
+            self._bar.set_postfix_str(", ".join(filter(None, (self._evaluated, f"reward {now['reward']:.3f}", pace))))
 
 
 def _quiet(_: str) -> None:
@@ -219,11 +219,12 @@ def _runs(options: argparse.Namespace, output: Path) -> dict:
     return {seed: run}
 
 
-def _fresh(options: argparse.Namespace, runs: dict, asked: dict):
-    from jaxdrones.learning.runs import Recipe
+def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
+    """The recipe that is asked for, if it may be written where it is to go."""
+    from jaxdrones.learning.runs import Recipe, Run
 
     recipe = Recipe.of(options.task, options.algo or "bptt", options.realistic, **asked)
-    for run in runs.values():
+    for run in (*runs.values(), Run(output)):
         if run.started and run.report() is None and not options.overwrite:
             raise ValueError(
                 f"{run.folder} holds a training that did not finish; go on with --resume, replace it with --overwrite, "
@@ -253,6 +254,16 @@ def _resumed(options: argparse.Namespace, runs: dict, asked: dict):
         if had.get(name) != x:
             raise ValueError(f"{folder} began with {name} {had.get(name)}, not {x}; leave that out to --resume")
     return recipe
+
+
+def _episodes(options: argparse.Namespace, runs: dict) -> int:
+    """Of an evaluation; when resuming, as many as before, so that the best stays comparable."""
+    from jaxdrones.checks import check_whole
+
+    if options.episodes is not None:
+        check_whole("episodes", options.episodes)
+        return options.episodes
+    return next((run.about("state")["episodes"] for run in runs.values() if run.started and options.resume), 1000)
 
 
 def _kept(run) -> str:

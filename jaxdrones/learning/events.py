@@ -6,11 +6,13 @@ Format: tensorflow/core/lib/io/record_writer.h and tensorflow/core/util/event.pr
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
+_LARGEST = 3.4e38  # of a float32
 PREFIX = "events.out.tfevents"
 
 
@@ -24,7 +26,7 @@ class EventFile:
 
     def add(self, step: int, scalars: Mapping[str, float]) -> None:
         """Write numbers by name."""
-        values = (_bytes(1, _bytes(1, name.encode()) + b"\x15" + struct.pack("<f", x)) for name, x in scalars.items())
+        values = (_bytes(1, _bytes(1, name.encode()) + b"\x15" + _float(x)) for name, x in scalars.items())
         self._record(_event(step) + _bytes(5, b"".join(values)))
 
     def flush(self) -> None:
@@ -47,6 +49,10 @@ def _event(step: int) -> bytes:
 
 def _bytes(field: int, content: bytes) -> bytes:
     return _varint(field << 3 | 2) + _varint(len(content)) + content
+
+
+def _float(x: float) -> bytes:
+    return struct.pack("<f", math.copysign(math.inf, x) if abs(x) > _LARGEST else x)
 
 
 def _varint(x: int) -> bytes:

@@ -136,9 +136,25 @@ class Run:
             raise ValueError(f"{self.folder / 'best.json'} names no recipe; it is not of `jaxdrones train`")
         return Recipe.from_dict(about["recipe"])
 
-    def policy(self, name: str = "best") -> Policy:
-        """The policy `best` or `last`."""
-        return checkpoint.load(self.folder / name)
+    def policy(self, name: str = "best", env: Env | None = None) -> Policy:
+        """The policy `best` or `last`.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: it is damaged, or does not fit `env`.
+        """
+        policy = checkpoint.load(self.folder / name)
+        if env is not None:
+            given, wanted = (
+                (policy.statistics.mean.size, policy.network.outputs),
+                (env.observation_size, env.action_size),
+            )
+            if given != wanted:
+                raise ValueError(
+                    f"{self.folder / name} was trained on another version of {env.task.name}: it has observations and "
+                    f"actions of {given} numbers, the environment {wanted}; train anew"
+                )
+        return policy
 
     @property
     def started(self) -> bool:
@@ -168,7 +184,10 @@ class Run:
 
     def history(self) -> list[dict[str, float]]:
         """The lines of progress.csv; numbers that were not measured in an update are left out."""
-        with (self.folder / "progress.csv").open(newline="") as file:
+        path = self.folder / "progress.csv"
+        if not path.exists():
+            return []
+        with path.open(newline="") as file:
             return [{name: float(x) for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
 
     def _events(self) -> list[Path]:
@@ -179,8 +198,8 @@ class Progress:
     """progress.csv and the event file of a run, open for more lines."""
 
     def __init__(self, run: Run, columns: list[str], update: int):
-        """Go on after an update; later lines, of a run that was killed, are dropped."""
-        rows = [row for row in run.history() if row["update"] <= update] if update else []
+        """Go on after an update; later lines, of a run that was killed, are dropped. There is a line per update."""
+        rows = run.history()[:update]
         for file in run._events():
             file.unlink()
         self._columns = columns

@@ -131,7 +131,7 @@ class _Course:
         """At the start, or where the run stopped."""
         self.trainer, self.run, self.config = trainer, run, trainer.recipe.config
         self.key = jax.random.key(seed)
-        self.about = {"recipe": trainer.recipe.as_dict(), "seed": seed}
+        self.about = {"recipe": trainer.recipe.as_dict(), "seed": seed, "episodes": trainer.episodes}
         self.evaluating = 0.0  # s
         self.unbroken = 0  # updates in a row that were not finite
         self.best = None  # score

@@ -4,10 +4,13 @@ import errno
 import struct
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+from jaxdrones.envs import make
 from jaxdrones.learning import events
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.runs import Progress, Recipe, Run
 
 
@@ -85,3 +88,12 @@ def test_a_disk_that_fills_up_leaves_the_checkpoint_that_was_there(tmp_path, mon
     monkeypatch.undo()
     assert run.about("state")["update"] == 1
     assert run.load_state({"x": np.zeros(3)})["x"].tolist() == [0, 1, 2]
+
+
+def test_a_policy_that_does_not_fit_the_environment_is_refused(tmp_path):
+    env = make("hover")
+    run = Run(tmp_path)
+    run.save_policy("best", Policy.init(jax.random.key(0), env, (4,)))
+    run.policy("best", env)
+    with pytest.raises(ValueError, match=r"trained on another version of leader-follower.*\(22, 4\).*train anew"):
+        run.policy("best", make("leader-follower"))

@@ -1,10 +1,12 @@
 """Teams in flight, and comparisons that say which array differs."""
 
+from collections.abc import Iterable, Sequence
 from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxdrones
 from jaxdrones import Params, State
@@ -69,3 +71,8 @@ def assert_same_motion(actual: State, expected: State, atol: float) -> None:
 def assert_finite(tree) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         assert np.all(np.isfinite(leaf)), f"{jax.tree_util.keystr(path)} is not finite: {leaf}"
+
+
+def mostly_slow(names: Iterable[str], quick: Sequence[str]) -> list:
+    """Parameters of a test: the `quick` ones run every time, the others only with the slow tests."""
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]

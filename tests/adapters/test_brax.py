@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import mostly_slow
 
 pytest.importorskip("brax")
 from jaxdrones.adapters import brax
@@ -20,7 +21,7 @@ with contextlib.redirect_stdout(sys.stderr):
 pytestmark = pytest.mark.float32
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", mostly_slow(TASKS, ("hover", "swap-goals")))
 def test_a_step_returns_what_it_was_given_as_the_trainers_scan_over_it(task, env_of):
     env = brax.wrap(env_of(task))
     batch = training.EvalWrapper(brax.wrap_for_training(env, episode_length=5))

@@ -329,12 +329,14 @@ def thrown(n, seed=0):
 STARTS, SHARE = thrown(128), jnp.full(128, 0.5)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_landing_is_that_of_central_differences():
     """Through touchdown and slide, 1e-8 apart: rounding of 1e-15 m leaves 1e-7, the bends of the slope more."""
     numeric = (landings(STARTS, SHARE + 1e-8) - landings(STARTS, SHARE - 1e-8)) / 2e-8
     np.testing.assert_allclose(landing_gradients(STARTS, SHARE), numeric, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_landing_is_unbiased_and_no_noisier_than_one_of_order_zero():
     """Against antithetic Gaussian smoothing by 0.03 of the weight, and differences over as much with common starts.
 

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import assert_close, mostly_slow
 
 from jaxdrones.envs import TASKS, check_env, make
 
 KEY = jax.random.key(3)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", mostly_slow(TASKS, ("hover", "gates", "swap-goals", "multi-hover")))
 def test_every_task_keeps_the_contract_on_bullet(task):
     with make(task, backend="bullet") as env:
         check_env(env, steps=2)

@@ -94,7 +94,7 @@ def test_a_double_integrator_is_flown_nearly_as_cheaply_as_by_lqr(learner, setti
 @LEARNERS
 @pytest.mark.float32
 def test_the_same_key_gives_the_same_result_and_seeds_by_vmap_are_the_seeds_alone(learner):
-    env = envs.make("paper-hover")
+    env = envs.make("hover")
 
     def learn(key):
         result = learner.train(key, env, SMALL[learner])
@@ -112,7 +112,7 @@ def test_the_same_key_gives_the_same_result_and_seeds_by_vmap_are_the_seeds_alon
 
 @pytest.mark.float32
 def test_learning_rates_can_be_mapped():
-    env = envs.make("paper-hover")
+    env = envs.make("hover")
 
     def change(rate):
         config = dataclasses.replace(SMALL[bptt], learning_rate=rate)

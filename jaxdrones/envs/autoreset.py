@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 from jaxdrones.envs.env import RESET, Env, Obs
 from jaxdrones.tasks.task import World
 
-_RESET = ("drones", "variables", "memory", "actions", "step", "images")
 _FEW = 64  # of so many worlds one may end in a step; more, and all are drawn
 
 
@@ -52,8 +51,9 @@ class AutoReset:
         info = info | {"final_obs": obs, "episode": {"return": returned, "length": length}}
 
         ended = terminated | truncated
-        fresh_obs, drawn = self._drawn(ended, jax.random.fold_in(key, RESET))
-        fresh = Episode(world.replace(**drawn), jnp.zeros_like(returned), jnp.zeros_like(length))
+        fresh_obs, fresh = self._drawn(ended, jax.random.fold_in(key, RESET))
+        fresh = fresh.replace(**{name: getattr(world, name) for name in self.env.kept})
+        fresh = Episode(fresh, jnp.zeros_like(returned), jnp.zeros_like(length))
         obs, episode = jax.tree.map(
             lambda new, old: old if new is old else jnp.where(ended, new, old),
             (fresh_obs, fresh),
@@ -61,13 +61,10 @@ class AutoReset:
         )
         return obs, episode, reward, terminated, truncated, info
 
-    def _draw(self, key: jax.Array) -> tuple[Obs, dict[str, Any]]:
-        """What a reset makes anew: all of a world but the parameters, if those are the nominal ones."""
+    def _draw(self, key: jax.Array) -> tuple[Obs, World]:
+        """A reset, without what is the same in every episode."""
         obs, world = self.env.reset(key)
-        drawn = {name: getattr(world, name) for name in _RESET}
-        if self.env.draws_params:
-            drawn["params"] = world.params
-        return obs, drawn
+        return obs, world.replace(**dict.fromkeys(self.env.kept))
 
 
 def _where_needed(draw: Callable) -> Callable:

@@ -74,8 +74,8 @@ class Env:
         self.action, self.action_size = action, action.size
         self.steps = round(task.duration / dt) + task.overtime
         self._parts, self._laws, self._noise, self._disturb = tuple(observation), tuple(laws), noise, disturb
-        self.draws_params = bool(laws) or disturb is not None
-        """Whether the parameters of a world are not the nominal ones."""
+        self.kept = () if laws or disturb else ("params",)
+        """What of a world is the same in every episode."""
         self._delay = _nearly_whole(delay / dt)
         self._history = max(math.ceil(self._delay) + 1, *(part.history for part in observation))
         self.physics, self.vision = step, vision

@@ -35,6 +35,7 @@ def test_bullet_reports_four_rates():
     assert len(rates) == 4 and min(rates.values()) > 0
 
 
+@pytest.mark.slow
 def test_envs_reports_five_rates():
     result = quick("envs.py")
     assert len(result["rates"]) == 5 and min(result["rates"].values()) > 0

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import assert_close
 
 from jaxdrones.envs import autoreset, make
@@ -65,6 +66,7 @@ def test_of_many_worlds_those_that_end_start_as_each_would_alone():
             assert_close(jax.tree.map(lambda x, i=i: x[i], together[:5]), alone[:5], 1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_pass_through_autoreset_the_same_way_in_and_out_of_vmap():
     keys = jax.random.split(jax.random.key(1), 70)
     _, episodes = jax.vmap(auto.reset)(keys)

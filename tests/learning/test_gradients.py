@@ -66,16 +66,19 @@ def flights():
     }
 
 
+@pytest.mark.slow
 def test_no_option_changes_the_flight(flights):
     for name, (value, _) in flights.items():
         np.testing.assert_allclose(value, flights["exact"][0], rtol=1e-12, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_decay_of_one_is_exact_and_a_smaller_one_shrinks_what_is_long_ago(flights):
     np.testing.assert_allclose(flights["no decay"][1], flights["exact"][1], rtol=1e-9, atol=1e-12)
     assert jnp.linalg.norm(flights["decay"][1]) < 0.5 * jnp.linalg.norm(flights["exact"][1])
 
 
+@pytest.mark.slow
 def test_a_surrogate_points_nearly_where_the_exact_gradient_does(flights):
     a, b = flights["surrogate"][1], flights["exact"][1]
     cosine = a @ b / jnp.linalg.norm(a) / jnp.linalg.norm(b)

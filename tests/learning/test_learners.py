@@ -91,6 +91,7 @@ def test_a_double_integrator_is_flown_nearly_as_cheaply_as_by_lqr(learner, setti
     assert 0.999 * best < jax.jit(flown_cost, static_argnums=0)(env, policy, starts) < within * best
 
 
+@pytest.mark.slow
 @LEARNERS
 @pytest.mark.float32
 def test_the_same_key_gives_the_same_result_and_seeds_by_vmap_are_the_seeds_alone(learner):

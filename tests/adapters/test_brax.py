@@ -154,4 +154,4 @@ def test_braxs_ppo_learns_to_hover():
             progress_fn=lambda steps, metrics: returns.append(float(metrics["eval/episode_reward"])),
         )
     before, after = returns
-    assert after > 0 > before  # of at most 500; without control it drifts away, about -380
+    assert after > before + 300, returns  # of at most 1,000

@@ -73,4 +73,5 @@ def test_sb3s_ppo_learns_to_hover(env_of):
     )
     before = episode_return(model, test)
     model.learn(750_000)
-    assert episode_return(model, test) > 0 > before  # of at most 500; without control it drifts away, about -700
+    after = episode_return(model, test)
+    assert after > before + 300, (before, after)  # of at most 1,000

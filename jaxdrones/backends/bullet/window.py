@@ -44,6 +44,10 @@ class Window(HostStep):
         time.sleep(max(0.0, self._start + self._count * self._dt - time.monotonic()))
         return state
 
+    def close(self) -> None:
+        """End the connection of the step that is watched, and the window with it."""
+        self._step.close()
+
     def _draw_axes(self, length: float) -> None:
         p, client = self._step.client.p, self._step.client.id
         for drone in self._step.client.drones:

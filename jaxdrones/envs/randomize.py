@@ -19,7 +19,8 @@ Disturbance = Callable[[jax.Array, Params, float], Params]
 """(key, params, control period) of a team -> the surroundings in the next control step."""
 
 
-def _check_range(field: str, low: float, high: float) -> None:
+def _check_law(field: str, low: float, high: float) -> None:
+    check_choice("parameter", field, Params.__dataclass_fields__)
     if not low <= high:
         raise ValueError(f"the range of {field} is ({low}, {high}); give the lower bound first")
 
@@ -30,8 +31,7 @@ def scaled(field: str, low: float, high: float) -> Law:
     Raises:
         ValueError: unknown field, or `low` above `high`.
     """
-    check_choice("parameter", field, Params.__dataclass_fields__)
-    _check_range(field, low, high)
+    _check_law(field, low, high)
 
     def law(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
@@ -46,8 +46,7 @@ def shifted(field: str, low: float, high: float) -> Law:
     Raises:
         ValueError: unknown field, or `low` above `high`.
     """
-    check_choice("parameter", field, Params.__dataclass_fields__)
-    _check_range(field, low, high)
+    _check_law(field, low, high)
 
     def law(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)

@@ -86,7 +86,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
             "altitude_lost": lambda world: world.variables["start"] - world.variables["lowest"],
             "upright": upright,
         },
-        success=lambda metrics, dt: _recovered(metrics),
+        success=_recovered,
     )
 
 
@@ -125,7 +125,7 @@ def settled(metrics: Mapping[str, Array], dt: float, within: float = 0.05, speed
     return jnp.all((metrics["error"][-steps:] < within) & (metrics["speed"][-steps:] < speed), axis=0)
 
 
-def _recovered(metrics: Mapping[str, Array]) -> Array:
+def _recovered(metrics: Mapping[str, Array], dt: float) -> Array:
     """Level to 15 degrees, slower than 0.5 m/s and within half a metre of the goal in the end."""
     level = metrics["upright"][-1] > jnp.cos(jnp.radians(15.0))
     return level & (metrics["speed"][-1] < 0.5) & (metrics["error"][-1] < 0.5)

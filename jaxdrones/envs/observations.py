@@ -17,7 +17,6 @@ from jaxdrones.tasks.task import Part, Task, World, norm
 _FAR, _FAST, _SPINNING = 20.0, 30.0, 100.0  # m, m/s, rad/s: the bounds of what is seen
 _RPM = 1e5
 _UNIT = 1.0 + 1e-6
-_AT_REST = 1e-9  # rad/s: below, a direction would be one of rounding errors
 
 
 def position(task: Task, world: World) -> Array:
@@ -109,7 +108,7 @@ def normalized_kinematics(task: Task, world: World) -> Array:
     place = [jnp.clip(x, -15, 15) / 15, jnp.clip(y, -15, 15) / 15, jnp.clip(z, 0, 5) / 5]
     motion = [jnp.clip(vx, -3, 3) / 3, jnp.clip(vy, -3, 3) / 3, jnp.clip(vz, -1, 1) / 3]
     columns = jnp.stack([*place, roll, pitch, yaw, *motion], axis=-1)
-    turns = speed > _AT_REST
+    turns = speed > jnp.finfo(speed.dtype).eps ** 0.5  # rad/s: below, a direction would be one of rounding errors
     return jnp.concatenate([columns, turn * (turns / jnp.where(turns, speed, 1))[:, None]], -1)
 
 

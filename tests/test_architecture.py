@@ -23,7 +23,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
 PLACE = {
     module: (layer, peer) for layer, peers in enumerate(LAYERS) for peer, group in enumerate(peers) for module in group
 }
-OPTIONAL = ("gymnasium", "pettingzoo", "brax", "pybullet", "matplotlib", "tqdm")
+OPTIONAL = ("gymnasium", "pettingzoo", "brax", "stable_baselines3", "torch", "pybullet", "matplotlib", "tqdm")
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

@@ -41,6 +41,11 @@ def test_envs_reports_five_rates():
     assert len(result["rates"]) == 5 and min(result["rates"].values()) > 0
 
 
+def test_devices_reports_one_and_all():
+    (row,) = quick("devices.py")["rows"]
+    assert row["one"] > 0 and row["all"] > 0
+
+
 def test_learning_reports_every_seed():
     rows = quick("learning.py")["rows"]
     assert rows and all(0 <= row["success"] <= 1 for row in rows)

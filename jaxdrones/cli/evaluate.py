@@ -26,10 +26,10 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     from jaxdrones.checks import check_whole
     from jaxdrones.learning import evaluate
-    from jaxdrones.learning.runs import Run, as_dict
+    from jaxdrones.learning.runs import as_dict, run_in
 
     check_whole("episodes", options.episodes)
-    run, name = Run(options.policy), "last" if options.last else "best"
+    run, name = run_in(options.policy), "last" if options.last else "best"
     recipe, about = run.recipe(), run.about(name)
     env = recipe.env()
     report = as_dict(evaluate(env, run.policy(name, env), jax.random.key(1_000_000 + options.seed), options.episodes))
@@ -45,7 +45,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 def described(recipe) -> str:
     """`hover by bptt`, with what was changed."""
     options = "".join(f", {name} {x}" for name, x in recipe.options.items())
-    return f"{recipe.task} by {recipe.algorithm}{', realistic' * recipe.realistic}{options}"
+    return f"{recipe.task} by {recipe.learner}{', realistic' * recipe.realistic}{options}"
 
 
 def evaluation_table(report: dict) -> str:

@@ -78,10 +78,10 @@ def _fly_policy(options: argparse.Namespace) -> int:
     import jax
 
     from jaxdrones.learning.episode import PolicyFlight, fly_episode, record_of
-    from jaxdrones.learning.runs import Run
+    from jaxdrones.learning.runs import run_in
 
     check_choice("backend", options.backend, BACKENDS)
-    run, seed = Run(options.policy), options.seed or 0
+    run, seed = run_in(options.policy), options.seed or 0
     recipe = run.recipe()
     output = options.output or options.policy / "flight"
     output.mkdir(parents=True, exist_ok=True)
@@ -90,7 +90,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
     conditions = PolicyFlight(
         str(options.policy),
         recipe.task,
-        recipe.algorithm,
+        recipe.learner,
         recipe.realistic,
         options.backend,
         seed,
@@ -98,7 +98,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
         recipe.options,
     )
     record = record_of(episode, conditions)
-    title = f"{recipe.task}: {env.task.summary} ({recipe.algorithm}, {options.backend})"
+    title = f"{recipe.task}: {env.task.summary} ({recipe.learner}, {options.backend})"
     files = _write(record, options, output, title, plots.POLICY_PANELS, env.task.scene)
     results = record.results(_LATE * float(record.t[-1]))
     end = {

@@ -11,6 +11,8 @@ from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.tasks.examples import FLIGHTS
 
 ALGORITHMS = ("bptt", "ppo", "shac")  # of jaxdrones.learning, which takes long to import
+SB3_ALGORITHMS = ("ppo", "a2c", "sac")  # of jaxdrones.learning.sb3, which may not be installed
+LIBRARIES = ("jaxdrones", "sb3")
 
 
 def add(commands) -> None:
@@ -35,6 +37,7 @@ def _list(options: argparse.Namespace) -> int:
         "actions": list(ACTIONS),
         "observations": list(OBSERVATIONS),
         "algorithms": list(ALGORITHMS),
+        "sb3": list(SB3_ALGORITHMS),
     }
     if options.json:
         print(json.dumps(names))

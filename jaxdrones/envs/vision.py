@@ -29,20 +29,9 @@ class Vision:
 
     def look(self, params: Params, drones: State) -> dict[str, Any]:
         """Take pictures now."""
-
-        def take(params, drones):
-            rgb, depth, segmentation = self.physics.camera(params, drones)
-            pictures = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
-            return {name: pictures[name] for name in self.images}
-
-        if not is_traced((params, drones)):
-            return take(params, drones)
-        n = len(drones.pos)
-        shapes = {}
-        for name in self.images:
-            dtype, channels = IMAGES[name]
-            shapes[name] = jax.ShapeDtypeStruct((n, 48, 64) + ((channels,) if channels else ()), dtype)
-        return jax.pure_callback(take, shapes, params, drones, vmap_method="sequential")
+        rgb, depth, segmentation = self.physics.camera(params, drones)
+        pictures = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
+        return {name: pictures[name] for name in self.images}
 
     def next(self, world: World) -> dict[str, Any]:
         """The pictures after a control step."""

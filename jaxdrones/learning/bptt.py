@@ -82,7 +82,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     def loss(params):
         policy = state.policy.replace(params=params)
         after, flight = collect.fly(
-            fly_key, env, lambda key, obs: (policy(obs), None), worlds, config.horizon, reset=False, link=linked(config)
+            fly_key, env, collect.piloted(policy), worlds, config.horizon, reset=False, link=linked(config)
         )
         return -jnp.mean(discounted(flight, config.discount)), (after, flight)
 

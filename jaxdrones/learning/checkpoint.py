@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.learning.networks import MLP, Policy
+from jaxdrones.learning.networks import MLP, Policy, VisionMLP
 from jaxdrones.learning.normalize import Statistics
 
 FORMAT = 1
@@ -28,8 +28,7 @@ def save(path: str | os.PathLike, policy: Policy, **about) -> None:
         policy: what flies.
         **about: anything JSON can hold, or a dataclass, to be found by `about`: env, options, algorithm, config.
     """
-    network = dataclasses.asdict(policy.network)
-    own = {"network": {name: network[name] for name in _NETWORK}, "per_role": policy.per_role}
+    own = {"network": _settings(policy.network), "per_role": policy.per_role}
     save_tree(path, policy, **about, policy=own)
 
 
@@ -43,7 +42,8 @@ def load(path: str | os.PathLike) -> Policy:
     kept = about(path)
     if "policy" not in kept:
         raise ValueError(f"{path} holds no policy; found {', '.join(kept)}")
-    network = MLP(**kept["policy"]["network"] | {"sizes": tuple(kept["policy"]["network"]["sizes"])})
+    settings = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()}
+    network = VisionMLP(**settings) if "channels" in settings else MLP(**settings)
     numbers = _restored(path)
     return Policy(numbers["params"], Statistics(**numbers["statistics"]), network, kept["policy"]["per_role"])
 
@@ -52,14 +52,17 @@ def save_tree(path: str | os.PathLike, tree: Any, **about) -> None:
     """Write any pytree, such as a training state, with what it means; keys are kept too."""
     path = Path(path)
     tree = _without_keys(tree)
-    kept = {name: _plain(x) for name, x in about.items()} | {
-        "format": FORMAT,
-        "versions": {"jax": jax.__version__, "flax": flax.__version__},
-        "shapes": _shapes(tree),
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _write(_numbers(path), flax.serialization.to_bytes(tree))
-    _write(_sidecar(path), json.dumps(kept, indent=2, default=str).encode())
+    versions = {"jax": jax.__version__, "flax": flax.__version__}
+    content = flax.serialization.to_bytes(tree)
+    save_bytes(_numbers(path), content, **about, versions=versions, shapes=_shapes(tree))
+
+
+def save_bytes(file: Path, content: bytes, **about) -> None:
+    """Write a file, and beside it, as .json, what it means."""
+    kept = {name: _plain(x) for name, x in about.items()} | {"format": FORMAT}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    _write(file, content)
+    _write(file.with_suffix(".json"), json.dumps(kept, indent=2, default=str).encode())
 
 
 def load_tree(path: str | os.PathLike, like: Any) -> Any:
@@ -110,7 +113,9 @@ def about(path: str | os.PathLike) -> dict[str, Any]:
     return kept
 
 
-_NETWORK = ("sizes", "outputs", "scale", "activation")
+def _settings(network: MLP | VisionMLP) -> dict[str, Any]:
+    names = {field.name for field in dataclasses.fields(network)} - {"parent", "name"}  # those are flax's own
+    return {name: getattr(network, name) for name in names}
 
 
 def _restored(path: str | os.PathLike) -> Any:

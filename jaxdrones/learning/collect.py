@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,18 +13,21 @@ from jaxtyping import Array
 
 from jaxdrones.envs import AutoReset, Env, autoreset
 from jaxdrones.envs.autoreset import Episode
-from jaxdrones.learning.normalize import Statistics
+from jaxdrones.envs.env import Obs
+from jaxdrones.learning import sharding
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import Statistics, vector
 
-Act = Callable[[jax.Array, Array], tuple[Array, Any]]
-"""(key, observations (w, n, d)) -> actions (w, n, a), and what is to be kept of the decision."""
+Act = Callable[[jax.Array, Obs], tuple[Array, Any]]
+"""(a key for each world (w,), observations (w, n, d)) -> actions (w, n, a), and what is to be kept of the decision."""
 
 
 class Worlds(flax.struct.PyTreeNode):
     """w worlds in flight."""
 
     episodes: Episode
-    obs: Array
-    """(w, n, d) what is seen now."""
+    obs: Obs
+    """(w, n, d) what is seen now; here and below, with cameras, a dictionary of that and of images."""
     ended: Array
     """(w,) whether the episode is over, and a new one has to be started."""
 
@@ -31,7 +35,7 @@ class Worlds(flax.struct.PyTreeNode):
 class Flight(flax.struct.PyTreeNode):
     """t control steps of w worlds."""
 
-    obs: Array
+    obs: Obs
     """(t, w, n, d) what was seen before the step."""
     action: Array
     """(t, w, n, a)"""
@@ -43,7 +47,7 @@ class Flight(flax.struct.PyTreeNode):
     """(t, w) what follows has no value."""
     truncated: Array
     """(t, w) the episode was cut, though it could go on."""
-    final_obs: Array
+    final_obs: Obs
     """(t, w, n, d) what was seen after the step, before a new episode started."""
     returned: Array
     """(t, w, n) sum of rewards of the episode so far."""
@@ -68,7 +72,7 @@ def idle(env: Env, worlds: int) -> Worlds:
 def restart(key: jax.Array, env: Env, worlds: Worlds, share: float = 0.0) -> Worlds:
     """A fresh episode where one is over, and with probability `share` elsewhere: so that not all are of an age."""
     start_key, choice_key = jax.random.split(key)
-    w = len(worlds.obs)
+    w = len(worlds.ended)
     chosen = worlds.ended | jax.random.bernoulli(choice_key, share, (w,))
     obs, episodes = jax.vmap(autoreset(env).reset)(jax.random.split(start_key, w))
     fresh = Worlds(episodes, obs, jnp.zeros_like(chosen))
@@ -84,12 +88,13 @@ def fly(
     reset: bool = True,
     link: Callable = lambda worlds: worlds,
 ) -> tuple[Worlds, Flight]:
-    """Fly on.
+    """Fly on; each device its share of the worlds, where `jax.set_mesh` was given several.
 
     Args:
         key: random key.
         env: environment.
-        act: the pilot of all worlds.
+        act: the pilot of all worlds; where several devices fly, it is differentiated by the arguments of a
+            `jax.tree_util.Partial` alone.
         worlds: in flight.
         length: control steps.
         reset: start a new episode in the step in which one ends; else that is left to `restart`, the drones fly on, and
@@ -98,12 +103,11 @@ def fly(
     """
     step = jax.vmap((autoreset(env) if reset else _Endless(env)).step)
 
-    def control_step(worlds: Worlds, key: jax.Array) -> tuple[Worlds, Flight]:
-        act_key, step_key = jax.random.split(key)
+    def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Flight]:
+        act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
         worlds = link(worlds)
-        action, kept = act(act_key, worlds.obs)
-        keys = jax.random.split(step_key, len(worlds.obs))
-        obs, episodes, reward, terminated, truncated, info = step(keys, worlds.episodes, action)
+        action, kept = act(act_keys, worlds.obs)
+        obs, episodes, reward, terminated, truncated, info = step(step_keys, worlds.episodes, action)
         flown = Flight(
             obs=worlds.obs,
             action=action,
@@ -119,7 +123,19 @@ def fly(
         ended = worlds.ended if reset else worlds.ended | terminated | truncated
         return Worlds(episodes, obs, ended), flown
 
-    return jax.lax.scan(control_step, worlds, jax.random.split(key, length))
+    def flown(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Flight]:
+        return jax.lax.scan(functools.partial(control_step, act, index), worlds, keys)
+
+    flown = sharding.each_device(
+        flown, (sharding.SAME, sharding.SAME, sharding.WORLDS, sharding.WORLDS), (sharding.WORLDS, sharding.STEPS)
+    )
+    act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
+    return flown(act, jax.random.split(key, length), jnp.arange(len(worlds.ended)), worlds)
+
+
+def piloted(policy: Policy) -> Act:
+    """The policy's own actions; nothing is kept."""
+    return jax.tree_util.Partial(lambda policy, keys, obs: (policy(obs), None), policy)
 
 
 class _Endless(AutoReset):
@@ -158,7 +174,7 @@ def remember(statistics: Statistics, flight: Flight, config, step: Array) -> Sta
         config: settings: `memory` in flights, `settle` as a share of `updates`.
         step: () updates made.
     """
-    new = statistics.update(flight.obs, memory=config.memory * flight.reward.size)
+    new = statistics.update(vector(flight.obs), memory=config.memory * flight.reward.size)
     settling = step < config.settle * config.updates
     return jax.tree.map(lambda new, old: jnp.where(settling, new, old), new, statistics)
 

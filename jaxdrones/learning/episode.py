@@ -86,7 +86,7 @@ def fly_episode(
 
     Args:
         env: environment of either backend.
-        policy: observations (n, d) -> actions (n, a).
+        policy: observations (n, d), or a dictionary with images, -> actions (n, a).
         key: of start and noise.
         tell: is told now and then which share of the longest episode is flown; with Bullet.
     """

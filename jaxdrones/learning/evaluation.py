@@ -45,8 +45,8 @@ def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -
     """Fly episodes from start to end; what a drone's metrics are when its episode ends, they stay.
 
     Args:
-        env: environment, of the explicit backend.
-        policy: observations (n, d) -> actions (n, a); a pytree, or any function.
+        env: environment of either backend.
+        policy: observations (n, d), or a dictionary with images, -> actions (n, a); a pytree, or any function.
         key: random key.
         episodes: number of them.
     """
@@ -85,7 +85,7 @@ def _episode(env: Env, policy: Callable, key: jax.Array) -> dict:
         lost = lost | ~jnp.all(jnp.isfinite(world.drones.pos))
         return (obs, world, lost, done | terminated | truncated, outcome, returned, length), outcome[0]
 
-    zero = jnp.zeros(env.drones, obs.dtype)
+    zero = jnp.zeros(env.drones, world.drones.pos.dtype)
     no = jnp.zeros((), bool)
     carry = (obs, world, no, no, nothing, zero, jnp.zeros((), jnp.int32))
     carry, metrics = jax.lax.scan(control_step, carry, jax.random.split(key, env.steps))

@@ -1,8 +1,8 @@
-"""Policies and value functions: multilayer perceptrons of normalised observations."""
+"""Policies and value functions: multilayer perceptrons of normalised observations, which see images through a CNN."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.linen as nn
@@ -11,10 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
-from jaxdrones.learning.normalize import Statistics
+from jaxdrones.envs.env import Obs
+from jaxdrones.learning.normalize import Statistics, on_vector, vector
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
+_FAR = 5.0  # m; beyond, all depths look the same
 
 
 class MLP(nn.Module):
@@ -33,6 +36,66 @@ class MLP(nn.Module):
         return nn.Dense(self.outputs, kernel_init=_init(self.scale))(x)
 
 
+class CNN(nn.Module):
+    """What is in a picture: 3x3 convolutions, each of which halves its edges, and a layer over all that they find."""
+
+    channels: Sequence[int]
+    features: int
+
+    @nn.compact
+    def __call__(self, picture: Float[Array, "*batch h w c"]) -> Float[Array, "*batch features"]:
+        """Of numbers in [0, 1]."""
+        for channels in self.channels:
+            picture = nn.relu(nn.Conv(channels, (3, 3), strides=2)(picture))
+        return nn.relu(nn.Dense(self.features)(picture.reshape(*picture.shape[:-3], -1)))
+
+
+class VisionMLP(nn.Module):
+    """An MLP of the vector of an observation and, beside it, of what a CNN finds in its images."""
+
+    sizes: Sequence[int]
+    outputs: int
+    scale: float = 1.0
+    activation: str = "tanh"
+    channels: Sequence[int] = (8, 16, 32)
+    features: int = 32
+
+    @nn.compact
+    def __call__(self, obs: dict[str, Array]) -> Array:
+        """(*batch, outputs)."""
+        pictures = [SCALES[name](obs[name]) for name in sorted(obs.keys() - {"state"})]
+        found = CNN(self.channels, self.features)(jnp.concatenate(pictures, axis=-1))
+        mlp = MLP(self.sizes, self.outputs, self.scale, self.activation)
+        return mlp(jnp.concatenate([obs["state"], found], axis=-1))
+
+
+def network_for(obs: Obs, sizes: Sequence[int], outputs: int, scale: float) -> MLP | VisionMLP:
+    """The kind of network that such observations need.
+
+    Raises:
+        ValueError: they have images that no network takes.
+    """
+    if not isinstance(obs, dict):
+        return MLP(tuple(sizes), outputs, scale)
+    for name in obs.keys() - {"state"}:
+        check_choice("image for a policy", name, SCALES)
+    return VisionMLP(tuple(sizes), outputs, scale)
+
+
+def _colours(rgb: Array) -> Float[Array, "*batch h w 3"]:
+    """Red, green, blue of (*batch, h, w, 4) bytes, in [0, 1]."""
+    return rgb[..., :3].astype(jnp.float32) / 255
+
+
+def _nearness(depth: Array) -> Float[Array, "*batch h w 1"]:
+    """Of (*batch, h, w) m: 1 at the eye, 0 far away."""
+    return 1 - jnp.clip(depth, 0, _FAR)[..., None] / _FAR
+
+
+SCALES: dict[str, Callable[[Array], Array]] = {"rgb": _colours, "depth": _nearness}
+"""Images that policies take, to channels in [0, 1]."""
+
+
 def _init(scale: float):
     """Normally distributed, so that outputs have the inputs' variance times `scale`^2; compiles fast."""
     return nn.initializers.variance_scaling(scale**2, "fan_in", "normal")
@@ -44,7 +107,7 @@ class Policy(flax.struct.PyTreeNode):
     params: Any
     """Of the network; with `per_role` one set per drone, along a leading axis."""
     statistics: Statistics
-    network: MLP = flax.struct.field(pytree_node=False)
+    network: MLP | VisionMLP = flax.struct.field(pytree_node=False)
     per_role: bool = flax.struct.field(pytree_node=False, default=False)
 
     @classmethod
@@ -57,29 +120,36 @@ class Policy(flax.struct.PyTreeNode):
             sizes: of the hidden layers.
             per_role: a network for every drone, else one for all.
         """
-        network = MLP(tuple(sizes), env.action_size, scale=0.01)
-        params = init_params(key, network, env.observation_size, env.drones if per_role else None)
+        obs = seen_by_one(env)
+        network = network_for(obs, sizes, env.action_size, scale=0.01)
+        params = init_params(key, network, obs, env.drones if per_role else None)
         return cls(params, Statistics.none(env.observation_size), network, per_role)
 
-    def __call__(self, obs: Float[Array, "*batch n d"]) -> Float[Array, "*batch n a"]:
-        """The action, in (-1, 1)."""
-        x = self.statistics.normalize(obs)
+    def __call__(self, obs: Obs) -> Float[Array, "*batch n a"]:
+        """The action, in (-1, 1), of observations (*batch, n, d), or of a dictionary of such arrays with images."""
+        x = on_vector(self.statistics.normalize, obs)
         return jnp.tanh(apply(self.network, self.params, x, self.per_role))
 
 
-def init_params(key: jax.Array, network: MLP, inputs: int, roles: int | None = None) -> Any:
-    """Parameters of a network, or one set per role along a leading axis."""
-    example = jnp.zeros(inputs)
+def seen_by_one(env: Env) -> Obs:
+    """An observation of one drone, all zero."""
+    obs, _ = jax.eval_shape(env.reset, jax.random.key(0))
+    return jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), obs)
+
+
+def init_params(key: jax.Array, network: MLP | VisionMLP, example: Obs, roles: int | None = None) -> Any:
+    """Parameters of a network for inputs like the example, or one set per role along a leading axis."""
     if roles is None:
         return network.init(key, example)
     return jax.vmap(network.init, in_axes=(0, None))(jax.random.split(key, roles), example)
 
 
-def apply(network: MLP, params: Any, x: Float[Array, "*batch n d"], per_role: bool) -> Array:
+def apply(network: MLP | VisionMLP, params: Any, x: Obs, per_role: bool) -> Array:
     """The network of every drone, or the one for all."""
     if not per_role:
         return network.apply(params, x)
-    return jax.vmap(network.apply, in_axes=(0, -2), out_axes=-2)(params, x)
+    drones = vector(x).ndim - 2
+    return jax.vmap(network.apply, in_axes=(0, drones), out_axes=drones)(params, x)
 
 
 def central(obs: Float[Array, "*batch n d"], action: Float[Array, "*batch n a"]) -> Float[Array, "*batch n e"]:

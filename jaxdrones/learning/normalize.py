@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxdrones.envs.env import Obs
 
 _LARGEST = 10.0  # standard deviations
 _SMALLEST = 1e-2  # standard deviation; an entry that hardly moves is not blown up
@@ -28,9 +32,10 @@ class Statistics(flax.struct.PyTreeNode):
     @classmethod
     def of(cls, obs: Float[Array, "*batch d"]) -> Statistics:
         """Of the vectors along the last axis."""
-        obs = jnp.reshape(obs, (-1, obs.shape[-1]))
-        mean = jnp.mean(obs, axis=0)
-        return cls(mean, jnp.mean((obs - mean[None]) ** 2, axis=0), jnp.asarray(len(obs), obs.dtype))
+        vectors = tuple(range(obs.ndim - 1))
+        mean = jnp.mean(obs, axis=vectors, keepdims=True)
+        var = jnp.mean((obs - mean) ** 2, axis=vectors)
+        return cls(mean.reshape(-1), var, jnp.asarray(obs.size // obs.shape[-1], obs.dtype))
 
     def update(self, obs: Float[Array, "*batch d"], memory: float = jnp.inf) -> Statistics:
         """With more vectors, joined as by Chan et al. (1983).
@@ -51,3 +56,13 @@ class Statistics(flax.struct.PyTreeNode):
         scale = 1 / jnp.maximum(jnp.sqrt(self.var), _SMALLEST)
         shape = (1,) * (obs.ndim - 1) + self.mean.shape
         return jnp.clip((obs - self.mean.reshape(shape)) * scale.reshape(shape), -_LARGEST, _LARGEST)
+
+
+def vector(obs: Obs) -> Float[Array, "*batch d"]:
+    """What of an observation is not an image."""
+    return obs["state"] if isinstance(obs, dict) else obs
+
+
+def on_vector(function: Callable[[Array], Array], obs: Obs) -> Obs:
+    """The observation with a function of its vector in place of it; images stay as they are."""
+    return obs | {"state": function(obs["state"])} if isinstance(obs, dict) else function(obs)

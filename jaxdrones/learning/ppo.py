@@ -13,8 +13,10 @@ import optax
 from jaxtyping import Array
 
 from jaxdrones.envs import Env
+from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect
-from jaxdrones.learning.networks import MLP, Policy, apply, central, init_params
+from jaxdrones.learning.networks import MLP, Policy, VisionMLP, apply, central, init_params, network_for, seen_by_one
+from jaxdrones.learning.normalize import on_vector
 from jaxdrones.learning.result import Result, bounded, scan_updates
 from jaxdrones.learning.returns import advantages
 
@@ -53,7 +55,7 @@ class Config:
     slowest: float = 1e-5
     fastest: float = 5e-3
     cool: float = 0.3
-    """Share of the updates, the last ones, in which the largest rate falls to the slowest."""
+    """Share of the updates, the last ones, in which the largest rate falls to the slowest, and the spread to `calm`."""
     discount: float = 0.99
     trace: float = 0.99
     """Lambda of the advantages."""
@@ -65,7 +67,9 @@ class Config:
     spread: float = 0.4
     """Standard deviation of actions at the start."""
     narrowest: float = 0.1
-    """The least it may become; what is tried next to the mean is what a policy learns from."""
+    """The least it may become before the last updates; what is tried next to the mean is what a policy learns from."""
+    calm: float = 0.02
+    """What it falls to in the last updates: rotors that are shaken lift more, so the mean is off without shaking."""
     restart: float = 0.05
     """Share of the worlds that start afresh before an update, so that not all are of an age."""
     clip: float = 0.5
@@ -94,12 +98,12 @@ class TrainState(flax.struct.PyTreeNode):
 
 
 class Sample(flax.struct.PyTreeNode):
-    """What is learnt from; leading axes (steps, n)."""
+    """What is learnt from; leading axes (t, w, n)."""
 
-    obs: Array
+    obs: Obs
     action: Array
     log_prob: Array
-    critic_obs: Array
+    critic_obs: Obs
     advantage: Array
     target: Array
 
@@ -111,7 +115,8 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     n, d, a = env.drones, env.observation_size, env.action_size
     log_std = jnp.full((n, a) if config.per_role else (a,), jnp.log(config.spread))
     inputs = n * d + (n - 1) * a if config.central_critic else d
-    critic = init_params(critic_key, _critic(config), inputs, n if config.per_role else None)
+    obs = on_vector(lambda _: jnp.zeros(inputs), seen_by_one(env))
+    critic = init_params(critic_key, _critic(config, obs), obs, n if config.per_role else None)
     optimiser = _descent(config).init((policy.params, log_std, critic))
     rate = jnp.asarray(config.learning_rate, log_std.dtype)
     worlds = collect.idle(env, config.worlds)
@@ -123,17 +128,20 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     key, restart_key, fly_key, learn_key = jax.random.split(state.key, 4)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart)
 
-    def act(key, obs):
-        mean = state.policy(obs)
-        std = jnp.broadcast_to(jnp.exp(state.log_std), mean.shape)
-        action = mean + std * jax.random.normal(key, mean.shape, mean.dtype)
-        return action, log_prob(action, mean, state.log_std)
+    def act(policy, log_std, keys, obs):
+        mean = policy(obs)
+        std = jnp.broadcast_to(jnp.exp(log_std), mean.shape)
+        noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(keys)
+        action = mean + std * noise
+        return action, log_prob(action, mean, log_std)
 
-    worlds, flight = collect.fly(fly_key, env, act, worlds, config.horizon)
+    pilot = jax.tree_util.Partial(act, state.policy, state.log_std)
+    worlds, flight = collect.fly(fly_key, env, pilot, worlds, config.horizon)
     sample = _judged(config, state, flight)
     learnt, optimiser, rate, losses = _learn(learn_key, config, state, sample)
     params, log_std, critic = learnt
-    log_std = jnp.maximum(log_std, jnp.log(config.narrowest))
+    widest = _falling(config, state.step, config.spread, config.calm)
+    log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.narrowest, widest)), jnp.log(widest))
     policy = state.policy.replace(
         params=params, statistics=collect.remember(state.policy.statistics, flight, config, state.step)
     )
@@ -172,8 +180,8 @@ def _judged(config: Config, state: TrainState, flight: collect.Flight) -> Sample
     policy = state.policy
 
     def seen(obs, action):
-        normal = policy.statistics.normalize(obs)
-        return central(normal, action) if config.central_critic else normal
+        normal = on_vector(policy.statistics.normalize, obs)
+        return on_vector(lambda x: central(x, action), normal) if config.central_critic else normal
 
     critic_obs = seen(flight.obs, flight.action)
     final_obs = seen(flight.final_obs, policy(flight.final_obs) if config.central_critic else None)
@@ -194,8 +202,7 @@ def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
         params, log_std, critic = learnt
         return loss(config, state.policy.replace(params=params), log_std, critic, batch)
 
-    last = jnp.clip((1 - state.step / config.updates) / config.cool, 0, 1)
-    fastest = config.slowest * (config.fastest / config.slowest) ** last
+    fastest = _falling(config, state.step, config.fastest, config.slowest)
 
     def step(carry, batch):
         learnt, optimiser, rate = carry
@@ -207,11 +214,12 @@ def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
         return (learnt, optimiser, rate), losses
 
     def epoch(carry, key):
-        order = jax.random.permutation(key, w)
+        # One world of every group goes into each batch: neighbours change places, so that no device needs another's.
+        order = jnp.argsort(jax.random.uniform(key, (w // config.batches, config.batches)), axis=1)
 
         def batches(x):
-            x = x[:, order].reshape(t, config.batches, w // config.batches, *x.shape[2:])
-            return jnp.moveaxis(x, 1, 0).reshape(config.batches, -1, *x.shape[3:])
+            x = x.reshape(t, *order.shape, *x.shape[2:])
+            return jax.vmap(lambda group, order: group[:, order], (1, 0), 2)(x, order).swapaxes(0, 1)
 
         return jax.lax.scan(step, carry, jax.tree.map(batches, sample))
 
@@ -220,13 +228,19 @@ def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
     return learnt, optimiser, rate, jax.tree.map(jnp.mean, losses)
 
 
-def _critic(config: Config) -> MLP:
-    return MLP(config.critic_sizes, 1, scale=0.01)
+def _falling(config: Config, step: Array, high: float, low: float) -> Array:
+    """`high`, but from there to `low` in the last updates, by the same factor in each."""
+    left = jnp.clip((1 - step / config.updates) / config.cool, 0, 1)
+    return low * (high / low) ** left
 
 
-def _value(config: Config, critic: Any, critic_obs: Array) -> Array:
+def _critic(config: Config, critic_obs: Obs) -> MLP | VisionMLP:
+    return network_for(critic_obs, config.critic_sizes, 1, scale=0.01)
+
+
+def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
     """(*batch, n) discounted sum of rewards to come; the network's output is a mean reward."""
-    return apply(_critic(config), critic, critic_obs, config.per_role)[..., 0] / (1 - config.discount)
+    return apply(_critic(config, critic_obs), critic, critic_obs, config.per_role)[..., 0] / (1 - config.discount)
 
 
 def _descent(config: Config) -> optax.GradientTransformation:

@@ -15,6 +15,7 @@ import dataclasses
 import inspect
 import json
 import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -57,19 +58,18 @@ class Recipe:
         check_choice("task", task, TASKS)
         check_choice("algorithm", algorithm, ALGORITHMS)
         known = {field.name for field in dataclasses.fields(ALGORITHMS[algorithm].Config)}
-        environment = {*inspect.signature(make).parameters, *inspect.signature(TASKS[task]).parameters}
-        for name in changes:
-            check_choice("setting", name, (known | environment) - {"task", "backend", "realistic", "options", "vision"})
-        options = {name: x for name, x in changes.items() if name not in known}
-        try:
-            _, config = preset(task, algorithm, realistic, **options)
-        except TypeError as error:
-            raise ValueError(f"options {options} do not fit {task}: {error}") from None
-        settings = {name: _checked(name, x, getattr(config, name)) for name, x in changes.items() if name in known}
+        options, settings = divided(task, changes, known)
+        _, config = fitting_preset(task, algorithm, realistic, options)
+        settings = {name: checked(name, x, getattr(config, name)) for name, x in settings.items()}
         config = dataclasses.replace(config, **settings)
         for name in ("updates", "worlds", "horizon"):
             check_whole(name, getattr(config, name))
         return cls(task, algorithm, realistic, options, config)
+
+    @property
+    def learner(self) -> str:
+        """The algorithm and, where that is another, its library."""
+        return self.algorithm
 
     def env(self, **options) -> Env:
         """The environment; options of `jaxdrones.make` replace those of the recipe."""
@@ -88,8 +88,34 @@ class Recipe:
         return cls(**kept | {"config": ALGORITHMS[kept["algorithm"]].Config(**config)})
 
 
-def _checked(name: str, value, now):
-    """A setting of the kind that it has now."""
+def divided(task: str, changes: dict[str, Any], known: Collection[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Options of the environment, and settings of the learner, whose names are `known`.
+
+    Raises:
+        ValueError: a name of neither; lists both.
+    """
+    environment = {*inspect.signature(make).parameters, *inspect.signature(TASKS[task]).parameters}
+    environment -= {"task", "backend", "realistic", "options", "vision"}
+    for name in changes:
+        check_choice("setting", name, environment.union(known))
+    settings = {name: x for name, x in changes.items() if name in known}
+    return {name: x for name, x in changes.items() if name not in known}, settings
+
+
+def fitting_preset(task: str, algorithm: str, realistic: bool, options: dict[str, Any]) -> tuple[Env, Any]:
+    """`preset`, whose complaints of wrong values are a `ValueError`."""
+    try:
+        return preset(task, algorithm, realistic, **options)
+    except TypeError as error:
+        raise ValueError(f"options {options} do not fit {task}: {error}") from None
+
+
+def checked(name: str, value, now):
+    """A setting of the kind that it has now.
+
+    Raises:
+        ValueError: it is of another kind.
+    """
     if isinstance(now, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if now is not None and type(value) is not type(now):
@@ -99,6 +125,8 @@ def _checked(name: str, value, now):
 
 class Run:
     """The folder of one seed."""
+
+    policy_suffix = "msgpack"
 
     def __init__(self, folder: str | os.PathLike):
         """Look at a folder; nothing is read or made yet."""
@@ -121,7 +149,7 @@ class Run:
 
     def clear(self) -> None:
         """Remove what an earlier run left, and nothing else."""
-        names = [f"{name}.{suffix}" for name in ("best", "last", "state") for suffix in ("msgpack", "json")]
+        names = [f"{name}.{suffix}" for name in ("best", "last", "state") for suffix in ("msgpack", "zip", "json")]
         for file in (*map(self.folder.joinpath, [*names, "progress.csv", "report.json"]), *self._events()):
             file.unlink(missing_ok=True)
 
@@ -150,16 +178,18 @@ class Run:
                 (env.observation_size, env.action_size),
             )
             if given != wanted:
-                raise ValueError(
-                    f"{self.folder / name} was trained on another version of {env.task.name}: it has observations and "
-                    f"actions of {given} numbers, the environment {wanted}; train anew"
-                )
+                raise misfit(self.folder / name, env, given, wanted)
         return policy
 
     @property
     def started(self) -> bool:
         """Whether there is a training state to go on from."""
         return (self.folder / "state.json").exists()
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether a training began here, with whichever library, and did not come to its end."""
+        return (self.folder / "best.json").exists() and self.report() is None
 
     def save_policy(self, name: str, policy: Policy, **about) -> None:
         """Write `best` or `last`."""
@@ -192,6 +222,27 @@ class Run:
 
     def _events(self) -> list[Path]:
         return sorted(self.folder.glob(f"{PREFIX}.*.jaxdrones"))
+
+
+def run_in(folder: str | os.PathLike) -> Run:
+    """The run in a folder, of whichever library trained it.
+
+    Raises:
+        ImportError: it is of Stable-Baselines3, which is not installed.
+    """
+    if (Path(folder) / "best.zip").exists():
+        from jaxdrones.learning import sb3  # an optional library behind it
+
+        return sb3.Run(folder)
+    return Run(folder)
+
+
+def misfit(path: Path, env: Env, given: tuple[int, int], wanted: tuple[int, int]) -> ValueError:
+    """The complaint about a policy of other sizes than those of the environment."""
+    return ValueError(
+        f"{path} was trained on another version of {env.task.name}: it has observations and "
+        f"actions of {given} numbers, the environment {wanted}; train anew"
+    )
 
 
 class Progress:

@@ -20,6 +20,8 @@ from jaxdrones.learning.networks import MLP, Policy, init_params
 from jaxdrones.learning.result import Result, descent, scan_updates
 from jaxdrones.learning.returns import advantages
 
+_STEPS = 4  # control steps that a gradient step of the critic is taken on
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -41,7 +43,7 @@ class Config:
     critic_rate: float = 5e-3
     """The same of the critic."""
     critic_steps: int = 8
-    """Gradient steps of the critic in an update, each with four times as many flown steps as there are worlds."""
+    """Gradient steps of the critic in an update, each with four successive control steps of all worlds."""
     trust: float = 0.9
     """Share of the updates in which the value of the end grows from nothing to its full weight."""
     discount: float = 0.98
@@ -86,7 +88,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     """Before the first update."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
-    critic = init_params(critic_key, _critic(config), env.observation_size)
+    critic = init_params(critic_key, _critic(config), jnp.zeros(env.observation_size))
     return TrainState(
         jnp.zeros((), jnp.int32),
         key,
@@ -114,7 +116,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     def loss(params):
         policy = state.policy.replace(params=params)
         after, flight = collect.fly(
-            fly_key, env, lambda key, obs: (policy(obs), None), worlds, config.horizon, False, linked(config)
+            fly_key, env, collect.piloted(policy), worlds, config.horizon, False, linked(config)
         )
         ahead = trust * config.discount * value(state.target, flight.final_obs)
         last = flight.truncated.at[-1].set(~flight.terminated[-1])
@@ -148,10 +150,8 @@ def _fit(key, config: Config, state: TrainState, value, flight: collect.Flight):
     )
     goal = now + advantages(flight.reward, now, later, *team, config.discount, config.trace)
     counts = jnp.broadcast_to(~flight.over[..., None], now.shape)
-    rows = jax.tree.map(
-        lambda x: x.reshape(-1, *x.shape[3:]), jax.lax.stop_gradient((flight.obs, goal, counts.astype(goal.dtype)))
-    )
-    size = len(rows[1])
+    flown = jax.lax.stop_gradient((flight.obs, goal, counts.astype(goal.dtype)))
+    length = min(_STEPS, config.horizon)
 
     def loss(params, obs, goal, counts):
         miss = (1 - config.discount) * (value(params, obs) - goal)
@@ -159,8 +159,8 @@ def _fit(key, config: Config, state: TrainState, value, flight: collect.Flight):
 
     def step(carry, key):
         params, optimiser = carry
-        start = jax.random.randint(key, (), 0, max(size - 4 * config.worlds, 1))
-        batch = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, min(4 * config.worlds, size)), rows)
+        start = jax.random.randint(key, (), 0, config.horizon - length + 1)
+        batch = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, length), flown)
         cost, gradient = jax.value_and_grad(loss)(params, *batch)
         change, optimiser = _critic_descent(config).update(gradient, optimiser)
         return (optax.apply_updates(params, change), optimiser), cost

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.learning import hosts, sharding
 from jaxdrones.learning.evaluation import Report, evaluate
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.presets import ALGORITHMS
@@ -35,7 +36,7 @@ class Diverged(RuntimeError):
 
 
 class Trainer:
-    """The compiled programs of a recipe; all seeds share them."""
+    """The compiled programs of a recipe; all seeds share them, and all devices of all hosts the worlds."""
 
     def __init__(self, recipe: Recipe, episodes: int = 1000):
         """Prepare; nothing is compiled yet.
@@ -43,8 +44,12 @@ class Trainer:
         Args:
             recipe: what to train.
             episodes: of an evaluation.
+
+        Raises:
+            ValueError: the devices cannot share the worlds equally.
         """
         self.recipe, self.episodes = recipe, episodes
+        self.mesh = sharding.devices(recipe.config.worlds)
         self.env, self.learner = recipe.env(), ALGORITHMS[recipe.algorithm]
         self.compile_seconds = 0.0
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
@@ -54,8 +59,12 @@ class Trainer:
         """Compile what trains; once."""
         start = time.perf_counter()
         count = jnp.zeros((), jnp.int32)
-        self.start = jax.jit(self._init).lower(jax.random.key(0)).compile(COMPILER_OPTIONS)
-        self._advance = jax.jit(self._updates).lower(self.shapes, count, count).compile(COMPILER_OPTIONS)
+        placed, same = sharding.layout(self.mesh, self.shapes), sharding.everywhere(self.mesh)
+        init = jax.jit(self._init, in_shardings=same, out_shardings=placed)
+        updates = jax.jit(self._updates, in_shardings=(placed, same, same), out_shardings=(placed, same))
+        with jax.set_mesh(self.mesh):
+            self.start = init.lower(jax.random.key(0)).compile(COMPILER_OPTIONS)
+            self._advance = updates.lower(self.shapes, count, count).compile(COMPILER_OPTIONS)
         self.compile_seconds = time.perf_counter() - start
 
     def prepare(self, run: Run) -> None:
@@ -72,7 +81,7 @@ class Trainer:
         start = time.perf_counter()
         self.advance(state, 3)
         pace = (time.perf_counter() - start) / 3
-        config = dataclasses.replace(self.recipe.config, updates=max(1, int(seconds / pace)))
+        config = dataclasses.replace(self.recipe.config, updates=max(1, int(hosts.agreed(seconds / pace))))
         self.recipe = dataclasses.replace(self.recipe, config=config)
 
     def advance(self, state, updates: int):
@@ -91,13 +100,14 @@ class Trainer:
 
         Raises:
             Diverged: numbers that are not finite; the best policy so far is kept.
-            KeyboardInterrupt: as it came; the state is saved.
+            KeyboardInterrupt: as it came; the state is saved, unless other hosts would have to help.
         """
         course = _Course(self, run, seed)
         try:
             course.go(tell)
         except KeyboardInterrupt:
-            course.save()
+            if jax.process_count() == 1:
+                course.save()
             raise
         course.finish()
 
@@ -136,7 +146,9 @@ class _Course:
         self.unbroken = 0  # updates in a row that were not finite
         self.best = None  # score
         if run.started:
-            self.state, self.seconds = run.load_state(trainer.shapes), run.about("state")["seconds"]
+            state = run.load_state(trainer.shapes)
+            self.state = sharding.placed(trainer.mesh, state)
+            self.seconds = run.about("state")["seconds"]
             self.best = tuple(run.about("best")["score"])
             self.update = int(self.state.step)
         else:
@@ -146,7 +158,7 @@ class _Course:
 
     def go(self, tell: Tell) -> None:
         """Make all updates that are left."""
-        updates, saved, length = self.config.updates, time.perf_counter(), 1
+        updates, saved, length = self.config.updates, self.seconds, 1
         points = {updates * (i + 1) // EVALUATIONS for i in range(EVALUATIONS)}
         with Progress(self.run, self._columns(), self.update) as progress:
             while self.update < updates:
@@ -159,9 +171,9 @@ class _Course:
                         raise _diverged(self.update + length)
                 progress.add(rows)
                 self.state, self.update = state, self.update + length
-                if self.update in points or time.perf_counter() - saved > _SAVE:
+                if self.update in points or self.seconds - saved > _SAVE:
                     self.save()
-                    saved = time.perf_counter()
+                    saved = self.seconds
                 tell(self.update, rows[-1] | {"steps_per_s": length * self._steps / took})
                 length = max(1, round(_CALL / took * length))
 
@@ -169,7 +181,7 @@ class _Course:
         """The state after some updates, a line of progress for each, and the seconds they took; checked."""
         start = time.perf_counter()
         state, metrics = self.trainer.advance(self.state, length)
-        took = time.perf_counter() - start
+        took = hosts.agreed(time.perf_counter() - start)
         self.unbroken = _unbroken(metrics, self.unbroken)
         if self.unbroken >= min(_PATIENCE, self.config.updates) or not _finite(state):
             raise _diverged(self.update + length)
@@ -186,6 +198,7 @@ class _Course:
 
     def judge(self, policy: Policy, update: int) -> dict[str, float]:
         """Evaluate a policy, always on the same episodes; keep it if it is the best."""
+        policy = sharding.whole(self.trainer.mesh, policy)
         report = self._evaluate(policy, _CHOICE)
         score = (report.success, report.returned if math.isfinite(report.returned) else -math.inf)
         if self.best is None or score > self.best:
@@ -195,8 +208,9 @@ class _Course:
 
     def save(self) -> None:
         """Write the newest policy and the training state."""
-        self.run.save_policy("last", self.state.policy, **self.about, update=self.update)
-        self.run.save_state(self.state, **self.about, update=self.update, seconds=self.seconds)
+        state = sharding.whole(self.trainer.mesh, self.state)
+        self.run.save_policy("last", state.policy, **self.about, update=self.update)
+        self.run.save_state(state, **self.about, update=self.update, seconds=self.seconds)
 
     def finish(self) -> None:
         """Evaluate the best policy on other episodes than it was chosen by, and write the report."""

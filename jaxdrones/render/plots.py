@@ -27,7 +27,7 @@ PANELS = {
     "rpm3": ("rpm", 3, "P3 (RPM)"),
 }
 ERROR = {"error": ("error", 0, "error (m)")}
-POLICY_PANELS = ("x", "rpm0", "y", "rpm1", "z", "rpm2", "error", "rpm3")
+POLICY_PANELS = ("x", "rpm0", "y", "rpm1", "z", "rpm2", "vz", "rpm3", "error", "yaw")
 
 
 def check_matplotlib() -> None:

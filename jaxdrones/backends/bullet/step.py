@@ -152,6 +152,10 @@ class BulletStep(HostStep):
         Raises:
             ValueError: a wrong shape, a closed client, a state that is not finite, or an eye inside a body.
         """
+        if is_traced((params, state)):
+            self.client.check_open()
+            check_team(params, state, state.rpm)
+            return self._traced_camera(params, state, camera, raw_depth)
         team = self._place(params, state)
         return of_drones(self.client, team, self._arms, camera, raw_depth)
 
@@ -196,13 +200,10 @@ class BulletStep(HostStep):
     def _traced(self, params: Params, state: State, rpm: jax.Array) -> State:
         """The same in a compiled program, which computes the wrenches itself and calls back for every physics step."""
         bodies, flat_params = _bodies(params), flatten(params)
-        omega = jax.vmap(rotation.rotate)(state.quat, state.omega)
-        team = jnp.concatenate([state.pos, state.quat, state.vel, omega, state.rpm, rpm], axis=-1)
+        team = _one_array(state, rpm)
 
         def advance(bodies, team, loads):
-            self.client.check_open()
-            self._params = None  # the bodies are no longer those of the last call with values
-            self.client.set_team(np.asarray(bodies, float))
+            self._become(bodies)
             return self.client.advance(np.asarray(team, float), np.asarray(loads, float)).astype(team.dtype)
 
         def substep(team, _):
@@ -214,6 +215,34 @@ class BulletStep(HostStep):
         team, _ = jax.lax.scan(substep, team, length=self._substeps)
         state = State(**{name: team[:, columns] for name, columns in _COLUMNS.items()})
         return state.replace(omega=jax.vmap(rotation.rotate_inverse)(state.quat, state.omega))
+
+    def _traced_camera(self, params: Params, state: State, camera: Camera, raw_depth: bool) -> tuple[jax.Array, ...]:
+        """The same in a compiled program; the callback itself computes nothing with JAX, which would be slow."""
+        n, size = len(state.pos), (camera.height, camera.width)
+        kinds = (((*size, 4), np.uint8), (size, np.float32), (size, np.int32))
+        pictures = tuple(jax.ShapeDtypeStruct((n, *shape), dtype) for shape, dtype in kinds)
+
+        def take(bodies, arms, team):
+            self._become(bodies)
+            team = np.asarray(team, float)
+            check_finite("state", team)
+            self.client.place(team)
+            return of_drones(self.client, team, np.asarray(arms, float), camera, raw_depth)
+
+        team = _one_array(state, state.rpm)
+        return jax.pure_callback(take, pictures, _bodies(params), params.arm, team, vmap_method="sequential")
+
+    def _become(self, bodies: jax.Array) -> None:
+        """The bodies of the team that a compiled program calls back with; no longer those of a call with values."""
+        self.client.check_open()
+        self._params = None
+        self.client.set_team(np.asarray(bodies, float))
+
+
+def _one_array(state: State, rpm: jax.Array) -> jax.Array:
+    """What the host sees of a team."""
+    omega = jax.vmap(rotation.rotate)(state.quat, state.omega)
+    return jnp.concatenate([state.pos, state.quat, state.vel, omega, state.rpm, rpm], axis=-1)
 
 
 def _bodies(params: Params) -> jax.Array:

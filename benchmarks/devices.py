@@ -1,0 +1,75 @@
+"""How much faster does a learner's update get on several devices than on one?
+
+Both programs run in one process, call by call in turn; medians. A CPU is cut into devices (`--cpu-devices`);
+XLA spreads the work of one device over all cores too, so that a CPU's figure says more about what sharing costs.
+"""
+
+import argparse
+import dataclasses
+import os
+import statistics
+import time
+
+import jax
+from common import about, report
+
+from jaxdrones.learning import COMPILER_OPTIONS, bptt, ppo, presets, shac, sharding
+
+ALGORITHMS = {"bptt": bptt, "ppo": ppo, "shac": shac}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--algo", nargs="+", default=["bptt", "ppo"], choices=ALGORITHMS)
+    parser.add_argument("--worlds", type=int, help="instead of the preset's")
+    parser.add_argument("--cpu-devices", type=int, default=2, metavar="N")
+    parser.add_argument("--repeats", type=int, default=15, help="updates on one device and on all, in turn")
+    parser.add_argument("--quick", action="store_true", help="a few worlds: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    jax.config.update("jax_num_cpu_devices", options.cpu_devices)
+    changes = {} if options.worlds is None else {"worlds": options.worlds}
+    if options.quick:
+        changes, options.algo, options.repeats = {"worlds": 8, "horizon": 4}, options.algo[:1], 2
+
+    rows = [measure(algorithm, changes, options.repeats) for algorithm in options.algo]
+    facts = about() | {"devices": jax.device_count(), "load": os.getloadavg()[0]}
+    lines = [f"{name}: {value}" for name, value in facts.items()]
+    lines += [
+        f"{row['algorithm']}, hover, {row['worlds']} worlds x {row['horizon']}: {1e3 * row['one']:.1f} ms on one, "
+        f"{1e3 * row['all']:.1f} ms on all ({row['one'] / row['all']:.2f} times as fast)"
+        for row in rows
+    ]
+    report({"about": facts, "rows": rows}, options.json, lines)
+
+
+def measure(algorithm: str, changes: dict, repeats: int) -> dict[str, object]:
+    """Seconds of an update of hover, on one device and on all."""
+    learner = ALGORITHMS[algorithm]
+    env, config = presets.preset("hover", algorithm)
+    config = dataclasses.replace(config, **changes)
+
+    def flying(mesh):
+        placed = sharding.layout(mesh, jax.eval_shape(lambda key: learner.init(key, env, config), jax.random.key(0)))
+        with jax.set_mesh(mesh):
+            init = jax.jit(lambda key: learner.init(key, env, config), out_shardings=placed)
+            update = jax.jit(lambda state: learner.update(env, config, state)[0], out_shardings=placed)
+            state = init(jax.random.key(0))
+            return update.lower(state).compile(COMPILER_OPTIONS), state
+
+    programs = {
+        "one": flying(sharding.devices(config.worlds, jax.devices()[:1])),
+        "all": flying(sharding.devices(config.worlds)),
+    }
+    times = {name: [] for name in programs}
+    for _ in range(1 + repeats):
+        for name, (update, state) in programs.items():
+            start = time.perf_counter()
+            programs[name] = update, jax.block_until_ready(update(state))
+            times[name].append(time.perf_counter() - start)
+    medians = {name: statistics.median(seconds[1:]) for name, seconds in times.items()}
+    return {"algorithm": algorithm, "worlds": config.worlds, "horizon": config.horizon} | medians
+
+
+if __name__ == "__main__":
+    main()

@@ -1,10 +1,11 @@
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxdrones import envs
-from jaxdrones.learning.networks import Policy, central
+from jaxdrones.learning.networks import CNN, Policy, central
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +45,13 @@ def test_the_central_critic_of_the_paper_sees_25_numbers_its_own_first():
     seen = central(obs, action)
     np.testing.assert_array_equal(seen[0], [*range(24), 200])
     np.testing.assert_array_equal(seen[1], [*range(12, 24), *range(12), 100])
+
+
+def test_a_layer_of_the_cnn_is_a_convolution():
+    cnn, picture = CNN(channels=(5,), strides=(4,), features=7), jax.random.normal(jax.random.key(1), (2, 8, 12, 3))
+    params = cnn.init(jax.random.key(0), picture)["params"]
+    kernel, head = params["Dense_0"]["kernel"].reshape(4, 4, 3, 5), params["Dense_1"]
+    found = nn.relu(nn.Conv(5, (4, 4), strides=4).apply({"params": {"kernel": kernel, "bias": jnp.ones(5)}}, picture))
+    params = params | {"Dense_0": params["Dense_0"] | {"bias": jnp.ones(5)}}
+    expected = nn.relu(found.reshape(2, -1) @ head["kernel"] + head["bias"][None])
+    np.testing.assert_allclose(cnn.apply({"params": params}, picture), expected, rtol=1e-5, atol=1e-5)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+HELPERS = {"common.py", "rivals_crazyflow.py", "rivals_venv.py"}
 
 
 def quick(name: str) -> dict:
@@ -51,7 +52,14 @@ def test_learning_reports_every_seed():
     assert rows and all(0 <= row["success"] <= 1 for row in rows)
 
 
-@pytest.mark.parametrize("name", [path.name for path in BENCHMARKS.glob("*.py") if path.name != "common.py"])
+@pytest.mark.slow
+def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():
+    result = quick("transfer.py")
+    assert [row["plant"] for row in result["rows"]] == ["own", "bullet, damping 0.04"]
+    assert all(0 <= row["success"] <= 1 and row["error p50"] > 0 for row in result["rows"])
+
+
+@pytest.mark.parametrize("name", sorted({path.name for path in BENCHMARKS.glob("*.py")} - HELPERS))
 def test_every_benchmark_explains_itself(name):
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / name), "--help"], capture_output=True, text=True, check=True

@@ -1,0 +1,194 @@
+"""Does a policy trained with the realistic preset fly a plant that it has not seen?
+
+Hover policies are trained on our plant and flown, with their weights frozen, on
+  own        our plant with all that the preset has: lag, drag, delay, noise, parameters drawn per episode;
+  bullet     the same with Bullet as integrator, contacts and the reference's damping, 0.04 1/s; 25 drones, 3 m apart,
+             share a world;
+  crazyflow  crazyflow 0.4.0: its airframes, thrust curves, rotors and drag, at its rate and by its integrator, in an
+             environment of its own (rivals_venv.py). Delay and noise are the preset's. An action asks for the same
+             share of the hover speed as in training: mass and hover speed are all that is told of the airframe.
+Starts, observations, delay, noise and the criterion (within 5 cm and 0.1 m/s for the last two of five seconds) are
+computed by one and the same code: an environment whose physics is exchanged. Before crazyflow counts, four constant
+rotor speeds must give the same flight there and here.
+"""
+
+import argparse
+import copy
+import importlib.metadata
+import importlib.util
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+import rivals_venv
+from common import about, report
+
+import jaxdrones as jd
+from jaxdrones.checks import check_choice
+from jaxdrones.envs import Env
+from jaxdrones.learning import COMPILER_OPTIONS, evaluate
+from jaxdrones.learning.episode import fly_episode
+from jaxdrones.learning.evaluation import wilson
+from jaxdrones.learning.presets import ALGORITHMS
+from jaxdrones.learning.runs import Recipe, Run
+
+PLANTS = ("own", "bullet", "crazyflow")
+DAMPING = 0.04  # 1/s, of the reference
+TEAM = 25  # drones of a Bullet world
+SEED = 1_000_000  # of the episodes: the same for every policy
+AGREED = 1e-9  # m, m/s, rad/s, RPM: largest difference that is rounding
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policy", nargs="*", type=Path, help="folders of `jaxdrones train hover --realistic`")
+    parser.add_argument("--algo", default="bptt", help="trains, where no policy is given: " + ", ".join(ALGORITHMS))
+    parser.add_argument("--seeds", type=int, default=3, help="how many to train")
+    parser.add_argument("--updates", type=int, help="instead of the preset's")
+    parser.add_argument("--plants", nargs="*", default=PLANTS, help=", ".join(PLANTS))
+    parser.add_argument("--airframes", nargs="*", help="of crazyflow; all its Crazyflies when left out")
+    parser.add_argument("--episodes", type=int, default=2000, help="of a policy on each plant")
+    parser.add_argument("--bullet-episodes", type=int, default=200, help="of a policy on Bullet")
+    parser.add_argument("--quick", action="store_true", help="two updates, two episodes, no crazyflow: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    for plant in options.plants:
+        check_choice("plant", plant, PLANTS)
+    changes = {} if options.updates is None else {"updates": options.updates}
+    if options.quick:
+        changes = dict(updates=2, worlds=8, horizon=4)
+        options.seeds, options.episodes, options.bullet_episodes, options.plants = 1, 2, 2, PLANTS[:2]
+
+    with tempfile.TemporaryDirectory() as folder:
+        runs = [Run(path) for path in options.policy or trained(options, changes, Path(folder))]
+        result = measure(runs, options)
+    lines = [f"{name}: {value}" for name, value in (result["about"] | result["crazyflow"]).items()]
+    lines.append("plant                | policy       | episodes | success [95 % interval]  | error cm p50    p99")
+    lines += [
+        f"{row['plant']:20} | {row['policy']:12} | {row['episodes']:8} |"
+        f" {row['success']:.4f} [{row['interval'][0]:.4f}, {row['interval'][1]:.4f}] |"
+        f" {100 * row['error p50']:12.2f} {100 * row['error p99']:6.2f}"
+        for row in result["rows"]
+    ]
+    report(result, options.json, lines)
+
+
+def trained(options, changes: dict, folder: Path) -> Iterator[Path]:
+    """Train one policy per seed."""
+    check_choice("algorithm", options.algo, ALGORITHMS)
+    recipe = Recipe.of("hover", options.algo, realistic=True, **changes)
+    env = recipe.env()
+    algorithm = ALGORITHMS[options.algo]
+    train = jax.jit(lambda key: algorithm.train(key, env, recipe.config).policy, compiler_options=COMPILER_OPTIONS)
+    for seed in range(options.seeds):
+        run = Run(folder / f"seed {seed}")
+        run.save_policy("best", train(jax.random.key(seed)), recipe=recipe.as_dict())
+        yield run.folder
+
+
+def measure(runs: list[Run], options) -> dict:
+    """A row per plant and policy."""
+    recipe, rows, crazyflow = runs[0].recipe(), [], {}
+    for plant in options.plants:
+        if plant == "crazyflow" and importlib.util.find_spec("crazyflow") is None:
+            there = flown_elsewhere(runs, options)
+            rows, crazyflow = rows + there["rows"], there["crazyflow"]
+            continue
+        if plant == "crazyflow":
+            crazyflow = checked_crazyflow()
+        rows += FLOWN[plant](recipe, runs, options)
+    return {"about": about(), "crazyflow": crazyflow, "rows": rows}
+
+
+def on_own(recipe: Recipe, runs: list[Run], options) -> list[dict]:
+    env = recipe.env()
+    return [flown("own", run, env, options.episodes) for run in runs]
+
+
+def on_bullet(recipe: Recipe, runs: list[Run], options) -> list[dict]:
+    from jaxdrones.backends import bullet  # not in the environment of the rivals
+
+    env = recipe.env(drones=min(TEAM, options.bullet_episodes))
+    substeps = env.task.substeps
+    physics = dict(effects=(jd.drag,), rotors=jd.lagging_rotors, dt=env.dt / substeps, substeps=substeps)
+    with bullet.make_step(**physics, scene=env.task.scene, damping=DAMPING) as step:
+        env = with_physics(env, step)
+        return [flown_in_teams(f"bullet, damping {DAMPING}", run, env, options.bullet_episodes) for run in runs]
+
+
+def on_crazyflow(recipe: Recipe, runs: list[Run], options) -> list[dict]:
+    import rivals_crazyflow as crazyflow  # only in the environment of the rivals
+
+    rows = []
+    nominal = jax.tree.map(lambda x: x[0], recipe.env().params)
+    for airframe in options.airframes or crazyflow.AIRFRAMES:
+        sim = crazyflow.make_sim(airframe)
+        env = recipe.env(vehicle=crazyflow.calibrated(airframe, nominal), laws=())
+        env = with_physics(env, crazyflow.make_step(sim, substeps=round(env.dt * sim.freq)))
+        rows += [flown(f"crazyflow {airframe}", run, env, options.episodes) for run in runs]
+    return rows
+
+
+FLOWN = {"own": on_own, "bullet": on_bullet, "crazyflow": on_crazyflow}
+
+
+def flown(plant: str, run: Run, env: Env, episodes: int) -> dict:
+    """How a policy flies many worlds at once."""
+    came = evaluate(env, run.policy(env=env), jax.random.key(SEED), episodes)
+    p50, p99 = came.error_percentiles[50], came.error_percentiles[99]
+    return row(plant, run, episodes, came.success, came.interval, p50, p99)
+
+
+def flown_in_teams(plant: str, run: Run, env: Env, episodes: int) -> dict:
+    """How a policy flies one world after the other; each drone of a team is an episode."""
+    policy, success, error = run.policy(env=env), [], []
+    for key in jax.random.split(jax.random.key(SEED), -(-episodes // env.drones)):
+        flight = fly_episode(env, policy, key)
+        whole = len(flight.t) == env.steps  # else one was lost, and all of its team count as failures
+        success += list(whole & env.task.success(flight.metrics, env.dt))
+        error += list(flight.metrics["error"][-1])
+    n = len(success)
+    interval = wilson(int(sum(success)), n)
+    p50, p99 = (float(np.percentile(error, q)) for q in (50, 99))
+    return row(plant, run, n, float(np.mean(success)), interval, p50, p99)
+
+
+def row(plant, run, episodes, success, interval, p50, p99) -> dict:
+    found = {"success": success, "interval": interval, "error p50": p50, "error p99": p99}
+    return {"plant": plant, "policy": run.folder.name, "episodes": episodes} | found
+
+
+def with_physics(env: Env, step) -> Env:
+    """The same environment on another plant."""
+    env = copy.copy(env)
+    env.physics = step
+    return env
+
+
+def checked_crazyflow() -> dict:
+    """Versions, and how far apart the same flight ends on both sides.
+
+    Raises:
+        RuntimeError: further than rounding, so frames, units or rotors are not what is taken for granted here.
+    """
+    import rivals_crazyflow as crazyflow
+
+    apart = crazyflow.agreement()
+    if not all(x <= AGREED for x in apart.values()):
+        raise RuntimeError(f"crazyflow and our plant do not fly alike: {apart}; the interface is wrong")
+    versions = {name: importlib.metadata.version(name) for name in ("crazyflow", "jax")}
+    return {"crazyflow": versions, "the same flight ends apart by": apart}
+
+
+def flown_elsewhere(runs: list[Run], options) -> dict:
+    """The same file, in the environment of the rivals."""
+    airframes = ["--airframes", *options.airframes] if options.airframes else []
+    folders = [str(run.folder.resolve()) for run in runs]
+    episodes = ["--episodes", str(options.episodes)]
+    return rivals_venv.run("transfer.py", "--plants", "crazyflow", *episodes, *airframes, "--policy", *folders)
+
+
+if __name__ == "__main__":
+    main()

@@ -5,46 +5,37 @@ program. Evaluation is not counted.
 """
 
 import argparse
-import dataclasses
 import time
 
 import jax
 from common import about, report
 
-from jaxdrones.checks import check_choice
-from jaxdrones.learning import COMPILER_OPTIONS, bptt, evaluate, ppo, presets, shac
-
-ALGORITHMS = {"bptt": bptt, "ppo": ppo, "shac": shac}
+from jaxdrones.cli.training import settings
+from jaxdrones.learning import COMPILER_OPTIONS, evaluate
+from jaxdrones.learning.presets import ALGORITHMS
+from jaxdrones.learning.runs import Recipe
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="hover")
     parser.add_argument("--realistic", action="store_true", help="lag, drag, delay, noise, parameter ranges")
-    parser.add_argument("--period", type=float, help="s, of tracking's curve")
     parser.add_argument("--algo", default="bptt", help=", ".join(ALGORITHMS))
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--updates", type=int, help="instead of the preset's")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="as of `jaxdrones train`")
     parser.add_argument("--episodes", type=int, default=10_000, help="of the evaluation of a seed")
     parser.add_argument("--quick", action="store_true", help="two updates of few worlds: does it run?")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     options = parser.parse_args()
-    check_choice("algorithm", options.algo, ALGORITHMS)
-    env, config = presets.preset(
-        options.task,
-        options.algo,
-        realistic=options.realistic,
-        **({} if options.period is None else {"period": options.period}),
-    )
-    if options.updates:
-        config = dataclasses.replace(config, updates=options.updates)
+    changes = settings(options.set)
     if options.quick:
-        config = dataclasses.replace(config, updates=2, worlds=8, horizon=4)
+        changes |= dict(updates=2, worlds=8, horizon=4)
         options.seeds, options.episodes = 1, 10
+    recipe = Recipe.of(options.task, options.algo, options.realistic, **changes)
 
-    rows, spent = measure(env, config, options)
-    lines = [f"{name}: {value}" for name, value in (settings(options, config) | about() | spent).items()]
+    rows, spent = measure(recipe, options)
+    lines = [f"{name}: {value}" for name, value in (recipe.as_dict() | about() | spent).items()]
     lines.append("seed |     steps | run s (CPU s) | success [95 % interval] |  error cm p50   p99 | rms cm | others")
     lines += [
         f"{row['seed']:4} | {row['steps']:9} | {row['run']:5.1f} ({row['run CPU']:5.1f}) |"
@@ -52,20 +43,16 @@ def main() -> None:
         f"  {100 * row['error p50']:8.2f} {100 * row['error p99']:8.2f} | {100 * row['rms']:6.2f} | {row['metrics']}"
         for row in rows
     ]
-    report({"settings": settings(options, config), "about": about(), "spent": spent, "rows": rows}, options.json, lines)
+    report({"settings": recipe.as_dict(), "about": about(), "spent": spent, "rows": rows}, options.json, lines)
 
 
-def settings(options, config) -> dict[str, object]:
-    plain = {name: x for name, x in dataclasses.asdict(config).items() if x is not None}
-    return {"task": options.task, "realistic": options.realistic, "algorithm": options.algo, "config": plain}
-
-
-def measure(env, config, options) -> tuple[list[dict], dict]:
+def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
     """A row per seed, and the seconds spent on compiling."""
     jax.config.update("jax_enable_compilation_cache", False)
-    algorithm = ALGORITHMS[options.algo]
+    algorithm, config = ALGORITHMS[recipe.algorithm], recipe.config
+    env, practice = recipe.env(), recipe.env(practice=True)
     start, start_cpu = time.perf_counter(), time.process_time()
-    train = jax.jit(lambda key: algorithm.train(key, env, config))
+    train = jax.jit(lambda key: algorithm.train(key, practice, config))
     train = train.lower(jax.random.key(0)).compile(COMPILER_OPTIONS)
     spent = {"compile s": time.perf_counter() - start, "compile CPU s": time.process_time() - start_cpu}
 

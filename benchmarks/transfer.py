@@ -79,7 +79,7 @@ def trained(options, changes: dict, folder: Path) -> Iterator[Path]:
     """Train one policy per seed."""
     check_choice("algorithm", options.algo, ALGORITHMS)
     recipe = Recipe.of("hover", options.algo, realistic=True, **changes)
-    env = recipe.env()
+    env = recipe.env(practice=True)
     algorithm = ALGORITHMS[options.algo]
     train = jax.jit(lambda key: algorithm.train(key, env, recipe.config).policy, compiler_options=COMPILER_OPTIONS)
     for seed in range(options.seeds):

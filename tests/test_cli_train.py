@@ -114,7 +114,7 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
         (["train", "hover", "--set", "worlds=2.5"], "worlds is 2.5; give something like 256"),
         (["train", "hover", "--set", "worlds=0"], "worlds is 0"),
         (["train", "hover", "--set", "worlds"], "give NAME=VALUE"),
-        (["train", "hover", "--algo", "ppo", "--set", "worlds=6"], "give a multiple of batches, 4"),
+        (["train", "hover", "--algo", "ppo", "--set", "worlds=6"], "give a multiple of batches, 8"),
         (["train", "hover", "--budget", "long"], "--budget is 'long'; give updates"),
         (["train", "hover", "--seeds", "0"], "seeds is 0"),
         (["train", "hover", "--resume"], "holds no training to go on with"),

@@ -36,7 +36,8 @@ def add(commands) -> None:
     parser.add_argument("task", metavar="TASK", help=", ".join(TASKS))
     parser.add_argument("--library", default=LIBRARIES[0], help=f"{', '.join(LIBRARIES)} ({LIBRARIES[0]})")
     parser.add_argument(
-        "--algo", help=f"{', '.join(ALGORITHMS)} (bptt); with sb3 {', '.join(SB3_ALGORITHMS)} ({SB3_ALGORITHMS[0]})"
+        "--algo",
+        help=f"{', '.join(ALGORITHMS)} (bptt; gates: ppo); with sb3 {', '.join(SB3_ALGORITHMS)} ({SB3_ALGORITHMS[0]})",
     )
     parser.add_argument(
         "--realistic", action="store_true", help="rotor lag, drag, delay, sensor noise, parameter ranges"
@@ -144,9 +145,10 @@ def _runs(options: argparse.Namespace, output: Path) -> dict:
 
 def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
     """The recipe that is asked for, if it may be written where it is to go."""
+    from jaxdrones.learning.presets import algorithm_for
     from jaxdrones.learning.runs import Recipe, Run
 
-    recipe = Recipe.of(options.task, options.algo or "bptt", options.realistic, **asked)
+    recipe = Recipe.of(options.task, options.algo or algorithm_for(options.task), options.realistic, **asked)
     for run in (*runs.values(), Run(output)):
         check_free(run, options.overwrite)
     return recipe

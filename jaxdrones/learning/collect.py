@@ -76,7 +76,7 @@ def restart(key: jax.Array, env: Env, worlds: Worlds, share: float = 0.0) -> Wor
     chosen = worlds.ended | jax.random.bernoulli(choice_key, share, (w,))
     obs, episodes = jax.vmap(autoreset(env).reset)(jax.random.split(start_key, w))
     fresh = Worlds(episodes, obs, jnp.zeros_like(chosen))
-    return jax.tree.map(lambda new, old: jnp.where(_rows(chosen, old), new, old), fresh, worlds)
+    return _where(chosen, fresh, worlds)
 
 
 def fly(
@@ -97,8 +97,8 @@ def fly(
             `jax.tree_util.Partial` alone.
         worlds: in flight.
         length: control steps.
-        reset: start a new episode in the step in which one ends; else that is left to `restart`, the drones fly on, and
-            everything from there on is marked as ended.
+        reset: start a new episode in the step in which one ends; else that is left to `restart`, the drones stay as
+            they are, and everything from there on is marked as over.
         link: applied to the worlds between steps; changes their gradients, not their values.
     """
     step = jax.vmap((autoreset(env) if reset else _Endless(env)).step)
@@ -120,8 +120,10 @@ def fly(
             error=info["metrics"]["error"],
             over=worlds.ended,
         )
-        ended = worlds.ended if reset else worlds.ended | terminated | truncated
-        return Worlds(episodes, obs, ended), flown
+        if reset:
+            return Worlds(episodes, obs, worlds.ended), flown
+        after = Worlds(episodes, obs, worlds.ended | terminated | truncated)
+        return _where(worlds.ended, worlds, after), flown  # a drone that is left to spin flies to infinity
 
     def flown(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Flight]:
         return jax.lax.scan(functools.partial(control_step, act, index), worlds, keys)
@@ -179,5 +181,10 @@ def remember(statistics: Statistics, flight: Flight, config, step: Array) -> Sta
     return jax.tree.map(lambda new, old: jnp.where(settling, new, old), new, statistics)
 
 
-def _rows(chosen: Array, leaf: Array) -> Array:
-    return chosen.reshape(chosen.shape + (1,) * (leaf.ndim - 1))
+def _where(chosen: Array, these: Worlds, others: Worlds) -> Worlds:
+    """These worlds where chosen (w,), else the others."""
+
+    def pick(this: Array, other: Array) -> Array:
+        return jnp.where(chosen.reshape(chosen.shape + (1,) * (this.ndim - 1)), this, other)
+
+    return jax.tree.map(pick, these, others)

@@ -29,13 +29,13 @@ _LARGEST_CHANGE = 10.0  # of a logarithm, far beyond what is rewarded; its expon
 class Config:
     """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
 
-    updates: int = 240
-    worlds: int = 512
+    updates: int = 400
+    worlds: int = 256
     horizon: int = 96
     """Control steps of an update; about a second, in which a rotor's speed comes to show in the position."""
-    epochs: int = 3
+    epochs: int = 4
     """Times that every step is learnt from."""
-    batches: int = 4
+    batches: int = 8
     """Parts of the flown steps, each of which makes one gradient step; cut out of the worlds."""
     sizes: tuple[int, ...] = (32, 32)
     critic_sizes: tuple[int, ...] = (32, 32)
@@ -49,7 +49,7 @@ class Config:
     """Values are of all drones' observations and of the others' actions, else of a drone's own observation."""
     learning_rate: float = 2e-3
     """At the start; follows how much the policy changes in a gradient step."""
-    change: float = 0.01
+    change: float = 0.02
     """That is aimed at: divergence (KL) of the policy from the one that flew. The rate falls above twice of it and
     grows below half of it, within `slowest` and `fastest`."""
     slowest: float = 1e-5

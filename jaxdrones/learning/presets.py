@@ -38,28 +38,41 @@ _ONE_D_PPO = dict(
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("tracking", "bptt"): dict(updates=250),
     ("recovery", "bptt"): dict(updates=250),
+    ("gates", "ppo"): dict(updates=1500, trace=0.95, calm=0.05, sizes=(64, 64), critic_sizes=(64, 64)),
     ("paper-hover", "bptt"): _ONE_D,
     ("paper-hover", "ppo"): _ONE_D_PPO,
     ("leader-follower", "bptt"): _ONE_D | dict(per_role=True),
     ("leader-follower", "ppo"): _ONE_D_PPO | dict(per_role=True, central_critic=True),
 }
 _REALISTIC: dict[tuple[str, str], dict[str, Any]] = {
-    ("hover", "bptt"): dict(updates=450),
+    ("hover", "bptt"): dict(updates=450, sizes=(64, 64)),
 }
 
+_PRACTICE: dict[str, dict[str, Any]] = {"gates": dict(anywhere=True)}
+"""Options with which a task is learnt, where they are not those with which it is flown."""
+_ALGORITHM: dict[str, str] = {"gates": "ppo"}
 
-def preset(task: str, algorithm: str, realistic: bool = False, **options) -> tuple[Env, Any]:
+
+def algorithm_for(task: str) -> str:
+    """The learner to try first: the gradient's, unless rewards jump."""
+    return _ALGORITHM.get(task, "bptt")
+
+
+def preset(task: str, algorithm: str, realistic: bool = False, practice: bool = False, **options) -> tuple[Env, Any]:
     """An environment and the settings to learn it with.
 
     Args:
         task: a name of `jaxdrones.envs.TASKS`.
         algorithm: bptt, ppo or shac.
         realistic: lag, drag, delay, noise and parameter ranges; the policy then sees rotors and its last three actions.
+        practice: the environment to learn in; it may have easier starts than the one to fly in.
         **options: of `jaxdrones.envs.make`.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
     if realistic and task in ("hover", "recovery", "landing"):
         options = {"observation": _DELAYED} | options
+    if practice:
+        options = _PRACTICE.get(task, {}) | options
     env = make(task, realistic=realistic, **options)
     found = _CONFIGS.get((task, algorithm), {}) | (_REALISTIC.get((task, algorithm), {}) if realistic else {})
     return env, dataclasses.replace(ALGORITHMS[algorithm].Config(), **found)

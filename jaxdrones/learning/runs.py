@@ -71,9 +71,9 @@ class Recipe:
         """The algorithm and, where that is another, its library."""
         return self.algorithm
 
-    def env(self, **options) -> Env:
-        """The environment; options of `jaxdrones.make` replace those of the recipe."""
-        return preset(self.task, self.algorithm, self.realistic, **self.options | options)[0]
+    def env(self, practice: bool = False, **options) -> Env:
+        """The environment to fly or to learn in; options of `jaxdrones.make` replace those of the recipe."""
+        return preset(self.task, self.algorithm, self.realistic, practice, **self.options | options)[0]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""

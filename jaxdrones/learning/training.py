@@ -50,7 +50,8 @@ class Trainer:
         """
         self.recipe, self.episodes = recipe, episodes
         self.mesh = sharding.devices(recipe.config.worlds)
-        self.env, self.learner = recipe.env(), ALGORITHMS[recipe.algorithm]
+        self.env, self.practice = recipe.env(), recipe.env(practice=True)
+        self.learner = ALGORITHMS[recipe.algorithm]
         self.compile_seconds = 0.0
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
         self.metrics = sorted(jax.eval_shape(self._one, self.shapes)[1])
@@ -112,13 +113,13 @@ class Trainer:
         course.finish()
 
     def _init(self, key: jax.Array):
-        return self.learner.init(key, self.env, self.recipe.config)
+        return self.learner.init(key, self.practice, self.recipe.config)
 
     def _one(self, state, updates=None):
         config = self.recipe.config
         if updates is not None:
             config = dataclasses.replace(config, updates=updates)
-        return self.learner.update(self.env, config, state)
+        return self.learner.update(self.practice, config, state)
 
     def _updates(self, state, count, updates):
         """`count` updates of a training that has `updates`; both may change without compiling anew."""

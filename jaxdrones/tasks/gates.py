@@ -25,6 +25,7 @@ LEVELS = (0, 1, 2, 3)
 
 _GATE_RANGE = np.array([0.15, 0.15, 0.1, 0.2])  # m, m, m, rad: level 2 moves gates by U(-range, range)
 _POLE_RANGE = 0.15  # m
+_IN_SIGHT = 3.0  # m, up to which poles are seen
 _INERTIA_RANGE = 0.2  # share: level 1 on
 
 
@@ -37,7 +38,8 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
         drones: number of drones; they start 0.5 m apart in y, and do not see each other.
         level: 0 nominal; 1 inertia randomised; 2 also gates and poles; 3 random tracks without poles.
         duration: of an episode, s.
-        anywhere: start in the air before any of the gates, for training; else on the ground at the start.
+        anywhere: start in the air before any of the gates, or one time in five at the start, for training; else on the
+            ground at the start.
     """
     if level not in LEVELS:
         raise ValueError(f"level is {level!r}; give one of {', '.join(map(str, LEVELS))}")
@@ -50,9 +52,11 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
         pos = jnp.stack([jnp.full(n, x, dtype), y + 0.5 * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1)
         index = jnp.zeros(n, jnp.int32)
         if anywhere:
-            index = jax.random.randint(gate_key, (n,), 0, len(GATES))
+            place = jax.random.randint(gate_key, (n,), -1, len(GATES))
+            index = jnp.maximum(place, 0)
             ahead = variables["gates"][index]
-            pos = ahead[:, :3] - 0.7 * _normal(ahead) + jax.random.uniform(place_key, (n, 3), dtype, -0.3, 0.3)
+            before = ahead[:, :3] - 0.7 * _normal(ahead) + jax.random.uniform(place_key, (n, 3), dtype, -0.3, 0.3)
+            pos = jnp.where(place[:, None] < 0, pos, before)
         lap = {
             "index": index,
             "before": index,
@@ -100,10 +104,10 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
         },
         success=lambda metrics, dt: metrics["gates"][-1] == len(GATES),
         laws=() if level == 0 else (_other_inertia,),
-        senses={"gates": Part(_see_gates, 20.0)},
+        senses={"gates": Part(_see_gates, 20.0), "poles": Part(_see_poles, _IN_SIGHT)},
         scene=_scene() if level < 2 else Scene(),
         contact=("ground",),
-        observation=("position", "gates", "rotation_matrix", "velocity", "omega", "last_action"),
+        observation=("position", "gates", "poles", "rotation_matrix", "velocity", "omega", "last_action"),
     )
 
 
@@ -139,9 +143,9 @@ def _track(key: jax.Array, level: int, dtype) -> Float[Array, "4 4"]:
     if level < 2:
         return jnp.asarray(GATES, dtype)
     if level == 2:
-        return jnp.asarray(GATES, dtype) + jnp.asarray(_GATE_RANGE, dtype) * u
+        return jnp.asarray(GATES, dtype) + jnp.asarray(_GATE_RANGE, dtype)[None] * u
     quarter = jnp.asarray([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype)  # one gate in each, so that they keep apart
-    place = quarter * jnp.asarray([1.3, 0.9], dtype) + 0.25 * u[:, :2]
+    place = quarter * jnp.asarray([[1.3, 0.9]], dtype) + 0.25 * u[:, :2]
     heading = jnp.arctan2(quarter[:, 0], -quarter[:, 1]) + 0.6 * u[:, 3]  # counter-clockwise, 34 degrees off
     return jnp.concatenate([place, 0.95 + 0.25 * u[:, 2:3], heading[:, None]], axis=-1)
 
@@ -180,6 +184,12 @@ def _see_gates(task: Task, world: World) -> Float[Array, "n 12"]:
     """Centre relative to the drone (m) and direction of the next gate and of the one after, world axes."""
     ahead = [_gate(world.variables, later) for later in (0, 1)]
     return jnp.concatenate([x for gate in ahead for x in (gate[:, :3] - world.drones.pos, _normal(gate))], axis=-1)
+
+
+def _see_poles(task: Task, world: World) -> Float[Array, "n 8"]:
+    """Where all poles are from the drone, x and y in world axes, m; cut at the limit of sight."""
+    away = world.variables["poles"][None] - world.drones.pos[:, None, :2]
+    return jnp.clip(away, -_IN_SIGHT, _IN_SIGHT).reshape(len(away), -1)
 
 
 def _scene() -> Scene:

@@ -143,7 +143,7 @@ def test_a_central_critic_learns_with_a_policy_per_role():
 
 
 @pytest.mark.float32
-def test_episodes_that_ended_do_not_count_until_they_are_restarted():
+def test_episodes_that_ended_stay_as_they_are_and_do_not_count_until_they_are_restarted():
     env = envs.make("hover", duration=0.05)  # five steps
     worlds = collect.restart(jax.random.key(0), env, collect.idle(env, 2))
 
@@ -153,6 +153,7 @@ def test_episodes_that_ended_do_not_count_until_they_are_restarted():
     worlds, flight = jax.jit(lambda w: collect.fly(jax.random.key(1), env, hover, w, 7, reset=False))(worlds)
     np.testing.assert_array_equal(flight.over[:, 0], [False] * 5 + [True] * 2)
     assert jnp.all(worlds.ended)
+    np.testing.assert_array_equal(worlds.obs, flight.final_obs[4])
     assert jnp.all(bptt.discounted(flight, 1.0)[5:] == 0)
     again = collect.restart(jax.random.key(2), env, worlds)
     assert jnp.all(again.episodes.length == 0) and not jnp.any(again.ended)

@@ -1,0 +1,95 @@
+"""What counts as passing a gate, what as hitting it, and where a race starts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones.envs import make
+from jaxdrones.tasks.gates import GATES, OPENING, OUTER, POLES
+
+ENV = make("gates")
+RADIUS = float(ENV.params.collision_radius[0])
+THROUGH, LEFT = np.array([0.1, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+
+
+def moved(start, end, index=0):
+    """The task's variables after a drone went from one place to another within a step."""
+    _, world = ENV.reset(jax.random.key(0))
+    variables = world.variables | {"pos": jnp.array([start]), "index": jnp.array([index])}
+    world = world.replace(drones=world.drones.replace(pos=jnp.array([end])), variables=variables)
+    return ENV.task.advance(world)
+
+
+def in_gate(offset, gate=GATES[0]):
+    """A place given in the axes of a gate: through it, to its left, up."""
+    cos, sin = np.cos(gate[3]), np.sin(gate[3])
+    return gate[:3] + np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ offset
+
+
+@pytest.mark.parametrize(
+    ("aside", "passes", "hits"),
+    [
+        (0.0, 1, False),
+        (OPENING / 2 - RADIUS - 0.01, 1, False),
+        (OPENING / 2 - RADIUS + 0.01, 0, True),
+        (-OUTER / 2, 0, True),
+        (OUTER / 2 + RADIUS + 0.01, 0, False),
+    ],
+)
+def test_a_gate_is_passed_by_its_opening_hit_by_its_frame_and_missed_beside_it(aside, passes, hits):
+    after = moved(in_gate(aside * LEFT - THROUGH), in_gate(aside * LEFT + THROUGH))
+    assert after["index"][0] == passes and bool(after["hit"][0]) == hits
+
+
+def test_a_gate_counts_in_its_direction_and_in_its_turn():
+    there, back = in_gate(-THROUGH), in_gate(THROUGH)
+    assert moved(back, there)["index"][0] == 0
+    assert moved(there, back, index=1)["index"][0] == 1
+
+
+def test_after_the_last_gate_nothing_counts():
+    after = moved(in_gate(-THROUGH, GATES[-1]), in_gate(THROUGH, GATES[-1]), index=len(GATES))
+    assert after["index"][0] == len(GATES) and not after["hit"][0] and after["came_nearer"][0] == 0
+
+
+def test_poles_are_hit_as_high_as_they_are():
+    place = np.array([*POLES[0], 1.0])
+    assert moved(place + 0.5, place)["hit"][0]
+    assert not moved(place + 0.5, place + [0, 0, 0.7])["hit"][0]
+
+
+def test_progress_is_the_distance_gained_on_the_next_gate():
+    start, end = in_gate(-10 * THROUGH), in_gate(-3 * THROUGH)
+    np.testing.assert_allclose(moved(start, end)["came_nearer"], 0.7, rtol=1e-12)
+
+
+def test_who_starts_anywhere_starts_at_the_start_one_time_in_five_and_else_before_a_gate():
+    env = make("gates", anywhere=True, level=2)
+    worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2000))[1]
+    z, index = worlds.drones.pos[:, 0, 2], worlds.variables["index"][:, 0]
+    grounded = z < 0.1
+    assert abs(jnp.mean(grounded) - 0.2) < 0.04  # 4 standard deviations
+    assert jnp.all(index[grounded] == 0)
+    np.testing.assert_allclose(np.bincount(index[~grounded]) / 1600, 0.25, atol=0.05)
+
+
+def test_poles_are_seen_from_the_drone_as_far_as_sight_goes():
+    env = make("gates", observation=("position", "poles"))
+    obs = np.asarray(env.reset(jax.random.key(0))[0])
+    np.testing.assert_allclose(obs[0, 3:].reshape(4, 2), np.clip(POLES - obs[0, :2], -3, 3), rtol=1e-12)
+
+
+def test_levels_move_gates_and_poles_within_their_ranges_and_keep_random_gates_apart():
+    def drawn(level):
+        env = make("gates", level=level)
+        return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 200))[1].variables
+
+    for level in (0, 1):
+        assert jnp.all(drawn(level)["gates"] == GATES[None])
+    off = np.abs(np.asarray(drawn(2)["gates"]) - GATES)
+    assert np.all(off <= [0.15, 0.15, 0.1, 0.2]) and np.all(off.max((0, 1)) > [0.14, 0.14, 0.09, 0.19])
+    assert np.max(np.abs(np.asarray(drawn(2)["poles"]) - POLES)) <= 0.15
+    centres = np.asarray(drawn(3)["gates"])[..., :3]
+    apart = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) + 10 * np.eye(4)
+    assert apart.min() > OUTER

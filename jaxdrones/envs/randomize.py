@@ -131,6 +131,6 @@ REALISTIC_LAWS: tuple[Law, ...] = (
     scaled("rotor_rise_time", 0.8, 1.2),
     scaled("rotor_fall_time", 0.2, 1.2),
 )
-"""10 or 20 % either way, but where those who identified a Crazyflie differ by more: its drag torque is a fifth of ours to
-some, and its rotors slow down five times as slowly as they speed up, or as fast."""
+"""10 or 20 % either way, but where those who identified a Crazyflie differ by more: its drag torque is a fifth of ours
+to some, and its rotors slow down five times as slowly as they speed up, or as fast."""
 REALISTIC_DELAY = 0.02  # s

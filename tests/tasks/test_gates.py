@@ -56,7 +56,7 @@ def test_after_the_last_gate_nothing_counts():
 def test_poles_are_hit_as_high_as_they_are():
     place = np.array([*POLES[0], 1.0])
     assert moved(place + 0.5, place)["hit"][0]
-    assert not moved(place + 0.5, place + [0, 0, 0.7])["hit"][0]
+    assert not moved(place + 0.5, place + np.array([0, 0, 0.7]))["hit"][0]
 
 
 def test_progress_is_the_distance_gained_on_the_next_gate():

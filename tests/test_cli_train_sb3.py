@@ -112,13 +112,13 @@ def test_the_papers_learners_climb_to_the_goal_and_fly_there_on_both_backends(al
 @pytest.mark.slow
 def test_an_interrupted_training_keeps_the_best_and_is_not_replaced_unasked(tmp_path, capsys, monkeypatch):
     pytest.importorskip("stable_baselines3")
-    from jaxdrones.learning import sb3
+    from jaxdrones.learning import sb3_training
 
     def interrupted(self):
         raise KeyboardInterrupt
 
     train = [*SB3, *SMALL, "--set", "batch_size=32", "--budget", "64", "--no-figure", "--output", str(tmp_path)]
-    monkeypatch.setattr(sb3._Course, "_on_rollout_end", interrupted)
+    monkeypatch.setattr(sb3_training._Course, "_on_rollout_end", interrupted)
     assert main(train) == 130
     assert "best.zip is the best policy, of update 0" in capsys.readouterr().err
     monkeypatch.undo()

@@ -35,6 +35,7 @@ def train(options: argparse.Namespace) -> int:
     if not options.no_figure:
         plots.check_matplotlib()
     from jaxdrones.learning import sb3
+    from jaxdrones.learning.sb3_training import Trainer
     from jaxdrones.learning.training import Diverged
 
     run = sb3.Run(options.output or Path("runs") / f"{options.task}-sb3-{algorithm}")
@@ -42,7 +43,7 @@ def train(options: argparse.Namespace) -> int:
     check_free(run, options.overwrite)
     say = quiet if options.json else print
     say(f"{_headline(recipe)}; compiling")
-    trainer = sb3.Trainer(recipe, seed, episodes)
+    trainer = Trainer(recipe, seed, episodes)
     trainer.prepare(run)
     run.clear()
     total = recipe.config["steps"] if seconds is None else None

@@ -11,6 +11,7 @@ from crazyflow.control import Control
 from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.sim import Sim
 from crazyflow.sim.integration import Integrator
+from rivals_ours import DRAG, constant_drag
 
 import jaxdrones as jd
 from jaxdrones import rotation
@@ -70,10 +71,10 @@ def agreement(seconds: float = 0.5, freq: int = 500) -> dict[str, float]:
     with jax.enable_x64(True):
         params = jax.tree.map(lambda x: x.astype(float), jd.load_params("cf2x"))
         sim = make_sim(AIRFRAMES[0], freq, Integrator.symplectic_euler)
-        sim.data = sim.data.replace(params=_told(sim.data.params, params))
+        sim.data = sim.data.replace(params=told(sim.data.params, params))
         steps = round(seconds * freq)
         theirs = make_step(sim, steps)
-        ours = jd.make_step(effects=(_constant_drag,), rotors=jd.lagging_rotors, dt=1 / freq, substeps=steps)
+        ours = jd.make_step(effects=(constant_drag,), rotors=jd.lagging_rotors, dt=1 / freq, substeps=steps)
 
         team = jd.repeat(params, 1)
         start = jd.State.at_rest(jnp.array([[0.1, 0.2, 2.0]])).replace(
@@ -87,15 +88,7 @@ def agreement(seconds: float = 0.5, freq: int = 500) -> dict[str, float]:
         return {name: float(np.max(np.abs(ended[0][name] - ended[1][name]))) for name in ended[0]}
 
 
-_DRAG = np.array([0.015, 0.015, 0.02])  # N/(m/s), along the body axes
-
-
-def _constant_drag(params: jd.Params, state: jd.State) -> jd.Wrench:
-    """Drag as crazyflow has it, which does not depend on the rotors."""
-    return jd.Wrench.of_force(-_DRAG * rotation.rotate_inverse(state.quat, state.vel))
-
-
-def _told(theirs, params: jd.Params):
+def told(theirs, params: jd.Params):
     """The parameters of our vehicle in its words; the momentum of propellers, which we leave out, is zero."""
     zero = jnp.zeros(())
     return theirs.replace(
@@ -107,7 +100,7 @@ def _told(theirs, params: jd.Params):
         J_inv=jnp.diag(1 / params.inertia),
         rpm2thrust=jnp.stack([zero, zero, params.kf])[None],
         rpm2torque=jnp.stack([zero, zero, params.km])[None],
-        drag_matrix=-jnp.diag(_DRAG),
+        drag_matrix=-jnp.diag(DRAG),
         rotor_dyn_coef=jnp.stack([1 / params.rotor_rise_time, zero, 1 / params.rotor_fall_time, zero])[None],
     )
 

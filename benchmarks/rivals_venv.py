@@ -4,13 +4,14 @@ Rivals pin their own versions of jax, so the project's environment cannot hold t
 """
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
 import venv
 from pathlib import Path
 
-RIVALS = ("crazyflow==0.4.0",)
+RIVALS = ("torch==2.13.0", "crazyflow==0.4.0", "rotorpy[batched]==3.0.0")
 
 _HERE = Path(__file__).parent
 _FOLDER = _HERE.parent / ".venv-rivals"
@@ -18,9 +19,19 @@ _FOLDER = _HERE.parent / ".venv-rivals"
 
 def run(script: str, *arguments: str) -> dict:
     """What a benchmark prints with `--json` in the environment of the rivals."""
-    command = [str(_python()), str(_HERE / script), *arguments, "--json"]
+    return _run(_python(), script, *arguments)
+
+
+def run_here(script: str, *arguments: str) -> dict:
+    """The same in the environment at hand, which has no rivals."""
+    return _run(Path(sys.executable), script, *arguments)
+
+
+def _run(python: Path, script: str, *arguments: str) -> dict:
+    command = [str(python), str(_HERE / script), *arguments, "--json"]
     with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it runs
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=folder)
+        environment = os.environ | {"SCIPY_ARRAY_API": "1"}  # crazyflow asks for it before scipy is imported
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=folder, env=environment)
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -32,7 +43,9 @@ def _python() -> Path:
         print(f"making {_FOLDER} with {', '.join(RIVALS)}", file=sys.stderr)
         venv.create(_FOLDER, with_pip=True, clear=True)
         (_FOLDER / ".gitignore").write_text("*\n")
-        pip = [str(python), "-m", "pip", "install", "--quiet", *RIVALS, "--editable", str(_HERE.parent)]
-        subprocess.run(pip, check=True, stdout=sys.stderr)
+        pip = [str(python), "-m", "pip", "install", "--quiet"]
+        torch, *others = RIVALS  # torch first: a later pip does not exchange it for one that needs a GPU
+        subprocess.run([*pip, torch], check=True, stdout=sys.stderr)
+        subprocess.run([*pip, *others, "--editable", str(_HERE.parent)], check=True, stdout=sys.stderr)
         holds.write_text(wanted)
     return python

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Leader and follower
-# The paper's multi-agent example (equation 13): the leader is to hover at z = 0.5 m, the follower to be as high as the leader.
-# Each has a policy of its own, of its own twelve numbers. While they learn, a critic sees all: both drones' observations
-# and the other's action, 25 numbers. It is not needed to fly.
+# The paper's multi-agent example (equation 13): the leader is to hover at z = 0.5 m, the follower to be as high as the
+# leader. Each has a policy of its own, of its own twelve numbers. While they learn, a critic sees all: both drones'
+# observations and the other's action, 25 numbers. It is not needed to fly.
 
 # %%
 import time
@@ -16,7 +16,9 @@ from jaxdrones.learning.episode import fly_episode
 
 # %%
 env, config = presets.preset("leader-follower", "ppo")
-print(f"policy per role: {config.per_role}, central critic: {config.central_critic}, {env.observation_size} numbers seen")
+print(
+    f"policy per role: {config.per_role}, central critic: {config.central_critic}, sees {env.observation_size} numbers"
+)
 
 train = jax.jit(lambda key: ppo.train(key, env, config), compiler_options=COMPILER_OPTIONS)
 began = time.perf_counter()

@@ -1,6 +1,7 @@
 """The benchmarks run and say what they measured."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-HELPERS = {"common.py", "rivals_crazyflow.py", "rivals_venv.py"}
+HELPERS = {"common.py", *(path.name for path in BENCHMARKS.glob("rivals_*.py"))}
 
 
 def quick(name: str) -> dict:
@@ -59,7 +60,20 @@ def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():
     assert all(0 <= row["success"] <= 1 and row["error p50"] > 0 for row in result["rows"])
 
 
-@pytest.mark.parametrize("name", sorted({path.name for path in BENCHMARKS.glob("*.py")} - HELPERS))
+def test_rivals_races_our_side_where_there_are_no_rivals():
+    rows = quick("rivals.py")["rows"]
+    assert {row["race"] for row in rows} == {"plant-symplectic_euler", "attitude"}
+    assert all(row["agree"] is None and min(row["rates"].values()) > 0 for row in rows)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="the limit is compiled by a C compiler")
+def test_limit_in_c_flies_our_trajectory():
+    result = quick("limit")
+    assert max(result["agreement"].values()) < 1e-4  # float32, 240 steps
+    assert all(row["share"] > 0 and len(row["rates"]) == 6 for row in result["rows"])
+
+
+@pytest.mark.parametrize("name", sorted({path.name for path in BENCHMARKS.glob("*.py")} - HELPERS | {"limit"}))
 def test_every_benchmark_explains_itself(name):
     done = subprocess.run(
         [sys.executable, str(BENCHMARKS / name), "--help"], capture_output=True, text=True, check=True

@@ -36,7 +36,7 @@ _ONE_D_PPO = dict(
 """The paper's tasks are slow, all rotors within 5 % of hover: what is done shows after seconds."""
 
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
-    ("tracking", "bptt"): dict(updates=250),
+    ("tracking", "bptt"): dict(updates=400, learning_rate=1e-2),
     ("recovery", "bptt"): dict(updates=250),
     ("gates", "ppo"): dict(updates=1500, trace=0.95, calm=0.05, sizes=(64, 64), critic_sizes=(64, 64)),
     ("paper-hover", "bptt"): _ONE_D,

@@ -1,0 +1,89 @@
+"""How many times as fast as other simulators are we, on the same work in the same run?
+
+crazyflow 0.4.0 and rotorpy 3.0.0 live with this library in an environment of their own, made at the first call
+(rivals_venv.py); one process there races all of them, A B A B, medians of repeats (rivals_races.py). The races:
+
+  plant-symplectic_euler, plant-euler, plant-rk4
+      rotor speeds held, lagging rotors, constant drag, our Crazyflie told to crazyflow, 500 Hz, float32. `euler` is
+      crazyflow's default; it turns by the exponential map where ours adds and normalises.
+  attitude
+      each simulator's own Crazyflie under its own cascade at 500 Hz, a new attitude and thrust at every step: here the
+      attitude loop and mixer of `pid`, or attitude over `rates`; there the Mellinger controller.
+  rotorpy
+      the plant without drag, by rk4, float64: rotorpy has no other numbers, no Euler, and drag at each rotor.
+
+Everybody flies many steps in one compiled program if it can (rotorpy cannot) and returns the whole final state; starts,
+commands and vehicle are known at run time only. crazyflow flies on one device and shared by its own sharding; we do all
+at once, in chunks, and in chunks on all devices. A ratio is of the best of each, and printed only if all end a flight
+of 64 worlds and two seconds (rotorpy 0.2 s) in the same state (`AGREED`), or `attitude` in the attitude asked for.
+
+PyFlyt 0.29.0 is not raced: it needs numpy below 2, this library 2 or later, so they cannot share a process.
+"""
+
+import argparse
+import os
+import sys
+
+import rivals_venv
+from common import about, report
+
+WORLDS = (1, 64, 1024, 16384, 262144)
+RACES = ("plant-symplectic_euler", "plant-euler", "plant-rk4", "attitude", "rotorpy")
+AGREED = {"pos": 1e-2, "vel": 1e-2, "omega": 1e-3, "rpm": 1.0, "angle": 2e-3}
+"""m, m/s, rad/s, RPM, rad, after two seconds of float32, 200 m up; the differences found are a tenth of these."""
+HELD = 0.05  # rad, between the attitude asked for, which drifts, and the one flown
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
+    parser.add_argument("--races", nargs="+", default=RACES, choices=RACES)
+    parser.add_argument("--devices", type=int, default=os.cpu_count(), help="to cut the CPU into")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="our side alone, few worlds, no environment: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    if options.quick:
+        options.worlds, options.races, options.repeats = (2,), ("plant-symplectic_euler", "attitude"), 1
+
+    arguments = ["--worlds", *map(str, options.worlds), "--races", *options.races]
+    arguments += ["--devices", str(options.devices), "--repeats", str(options.repeats)]
+    start = rivals_venv.run_here if options.quick else rivals_venv.run
+    result = start("rivals_races.py", *arguments, *(["--alone"] if options.quick else []))
+    rows = [row | _ratio(row) for row in result["rows"]]
+    facts = about() | result["versions"] | {"devices": options.devices, "load": result["load"]}
+    lines = [f"{name}: {value}" for name, value in facts.items()]
+    lines += ["M drone-steps/s, median (best); ratio of the best of ours to the best of theirs"]
+    for row in rows:
+        lines.append(f"{row['race']}, {row['worlds']} worlds, {row['steps']} steps a call: {_verdict(row)}")
+        lines += [
+            f"    {name:30} {rate:9.3f} ({row['best'][name]:.3f}){'' if name in row['alike'] else ' does not count'}"
+            for name, rate in row["rates"].items()
+        ]
+    report({"about": facts, "rows": rows}, options.json, lines)
+    if any(row["agree"] is False for row in rows):
+        sys.exit("some contenders did not fly alike; their rates do not count")
+
+
+def _ratio(row: dict) -> dict[str, object]:
+    """Whether all flew alike, and how many times as fast our best is as their best; None where nobody else flew."""
+    rates = row["rates"]
+    theirs = [name for name in rates if not name.startswith("ours")]
+    if not theirs:
+        return {"agree": None, "ratio": None, "alike": list(rates)}
+    bounds = {"angle": HELD} if row["race"] == "attitude" else AGREED
+    alike = [name for name in rates if all(d <= bounds[field] for field, d in row["differences"][name].items())]
+    ours = [name for name in alike if name.startswith("ours")]
+    agree = bool(ours) and set(theirs) <= set(alike)
+    ratio = max(rates[name] for name in ours) / max(rates[name] for name in theirs) if agree else None
+    return {"agree": agree, "ratio": ratio, "alike": alike}
+
+
+def _verdict(row: dict) -> str:
+    if row["agree"] is None:
+        return "alone"
+    return f"{row['ratio']:.1f} times as fast" if row["agree"] else f"NOT ALIKE: {row['differences']}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Our plant as the benchmarks of rivals and of the limit fly it: by the public API, every input an argument."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdrones as jd
+from jaxdrones import rotation
+from jaxdrones.control import allocation, pid, rates
+from jaxdrones.learning import sharding
+
+CHUNK = 512
+"""Worlds whose states fit the cache."""
+
+
+DRAG = np.array([0.015, 0.015, 0.02], np.float32)
+"""N/(m/s), along the body axes."""
+
+_PWM_TO_RPM, _PWM_OFFSET, _PWM_RANGE = 0.2685, 4070.3, (20000.0, 65535.0)  # as in control.pid
+
+
+def constant_drag(params: jd.Params, state: jd.State) -> jd.Wrench:
+    """Drag that does not depend on the rotors, as rivals have it."""
+    return jd.Wrench.of_force(-jnp.asarray(DRAG, state.vel.dtype) * rotation.rotate_inverse(state.quat, state.vel))
+
+
+def even_rotors(time: float) -> jd.Params:
+    """A Crazyflie whose rotors rise and fall with one time constant (s), under a gravity of 9.81 m/s^2."""
+    time = jnp.asarray(time, float)
+    return jd.load_params("cf2x").replace(rotor_rise_time=time, rotor_fall_time=time, gravity=jnp.asarray(9.81))
+
+
+def flight(step: jd.Step, length: int) -> Callable:
+    """`(params, start, rpm) -> final state` of a world that holds its rotor speeds for `length` steps."""
+
+    def fly(params: jd.Params, start: jd.State, rpm: jax.Array) -> jd.State:
+        return jax.lax.scan(lambda state, _: (step(params, state, rpm), None), start, length=length)[0]
+
+    return fly
+
+
+def many(fly: Callable, chunk: int | None = CHUNK, devices: Sequence[jax.Device] | None = None) -> Callable:
+    """The same for many worlds of one vehicle: all at once or chunk after chunk, on one device or shared by several."""
+
+    def batched(params, *inputs):
+        if chunk is None:
+            return jax.vmap(lambda *x: fly(params, *x))(*inputs)
+        return jax.lax.map(lambda x: fly(params, *x), inputs, batch_size=chunk)
+
+    if devices is None:
+        return batched
+    return jax.shard_map(
+        batched,
+        mesh=jax.make_mesh((len(devices),), ("worlds",), axis_types=(jax.sharding.AxisType.Auto,), devices=devices),
+        in_specs=(sharding.SAME, sharding.WORLDS, sharding.WORLDS),
+        out_specs=sharding.WORLDS,
+        check_vma=False,
+    )
+
+
+def starts(worlds: int, key: jax.Array, params: jd.Params) -> tuple[jd.State, jax.Array]:
+    """A turning start and the rotor speeds to hold, of one drone in each world.
+
+    High above any floor, and with rotors so nearly equal that a drone does not spin up within ten seconds.
+    """
+    at, turned, moving, turning, asked, uneven = jax.random.split(key, 6)
+    hover = params.hover_rpm[0]
+
+    def spread(k, scale, *shape):
+        return scale * jax.random.normal(k, (worlds, 1, *shape))
+
+    state = jd.State(
+        pos=jnp.array([0.0, 0.0, 200.0]) + spread(at, 0.1, 3),
+        quat=jax.vmap(jax.vmap(jd.rotation.exp))(spread(turned, 0.2, 3)),
+        vel=spread(moving, 0.3, 3),
+        omega=spread(turning, 0.5, 3),
+        rpm=jnp.full((worlds, 1, 4), hover),
+    )
+    return state, hover * (1 + spread(asked, 0.02, 1) + spread(uneven, 1e-4, 4))
+
+
+def attitudes(worlds: int, steps: int, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    """Roll, pitch, yaw (rad) that drift, (worlds, steps, 1, 3), and thrust over weight, (worlds, steps, 1, 1)."""
+    first, rate, thrust = (np.asarray(jax.random.normal(k, (worlds, 1, 1, 3))) for k in jax.random.split(key, 3))
+    t = np.linspace(0, 1, steps, dtype=np.float32)[:, None, None]
+    return 0.1 * first + 0.05 * rate * t, 1 + 0.02 * thrust[..., :1] * (1 - t)
+
+
+def ways(fly: Callable, devices: Sequence[jax.Device], *inputs) -> dict[str, Callable[[], jd.State]]:
+    """Compiled programs: all worlds at once, in chunks, and in chunks on all devices."""
+    worlds = len(inputs[1].pos)
+    functions = {"ours": many(fly, chunk=None), "ours, chunks": many(fly)}
+    if len(devices) > 1 and worlds % len(devices) == 0:
+        functions[f"ours, chunks, {len(devices)} devices"] = many(fly, devices=devices)
+    return {name: partial(jax.jit(f).lower(*inputs).compile(), *inputs) for name, f in functions.items()}
+
+
+def difference(state: jd.State, other: jd.State) -> dict[str, float]:
+    """Largest difference of each quantity over the worlds: m, m/s, rad/s, RPM, rad."""
+    fields = ("pos", "vel", "omega", "rpm")
+    pairs = {name: (np.asarray(getattr(state, name)), np.asarray(getattr(other, name))) for name in fields}
+    return {name: float(np.max(np.abs(a - b))) for name, (a, b) in pairs.items()} | {
+        "angle": angle(state.quat, other.quat)
+    }
+
+
+def angle(quat, other) -> float:
+    """Largest angle between two attitudes, rad."""
+    difference = np.minimum(
+        np.linalg.norm(np.asarray(quat) - np.asarray(other), axis=-1),
+        np.linalg.norm(np.asarray(quat) + np.asarray(other), axis=-1),
+    )
+    return float(4 * np.arcsin(np.minimum(np.max(difference) / 2, 1)))
+
+
+def _piloted(step: jd.Step, control: Callable, memory: Callable) -> Callable:
+    """`(params, start, commands) -> final state` of a world; commands (steps, 1, 4) are roll, pitch, yaw, thrust."""
+
+    def fly(params: jd.Params, start: jd.State, commands: jax.Array) -> jd.State:
+        def advance(carry, command):
+            memory, state = carry
+            memory, rpm = jax.vmap(control)(params, memory, state, command)
+            return (memory, step(params, state, rpm)), None
+
+        return jax.lax.scan(advance, (memory(1), start), commands)[0][1]
+
+    return fly
+
+
+def _by_pid(step: jd.Step, dt: float) -> Callable:
+    """The paper's attitude loop and PWM mixer, which is the cascade that crazyflow flies."""
+    gains = pid.gains("cf2x")
+
+    def control(params, memory, state, command):
+        thrust = pid.rpm_to_pwm(jnp.sqrt(command[3] / (4 * params.kf)))
+        target = rotation.to_matrix(rotation.from_rpy(command[:3]))
+        memory, torque = pid.attitude_loop(gains, memory, state, target, jnp.zeros(3), dt)
+        pwm = jnp.clip(thrust + allocation.mixer(params) @ torque, *_PWM_RANGE)
+        return memory, _PWM_TO_RPM * pwm + _PWM_OFFSET
+
+    return _piloted(step, control, pid.init)
+
+
+def _by_rates(step: jd.Step, dt: float) -> Callable:
+    """Attitude to body rates to rotor speeds, by the exact inverse of the rotors."""
+    gains = rates.gains()
+
+    def control(params, memory, state, command):
+        error = rotation.multiply(rotation.conjugate(state.quat), rotation.from_rpy(command[:3]))
+        omega = 2 * gains.attitude * error[:3] * jnp.where(error[3] < 0, -1, 1)
+        return memory, rates.follow(gains, params, state, command[3] / params.mass, omega)
+
+    return _piloted(step, control, rates.init)
+
+
+PILOTS = {"pid": _by_pid, "rates": _by_rates}

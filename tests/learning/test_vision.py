@@ -164,7 +164,7 @@ def test_a_policy_that_sees_flies_on_as_it_was_saved(team, tmp_path):
 
 
 def test_a_central_critic_sees_every_vector_and_its_own_pictures(team):
-    config = ppo.Config(updates=1, worlds=4, horizon=2, per_role=True, central_critic=True, critic_sizes=(8,))
+    config = ppo.Config(updates=1, worlds=8, horizon=2, per_role=True, central_critic=True, critic_sizes=(8,))
     state = jax.eval_shape(lambda key: ppo.init(key, team, config), KEY)
     d, a, found = team.observation_size, team.action_size, state.policy.network.features
     assert state.critic["params"]["MLP_0"]["Dense_0"]["kernel"].shape == (2, 2 * d + a + found, 8)

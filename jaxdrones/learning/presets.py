@@ -45,7 +45,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("leader-follower", "ppo"): _ONE_D_PPO | dict(per_role=True, central_critic=True),
 }
 _REALISTIC: dict[tuple[str, str], dict[str, Any]] = {
-    ("hover", "bptt"): dict(updates=450, sizes=(64, 64)),
+    ("hover", "bptt"): dict(updates=600, sizes=(64, 64)),
 }
 
 _PRACTICE: dict[str, dict[str, Any]] = {"gates": dict(anywhere=True)}

@@ -36,6 +36,7 @@ _ONE_D_PPO = dict(
 """The paper's tasks are slow, all rotors within 5 % of hover: what is done shows after seconds."""
 
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
+    ("hover", "bptt"): dict(gradient="decay", decay=0.99, learning_rate=1.5e-2),  # exact: 1 of 10 seeds is lost
     ("tracking", "bptt"): dict(updates=400, learning_rate=1e-2),
     ("recovery", "bptt"): dict(updates=250),
     ("gates", "ppo"): dict(updates=1500, trace=0.95, calm=0.05, sizes=(64, 64), critic_sizes=(64, 64)),
@@ -45,7 +46,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("leader-follower", "ppo"): _ONE_D_PPO | dict(per_role=True, central_critic=True),
 }
 _REALISTIC: dict[tuple[str, str], dict[str, Any]] = {
-    ("hover", "bptt"): dict(updates=600, sizes=(64, 64)),
+    ("hover", "bptt"): dict(updates=600, sizes=(64, 64), gradient="exact", learning_rate=2e-2),
 }
 
 _PRACTICE: dict[str, dict[str, Any]] = {"gates": dict(anywhere=True)}

@@ -9,17 +9,14 @@ import numpy as np
 
 import jaxdrones as jd
 from jaxdrones import rotation
-from jaxdrones.control import allocation, pid, rates
+from jaxdrones.control import pid, rates
 from jaxdrones.learning import sharding
 
 CHUNK = 512
-"""Worlds whose states fit the cache."""
-
+"""Worlds that are flown by one kernel, and whose states fit the cache."""
 
 DRAG = np.array([0.015, 0.015, 0.02], np.float32)
 """N/(m/s), along the body axes."""
-
-_PWM_TO_RPM, _PWM_OFFSET, _PWM_RANGE = 0.2685, 4070.3, (20000.0, 65535.0)  # as in control.pid
 
 
 def constant_drag(params: jd.Params, state: jd.State) -> jd.Wrench:
@@ -46,9 +43,8 @@ def many(fly: Callable, chunk: int | None = CHUNK, devices: Sequence[jax.Device]
     """The same for many worlds of one vehicle: all at once or chunk after chunk, on one device or shared by several."""
 
     def batched(params, *inputs):
-        if chunk is None:
-            return jax.vmap(lambda *x: fly(params, *x))(*inputs)
-        return jax.lax.map(lambda x: fly(params, *x), inputs, batch_size=chunk)
+        world = partial(fly, params)
+        return (jd.over_worlds(world, chunk) if chunk else jax.vmap(world))(*inputs)
 
     if devices is None:
         return batched
@@ -136,10 +132,9 @@ def _by_pid(step: jd.Step, dt: float) -> Callable:
 
     def control(params, memory, state, command):
         thrust = pid.rpm_to_pwm(jnp.sqrt(command[3] / (4 * params.kf)))
-        target = rotation.to_matrix(rotation.from_rpy(command[:3]))
+        target = rotation.axes(rotation.from_rpy(command[:3]))
         memory, torque = pid.attitude_loop(gains, memory, state, target, jnp.zeros(3), dt)
-        pwm = jnp.clip(thrust + allocation.mixer(params) @ torque, *_PWM_RANGE)
-        return memory, _PWM_TO_RPM * pwm + _PWM_OFFSET
+        return memory, pid.rotor_speeds(params, thrust, torque)
 
     return _piloted(step, control, pid.init)
 

@@ -3,6 +3,7 @@
 from jaxdrones import rotation
 from jaxdrones.backends.explicit import Step, make_step
 from jaxdrones.backends.rollout import rollout
+from jaxdrones.backends.worlds import over_worlds
 from jaxdrones.backends.wrenches import Effect, Pair
 from jaxdrones.dynamics import (
     downwash,
@@ -50,6 +51,7 @@ __all__ = [
     "load_params",
     "make",
     "make_step",
+    "over_worlds",
     "repeat",
     "rk4",
     "rollout",

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.numerics import safe_sqrt
+from jaxdrones.numerics import asin, atan2, safe_sqrt
 
 
 def unstack(v: Float[Array, " n"]) -> list[Float[Array, ""]]:
@@ -78,10 +78,19 @@ def _rotate(x, y, z, w, v):
     return jnp.stack([vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx])
 
 
-def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
-    """R e_z: the body z axis (thrust axis) in the world frame."""
+def axes(q: Float[Array, "4"]) -> list[Float[Array, "3"]]:
+    """R e_x, R e_y, R e_z: the body axes in the world frame, the columns of the rotation matrix."""
     x, y, z, w = unstack(q)
-    return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    return [
+        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
+        jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
+        jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]),
+    ]
+
+
+def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
+    """R e_z: the thrust axis in the world frame."""
+    return axes(q)[2]
 
 
 def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -107,14 +116,7 @@ def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
 
 def to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """The rotation matrix R."""
-    x, y, z, w = unstack(q)
-    return jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
+    return jnp.stack(axes(q), axis=-1)
 
 
 def from_matrix(r: Float[Array, "3 3"]) -> Float[Array, "4"]:
@@ -150,19 +152,10 @@ def to_rpy(q: Float[Array, "4"]) -> Float[Array, "3"]:
     sin_pitch = 2 * (w * y - x * z)
     up, down = sin_pitch >= 0.99999, sin_pitch <= -0.99999
     regular = ~(up | down)
-    roll = _atan2(2 * (y * z + w * x), w * w - x * x - y * y + z * z, regular)
-    pitch = jnp.arcsin(jnp.where(regular, sin_pitch, 0))
-    yaw = _atan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z, regular)
-    yaw_up, yaw_down = 2 * _atan2(-x, y, up), 2 * _atan2(x, -y, down)
-    return jnp.stack(
-        [
-            roll,
-            jnp.where(up, jnp.pi / 2, jnp.where(down, -jnp.pi / 2, pitch)),
-            jnp.where(up, yaw_up, jnp.where(down, yaw_down, yaw)),
-        ]
-    )
-
-
-def _atan2(y, x, where):
-    """atan2 where it is used, else zero with a zero gradient."""
-    return jnp.where(where, jnp.arctan2(jnp.where(where, y, 0), jnp.where(where, x, 1)), 0)
+    roll_y, roll_x = 2 * (y * z + w * x), w * w - x * x - y * y + z * z
+    roll = jnp.where(regular, atan2(jnp.where(regular, roll_y, 0), jnp.where(regular, roll_x, 1)), 0)
+    pitch = jnp.where(regular, asin(jnp.where(regular, sin_pitch, 0)), jnp.where(up, jnp.pi / 2, -jnp.pi / 2))
+    yaw_y = jnp.where(regular, 2 * (x * y + w * z), jnp.where(up, -x, x))
+    yaw_x = jnp.where(regular, w * w + x * x - y * y - z * z, jnp.where(up, y, -y))
+    yaw = jnp.where(regular, 1, 2) * atan2(yaw_y, yaw_x)
+    return jnp.stack([roll, pitch, yaw])

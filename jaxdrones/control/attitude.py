@@ -4,17 +4,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.rotation import dot
+
+Axes = list[Float[Array, "3"]]
+"""The body's x, y and z in the world frame."""
 
 
-def from_thrust(force: Float[Array, "3"], yaw: Float[Array, ""]) -> Float[Array, "3 3"]:
+def from_thrust(force: Float[Array, "3"], yaw: Float[Array, ""]) -> Axes:
     """The attitude with body z along `force` (N, world) and body x as near to the heading `yaw` (rad) as it can be."""
     heading = jnp.stack([jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)])
     z = rotation.unit(force)
     y = rotation.unit(rotation.cross(z, heading))
-    return jnp.stack([rotation.cross(y, z), y, z], axis=-1)
+    return [rotation.cross(y, z), y, z]
 
 
-def error(r: Float[Array, "3 3"], target: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def error(axes: Axes, target: Axes) -> Float[Array, "3"]:
     """Vector of (R_d^T R - R^T R_d) / 2, body: the sine of the angle times the axis (Lee et al. 2010)."""
-    e = target.T @ r
-    return jnp.stack([e[2, 1] - e[1, 2], e[0, 2] - e[2, 0], e[1, 0] - e[0, 1]]) / 2
+    x, y, z = axes
+    tx, ty, tz = target
+    return jnp.stack([dot(tz, y) - dot(ty, z), dot(tx, z) - dot(tz, x), dot(ty, x) - dot(tx, y)]) / 2

@@ -69,13 +69,14 @@ def control(
 
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
     acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
-    r = rotation.to_matrix(state.quat)
+    axes = rotation.axes(state.quat)
     target = attitude.from_thrust(acc, setpoint.yaw)
 
-    thrust = params.mass * jnp.sum(acc * r[:, 2])
-    omega_target = r.T @ (target @ setpoint.omega)
+    thrust = params.mass * rotation.dot(acc, axes[2])
+    asked = sum(rate * axis for rate, axis in zip(rotation.unstack(setpoint.omega), target, strict=True))  # world
+    omega_target = jnp.stack([rotation.dot(axis, asked) for axis in axes])
     omega_rate = (
-        -gains.attitude * attitude.error(r, target)
+        -gains.attitude * attitude.error(axes, target)
         - gains.rate * (state.omega - omega_target)
         - rotation.cross(state.omega, omega_target)
     )

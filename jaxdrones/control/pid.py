@@ -7,6 +7,7 @@ Crazyflie's 16-bit PWM, whatever the vehicle.
 from __future__ import annotations
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -109,26 +110,25 @@ def control(
     check_single(params, state, setpoint, memory)
     memory, thrust, target = position_loop(gains, params, memory, state, setpoint, dt)
     memory, torque = attitude_loop(gains, memory, state, target, setpoint.omega, dt)
-    pwm = jnp.clip(thrust + mixer(params) @ torque, *_PWM_RANGE)
-    return memory, _PWM_TO_RPM * pwm + _PWM_OFFSET
+    return memory, rotor_speeds(params, thrust, torque)
 
 
 def position_loop(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, dt: float
-) -> tuple[Memory, Float[Array, ""], Float[Array, "3 3"]]:
+) -> tuple[Memory, Float[Array, ""], attitude.Axes]:
     """Thrust per rotor (PWM, not clipped) and the attitude that points it where the position error asks."""
     error = setpoint.pos - state.pos
     limit = jnp.array(_MAX_POS_INTEGRAL)
     integral = jnp.clip(memory.pos_integral + error * dt, -limit, limit)
     force = gains.pos_p * error + gains.pos_i * integral + gains.pos_d * (setpoint.vel - state.vel)
     force = force + jnp.stack([jnp.zeros_like(params.mass), jnp.zeros_like(params.mass), params.weight])
-    thrust = jnp.maximum(jnp.sum(force * rotation.z_axis(state.quat)), 0)
+    thrust = jnp.maximum(rotation.dot(force, rotation.z_axis(state.quat)), 0)
     pwm = rpm_to_pwm(safe_sqrt(thrust / (4 * params.kf)))
     return memory.replace(pos_integral=integral), pwm, attitude.from_thrust(force, setpoint.yaw)
 
 
 def attitude_loop(
-    gains: Gains, memory: Memory, state: State, target: Float[Array, "3 3"], rpy_rate: Float[Array, "3"], dt: float
+    gains: Gains, memory: Memory, state: State, target: attitude.Axes, rpy_rate: Float[Array, "3"], dt: float
 ) -> tuple[Memory, Float[Array, "3"]]:
     """Torque (PWM) towards the attitude `target`.
 
@@ -136,9 +136,15 @@ def attitude_loop(
     crosses +-180 degrees.
     """
     rpy = rotation.to_rpy(state.quat)
-    error = 2 * attitude.error(rotation.to_matrix(state.quat), target)
+    error = 2 * attitude.error(rotation.axes(state.quat), target)
     rate_error = rpy_rate - (rpy - memory.rpy) / dt
     limit = jnp.array(_MAX_RPY_INTEGRAL)
     integral = jnp.clip(memory.rpy_integral - error * dt, -limit, limit)
     torque = -gains.rpy_p * error + gains.rpy_d * rate_error + gains.rpy_i * integral
     return memory.replace(rpy_integral=integral, rpy=rpy), jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE)
+
+
+def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
+    """RPM of a thrust per rotor and a torque (PWM), each rotor's PWM cut to the Crazyflie's range."""
+    pwm = jnp.clip(thrust + jax.vmap(rotation.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
+    return _PWM_TO_RPM * pwm + _PWM_OFFSET

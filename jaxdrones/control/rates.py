@@ -72,7 +72,7 @@ def command(
     check_single(params, state, setpoint)
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
     acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
-    collective = jnp.sum(acc * rotation.z_axis(state.quat))
+    collective = rotation.dot(acc, rotation.z_axis(state.quat))
 
     left = jnp.stack([-jnp.sin(setpoint.yaw), jnp.cos(setpoint.yaw), jnp.zeros_like(setpoint.yaw)])
     z = rotation.unit(acc)

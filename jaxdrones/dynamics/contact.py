@@ -51,7 +51,7 @@ def ground_contact(params: Params, state: State) -> Wrench:
     Not for the Bullet backend, whose ground does it already.
     """
     ball, ring = _shape(params)
-    x_axis, y_axis, z_axis = _rows(rotation.to_matrix(state.quat).T)
+    x_axis, y_axis, z_axis = rotation.axes(state.quat)
     omega = rotation.rotate(state.quat, state.omega)
     # Everything below is world frame. The lowest point of the ball at angle t is p + x cos t + y sin t from the centre
     # of mass, and so are its velocity and, summed over the balls, the moments of the forces.
@@ -123,7 +123,7 @@ class _Body(NamedTuple):
 
 
 def _body(params: Params, state: State, pos: Float[Array, "3"]) -> _Body:
-    axes = _rows(rotation.to_matrix(state.quat).T)
+    axes = rotation.axes(state.quat)
     center = pos + params.collision_offset * axes[2]
     return _Body(pos, state.vel, rotation.rotate(state.quat, state.omega), center, axes, *_shape(params))
 

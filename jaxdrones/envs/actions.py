@@ -152,9 +152,9 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
 
     def command(params, memory, state, action, setpoint, dt):
         limits = jnp.array([jnp.radians(max_tilt), jnp.radians(max_tilt), jnp.pi], action.dtype)
-        target = rotation.to_matrix(rotation.from_rpy(limits * action[1:]))
+        target = rotation.axes(rotation.from_rpy(limits * action[1:]))
         gains = rates.gains()
-        omega = -2 * gains.attitude * attitude.error(rotation.to_matrix(state.quat), target)
+        omega = -2 * gains.attitude * attitude.error(rotation.axes(state.quat), target)
         return memory, rates.follow(gains, params, state, _collective(params, action[0]), omega)
 
     return Action(4, command)

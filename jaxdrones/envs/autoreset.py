@@ -29,8 +29,8 @@ class Episode(flax.struct.PyTreeNode):
 class AutoReset:
     """The same two functions, of an `Episode` in place of a `World`; an episode that ends is followed by a fresh one.
 
-    `info` gains `final_obs`, what was seen last (of every step, so also before a reset), and `episode`: `return`
-    (n,) and `length` () so far, which are those of the whole episode where it ended.
+    `info` gains `final_obs` and `final_world`, what was seen and what there was last (of every step, so also before a
+    reset), and `episode`: `return` (n,) and `length` () so far, which are those of the whole episode where it ended.
     """
 
     def __init__(self, env: Env):
@@ -48,7 +48,8 @@ class AutoReset:
         """One control step; where it ends the episode, the observation and the world are those of the next one."""
         obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
         returned, length = episode.returned + reward, episode.length + 1
-        info = info | {"final_obs": obs, "episode": {"return": returned, "length": length}}
+        last = {"final_obs": obs, "final_world": world}
+        info = info | last | {"episode": {"return": returned, "length": length}}
 
         ended = terminated | truncated
         fresh_obs, fresh = self._drawn(ended, jax.random.fold_in(key, RESET))

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +26,15 @@ from jaxdrones.tasks.task import Part, Task, World
 DISTURB, NOISE, START, LAWS, RESET = range(5)  # what a key is folded with: only the draws that are used cost time
 
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
+
+
+class Truth(flax.struct.PyTreeNode):
+    """Of a team, as no sensor shows it."""
+
+    obs: Array
+    """(n, d) the vector that would be observed without noise."""
+    secrets: Array
+    """(n, e) of the parameters that are drawn: deviations from their nominal values, as shares of the largest one."""
 
 
 class Env:
@@ -119,6 +129,24 @@ class Env:
             world = world.replace(images=self.vision.next(world))
         return self._seen(obs, world), world, *outcome
 
+    def truth(self, world: World) -> Truth:
+        """What a critic may know in training, and no policy in flight."""
+        off = [_deviation(getattr(world.params, name), getattr(self.params, name)) for name in self._varied]
+        secrets = [jnp.reshape(x, (self.drones, -1)) for x in off]
+        return Truth(self._shown(world), jnp.concatenate([jnp.zeros((self.drones, 0)), *secrets], axis=-1))
+
+    @property
+    def secret_size(self) -> int:
+        """Numbers that `truth` has of a drone beside its observation."""
+        return sum(getattr(self.params, name).size for name in self._varied) // self.drones
+
+    @functools.cached_property
+    def _varied(self) -> list[str]:
+        """Names of the parameters that a draw changes."""
+        with jax.ensure_compile_time_eval():
+            drawn = vars(draw(self._laws, jax.random.key(0), self.params))
+            return [name for name, value in drawn.items() if jnp.any(value != getattr(self.params, name))]
+
     def close(self) -> None:
         """End the connection of a backend that has one."""
         if isinstance(self.physics, HostStep):
@@ -179,6 +207,9 @@ class Env:
     def _observe(self, key: jax.Array, world: World) -> Array:
         if self._noise:
             world = world.replace(drones=self._noise(key, world.drones))
+        return self._shown(world)
+
+    def _shown(self, world: World) -> Array:
         parts = [part.observe(self.task, world) for part in self._parts]
         return jnp.concatenate([_cut(x, part.bound) for x, part in zip(parts, self._parts, strict=True)], axis=-1)
 
@@ -191,6 +222,12 @@ class Env:
 
     def _seen(self, obs: Array, world: World) -> Obs:
         return obs if self.vision is None else {"state": obs, **world.images}
+
+
+def _deviation(value: Array, nominal: Array) -> Array:
+    """As a share of the largest magnitude of the nominal one; of none, as it is."""
+    largest = jnp.max(jnp.abs(nominal))
+    return (value - nominal) / jnp.where(largest > 0, largest, 1)
 
 
 def _any(conditions) -> Array:

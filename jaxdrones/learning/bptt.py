@@ -16,6 +16,7 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import collect
 from jaxdrones.learning.gradients import GRADIENTS, linked, with_gradient
 from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import vector
 from jaxdrones.learning.result import Result, descent, scan_updates
 
 
@@ -90,7 +91,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     step, optimiser = _optimiser(config).update(gradient, state.optimiser)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
-        statistics=collect.remember(state.policy.statistics, flight, config, state.step),
+        statistics=collect.remember(state.policy.statistics, vector(flight.obs), config, state.step),
     )
     metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient)}
     return TrainState(state.step + 1, key, policy, optimiser, worlds), metrics

@@ -9,14 +9,14 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxdrones.envs import AutoReset, Env, autoreset
 from jaxdrones.envs.autoreset import Episode
-from jaxdrones.envs.env import Obs
+from jaxdrones.envs.env import Obs, Truth
 from jaxdrones.learning import sharding
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.normalize import Statistics, vector
+from jaxdrones.learning.normalize import Statistics
 
 Act = Callable[[jax.Array, Obs], tuple[Array, Any]]
 """(a key for each world (w,), observations (w, n, d)) -> actions (w, n, a), and what is to be kept of the decision."""
@@ -53,6 +53,10 @@ class Flight(flax.struct.PyTreeNode):
     """(t, w, n) sum of rewards of the episode so far."""
     error: Array
     """(t, w, n) distance from the target, m."""
+    truth: Truth | None
+    """(t, w, n, ...) before the step, where it was asked for."""
+    final_truth: Truth | None
+    """(t, w, n, ...) after the step, before a new episode started."""
     over: Array
     """(t, w) the episode was over before the step, which does not count; never so where episodes are reset."""
 
@@ -86,6 +90,7 @@ def fly(
     worlds: Worlds,
     length: int,
     reset: bool = True,
+    informed: bool = False,
     link: Callable = lambda worlds: worlds,
 ) -> tuple[Worlds, Flight]:
     """Fly on; each device its share of the worlds, where `jax.set_mesh` was given several.
@@ -99,8 +104,10 @@ def fly(
         length: control steps.
         reset: start a new episode in the step in which one ends; else that is left to `restart`, the drones stay as
             they are, and everything from there on is marked as over.
+        informed: keep the truth beside what is seen.
         link: applied to the worlds between steps; changes their gradients, not their values.
     """
+    truth = jax.vmap(env.truth)
     step = jax.vmap((autoreset(env) if reset else _Endless(env)).step)
 
     def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Flight]:
@@ -118,6 +125,8 @@ def fly(
             final_obs=info["final_obs"],
             returned=info["episode"]["return"],
             error=info["metrics"]["error"],
+            truth=truth(worlds.episodes.world) if informed else None,
+            final_truth=truth(info["final_world"]) if informed else None,
             over=worlds.ended,
         )
         if reset:
@@ -146,7 +155,8 @@ class _Endless(AutoReset):
     def step(self, key: jax.Array, episode: Episode, action: Array):
         obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
         episode = Episode(world, episode.returned + reward, episode.length + 1)
-        info = info | {"final_obs": obs, "episode": {"return": episode.returned, "length": episode.length}}
+        last = {"final_obs": obs, "final_world": world}
+        info = info | last | {"episode": {"return": episode.returned, "length": episode.length}}
         return obs, episode, reward, terminated, truncated, info
 
 
@@ -167,16 +177,16 @@ def progress(flight: Flight) -> dict[str, Array]:
     }
 
 
-def remember(statistics: Statistics, flight: Flight, config, step: Array) -> Statistics:
-    """The statistics of observations with those of a flight, until they are settled.
+def remember(statistics: Statistics, seen: Float[Array, "t w n d"], config, step: Array) -> Statistics:
+    """The statistics of what was seen so far with those of a flight, until they are settled.
 
     Args:
         statistics: so far.
-        flight: new.
+        seen: in the flight.
         config: settings: `memory` in flights, `settle` as a share of `updates`.
         step: () updates made.
     """
-    new = statistics.update(vector(flight.obs), memory=config.memory * flight.reward.size)
+    new = statistics.update(seen, memory=config.memory * seen[..., 0].size)
     settling = step < config.settle * config.updates
     return jax.tree.map(lambda new, old: jnp.where(settling, new, old), new, statistics)
 

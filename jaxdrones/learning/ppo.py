@@ -16,7 +16,7 @@ from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect
 from jaxdrones.learning.networks import MLP, Policy, VisionMLP, apply, central, init_params, network_for, seen_by_one
-from jaxdrones.learning.normalize import on_vector
+from jaxdrones.learning.normalize import on_vector, vector
 from jaxdrones.learning.result import Result, bounded, scan_updates
 from jaxdrones.learning.returns import advantages
 
@@ -47,6 +47,8 @@ class Config:
     """A policy and a value function for every drone, else one of each for all."""
     central_critic: bool = False
     """Values are of all drones' observations and of the others' actions, else of a drone's own observation."""
+    informed_critic: bool = False
+    """Values are of what a policy never sees: observations without noise, and drawn parameters (`Env.truth`)."""
     learning_rate: float = 2e-3
     """At the start; follows how much the policy changes in a gradient step."""
     change: float = 0.02
@@ -112,7 +114,8 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     """Before the first update."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
-    n, d, a = env.drones, env.observation_size, env.action_size
+    n, a = env.drones, env.action_size
+    d = env.observation_size + (env.secret_size if config.informed_critic else 0)
     log_std = jnp.full((n, a) if config.per_role else (a,), jnp.log(config.spread))
     inputs = n * d + (n - 1) * a if config.central_critic else d
     obs = on_vector(lambda _: jnp.zeros(inputs), seen_by_one(env))
@@ -136,15 +139,14 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         return action, log_prob(action, mean, log_std)
 
     pilot = jax.tree_util.Partial(act, state.policy, state.log_std)
-    worlds, flight = collect.fly(fly_key, env, pilot, worlds, config.horizon)
+    worlds, flight = collect.fly(fly_key, env, pilot, worlds, config.horizon, informed=config.informed_critic)
     sample = _judged(config, state, flight)
     learnt, optimiser, rate, losses = _learn(learn_key, config, state, sample)
     params, log_std, critic = learnt
     widest = _falling(config, state.step, config.spread, config.calm)
     log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.narrowest, widest)), jnp.log(widest))
-    policy = state.policy.replace(
-        params=params, statistics=collect.remember(state.policy.statistics, flight, config, state.step)
-    )
+    statistics = collect.remember(state.policy.statistics, vector(flight.obs), config, state.step)
+    policy = state.policy.replace(params=params, statistics=statistics)
     metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std)), "rate": rate}
     return TrainState(state.step + 1, key, policy, log_std, critic, optimiser, rate, worlds), metrics
 
@@ -179,12 +181,18 @@ def _judged(config: Config, state: TrainState, flight: collect.Flight) -> Sample
     """The flown steps with their advantages."""
     policy = state.policy
 
-    def seen(obs, action):
-        normal = on_vector(policy.statistics.normalize, obs)
-        return on_vector(lambda x: central(x, action), normal) if config.central_critic else normal
+    def seen(obs, truth, action):
+        """What the critic sees, where the policy sees `obs`."""
+        if config.informed_critic:
+            obs = on_vector(lambda _: truth.obs, obs)
+        obs = on_vector(policy.statistics.normalize, obs)
+        if config.informed_critic:
+            obs = on_vector(lambda x: jnp.concatenate([x, truth.secrets], axis=-1), obs)
+        return on_vector(lambda x: central(x, action), obs) if config.central_critic else obs
 
-    critic_obs = seen(flight.obs, flight.action)
-    final_obs = seen(flight.final_obs, policy(flight.final_obs) if config.central_critic else None)
+    critic_obs = seen(flight.obs, flight.truth, flight.action)
+    final_action = policy(flight.final_obs) if config.central_critic else None
+    final_obs = seen(flight.final_obs, flight.final_truth, final_action)
     value = _value(config, state.critic, critic_obs)
     next_value = _value(config, state.critic, final_obs)
     terminated, truncated = (jnp.broadcast_to(x[..., None], value.shape) for x in (flight.terminated, flight.truncated))

@@ -17,6 +17,7 @@ from jaxdrones.learning import collect
 from jaxdrones.learning.bptt import discounted
 from jaxdrones.learning.gradients import GRADIENTS, linked, with_gradient
 from jaxdrones.learning.networks import MLP, Policy, init_params
+from jaxdrones.learning.normalize import vector
 from jaxdrones.learning.result import Result, descent, scan_updates
 from jaxdrones.learning.returns import advantages
 
@@ -130,7 +131,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     target = optax.incremental_update(critic, state.target, config.target_speed)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
-        statistics=collect.remember(state.policy.statistics, flight, config, state.step),
+        statistics=collect.remember(state.policy.statistics, vector(flight.obs), config, state.step),
     )
     metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient), "critic_loss": critic_loss}
     return TrainState(state.step + 1, key, policy, optimiser, critic, target, critic_optimiser, worlds), metrics

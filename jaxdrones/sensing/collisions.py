@@ -104,7 +104,7 @@ class _Box(NamedTuple):
         return dot(jnp.abs(rotation.rotate_inverse(self.quat, direction)), self.half)
 
     def directions(self, towards: Float[Array, "3"]) -> list[Float[Array, "3"]]:
-        return [jnp.squeeze(axis, 1) for axis in jnp.split(rotation.to_matrix(self.quat), 3, axis=1)]
+        return rotation.axes(self.quat)
 
 
 def _body(params: Params, state: State) -> _Cylinder:

@@ -150,7 +150,7 @@ def circle():
 
     def turn(t):
         def pointing(t):
-            return attitude.from_thrust(acceleration(t) + up, jnp.zeros_like(t))
+            return jnp.stack(attitude.from_thrust(acceleration(t) + up, jnp.zeros_like(t)), axis=-1)
 
         skew = pointing(t).T @ jax.jacfwd(pointing)(t)
         return jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])

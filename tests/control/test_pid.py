@@ -118,7 +118,8 @@ def call_fresh(params, pos, quat, vel, target_pos, target_rpy, target_vel, targe
     setpoint = Setpoint.at(target_pos, vel=target_vel, yaw=target_rpy[2], omega=target_rpy_rates)
     fresh = one(pid.init(1))
     memory, rpm = pid.control(pid.gains(), params, fresh, state, setpoint, dt=dt)
-    return memory, rpm, pid.position_loop(pid.gains(), params, fresh, state, setpoint, dt)[1:]
+    _, thrust, target = pid.position_loop(pid.gains(), params, fresh, state, setpoint, dt)
+    return memory, rpm, (thrust, jnp.stack(target, axis=-1))
 
 
 @jax.jit

@@ -1,0 +1,61 @@
+"""Many worlds in chunks, each chunk one kernel."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from helpers import assert_close, flying, tape
+
+import jaxdrones as jd
+from jaxdrones.control import pid, setpoint
+
+team = jd.repeat(jd.load_params("cf2x"), 2)
+step = jd.make_step((jd.drag,), rotors=jd.lagging_rotors)
+starts = jax.vmap(lambda vz: flying(team).replace(vel=jnp.full((2, 3), vz)))(jnp.linspace(-1, 1, 5))
+commands = jnp.stack([tape(team, 10) * (1 + 0.01 * i) for i in range(5)])
+
+
+def fly(start, commands):
+    return jax.lax.scan(lambda state, rpm: (step(team, state, rpm), None), start, commands)[0]
+
+
+def miss(start, commands):
+    return jnp.sum(fly(start, commands).pos ** 2)
+
+
+@pytest.mark.parametrize("chunk", [2, 5, 100], ids=["with a rest", "all", "more than there are"])
+def test_a_flight_in_chunks_is_the_flight_at_once(chunk):
+    flown = jax.jit(jd.over_worlds(fly, chunk))(starts, commands)
+    assert_close(flown, jax.jit(jax.vmap(fly))(starts, commands), 1e-11)  # RPM of 10,000 to rounding
+
+
+def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all():
+    at_once = jax.jit(jax.vmap(jax.grad(miss, 1)))(starts, commands)
+    inside = jax.jit(jd.over_worlds(jax.grad(miss, 1), 2))(starts, commands)
+    around = jax.jit(jax.grad(lambda c: jnp.sum(jd.over_worlds(miss, 2)(starts, c))))(commands)
+    assert_close(inside, at_once, 1e-12)
+    assert_close(around, at_once, 1e-12)
+
+
+def test_a_controlled_flight_is_one_kernel():
+    gains, hold = pid.gains(), setpoint.Setpoint.at(jnp.array([[0.0, 0.0, 1.0]] * 2))
+
+    def control(params, memory, state, target):
+        return pid.control(gains, params, memory, state, target, dt=1 / 240)
+
+    def held(start):
+        return jd.rollout(step, lambda p, m, s, k: jax.vmap(control)(p, m, s, hold), team, start, pid.init(2), 10)[0]
+
+    assert_close(jax.jit(jd.over_worlds(held, 2))(starts), jax.jit(jax.vmap(held))(starts), 1e-10)
+
+
+def test_a_function_with_a_solver_is_flown_without_the_single_kernel():
+    def solved(start):
+        return jnp.linalg.solve(jnp.eye(3) + start.pos.T @ start.pos, start.vel.T)
+
+    assert_close(jax.jit(jd.over_worlds(solved, 2, one_kernel=False))(starts), jax.vmap(solved)(starts), 1e-12)
+
+
+@pytest.mark.parametrize("chunk", [0, 1.5])
+def test_a_chunk_is_a_whole_number(chunk):
+    with pytest.raises(ValueError, match="chunk"):
+        jd.over_worlds(fly, chunk)

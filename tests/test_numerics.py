@@ -1,0 +1,45 @@
+"""Functions that replace those of the library."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones.numerics import asin, atan2
+
+rng = np.random.default_rng(0)
+
+
+def test_the_angle_of_a_point_is_that_of_the_library_in_all_quadrants_and_at_any_distance():
+    y, x = rng.normal(size=(2, 10_000)) * 10.0 ** rng.uniform(-150, 150, 10_000)
+    np.testing.assert_allclose(jax.jit(atan2)(y, x), np.arctan2(y, x), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(jax.jit(atan2)(1e-9 * y, x), np.arctan2(1e-9 * y, x), rtol=1e-15)
+
+
+@pytest.mark.float32
+def test_it_is_as_exact_in_float32():
+    y, x = rng.normal(size=(2, 10_000)).astype(np.float32)
+    np.testing.assert_allclose(jax.jit(atan2)(y, x), np.arctan2(y.astype(float), x), rtol=0, atol=4e-7)
+
+
+@pytest.mark.parametrize("y", [-1.0, -0.0, 0.0, 1.0])
+@pytest.mark.parametrize("x", [-1.0, 0.0, 1.0])
+def test_axes_and_diagonals_are_met_with_the_sign_of_y(y, x):
+    np.testing.assert_allclose(atan2(jnp.array(y), jnp.array(x)), np.arctan2(y, x), rtol=0, atol=5e-16)
+    assert np.signbit(atan2(jnp.array(y), jnp.array(x))) == np.signbit(y)
+
+
+def test_the_angle_of_what_is_not_a_number_is_none():
+    assert jnp.isnan(atan2(jnp.array(jnp.nan), jnp.array(1.0)))
+    assert jnp.isnan(atan2(jnp.array(1.0), jnp.array(jnp.nan)))
+
+
+def test_its_derivatives_are_those_of_the_library():
+    points = rng.normal(size=(100, 2))
+    mine, library = (jax.jit(jax.vmap(jax.jacrev(lambda p, f=f: f(p[0], p[1]))))(points) for f in (atan2, jnp.arctan2))
+    np.testing.assert_allclose(mine, library, rtol=1e-13)
+
+
+def test_the_arcsine_is_that_of_the_library_to_the_ends():
+    s = np.concatenate([np.linspace(-1, 1, 10_001), 1 - np.logspace(-15, -1, 100)])
+    np.testing.assert_allclose(jax.jit(asin)(s), np.arcsin(s), rtol=0, atol=5e-16)

@@ -8,7 +8,7 @@ crazyflow 0.4.0 and rotorpy 3.0.0 live with this library in an environment of th
       crazyflow's default; it turns by the exponential map where ours adds and normalises.
   attitude
       each simulator's own Crazyflie under its own cascade at 500 Hz, a new attitude and thrust at every step: here the
-      attitude loop and mixer of `pid`, or attitude over `rates`; there the Mellinger controller.
+      attitude loop and mixer of `pid`, there the Mellinger controller.
   rotorpy
       the plant without drag, by rk4, float64: rotorpy has no other numbers, no Euler, and drag at each rotor.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxdrones as jd
 from jaxdrones import rotation
-from jaxdrones.control import pid, rates
+from jaxdrones.control import pid
 from jaxdrones.learning import sharding
 
 CHUNK = 512
@@ -112,22 +112,11 @@ def angle(quat, other) -> float:
     return float(4 * np.arcsin(np.minimum(np.max(difference) / 2, 1)))
 
 
-def _piloted(step: jd.Step, control: Callable, memory: Callable) -> Callable:
-    """`(params, start, commands) -> final state` of a world; commands (steps, 1, 4) are roll, pitch, yaw, thrust."""
+def piloted(step: jd.Step, dt: float) -> Callable:
+    """`(params, start, commands) -> final state` of a world; commands (steps, 1, 4) are roll, pitch, yaw, thrust.
 
-    def fly(params: jd.Params, start: jd.State, commands: jax.Array) -> jd.State:
-        def advance(carry, command):
-            memory, state = carry
-            memory, rpm = jax.vmap(control)(params, memory, state, command)
-            return (memory, step(params, state, rpm)), None
-
-        return jax.lax.scan(advance, (memory(1), start), commands)[0][1]
-
-    return fly
-
-
-def _by_pid(step: jd.Step, dt: float) -> Callable:
-    """The paper's attitude loop and PWM mixer, which is the cascade that crazyflow flies."""
+    The pilot is the paper's attitude loop and PWM mixer, the kind of cascade that crazyflow flies.
+    """
     gains = pid.gains("cf2x")
 
     def control(params, memory, state, command):
@@ -136,19 +125,12 @@ def _by_pid(step: jd.Step, dt: float) -> Callable:
         memory, torque = pid.attitude_loop(gains, memory, state, target, jnp.zeros(3), dt)
         return memory, pid.rotor_speeds(params, thrust, torque)
 
-    return _piloted(step, control, pid.init)
+    def fly(params: jd.Params, start: jd.State, commands: jax.Array) -> jd.State:
+        def advance(carry, command):
+            memory, state = carry
+            memory, rpm = jax.vmap(control)(params, memory, state, command)
+            return (memory, step(params, state, rpm)), None
 
+        return jax.lax.scan(advance, (pid.init(1), start), commands)[0][1]
 
-def _by_rates(step: jd.Step, dt: float) -> Callable:
-    """Attitude to body rates to rotor speeds, by the exact inverse of the rotors."""
-    gains = rates.gains()
-
-    def control(params, memory, state, command):
-        error = rotation.multiply(rotation.conjugate(state.quat), rotation.from_rpy(command[:3]))
-        omega = 2 * gains.attitude * error[:3] * jnp.where(error[3] < 0, -1, 1)
-        return memory, rates.follow(gains, params, state, command[3] / params.mass, omega)
-
-    return _piloted(step, control, rates.init)
-
-
-PILOTS = {"pid": _by_pid, "rates": _by_rates}
+    return fly

@@ -95,10 +95,7 @@ class Attitude:
         rpy, thrust_to_weight = ours.attitudes(worlds, steps, jax.random.key(1))
         self._asked = rpy[:, -1]
         commands = jnp.asarray(np.concatenate([rpy, thrust_to_weight * np.asarray(params.weight[0])], axis=-1))
-        programs = {}
-        for name, pilot in ours.PILOTS.items():
-            ways = ours.ways(pilot(step, DT), jax.devices(), params, start, commands)
-            programs |= {f"{way}, {name}": program for way, program in ways.items()}
+        programs = ours.ways(ours.piloted(step, DT), jax.devices(), params, start, commands)
         if alone:
             return programs
         import rivals_crazyflow_many as crazyflow

@@ -1,6 +1,7 @@
 """A vectorised, differentiable simulator of quadrotor teams."""
 
 from jaxdrones import rotation
+from jaxdrones.backends.cells import Cells
 from jaxdrones.backends.explicit import Step, make_step
 from jaxdrones.backends.rollout import rollout
 from jaxdrones.backends.worlds import over_worlds
@@ -29,6 +30,7 @@ from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
 
 __all__ = [
+    "Cells",
     "Effect",
     "Pair",
     "Params",

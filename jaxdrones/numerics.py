@@ -13,6 +13,33 @@ def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, x)))
 
 
+_HALF_TURN = (3.140625, math.pi - 3.140625)  # the first part has few digits, so that many times of it are exact
+
+
+@jax.custom_jvp
+def sin_cos(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Sine and cosine of an angle.
+
+    Less half turns, by the tangent of half the angle, of which nine terms of Lambert's continued fraction are exact to
+    float64 (6e-16). XLA's CPU compiler calls the C library for `jnp.sin`, number by number: 2 ns each, half of the time
+    of an attitude from three angles.
+    """
+    turns = jnp.round(x / math.pi)
+    sign = 1 - 2 * jnp.abs(turns - 2 * jnp.round(turns / 2))
+    half = (x - turns * _HALF_TURN[0] - turns * _HALF_TURN[1]) / 2
+    s = half * half
+    a = 34459425 - s * (16216200 - s * (945945 - s * (13860 - s * 45)))
+    b = 34459425 - s * (4729725 - s * (135135 - s * (990 - s)))
+    scale = sign / (a * a + s * b * b)
+    return 2 * half * a * b * scale, (a * a - s * b * b) * scale
+
+
+@sin_cos.defjvp
+def _(x, turn):
+    sin, cos = sin_cos(*x)
+    return (sin, cos), (cos * turn[0], -sin * turn[0])
+
+
 _EIGHTH = math.tan(math.pi / 8)
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.numerics import asin, atan2, safe_sqrt
+from jaxdrones.numerics import asin, atan2, safe_sqrt, sin_cos
 
 
 def unstack(v: Float[Array, " n"]) -> list[Float[Array, ""]]:
@@ -131,8 +131,9 @@ def from_matrix(r: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 def from_rpy(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
     """The quaternion of roll, pitch, yaw (rad) about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    cr, cp, cy = jnp.cos(rpy / 2)
-    sr, sp, sy = jnp.sin(rpy / 2)
+    sin, cos = sin_cos(rpy / 2)
+    cr, cp, cy = unstack(cos)
+    sr, sp, sy = unstack(sin)
     return jnp.stack(
         [
             sr * cp * cy - cr * sp * sy,

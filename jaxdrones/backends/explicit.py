@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 
+from jaxdrones.backends.cells import Cells
 from jaxdrones.backends.team import check_team
 from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_total_wrench
 from jaxdrones.checks import check_positive, check_whole
@@ -23,6 +24,7 @@ def make_step(
     integrator: Integrator = semi_implicit_euler,
     dt: float = 1 / 240,
     substeps: int = 1,
+    cells: Cells | None = None,
 ) -> Step:
     """Build the step of a world.
 
@@ -33,6 +35,7 @@ def make_step(
         integrator: `semi_implicit_euler`, `euler`, `rk4` or `implicit_midpoint`.
         dt: physics step, s.
         substeps: physics steps per call, with the command held.
+        cells: limits pairs to drones near each other, which makes large teams (above a hundred or so) fast.
 
     Returns:
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
@@ -45,7 +48,7 @@ def make_step(
     check_whole("substeps", substeps)
     check_functions("rotors", [rotors])
     check_functions("integrator", [integrator])
-    total_wrench = make_total_wrench(effects, pairs)
+    total_wrench = make_total_wrench(effects, pairs, cells)
 
     def derivative(params: Params, state: State, command: jax.Array) -> State:
         rpm, rpm_rate = jax.vmap(rotors)(params, state.rpm, command)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
+from jaxdrones.backends.cells import Cells
 from jaxdrones.dynamics import rotor_wrench
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -31,22 +32,30 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
     return functions
 
 
-def make_total_wrench(effects: Sequence[Effect], pairs: Sequence[Pair]) -> Callable[[Params, State], Wrench]:
-    """Build `(params, state) -> Wrench` of a team: rotors, effects and pairs, one row per drone."""
+def make_total_wrench(
+    effects: Sequence[Effect], pairs: Sequence[Pair], cells: Cells | None = None
+) -> Callable[[Params, State], Wrench]:
+    """Build `(params, state) -> Wrench` of a team: rotors, effects and pairs, one row per drone.
+
+    Raises:
+        ValueError: a sequence that holds something else than functions, or cells that are none.
+    """
     effects, pairs = check_functions("effects", effects), check_functions("pairs", pairs)
+    if not (cells is None or isinstance(cells, Cells)):
+        raise ValueError(f"cells is {cells!r}; give for example jaxdrones.Cells(reach=3.0), or leave it out")
 
     def alone(params: Params, state: State) -> Wrench:
         return sum((effect(params, state) for effect in effects), rotor_wrench(params, state))
 
     def total_wrench(params: Params, state: State) -> Wrench:
         wrench = jax.vmap(alone)(params, state)
-        return sum((_from_others(pair, params, state) for pair in pairs), wrench)
+        return sum((_from_others(pair, params, state, cells) for pair in pairs), wrench)
 
     return total_wrench
 
 
-def _from_others(pair: Pair, params: Params, state: State) -> Wrench:
-    """The sum of a pair effect over all other drones, for every drone of the team.
+def _from_others(pair: Pair, params: Params, state: State, cells: Cells | None) -> Wrench:
+    """The sum of a pair effect over all other drones, or over those within reach, for every drone of the team.
 
     Sums are taken component by component, over an axis in front of that of the drones acted on: so XLA's CPU compiler
     vectorises a pair along the latter.
@@ -54,19 +63,35 @@ def _from_others(pair: Pair, params: Params, state: State) -> Wrench:
     index = jnp.arange(len(state.pos))
     state = jax.tree.map(_stored, state)
 
-    def because_of(j, other, other_state, i, own_params, own_state):
-        # A drone is not its own neighbour. Its copy is moved out of reach before it is masked, so that
+    def because_of(j, counts, other, other_state, i, own_params, own_state):
+        # A drone is not its own neighbour. What does not count is moved out of reach before it is masked, so that
         # neither value nor gradient of a pair is ever taken at zero distance.
-        itself = i == j
-        away = jnp.where(itself, _OUT_OF_REACH, 0)
+        counts = counts & (i != j)
+        if cells is not None:
+            x, y = rotation.unstack(other_state.pos[:2] - own_state.pos[:2])
+            counts &= x * x + y * y < cells.reach**2
+        away = jnp.where(counts, 0, _OUT_OF_REACH)
         pos = jnp.stack([x + away for x in rotation.unstack(other_state.pos)])
         wrench = pair(own_params, own_state, other, other_state.replace(pos=pos))
         components = rotation.unstack(wrench.force) + rotation.unstack(wrench.torque)
-        return [jnp.where(itself, 0, x) for x in components]
+        return [jnp.where(counts, x, 0) for x in components]
 
-    on_each = jax.vmap(because_of, in_axes=(None, None, None, 0, 0, 0))
-    from_each = jax.vmap(on_each, in_axes=(0, 0, 0, None, None, None))
-    components = [_stored(_sum(x)) for x in from_each(index, params, state, index, params, state)]
+    def on_all():
+        on_each = jax.vmap(because_of, in_axes=(None, None, None, None, 0, 0, 0))
+        from_each = jax.vmap(on_each, in_axes=(0, None, 0, 0, None, None, None))
+        return [_sum(x) for x in from_each(index, True, params, state, index, params, state)]
+
+    def on_near():
+        other, other_state = jax.tree.map(lambda x: x.at[near].get(mode="promise_in_bounds"), (params, state))
+        from_each = jax.vmap(jax.vmap(because_of), in_axes=(0, 0, 0, 0, None, None, None))
+        return [_sum(x) for x in from_each(near, meant, other, other_state, index, params, state)]
+
+    if cells is None:
+        components = on_all()
+    else:
+        near, meant, complete = cells.near(jax.lax.stop_gradient(state.pos))
+        components = jax.lax.cond(complete, on_near, on_all)
+    components = [_stored(x) for x in components]
     force, torque = components[:3], components[3:]
     return Wrench(jnp.stack(force, axis=-1), jnp.stack(torque, axis=-1))
 

@@ -47,6 +47,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
 }
 _REALISTIC: dict[tuple[str, str], dict[str, Any]] = {
     ("hover", "bptt"): dict(updates=600, sizes=(64, 64), gradient="exact", learning_rate=2e-2),
+    ("hover", "ppo"): dict(updates=750, critic_sizes=(64, 64), informed_critic=True, change=0.01),
 }
 
 _PRACTICE: dict[str, dict[str, Any]] = {"gates": dict(anywhere=True)}

@@ -24,6 +24,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     parser.add_argument("--drones", type=int, default=1, help="drones per world")
     parser.add_argument("--chunk", type=int, default=512, help="worlds flown at a time")
+    parser.add_argument("--many-kernels", action="store_true", help="do not compile a chunk's flight as one kernel")
     parser.add_argument("--effects", default="drag", help="names as in `jaxdrones list`, or none")
     parser.add_argument("--rotors", default="instant")
     parser.add_argument("--integrator", default="semi_implicit_euler")
@@ -48,6 +49,7 @@ def main() -> None:
         "controller": "none, constant rotor speeds",
         "drones per world": options.drones,
         "chunk": options.chunk,
+        "kernels": "as XLA cuts them" if options.many_kernels else "one for a chunk's flight",
         "dtype": "float64" if options.float64 else "float32",
         "gradient": f"of the mean squared final position in the rotor speeds of {GRADIENT_STEPS} steps",
     }
@@ -97,7 +99,7 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         return jnp.mean(final.pos**2)
 
     def in_chunks(world):
-        return lambda *arguments: jax.lax.map(lambda x: world(*x), arguments, batch_size=chunk)
+        return jd.over_worlds(world, chunk, one_kernel=not options.many_kernels)
 
     forward, forward_compile = compiled(in_chunks(fly), starts, rpm)
     time = seconds(forward, starts, rpm, repeats=options.repeats)

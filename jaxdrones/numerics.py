@@ -1,4 +1,4 @@
-"""Functions that stay differentiable where the usual ones do not, or that compilers vectorise where they do not those."""
+"""Functions that are differentiable where the usual ones are not, or that a compiler vectorises better."""
 
 import math
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-HELPERS = {"common.py", *(path.name for path in BENCHMARKS.glob("rivals_*.py"))}
+HELPERS = {"common.py", "figure.py", *(path.name for path in BENCHMARKS.glob("rivals_*.py"))}
 
 
 def quick(name: str) -> dict:
@@ -25,6 +25,14 @@ def test_throughput_reports_what_a_step_is_and_every_rate():
     assert [row["worlds"] for row in result["rows"]] == [1, 32]
     for row in result["rows"]:
         assert row["forward"] > 0 and row["with backward"] > 0 and row["time over forward"] > 0
+
+
+def test_swarm_and_scaling_report_every_way_to_fly():
+    alone, crowd = quick("swarm.py")["rows"]
+    assert "cells" not in alone and min(crowd[way] for way in ("all pairs", "cells", "the reference's loop")) > 0
+    for row in quick("scaling.py")["rows"]:
+        assert {"held", "controlled"} <= set(row["rates"]) and min(row["rates"].values()) > 0
+        assert set(row["memory"]) == set(row["compile"]) == set(row["rates"])
 
 
 def test_startup_loads_nothing_optional():

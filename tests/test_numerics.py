@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.numerics import asin, atan2
+from jaxdrones.numerics import asin, atan2, sin_cos
 
 rng = np.random.default_rng(0)
 
@@ -43,3 +43,19 @@ def test_its_derivatives_are_those_of_the_library():
 def test_the_arcsine_is_that_of_the_library_to_the_ends():
     s = np.concatenate([np.linspace(-1, 1, 10_001), 1 - np.logspace(-15, -1, 100)])
     np.testing.assert_allclose(jax.jit(asin)(s), np.arcsin(s), rtol=0, atol=5e-16)
+
+
+def test_sine_and_cosine_are_those_of_the_library_over_many_turns():
+    x = np.concatenate([rng.uniform(-50, 50, 10_000), np.arange(-8, 9) * np.pi / 4])
+    for mine, library in zip(jax.jit(sin_cos)(x), (np.sin(x), np.cos(x)), strict=True):
+        np.testing.assert_allclose(mine, library, rtol=0, atol=4e-15)  # the rounding of 16 half turns
+    sin, cos = jax.jit(sin_cos)(np.linspace(-np.pi, np.pi, 10_001))
+    np.testing.assert_allclose(sin**2 + cos**2, 1, rtol=0, atol=1e-15)
+
+
+def test_their_derivatives_are_each_other():
+    x = rng.uniform(-5, 5, 100)
+    sin, cos = sin_cos(x)
+    by_sin, by_cos = (jax.vmap(jax.grad(lambda x, i=i: sin_cos(x)[i]))(x) for i in (0, 1))
+    np.testing.assert_array_equal(by_sin, cos)
+    np.testing.assert_array_equal(by_cos, -sin)

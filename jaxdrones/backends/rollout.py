@@ -17,7 +17,13 @@ Control = Callable[[Params, Any, State, jax.Array], tuple[Any, jax.Array]]
 
 
 def rollout(
-    step: Step, control: Control, params: Params, state: State, memory: Any, length: int
+    step: Step,
+    control: Control,
+    params: Params,
+    state: State,
+    memory: Any,
+    length: int,
+    checkpoint: int | None = None,
 ) -> tuple[State, State]:
     """Fly `length` control steps.
 
@@ -28,12 +34,15 @@ def rollout(
         state: of the team, at the start.
         memory: what the controller keeps between calls, any pytree; `None` if nothing.
         length: number of control steps.
+        checkpoint: control steps between those that a backward pass keeps; it flies the others again, and needs memory
+            for `length / checkpoint + checkpoint` steps instead of `length`.
 
     Returns:
         The final state, and the state after every control step: arrays (length, n, ...).
 
     Raises:
-        ValueError: `length` < 1, wrong shapes, or numbers that are not finite (where they can be looked at).
+        ValueError: `length` < 1 or no multiple of `checkpoint`, wrong shapes, or numbers that are not finite (where
+            they can be looked at).
     """
     check_whole("length", length)
     check_finite("state", state)
@@ -48,8 +57,18 @@ def rollout(
         state = step(params, state, rpm)
         return (memory, state), state
 
-    (_, final), trajectory = jax.lax.scan(advance, (memory, state), jnp.arange(length))
-    return final, trajectory
+    def fly(carry: tuple[Any, State], ks: jax.Array) -> tuple[tuple[Any, State], State]:
+        return jax.lax.scan(advance, carry, ks)
+
+    ks = jnp.arange(length)
+    if checkpoint is None:
+        (_, final), trajectory = fly((memory, state), ks)
+        return final, trajectory
+    check_whole("checkpoint", checkpoint)
+    if length % checkpoint:
+        raise ValueError(f"length is {length}; give a multiple of checkpoint, {checkpoint}")
+    (_, final), legs = jax.lax.scan(jax.checkpoint(fly), (memory, state), ks.reshape(-1, checkpoint))
+    return final, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), legs)
 
 
 def _loop(

@@ -72,5 +72,5 @@ def test_cells_have_a_size_and_room(settings, message):
 
 
 def test_cells_are_asked_for_by_name():
-    with pytest.raises(ValueError, match="cells is 3.0"):
+    with pytest.raises(ValueError, match=r"cells is 3\.0"):
         jd.make_step(pairs=(jd.downwash,), cells=3.0)

@@ -105,3 +105,24 @@ def test_numbers_under_jit_cannot_be_looked_at_and_pass():
     broken = start.replace(vel=start.vel.at[0, 0].set(jnp.nan))
     fly = jax.jit(lambda s: jaxdrones.rollout(step, replay, team, s, None, 1)[0])
     assert isinstance(fly(broken), State)
+
+
+def test_checkpoints_change_memory_and_neither_the_flight_nor_its_gradient():
+    def miss(start, checkpoint=None, length=100):
+        final, _ = jaxdrones.rollout(step, damp_climb, team, start, jnp.zeros((2, 1)), length, checkpoint)
+        return jnp.sum(final.pos**2)
+
+    flown = [jaxdrones.rollout(step, damp_climb, team, start, jnp.zeros((2, 1)), 20, every) for every in (None, 5)]
+    assert_close(flown[1], flown[0], 1e-12)
+    plain, kept = (
+        jax.jit(jax.grad(lambda s, every=every: miss(s, every))).lower(start).compile() for every in (None, 10)
+    )
+    assert_close(kept(start), plain(start), 1e-12, 1e-10)
+    memory = [program.memory_analysis().temp_size_in_bytes for program in (plain, kept)]
+    assert memory[1] < memory[0] / 2
+
+
+@pytest.mark.parametrize("every", [0, 7, 2.0])
+def test_a_checkpoint_divides_the_flight(every):
+    with pytest.raises(ValueError, match="checkpoint"):
+        jaxdrones.rollout(step, replay, team, start, None, 20, every)

@@ -1,0 +1,102 @@
+"""What does a step cost with many drones in one world, each in the jets of all others?
+
+Drones 1 m apart on a jittered grid, 1 to 4 m high, drag and downwash, semi-implicit Euler at 240 Hz, float32.
+`all pairs` tries every pair; `cells` those within 2 m of each other in the horizontal plane. `the reference's loop` is
+its downwash alone (equation 6) as it computes it, a Python loop over pairs, timed here for 30 drones, without its call
+of PyBullet for each, and extrapolated by the number of pairs.
+"""
+
+import argparse
+import math
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import about, compiled, report
+from figure import loglog
+from rivals_timing import in_turn
+
+import jaxdrones as jd
+
+DRONES = (1, 8, 32, 100, 300, 1000, 2000, 4096)
+REACH = 2.0  # m
+FEW = 30  # drones of the timed loop
+MOST_PAIRS = 2**22  # tried by `all pairs`, so that a benchmark ends
+STEPS = 5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--drones", type=int, nargs="+", default=DRONES)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--figure", help="PNG to write")
+    parser.add_argument("--quick", action="store_true", help="few drones: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    if options.quick:
+        options.drones, options.repeats = (1, 40), 1
+
+    a_pair = reference_pair(options.repeats)
+    rows = [measure(n, options.repeats) | {"the reference's loop": a_pair * n * (n - 1)} for n in options.drones]
+    names = ("all pairs", "cells", "the reference's loop")
+    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines.append("ms per step of the world; cells over N log N, us; the reference's loop over our faster one")
+    for row in rows:
+        n, ours = row["drones"], min(row[name] for name in names[:2] if name in row)
+        cells = "          " if "cells" not in row else f"{1e6 * row['cells'] / (n * math.log2(max(n, 2))):10.3f}"
+        taken = " | ".join(f"{name} {1e3 * row[name]:10.3f}" for name in names if name in row)
+        lines.append(f"{n:5} drones | {taken} | {cells} | {row[names[2]] / ours:8.1f}")
+    if options.figure:
+        curves = {name: [(row["drones"], row[name]) for row in rows if row.get(name)] for name in names}
+        loglog(options.figure, curves, "drones in a world", "s per step")
+    report({"about": about(), "rows": rows}, options.json, lines)
+
+
+def measure(n: int, repeats: int) -> dict[str, float]:
+    """Seconds of a step, and of compiling it."""
+    side = math.ceil(math.sqrt(n))
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2)[:n]
+    pos = np.column_stack([grid + rng.uniform(-0.3, 0.3, (n, 2)), rng.uniform(1, 4, n)])
+    params = jd.repeat(jd.load_params("cf2x"), n)
+    state = jd.State.at_rest(jnp.asarray(pos, jnp.float32)).replace(rpm=params.hover_rpm[:, None] * jnp.ones((n, 4)))
+    ways = {"all pairs": None} if n**2 <= MOST_PAIRS else {}
+    ways |= {"cells": jd.Cells(REACH)} if n > 1 else {}
+    row = {"drones": n}
+    programs = {}
+    for name, cells in ways.items():
+        step = jd.make_step((jd.drag,), (jd.downwash,), cells=cells)
+        program, row[f"{name}, compile"] = compiled(lambda s, step=step: _flown(step, params, s), state)
+        programs[name] = lambda program=program: program(state)
+    return row | {name: taken["median"] / STEPS for name, taken in in_turn(programs, repeats).items()}
+
+
+def _flown(step: jd.Step, params: jd.Params, state: jd.State) -> jd.State:
+    return jax.lax.scan(lambda s, _: (step(params, s, s.rpm), None), state, length=STEPS)[0]
+
+
+def reference_pair(repeats: int) -> float:
+    """Seconds that the reference's Python takes for the downwash of one drone on another."""
+    params = jd.load_params("cf2x")
+    k1, k2, k3 = (float(k) for k in params.downwash_coeff)
+    radius = float(params.prop_radius)
+    pos = np.random.default_rng(0).uniform(0, 3, (FEW, 3))
+
+    def all_forces() -> float:
+        start = time.perf_counter()
+        for i in range(FEW):
+            for j in range(FEW):
+                dz = pos[j, 2] - pos[i, 2]
+                dxy = np.linalg.norm(pos[j, :2] - pos[i, :2])
+                if dz > 0 and dxy < 10:
+                    alpha = k1 * (radius / (4 * dz)) ** 2
+                    beta = k2 * dz + k3
+                    [0, 0, -alpha * np.exp(-0.5 * (dxy / beta) ** 2)]
+        return time.perf_counter() - start
+
+    return sorted(all_forces() for _ in range(repeats))[repeats // 2] / FEW**2
+
+
+if __name__ == "__main__":
+    main()

@@ -26,11 +26,11 @@ def about() -> dict[str, object]:
     }
 
 
-def compiled(function, *arguments):
+def compiled(function, *arguments, options: dict | None = None):
     """The compiled function and the seconds it took, the compilation cache switched off."""
     jax.config.update("jax_enable_compilation_cache", False)
     start = time.perf_counter()
-    program = jax.jit(function).lower(*arguments).compile()
+    program = jax.jit(function).lower(*arguments).compile(options)
     return program, time.perf_counter() - start
 
 

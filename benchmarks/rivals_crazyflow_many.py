@@ -63,18 +63,20 @@ def _with(sim: Sim, start: jd.State):
 
 
 def _ways(fly: Callable, devices: Sequence[jax.Device], data, *commands) -> dict[str, Callable[[], jd.State]]:
-    """On one device, and on all by its own sharding."""
+    """On one device, and on all by its own sharding; compiled as JAX does it by default, and with our options."""
 
-    def program(*inputs):
-        compiled = jax.jit(fly).lower(*inputs).compile()
-        return lambda: _state(compiled(*inputs))
+    def programs_of(name, *inputs):
+        for options, said in ((None, ""), (jd.COMPILER_OPTIONS, ", our options")):
+            compiled = jax.jit(fly).lower(*inputs).compile(options)
+            programs[name + said] = lambda compiled=compiled: _state(compiled(*inputs))
 
-    programs = {"crazyflow": program(data, *commands)}
+    programs = {}
+    programs_of("crazyflow", data, *commands)
     if len(devices) > 1 and data.core.n_worlds % len(devices) == 0:
         mesh = world_mesh(devices)
         spread = jax.NamedSharding(mesh, jax.P(None, *mesh.axis_names))
         placed = jax.device_put(data, placement(data, mesh)), *(jax.device_put(c, spread) for c in commands)
-        programs[f"crazyflow, {len(devices)} devices"] = program(*placed)
+        programs_of(f"crazyflow, {len(devices)} devices", *placed)
     return programs
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import jaxdrones as jd
 from jaxdrones import rotation
 from jaxdrones.control import pid
-from jaxdrones.learning import sharding
 
 CHUNK = 512
 """Worlds that are flown by one kernel, and whose states fit the cache."""
@@ -39,22 +38,14 @@ def flight(step: jd.Step, length: int) -> Callable:
     return fly
 
 
-def many(fly: Callable, chunk: int | None = CHUNK, devices: Sequence[jax.Device] | None = None) -> Callable:
+def many(fly: Callable, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = ()) -> Callable:
     """The same for many worlds of one vehicle: all at once or chunk after chunk, on one device or shared by several."""
 
-    def batched(params, *inputs):
-        world = partial(fly, params)
-        return (jd.over_worlds(world, chunk) if chunk else jax.vmap(world))(*inputs)
+    def batched(params, start, commands):
+        ways = dict(chunk=chunk) if chunk else dict(chunk=len(start.pos), one_kernel=False)
+        return jd.over_worlds(partial(fly, params), devices=devices, **ways)(start, commands)
 
-    if devices is None:
-        return batched
-    return jax.shard_map(
-        batched,
-        mesh=jax.make_mesh((len(devices),), ("worlds",), axis_types=(jax.sharding.AxisType.Auto,), devices=devices),
-        in_specs=(sharding.SAME, sharding.WORLDS, sharding.WORLDS),
-        out_specs=sharding.WORLDS,
-        check_vma=False,
-    )
+    return batched
 
 
 def starts(worlds: int, key: jax.Array, params: jd.Params) -> tuple[jd.State, jax.Array]:
@@ -91,7 +82,9 @@ def ways(fly: Callable, devices: Sequence[jax.Device], *inputs) -> dict[str, Cal
     functions = {"ours": many(fly, chunk=None), "ours, chunks": many(fly)}
     if len(devices) > 1 and worlds % len(devices) == 0:
         functions[f"ours, chunks, {len(devices)} devices"] = many(fly, devices=devices)
-    return {name: partial(jax.jit(f).lower(*inputs).compile(), *inputs) for name, f in functions.items()}
+    return {
+        name: partial(jax.jit(f).lower(*inputs).compile(jd.COMPILER_OPTIONS), *inputs) for name, f in functions.items()
+    }
 
 
 def difference(state: jd.State, other: jd.State) -> dict[str, float]:

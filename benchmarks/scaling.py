@@ -72,14 +72,16 @@ def measure(worlds: int, options) -> dict[str, object]:
         "held": (ours.flight(step, most), rpm, most),
         "controlled": (ours.piloted(step, DT), commands, fewer),
     }
-    places = {"": None}
+    places = {"": ()}
     if options.devices > 1 and worlds % options.devices == 0:
         places[f", {options.devices} devices"] = jax.devices()
     programs, steps, memory, compiling = {}, {}, {}, {}
     for flight, (fly, asked, length) in flights.items():
         for place, devices in places.items():
             name = flight + place
-            program, compiling[name] = compiled(ours.many(fly, devices=devices), params, start, asked)
+            program, compiling[name] = compiled(
+                ours.many(fly, devices=devices), params, start, asked, options=jd.COMPILER_OPTIONS
+            )
             memory[name] = program.memory_analysis().temp_size_in_bytes
             programs[name] = lambda program=program, asked=asked: program(params, start, asked)
             steps[name] = worlds * length / 1e6

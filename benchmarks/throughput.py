@@ -98,10 +98,12 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         final, _ = jax.lax.scan(lambda state, rpm: (step(params, state, rpm), None), start, rpms)
         return jnp.mean(final.pos**2)
 
+    ours = None if options.many_kernels else jd.COMPILER_OPTIONS
+
     def in_chunks(world):
         return jd.over_worlds(world, chunk, one_kernel=not options.many_kernels)
 
-    forward, forward_compile = compiled(in_chunks(fly), starts, rpm)
+    forward, forward_compile = compiled(in_chunks(fly), starts, rpm, options=ours)
     time = seconds(forward, starts, rpm, repeats=options.repeats)
     steps = worlds * n * options.substeps / 1e6
 
@@ -109,8 +111,8 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         worlds, 16 * options.chunk
     )  # of many worlds a part shows the same: memory grows with them, speed does not
     starts, rpms = jax.tree.map(lambda x: x[:few], (starts, jnp.repeat(rpm[:, None], grad_length, axis=1)))
-    value, _ = compiled(in_chunks(loss), starts, rpms)
-    gradient, backward_compile = compiled(in_chunks(jax.value_and_grad(loss, 1)), starts, rpms)
+    value, _ = compiled(in_chunks(loss), starts, rpms, options=ours)
+    gradient, backward_compile = compiled(in_chunks(jax.value_and_grad(loss, 1)), starts, rpms, options=ours)
     value_time = seconds(value, starts, rpms, repeats=options.repeats)["median"]
     gradient_time = seconds(gradient, starts, rpms, repeats=options.repeats)["median"]
     return {

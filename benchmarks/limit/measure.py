@@ -109,7 +109,7 @@ def measure(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int, 
 
 
 def _compiled(way, *inputs):
-    return jax.jit(way).lower(*inputs).compile()
+    return jax.jit(way).lower(*inputs).compile(jd.COMPILER_OPTIONS)
 
 
 def _command(rpm: jax.Array) -> np.ndarray:

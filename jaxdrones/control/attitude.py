@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.numerics import sin_cos
 from jaxdrones.rotation import dot
 
 Axes = list[Float[Array, "3"]]
@@ -12,7 +13,8 @@ Axes = list[Float[Array, "3"]]
 
 def from_thrust(force: Float[Array, "3"], yaw: Float[Array, ""]) -> Axes:
     """The attitude with body z along `force` (N, world) and body x as near to the heading `yaw` (rad) as it can be."""
-    heading = jnp.stack([jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)])
+    sin, cos = sin_cos(yaw)
+    heading = jnp.stack([cos, sin, jnp.zeros_like(yaw)])
     z = rotation.unit(force)
     y = rotation.unit(rotation.cross(z, heading))
     return [rotation.cross(y, z), y, z]

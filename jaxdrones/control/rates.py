@@ -13,6 +13,7 @@ from jaxdrones.checks import check_positive, check_shape
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
+from jaxdrones.numerics import sin_cos
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -74,7 +75,8 @@ def command(
     acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
     collective = rotation.dot(acc, rotation.z_axis(state.quat))
 
-    left = jnp.stack([-jnp.sin(setpoint.yaw), jnp.cos(setpoint.yaw), jnp.zeros_like(setpoint.yaw)])
+    sin, cos = sin_cos(setpoint.yaw)
+    left = jnp.stack([-sin, cos, jnp.zeros_like(sin)])
     z = rotation.unit(acc)
     x = rotation.unit(rotation.cross(left, z))
     target = rotation.from_matrix(jnp.stack([x, rotation.cross(z, x), z], axis=-1))

@@ -1,5 +1,10 @@
 """Many worlds in chunks, each chunk one kernel."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -59,3 +64,19 @@ def test_a_function_with_a_solver_is_flown_without_the_single_kernel():
 def test_a_chunk_is_a_whole_number(chunk):
     with pytest.raises(ValueError, match="chunk"):
         jd.over_worlds(fly, chunk)
+
+
+def test_two_devices_fly_what_one_flies():
+    script = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+jax.config.update("jax_enable_x64", True)
+from test_worlds import *
+flown = jax.jit(jd.over_worlds(fly, 2, devices=jax.devices()))
+args = [jax.tree.map(lambda x: x[:4], x) for x in (starts, commands)]
+assert len(flown(*args).pos.sharding.device_set) == 2
+assert_close(flown(*args), jax.jit(jax.vmap(fly))(*args), 1e-11)
+"""
+    folders = [Path(__file__).parent, Path(__file__).parent.parent]
+    path = os.pathsep.join(map(str, folders))
+    subprocess.run([sys.executable, "-c", script], check=True, env=os.environ | {"PYTHONPATH": path})

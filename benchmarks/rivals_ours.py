@@ -82,9 +82,12 @@ def ways(fly: Callable, devices: Sequence[jax.Device], *inputs) -> dict[str, Cal
     functions = {"ours": many(fly, chunk=None), "ours, chunks": many(fly)}
     if len(devices) > 1 and worlds % len(devices) == 0:
         functions[f"ours, chunks, {len(devices)} devices"] = many(fly, devices=devices)
-    return {
-        name: partial(jax.jit(f).lower(*inputs).compile(jd.COMPILER_OPTIONS), *inputs) for name, f in functions.items()
-    }
+    return {name: partial(compiled(f, *inputs), *inputs) for name, f in functions.items()}
+
+
+def compiled(function: Callable, *inputs) -> Callable:
+    """With our options."""
+    return jax.jit(function).lower(*inputs).compile(jd.COMPILER_OPTIONS)
 
 
 def difference(state: jd.State, other: jd.State) -> dict[str, float]:

@@ -94,7 +94,7 @@ def measure(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int, 
     programs = {
         "C, 1 thread": lambda: plant.fly(rows.copy(), command, length, threads=1),
         f"C, {options.devices} threads": lambda: plant.fly(rows.copy(), command, length, threads=options.devices),
-    } | {name: partial(_compiled(way, params, start, rpm), params, start, rpm) for name, way in ways.items()}
+    } | {name: partial(ours.compiled(way, params, start, rpm), params, start, rpm) for name, way in ways.items()}
     times = in_turn(programs, options.repeats, shortest=0 if options.quick else 0.05)
     rates = {name: worlds * length / 1e6 / taken["median"] for name, taken in times.items()}
     best = {name: worlds * length / 1e6 / taken["best"] for name, taken in times.items()}
@@ -106,10 +106,6 @@ def measure(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int, 
         "best": best,
         "share": max(rates[name] for name in ways) / limit,
     }
-
-
-def _compiled(way, *inputs):
-    return jax.jit(way).lower(*inputs).compile(jd.COMPILER_OPTIONS)
 
 
 def _command(rpm: jax.Array) -> np.ndarray:

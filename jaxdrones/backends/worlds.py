@@ -13,7 +13,8 @@ from jaxdrones.checks import check_whole
 
 COMPILER_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_use_fusion_emitters": False}
 """For `jax.jit(over_worlds(...), compiler_options=...)` on a CPU: wider vectors where the CPU has them, and the elder
-emitters; together 1.3 to 1.5 times as many steps of a single kernel. Not the default of JAX, and not for other devices."""
+emitters; together 1.3 to 1.5 times as many steps of a single kernel. Not JAX's default, and nothing to other devices.
+"""
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """To XLA's CPU compiler: make a single function of what this `jax.jit` calls, loops included. It would otherwise run

@@ -10,6 +10,7 @@ import numpy as np
 import jaxdrones as jd
 from jaxdrones import rotation
 from jaxdrones.control import pid
+from jaxdrones.learning import sharding
 
 CHUNK = 512
 """Worlds that are flown by one kernel, and whose states fit the cache."""
@@ -78,16 +79,25 @@ def attitudes(worlds: int, steps: int, key: jax.Array) -> tuple[np.ndarray, np.n
 
 def ways(fly: Callable, devices: Sequence[jax.Device], *inputs) -> dict[str, Callable[[], jd.State]]:
     """Compiled programs: all worlds at once, in chunks, and in chunks on all devices."""
-    worlds = len(inputs[1].pos)
-    functions = {"ours": many(fly, chunk=None), "ours, chunks": many(fly)}
-    if len(devices) > 1 and worlds % len(devices) == 0:
-        functions[f"ours, chunks, {len(devices)} devices"] = many(fly, devices=devices)
-    return {name: partial(compiled(f, *inputs), *inputs) for name, f in functions.items()}
+    programs = {"ours": program(fly, *inputs, chunk=None), "ours, chunks": program(fly, *inputs)}
+    if len(devices) > 1 and len(inputs[1].pos) % len(devices) == 0:
+        programs[f"ours, chunks, {len(devices)} devices"] = program(fly, *inputs, devices=devices)
+    return programs
 
 
-def compiled(function: Callable, *inputs) -> Callable:
-    """With our options."""
-    return jax.jit(function).lower(*inputs).compile(jd.COMPILER_OPTIONS)
+def program(fly: Callable, *inputs, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = ()):
+    """Compiled with our options; a call without arguments flies from these inputs."""
+    inputs = placed(devices, *inputs)
+    return partial(jax.jit(many(fly, chunk, devices)).lower(*inputs).compile(jd.COMPILER_OPTIONS), *inputs)
+
+
+def placed(devices: Sequence[jax.Device], params: jd.Params, *inputs):
+    """The same, but of all worlds on each device its share."""
+    if len(devices) < 2:
+        return params, *inputs
+    mesh = sharding.devices(len(inputs[0].pos), devices)
+    shared = jax.NamedSharding(mesh, sharding.WORLDS)
+    return params, *(jax.device_put(x, shared) for x in inputs)
 
 
 def difference(state: jd.State, other: jd.State) -> dict[str, float]:

@@ -7,6 +7,7 @@ every step. Memory is what the compiled program takes beside its inputs and resu
 
 import argparse
 import os
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -79,11 +80,10 @@ def measure(worlds: int, options) -> dict[str, object]:
     for flight, (fly, asked, length) in flights.items():
         for place, devices in places.items():
             name = flight + place
-            program, compiling[name] = compiled(
-                ours.many(fly, devices=devices), params, start, asked, options=jd.COMPILER_OPTIONS
-            )
+            inputs = ours.placed(devices, params, start, asked)
+            program, compiling[name] = compiled(ours.many(fly, devices=devices), *inputs, options=jd.COMPILER_OPTIONS)
             memory[name] = program.memory_analysis().temp_size_in_bytes
-            programs[name] = lambda program=program, asked=asked: program(params, start, asked)
+            programs[name] = partial(program, *inputs)
             steps[name] = worlds * length / 1e6
     times = in_turn(programs, options.repeats, 0 if options.quick else 0.05)
     rates = {name: steps[name] / taken["median"] for name, taken in times.items()}

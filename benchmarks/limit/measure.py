@@ -11,7 +11,6 @@ so bound to 22 G drone-steps/s with a kernel per step, and to some 200 G with ma
 
 import argparse
 import os
-from functools import partial
 
 import jax
 import native
@@ -85,16 +84,16 @@ def measure(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int, 
     start, rpm = ours.starts(worlds, jax.random.key(0), params)
     fly = ours.flight(step, length)
     several = jax.devices()[: min(options.devices, worlds)]
-    ways = {"at once": ours.many(fly, chunk=None), "chunks": ours.many(fly)}
+    ways = {"at once": dict(chunk=None), "chunks": {}}
     if len(several) > 1 and worlds % len(several) == 0:
-        ways[f"at once, {len(several)} devices"] = ours.many(fly, chunk=None, devices=several)
-        ways[f"chunks, {len(several)} devices"] = ours.many(fly, devices=several)
+        ways[f"at once, {len(several)} devices"] = dict(chunk=None, devices=several)
+        ways[f"chunks, {len(several)} devices"] = dict(devices=several)
 
     rows, command = native.rows_of(start), _command(rpm)
     programs = {
         "C, 1 thread": lambda: plant.fly(rows.copy(), command, length, threads=1),
         f"C, {options.devices} threads": lambda: plant.fly(rows.copy(), command, length, threads=options.devices),
-    } | {name: partial(ours.compiled(way, params, start, rpm), params, start, rpm) for name, way in ways.items()}
+    } | {name: ours.program(fly, params, start, rpm, **way) for name, way in ways.items()}
     times = in_turn(programs, options.repeats, shortest=0 if options.quick else 0.05)
     rates = {name: worlds * length / 1e6 / taken["median"] for name, taken in times.items()}
     best = {name: worlds * length / 1e6 / taken["best"] for name, taken in times.items()}

@@ -35,8 +35,9 @@ def over_worlds(
     Args:
         function: of one world; what is the same for all worlds it closes over.
         chunk: worlds of a chunk.
-        one_kernel: False for a function with matrix products, sorting or solvers (networks, `rates`, `Cells`): of these
-            XLA cannot make one kernel, and says UNIMPLEMENTED or "Failed to materialize symbols".
+        one_kernel: False for a function with matrix products, sorting or solvers (networks, `rates`, `Cells`), and for
+            one that returns long trajectories (half a megabyte of a chunk). Of these XLA cannot make one kernel, and
+            says UNIMPLEMENTED, "Failed to materialize symbols" or "Incorrect number of arguments".
         devices: each flies an equal share of the worlds. A CPU is one device, unless JAX is told before its first use:
             `jax.config.update("jax_num_cpu_devices", 2)`.
 

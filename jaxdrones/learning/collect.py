@@ -90,8 +90,8 @@ def fly(
     worlds: Worlds,
     length: int,
     reset: bool = True,
-    informed: bool = False,
     link: Callable = lambda worlds: worlds,
+    informed: bool = False,
 ) -> tuple[Worlds, Flight]:
     """Fly on; each device its share of the worlds, where `jax.set_mesh` was given several.
 
@@ -104,10 +104,10 @@ def fly(
         length: control steps.
         reset: start a new episode in the step in which one ends; else that is left to `restart`, the drones stay as
             they are, and everything from there on is marked as over.
-        informed: keep the truth beside what is seen.
         link: applied to the worlds between steps; changes their gradients, not their values.
+        informed: keep the truth beside what is seen.
     """
-    truth = jax.vmap(env.truth)
+    truth = jax.vmap(env.truth) if informed else lambda worlds: None
     step = jax.vmap((autoreset(env) if reset else _Endless(env)).step)
 
     def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Flight]:
@@ -125,8 +125,8 @@ def fly(
             final_obs=info["final_obs"],
             returned=info["episode"]["return"],
             error=info["metrics"]["error"],
-            truth=truth(worlds.episodes.world) if informed else None,
-            final_truth=truth(info["final_world"]) if informed else None,
+            truth=truth(worlds.episodes.world),
+            final_truth=truth(info["final_world"]),
             over=worlds.ended,
         )
         if reset:

@@ -121,3 +121,17 @@ def test_mistakes_are_named():
         scaled("mas", 0.9, 1.1)
     with pytest.raises(ValueError, match=r"the range of mass is \(1.1, 0.9\); give the lower bound first"):
         scaled("mass", 1.1, 0.9)
+
+
+def test_the_truth_is_the_observation_without_noise_and_how_far_parameters_are_off():
+    laws = (scaled("mass", 0.9, 1.1), constant_wind(2.0))
+    env = make("hover", laws=laws, noise=sensor_noise())
+    obs, world = env.reset(KEY)
+    truth = env.truth(world)
+    assert truth.secrets.shape == (1, env.secret_size) == (1, 4)
+    np.testing.assert_allclose(truth.secrets[0, 0], world.params.mass[0] / env.params.mass[0] - 1, rtol=1e-12)
+    np.testing.assert_array_equal(truth.secrets[0, 1:], world.params.wind[0])
+    plain = make("hover", laws=laws)
+    np.testing.assert_allclose(truth.obs, plain.reset(KEY)[0], rtol=0, atol=1e-15)
+    assert np.abs(obs - truth.obs).max() > 1e-4
+    assert plain.reset(KEY)[0].shape == truth.obs.shape and make("hover").secret_size == 0

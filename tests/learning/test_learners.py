@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
+from jaxdrones.envs.randomize import scaled
 from jaxdrones.learning import bptt, collect, ppo, shac
 from jaxdrones.learning.networks import MLP, Policy
 from jaxdrones.learning.normalize import Statistics
@@ -140,6 +141,31 @@ def test_a_central_critic_learns_with_a_policy_per_role():
     assert all(jnp.all(jnp.isfinite(x)) for x in metrics.values())
     change = after.critic["params"]["Dense_0"]["kernel"] - kernel
     assert jnp.all(jnp.any(change != 0, axis=(1, 2)))
+
+
+@pytest.mark.float32
+def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
+    """Reward is a parameter that nobody sees: told, the critic knows the value; else it knows the mean."""
+    task = envs.make("hover").task
+    gain = {"mass": (100.0, lambda world: world.params.mass - 0.027)}
+    task = dataclasses.replace(task, rewards=gain, ends={}, duration=1.0)
+    env = envs.make(task, laws=(scaled("mass", 0.5, 1.5),))
+
+    def miss(informed):
+        config = dataclasses.replace(
+            SMALL[ppo],
+            updates=200,
+            epochs=8,
+            worlds=64,
+            horizon=8,
+            learning_rate=5e-3,
+            informed_critic=informed,
+            discount=0.9,
+        )
+        history = jax.jit(lambda key: ppo.train(key, env, config))(jax.random.key(0)).history
+        return jnp.mean(history["value_loss"][-10:])
+
+    assert miss(True) < 0.2 * miss(False)
 
 
 @pytest.mark.float32

@@ -197,7 +197,7 @@ class Env:
         rewards = {name: scale * term(world) for name, (scale, term) in task.rewards.items()}
         ends = {name: jnp.any(condition(world)) for name, condition in task.ends.items()}
         limits = {name: jnp.any(condition(world)) for name, condition in task.limits.items()}
-        metrics = {name: metric(world) for name, metric in task.metrics.items()}
+        metrics = task.measure(world)
         terminated = _any(ends.values())
         truncated = _any(limits.values()) | (world.step >= self.steps)
         info = {"rewards": rewards, "metrics": metrics, "ends": ends | limits}

@@ -92,7 +92,7 @@ class Task:
     advance: Callable[[World], Any] = lambda world: world.variables
     """The task's variables after a step, from the world with the variables before it."""
     metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)
-    """What is reported but not rewarded; every task has `error` (m) and `speed` (m/s)."""
+    """What is reported but not rewarded, beside the `error` (m) and `speed` (m/s) of every task."""
     success: Callable[[Mapping[str, Array], float], Array] | None = None
     """(metrics over an episode (T, n), control period) -> (n,): whether a drone did what it should."""
     senses: Mapping[str, Part] = dataclasses.field(default_factory=dict)
@@ -111,9 +111,10 @@ class Task:
     overtime: int = 0
     """Control steps an episode goes on after `duration`; 2 in the reference, which looks at the clock late."""
 
-    def __post_init__(self):
-        standard = {"error": lambda world: distance(self, world), "speed": lambda world: norm(world.drones.vel)}
-        object.__setattr__(self, "metrics", standard | dict(self.metrics))
+    def measure(self, world: World) -> dict[str, Float[Array, " n"]]:
+        """All metrics by name; one's own go before the standard ones."""
+        standard = {"error": distance(self, world), "speed": norm(world.drones.vel)}
+        return standard | {name: metric(world) for name, metric in self.metrics.items()}
 
     def target_now(self, world: World) -> Setpoint:
         """Where every drone should be at this moment."""

@@ -87,6 +87,16 @@ def test_different_keys_start_differently_or_the_task_has_one_start(task):
     )
 
 
+def test_the_error_is_to_the_target_of_a_task_that_was_given_another():
+    task = TASKS["hover"]()
+    above = dataclasses.replace(task, target=lambda goal, t: task.target(goal + jnp.array([[0.0, 0.0, 1.0]]), t))
+    env = make(above)
+    _, world = env.reset(KEY)
+    _, world, *_, info = env.step(KEY, world, zeros(env))
+    expected = np.linalg.norm(world.drones.pos - world.variables - np.array([[0.0, 0.0, 1.0]]), axis=-1)
+    np.testing.assert_allclose(info["metrics"]["error"], expected, rtol=1e-12)
+
+
 def test_an_episode_is_cut_after_its_duration_and_not_before():
     env = make("hover", duration=0.05)
     _, world = env.reset(KEY)

@@ -88,7 +88,7 @@ def ways(fly: Callable, devices: Sequence[jax.Device], *inputs) -> dict[str, Cal
 def program(fly: Callable, *inputs, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = ()):
     """Compiled with our options; a call without arguments flies from these inputs."""
     inputs = placed(devices, *inputs)
-    return partial(jax.jit(many(fly, chunk, devices)).lower(*inputs).compile(jd.COMPILER_OPTIONS), *inputs)
+    return partial(jax.jit(many(fly, chunk, devices)).lower(*inputs).compile(jd.KERNEL_OPTIONS), *inputs)
 
 
 def placed(devices: Sequence[jax.Device], params: jd.Params, *inputs):

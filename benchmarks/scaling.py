@@ -81,7 +81,7 @@ def measure(worlds: int, options) -> dict[str, object]:
         for place, devices in places.items():
             name = flight + place
             inputs = ours.placed(devices, params, start, asked)
-            program, compiling[name] = compiled(ours.many(fly, devices=devices), *inputs, options=jd.COMPILER_OPTIONS)
+            program, compiling[name] = compiled(ours.many(fly, devices=devices), *inputs, options=jd.KERNEL_OPTIONS)
             memory[name] = program.memory_analysis().temp_size_in_bytes
             programs[name] = partial(program, *inputs)
             steps[name] = worlds * length / 1e6

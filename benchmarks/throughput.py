@@ -98,7 +98,7 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         final, _ = jax.lax.scan(lambda state, rpm: (step(params, state, rpm), None), start, rpms)
         return jnp.mean(final.pos**2)
 
-    ours = None if options.many_kernels else jd.COMPILER_OPTIONS
+    ours = None if options.many_kernels else jd.KERNEL_OPTIONS
 
     def in_chunks(world):
         return jd.over_worlds(world, chunk, one_kernel=not options.many_kernels)

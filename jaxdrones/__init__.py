@@ -4,7 +4,7 @@ from jaxdrones import rotation
 from jaxdrones.backends.cells import Cells
 from jaxdrones.backends.explicit import Step, make_step
 from jaxdrones.backends.rollout import rollout
-from jaxdrones.backends.worlds import COMPILER_OPTIONS, over_worlds
+from jaxdrones.backends.worlds import KERNEL_OPTIONS, over_worlds
 from jaxdrones.backends.wrenches import Effect, Pair
 from jaxdrones.dynamics import (
     downwash,
@@ -30,7 +30,7 @@ from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
 
 __all__ = [
-    "COMPILER_OPTIONS",
+    "KERNEL_OPTIONS",
     "Cells",
     "Effect",
     "Pair",

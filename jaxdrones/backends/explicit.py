@@ -35,7 +35,7 @@ def make_step(
         integrator: `semi_implicit_euler`, `euler`, `rk4` or `implicit_midpoint`.
         dt: physics step, s.
         substeps: physics steps per call, with the command held.
-        cells: limits pairs to drones near each other, which makes large teams (above a hundred or so) fast.
+        cells: limits pairs to drones near each other, which is faster from some 700 drones on.
 
     Returns:
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,

@@ -11,15 +11,15 @@ from jax.sharding import AxisType, PartitionSpec
 
 from jaxdrones.checks import check_whole
 
-COMPILER_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_use_fusion_emitters": False}
+KERNEL_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_use_fusion_emitters": False}
 """For `jax.jit(over_worlds(...), compiler_options=...)` on a CPU: wider vectors where the CPU has them, and the elder
 emitters; together 1.3 to 1.5 times as many steps of a single kernel. Not JAX's default, and nothing to other devices.
 """
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """To XLA's CPU compiler: make a single function of what this `jax.jit` calls, loops included. It would otherwise run
-every step of a scan as some twenty kernels, and hand each to a thread: 41 M steps/s, not 131 M, of a drone with lagging
-rotors in each of 16,384 worlds on one core; with gradients 4.6 and 13.6 M. Compiles in half the time."""
+every step of a scan as some twenty kernels, and hand each to a thread: 78 M steps/s, not 121 M or more, of a drone with
+lagging rotors in each of 1,024 worlds; with gradients 9.9 and 27 M. Compiles in half the time."""
 
 
 def over_worlds(
@@ -30,7 +30,7 @@ def over_worlds(
     On a CPU it is applied to one chunk of the worlds after another, whose states stay in the cache, and each call of it
     is compiled as a single kernel, which keeps one core busy. So it should be a flight of many steps, or the gradient
     of one, not a step. On other devices this is `jax.vmap`.
-    `jax.jit(over_worlds(fly), compiler_options=jaxdrones.COMPILER_OPTIONS)` is faster still.
+    `jax.jit(over_worlds(fly), compiler_options=jaxdrones.KERNEL_OPTIONS)` is faster still.
 
     Args:
         function: of one world; what is the same for all worlds it closes over.

@@ -43,7 +43,7 @@ def attitude(
     """Its default airframe under its attitude controller, with a new command at every step."""
     sim = Sim(dynamics=Dynamics.first_principles, control=Control.attitude, freq=freq, attitude_freq=freq)
     weight = float(sim.data.params.mass[0]) * 9.81
-    commands = jnp.asarray(np.concatenate([rpy, thrust_to_weight * weight], axis=-1)).swapaxes(0, 1)
+    commands = jnp.asarray(np.concatenate([rpy, thrust_to_weight * weight], axis=-1))
     advance = sim.build_step_fn()
 
     def fly(data, commands):

@@ -39,12 +39,15 @@ def flight(step: jd.Step, length: int) -> Callable:
     return fly
 
 
-def many(fly: Callable, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = ()) -> Callable:
-    """The same for many worlds of one vehicle: all at once or chunk after chunk, on one device or shared by several."""
+def many(fly: Callable, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = (), axis: int = 0) -> Callable:
+    """The same for many worlds of one vehicle: all at once or chunk after chunk, on one device or shared by several.
+
+    `axis` is that over worlds of the commands.
+    """
 
     def batched(params, start, commands):
         ways = dict(chunk=chunk) if chunk else dict(chunk=len(start.pos), one_kernel=False)
-        return jd.over_worlds(partial(fly, params), devices=devices, **ways)(start, commands)
+        return jd.over_worlds(partial(fly, params), in_axes=(0, axis), devices=devices, **ways)(start, commands)
 
     return batched
 
@@ -71,33 +74,35 @@ def starts(worlds: int, key: jax.Array, params: jd.Params) -> tuple[jd.State, ja
 
 
 def attitudes(worlds: int, steps: int, key: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-    """Roll, pitch, yaw (rad) that drift, (worlds, steps, 1, 3), and thrust over weight, (worlds, steps, 1, 1)."""
-    first, rate, thrust = (np.asarray(jax.random.normal(k, (worlds, 1, 1, 3))) for k in jax.random.split(key, 3))
-    t = np.linspace(0, 1, steps, dtype=np.float32)[:, None, None]
+    """Roll, pitch, yaw (rad) that drift, (steps, worlds, 1, 3), and thrust over weight, (steps, worlds, 1, 1)."""
+    first, rate, thrust = (np.asarray(jax.random.normal(k, (worlds, 1, 3))) for k in jax.random.split(key, 3))
+    t = np.linspace(0, 1, steps, dtype=np.float32)[:, None, None, None]
     return 0.1 * first + 0.05 * rate * t, 1 + 0.02 * thrust[..., :1] * (1 - t)
 
 
-def ways(fly: Callable, devices: Sequence[jax.Device], *inputs) -> dict[str, Callable[[], jd.State]]:
+def ways(fly: Callable, devices: Sequence[jax.Device], *inputs, axis: int = 0) -> dict[str, Callable[[], jd.State]]:
     """Compiled programs: all worlds at once, in chunks, and in chunks on all devices."""
-    programs = {"ours": program(fly, *inputs, chunk=None), "ours, chunks": program(fly, *inputs)}
+    programs = {"ours": program(fly, *inputs, chunk=None, axis=axis), "ours, chunks": program(fly, *inputs, axis=axis)}
     if len(devices) > 1 and len(inputs[1].pos) % len(devices) == 0:
-        programs[f"ours, chunks, {len(devices)} devices"] = program(fly, *inputs, devices=devices)
+        programs[f"ours, chunks, {len(devices)} devices"] = program(fly, *inputs, devices=devices, axis=axis)
     return programs
 
 
-def program(fly: Callable, *inputs, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = ()):
+def program(
+    fly: Callable, *inputs, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = (), axis: int = 0
+) -> Callable[[], jd.State]:
     """Compiled with our options; a call without arguments flies from these inputs."""
-    inputs = placed(devices, *inputs)
-    return partial(jax.jit(many(fly, chunk, devices)).lower(*inputs).compile(jd.KERNEL_OPTIONS), *inputs)
+    inputs = placed(devices, *inputs, axis=axis)
+    return partial(jax.jit(many(fly, chunk, devices, axis)).lower(*inputs).compile(jd.KERNEL_OPTIONS), *inputs)
 
 
-def placed(devices: Sequence[jax.Device], params: jd.Params, *inputs):
+def placed(devices: Sequence[jax.Device], params: jd.Params, start: jd.State, commands: jax.Array, axis: int = 0):
     """The same, but of all worlds on each device its share."""
     if len(devices) < 2:
-        return params, *inputs
-    mesh = sharding.devices(len(inputs[0].pos), devices)
-    shared = jax.NamedSharding(mesh, sharding.WORLDS)
-    return params, *(jax.device_put(x, shared) for x in inputs)
+        return params, start, commands
+    mesh = sharding.devices(len(start.pos), devices)
+    shares = (jax.NamedSharding(mesh, jax.P(*[None] * along, *sharding.WORLDS)) for along in (0, axis))
+    return params, *map(jax.device_put, (start, commands), shares)
 
 
 def difference(state: jd.State, other: jd.State) -> dict[str, float]:

@@ -70,18 +70,19 @@ def measure(worlds: int, options) -> dict[str, object]:
     rpy, thrust = ours.attitudes(worlds, fewer, jax.random.key(1))
     commands = jnp.asarray(np.concatenate([rpy, thrust * np.asarray(params.weight[0])], axis=-1))
     flights = {
-        "held": (ours.flight(step, most), rpm, most),
-        "controlled": (ours.piloted(step, DT), commands, fewer),
+        "held": (ours.flight(step, most), rpm, 0, most),
+        "controlled": (ours.piloted(step, DT), commands, 1, fewer),
     }
     places = {"": ()}
     if options.devices > 1 and worlds % options.devices == 0:
         places[f", {options.devices} devices"] = jax.devices()
     programs, steps, memory, compiling = {}, {}, {}, {}
-    for flight, (fly, asked, length) in flights.items():
+    for flight, (fly, asked, axis, length) in flights.items():
         for place, devices in places.items():
             name = flight + place
-            inputs = ours.placed(devices, params, start, asked)
-            program, compiling[name] = compiled(ours.many(fly, devices=devices), *inputs, options=jd.KERNEL_OPTIONS)
+            inputs = ours.placed(devices, params, start, asked, axis)
+            flown = ours.many(fly, devices=devices, axis=axis)
+            program, compiling[name] = compiled(flown, *inputs, options=jd.KERNEL_OPTIONS)
             memory[name] = program.memory_analysis().temp_size_in_bytes
             programs[name] = partial(program, *inputs)
             steps[name] = worlds * length / 1e6

@@ -53,6 +53,13 @@ def test_sine_and_cosine_are_those_of_the_library_over_many_turns():
     np.testing.assert_allclose(sin**2 + cos**2, 1, rtol=0, atol=1e-15)
 
 
+@pytest.mark.float32
+def test_they_are_as_exact_in_float32():
+    x = rng.uniform(-4, 4, 10_000).astype(np.float32)
+    for mine, library in zip(jax.jit(sin_cos)(x), (np.sin(x.astype(float)), np.cos(x.astype(float))), strict=True):
+        np.testing.assert_allclose(mine, library, rtol=0, atol=4e-7)
+
+
 def test_their_derivatives_are_each_other():
     x = rng.uniform(-5, 5, 100)
     sin, cos = sin_cos(x)

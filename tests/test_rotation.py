@@ -58,18 +58,27 @@ def test_normalize_gives_unit_length_and_keeps_the_direction():
     np.testing.assert_allclose(each(rotation.normalize, 3 * quats), quats, atol=ROUND_OFF)
 
 
-@pytest.mark.parametrize(("angle", "atol"), [(0.0, 0), (1e-9, 1e-16), (0.1, 1e-15), (2.0, 1e-14), (2 * np.pi, 1e-7)])
+@pytest.mark.parametrize(("angle", "atol"), [(0.0, 0), (1e-9, 1e-16), (0.1, 1e-15), (2.0, 1e-14), (2 * np.pi, 1e-12)])
 def test_exp_is_the_rotation_vector_to_the_accuracy_it_promises(angle, atol):
     axes = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     expected = np.hstack([axes * np.sin(angle / 2), np.full((len(axes), 1), np.cos(angle / 2))])
     np.testing.assert_allclose(each(rotation.exp, angle * axes), expected, rtol=0, atol=atol)
 
 
+@pytest.mark.float32
+@pytest.mark.parametrize("angle", [1e-9, 0.1, 2.0, 2 * np.pi])
+def test_exp_is_as_exact_in_float32(angle):
+    expected = [np.sin(angle / 2), 0, 0, np.cos(angle / 2)]
+    turned = rotation.exp(jnp.array([angle, 0.0, 0.0]))
+    assert turned.dtype == jnp.float32
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-6)
+
+
 def test_exp_is_smooth_at_zero():
     half_turn_rate = np.vstack([np.eye(3) / 2, np.zeros(3)])
     np.testing.assert_array_equal(jax.jit(jax.jacobian(rotation.exp))(jnp.zeros(3)), half_turn_rate)
     curvature = jax.jit(jax.hessian(rotation.exp))(jnp.zeros(3))  # cos(|v|/2) = 1 - |v|^2/8, the rest is odd
-    np.testing.assert_array_equal(curvature, np.concatenate([np.zeros((3, 3, 3)), -np.eye(3)[None] / 4]))
+    np.testing.assert_allclose(curvature, np.concatenate([np.zeros((3, 3, 3)), -np.eye(3)[None] / 4]), rtol=3e-16)
 
 
 def test_roll_pitch_yaw_come_back():

@@ -11,6 +11,7 @@ from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_tota
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
+from jaxdrones.numerics import stored
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -54,7 +55,8 @@ def make_step(
         rpm, rpm_rate = jax.vmap(rotors)(params, state.rpm, command)
         state = state.replace(rpm=rpm)
         acc, omega_rate = jax.vmap(newton_euler)(params, state, total_wrench(params, state))
-        return State(pos=state.vel, quat=jax.vmap(quat_rate)(state), vel=acc, omega=omega_rate, rpm=rpm_rate)
+        rate = State(pos=state.vel, quat=jax.vmap(quat_rate)(state), vel=acc, omega=omega_rate, rpm=rpm_rate)
+        return stored(rate)  # halves the time of the gradient by rk4
 
     def step(params: Params, state: State, rpm: jax.Array) -> State:
         rpm = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
@@ -65,19 +67,9 @@ def make_step(
         # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
         @jax.checkpoint
         def substep(state: State, _: None) -> tuple[State, None]:
-            start, command = _stored((state, rpm))
+            start, command = stored((state, rpm))  # not read out of a stack of states or commands in every expression
             return integrator(lambda s: derivative(params, s, command), start, dt), None
 
         return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, length=substeps)[0]
 
     return jax.jit(step, inline=True)
-
-
-def _stored(tree):
-    """The same numbers, with a hint to XLA's CPU compiler to store them before they are used.
-
-    It would otherwise read them out of the stack of a `scan` (commands, or states saved for the backward pass) anew in
-    every expression, which then is not vectorised. A quotient that is used several times is stored, and the compiler
-    does not see that the divisor is one. Values and gradients do not change.
-    """
-    return jax.tree.map(lambda x: x / jax.lax.optimization_barrier(jnp.ones((), x.dtype)), tree)

@@ -45,7 +45,7 @@ def over_worlds(
             Results have worlds first.
         one_kernel: False for a function with matrix products, sorting or solvers (networks, `rates`, `Cells`). Of these
             XLA cannot make one kernel, and says UNIMPLEMENTED, "Failed to materialize symbols" or "Incorrect number of
-            arguments".
+            arguments"; sometimes neither of one that returns long trajectories.
         devices: each flies an equal share of the worlds. A CPU is one device, unless JAX is told before its first use:
             `jax.config.update("jax_num_cpu_devices", 2)`.
 
@@ -56,7 +56,7 @@ def over_worlds(
     check_whole("chunk", chunk)
 
     def many(*arguments):
-        axes = (in_axes,) * len(arguments) if isinstance(in_axes, int) else tuple(in_axes)
+        axes = tuple(in_axes) if isinstance(in_axes, Sequence) else (in_axes,) * len(arguments)
         worlds = _worlds(arguments, axes)
         if jax.default_backend() != "cpu":
             share = jax.vmap(function, axes)
@@ -77,6 +77,8 @@ def over_worlds(
 
 def _worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
     """The number of worlds, which all arguments must have."""
+    for axis in axes:
+        check_whole("an axis of in_axes", axis, minimum=0)
     if len(axes) != len(arguments):
         raise ValueError(f"in_axes is of {len(axes)} arguments, {len(arguments)} were given; give an axis for each")
     found = {x.shape[axis] for tree, axis in zip(arguments, axes, strict=True) for x in jax.tree.leaves(tree)}

@@ -33,6 +33,21 @@ def test_a_flight_in_chunks_is_the_flight_at_once(chunk):
     assert_close(flown, jax.jit(jax.vmap(fly))(starts, commands), 1e-11)  # RPM of 10,000 to rounding
 
 
+@pytest.mark.parametrize("chunk", [2, 5])
+def test_commands_may_be_given_step_by_step(chunk):
+    flown = jax.jit(jd.over_worlds(fly, chunk, in_axes=(0, 1)))(starts, commands.swapaxes(0, 1))
+    assert_close(flown, jax.jit(jax.vmap(fly))(starts, commands), 1e-11)
+
+
+@pytest.mark.parametrize(
+    ("in_axes", "count", "says"),
+    [(0, 4, "4, 5.*worlds"), ((0,), 5, "1 arguments, 2"), (-1, 5, "in_axes is -1"), ((0, "x"), 5, "in_axes is 'x'")],
+)
+def test_arguments_that_do_not_fit_are_named(in_axes, count, says):
+    with pytest.raises(ValueError, match=says):
+        jd.over_worlds(fly, in_axes=in_axes)(starts, commands[:count])
+
+
 def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all():
     at_once = jax.jit(jax.vmap(jax.grad(miss, 1)))(starts, commands)
     inside = jax.jit(jd.over_worlds(jax.grad(miss, 1), 2))(starts, commands)
@@ -76,6 +91,10 @@ flown = jax.jit(jd.over_worlds(fly, 2, devices=jax.devices()))
 args = [jax.tree.map(lambda x: x[:4], x) for x in (starts, commands)]
 assert len(flown(*args).pos.sharding.device_set) == 2
 assert_close(flown(*args), jax.jit(jax.vmap(fly))(*args), 1e-11)
+by_step = jax.jit(jd.over_worlds(fly, 2, in_axes=(0, 1), devices=jax.devices()))(args[0], args[1].swapaxes(0, 1))
+assert_close(by_step, jax.jit(jax.vmap(fly))(*args), 1e-11)
+with pytest.raises(ValueError, match="5 worlds.*2 devices"):
+    flown(starts, commands)
 """
     folders = [Path(__file__).parent, Path(__file__).parent.parent]
     path = os.pathsep.join(map(str, folders))

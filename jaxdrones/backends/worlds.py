@@ -45,7 +45,7 @@ def over_worlds(
             Results have worlds first.
         one_kernel: False for a function with matrix products, sorting or solvers (networks, `rates`, `Cells`). Of these
             XLA cannot make one kernel, and says UNIMPLEMENTED, "Failed to materialize symbols" or "Incorrect number of
-            arguments"; sometimes neither of one that returns long trajectories.
+            arguments".
         devices: each flies an equal share of the worlds. A CPU is one device, unless JAX is told before its first use:
             `jax.config.update("jax_num_cpu_devices", 2)`.
 
@@ -81,7 +81,11 @@ def _worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
         check_whole("an axis of in_axes", axis, minimum=0)
     if len(axes) != len(arguments):
         raise ValueError(f"in_axes is of {len(axes)} arguments, {len(arguments)} were given; give an axis for each")
-    found = {x.shape[axis] for tree, axis in zip(arguments, axes, strict=True) for x in jax.tree.leaves(tree)}
+    shapes = [(jnp.shape(x), axis) for tree, axis in zip(arguments, axes, strict=True) for x in jax.tree.leaves(tree)]
+    for shape, axis in shapes:
+        if len(shape) <= axis:
+            raise ValueError(f"an array of shape {shape} has no axis {axis} over worlds; give one, or close over it")
+    found = {shape[axis] for shape, axis in shapes}
     if len(found) != 1:
         raise ValueError(f"arguments of {sorted(found)} worlds, by in_axes {axes}; give all of them the same number")
     return found.pop()

@@ -48,6 +48,11 @@ def test_arguments_that_do_not_fit_are_named(in_axes, count, says):
         jd.over_worlds(fly, in_axes=in_axes)(starts, commands[:count])
 
 
+def test_a_number_for_all_worlds_is_no_argument():
+    with pytest.raises(ValueError, match="no axis 0 over worlds"):
+        jd.over_worlds(lambda start, gain: fly(start, commands[0] * gain))(starts, 1.01)
+
+
 def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all():
     at_once = jax.jit(jax.vmap(jax.grad(miss, 1)))(starts, commands)
     inside = jax.jit(jd.over_worlds(jax.grad(miss, 1), 2))(starts, commands)

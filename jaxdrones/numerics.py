@@ -7,6 +7,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float
 
 
@@ -16,14 +17,37 @@ def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(none, 0, jnp.sqrt(jnp.where(none, 1, x)))
 
 
+@jax.custom_jvp
 def stored(tree):
-    """The same numbers, with a hint to XLA's CPU compiler to store them before they are used.
+    """The same numbers, which XLA's CPU compiler stores before they are used.
 
     It would otherwise compute them anew in every expression that reads them, or read them there out of the stack of a
-    `scan`, which it does not vectorise. A quotient that is used several times is stored, and the compiler sees too late
-    that the divisor is one. Values and gradients do not change.
+    `scan`, which it does not vectorise. It fuses nothing across a call: so they go through one that does nothing.
     """
-    return jax.tree.map(lambda x: x / jax.lax.optimization_barrier(jnp.ones((), x.dtype)), tree)
+    return set_xla_metadata(_same(tree), inlineable="false") if jax.default_backend() == "cpu" else tree
+
+
+@jax.custom_jvp
+def stored_for_derivatives(tree):
+    """The same numbers, stored where derivatives are taken."""
+    return tree
+
+
+_same = jax.jit(lambda tree: tree)
+
+
+@stored.defjvp
+@stored_for_derivatives.defjvp
+def _by_quotient(tree, tangent):
+    """A gradient by rk4 takes 240 ns a step with it, 400 with calls.
+
+    A quotient that is used several times is stored, and the compiler sees too late that the divisor is one.
+    """
+
+    def quotient(tree):
+        return jax.tree.map(lambda x: x / jax.lax.optimization_barrier(jnp.ones((), x.dtype)), tree)
+
+    return jax.jvp(quotient, tree, tangent)
 
 
 def tangent(s: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
@@ -50,7 +74,7 @@ def sin_cos(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n
     s = half * half
     a, b = tangent(s)
     scale = sign / (a * a + s * b * b)
-    return 2 * half * a * b * scale, (a * a - s * b * b) * scale
+    return stored((2 * half * a * b * scale, (a * a - s * b * b) * scale))
 
 
 @sin_cos.defjvp

@@ -11,7 +11,7 @@ from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_tota
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
-from jaxdrones.numerics import stored
+from jaxdrones.numerics import stored, stored_for_derivatives
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -56,7 +56,7 @@ def make_step(
         state = state.replace(rpm=rpm)
         acc, omega_rate = jax.vmap(newton_euler)(params, state, total_wrench(params, state))
         rate = State(pos=state.vel, quat=jax.vmap(quat_rate)(state), vel=acc, omega=omega_rate, rpm=rpm_rate)
-        return stored(rate)  # the gradient by rk4 takes 260 instead of 570 ns
+        return stored(rate)  # rk4 takes 39 instead of 72 ns, its gradient 240 instead of 570
 
     def step(params: Params, state: State, rpm: jax.Array) -> State:
         rpm = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
@@ -67,7 +67,7 @@ def make_step(
         # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
         @jax.checkpoint
         def substep(state: State, _: None) -> tuple[State, None]:
-            start, command = stored((state, rpm))
+            start, command = stored_for_derivatives((state, rpm))
             return integrator(lambda s: derivative(params, s, command), start, dt), None
 
         return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, length=substeps)[0]

@@ -17,7 +17,7 @@ from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
-from jaxdrones.numerics import safe_sqrt
+from jaxdrones.numerics import safe_sqrt, stored
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -143,7 +143,8 @@ def attitude_loop(
     limit = jnp.array(_MAX_RPY_INTEGRAL)
     integral = jnp.clip(memory.rpy_integral - error * dt, -limit, limit)
     torque = -gains.rpy_p * error + gains.rpy_d * rate_error + gains.rpy_i * integral
-    return memory.replace(rpy_integral=integral, rpy=rpy), jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE)
+    memory = memory.replace(rpy_integral=integral, rpy=rpy)
+    return stored((memory, jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE)))
 
 
 def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxdrones import rotation
 from jaxdrones.backends.cells import Cells
 from jaxdrones.dynamics import rotor_wrench
+from jaxdrones.numerics import stored
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
@@ -102,20 +103,10 @@ def _sum(x: jax.Array) -> jax.Array:
 
 
 def _stored(x: jax.Array) -> jax.Array:
-    """The same numbers of a team (n, ...), with a hint to XLA's CPU compiler to store each component by itself.
+    """The same numbers of a team (n, ...), each component stored by itself.
 
-    It would otherwise compute them anew in every expression that they go into, and read them at strides of 3 or 4,
-    which it does not vectorise. A quotient that is used several times is stored; one by a constant would not be.
+    They would be read at strides of 3 or 4, which XLA's CPU compiler does not vectorise.
     """
     if x.ndim == 1:
-        return _divided_by_one(x)
+        return stored(x)
     return jnp.stack([_stored(jnp.squeeze(c, 1)) for c in jax.lax.split(x, [1] * x.shape[1], axis=1)], axis=1)
-
-
-@jax.custom_jvp
-def _divided_by_one(x: jax.Array) -> jax.Array:
-    """x, with the derivative of x."""
-    return x / (1 + 0 * x)
-
-
-_divided_by_one.defjvp(lambda primals, tangents: (_divided_by_one(*primals), *tangents))

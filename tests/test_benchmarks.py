@@ -27,6 +27,7 @@ def test_throughput_reports_what_a_step_is_and_every_rate():
         assert row["forward"] > 0 and row["with backward"] > 0 and row["time over forward"] > 0
 
 
+@pytest.mark.slow
 def test_swarm_and_scaling_report_every_way_to_fly():
     alone, crowd = quick("swarm.py")["rows"]
     assert "cells" not in alone and min(crowd[way] for way in ("all pairs", "cells", "the reference's loop")) > 0
@@ -51,11 +52,13 @@ def test_envs_reports_five_rates():
     assert len(result["rates"]) == 5 and min(result["rates"].values()) > 0
 
 
+@pytest.mark.slow
 def test_devices_reports_one_and_all():
     (row,) = quick("devices.py")["rows"]
     assert row["one"] > 0 and row["all"] > 0
 
 
+@pytest.mark.slow
 def test_learning_reports_every_seed():
     rows = quick("learning.py")["rows"]
     assert rows and all(0 <= row["success"] <= 1 for row in rows)
@@ -68,6 +71,7 @@ def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():
     assert all(0 <= row["success"] <= 1 and row["error p50"] > 0 for row in result["rows"])
 
 
+@pytest.mark.slow
 def test_rivals_races_our_side_where_there_are_no_rivals():
     rows = quick("rivals.py")["rows"]
     assert {row["race"] for row in rows} == {"plant-symplectic_euler", "attitude"}

@@ -27,6 +27,7 @@ def test_a_policy_flies_on_as_it_was_saved(env, tmp_path):
     assert kept["env"] == "paper-hover" and kept["config"]["horizon"] == 2 and "jax" in kept["versions"]
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_training_goes_on_bit_for_bit(tmp_path):
     env = envs.make("paper-hover")

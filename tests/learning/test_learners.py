@@ -130,6 +130,7 @@ def optax_norm(tree):
     return jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree)))
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_a_central_critic_learns_with_a_policy_per_role():
     env = envs.make("leader-follower")
@@ -143,6 +144,7 @@ def test_a_central_critic_learns_with_a_policy_per_role():
     assert jnp.all(jnp.any(change != 0, axis=(1, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
     """Reward is a parameter that nobody sees: told, the critic knows the value; else it knows the mean."""

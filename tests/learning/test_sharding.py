@@ -62,6 +62,7 @@ def assert_same(files):
                 np.testing.assert_allclose(other[name], first[name], rtol=1e-5, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_two_devices_come_to_what_one_comes_to_and_do_not_talk_while_they_fly(tmp_path):
     files = [tmp_path / "one.npz", tmp_path / "two.npz"]
     finished(*(start(SCRIPT, file, devices) for devices, file in enumerate(files, 1)))

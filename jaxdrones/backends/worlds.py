@@ -12,9 +12,14 @@ from jax.sharding import AxisType, PartitionSpec
 
 from jaxdrones.checks import check_whole
 
-KERNEL_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_use_fusion_emitters": False}
+KERNEL_OPTIONS = {
+    "xla_cpu_prefer_vector_width": 512,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_experimental_ynn_fusion_type": "",
+}
 """For `jax.jit(over_worlds(...), compiler_options=...)` on a CPU: wider vectors where the CPU has them, and the elder
-emitters; together 1.3 to 1.5 times as many steps of a single kernel. Not JAX's default, and nothing to other devices.
+emitters; together 1.3 to 1.5 times as many steps of a single kernel. And no sums by a library, which do not compile in
+one: gradients through contacts or downwash need it. Not JAX's default, and nothing to other devices.
 """
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}

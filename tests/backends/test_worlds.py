@@ -61,6 +61,19 @@ def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all
     assert_close(around, at_once, 1e-12)
 
 
+def test_with_our_options_gradients_through_contacts_and_downwash_are_one_kernel():
+    meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
+
+    def sunk(start, commands):
+        return jnp.sum(jax.lax.scan(lambda s, rpm: (meeting(team, s, rpm), None), start, commands)[0].pos ** 2)
+
+    lower = jnp.array([[0.0, 0.0, 0.012], [0.05, 0.0, 0.4]])  # one touches the ground, below the other
+    low = starts.replace(pos=jnp.broadcast_to(lower, (5, 2, 3)))
+    inside = jax.jit(jd.over_worlds(jax.grad(sunk, 1), 5), compiler_options=jd.KERNEL_OPTIONS)(low, commands)
+    assert_close(inside, jax.jit(jax.vmap(jax.grad(sunk, 1)))(low, commands), 1e-12)
+    assert jnp.all(jnp.abs(inside) > 0)
+
+
 def test_a_controlled_flight_is_one_kernel():
     gains, hold = pid.gains(), setpoint.Setpoint.at(jnp.array([[0.0, 0.0, 1.0]] * 2))
 

@@ -76,14 +76,24 @@ def _ratio(row: dict) -> dict[str, object]:
     alike = [name for name in rates if all(d <= bounds[field] for field, d in row["differences"][name].items())]
     ours = [name for name in alike if name.startswith("ours")]
     agree = bool(ours) and set(theirs) <= set(alike)
-    ratio = max(rates[name] for name in ours) / max(rates[name] for name in theirs) if agree else None
-    return {"agree": agree, "ratio": ratio, "alike": alike}
+    if not agree:
+        return {"agree": False, "ratio": None, "alike": alike}
+    best = max(rates[name] for name in ours)
+    by_default = [name for name in theirs if "our options" not in name]
+    return {
+        "agree": True,
+        "ratio": best / max(rates[name] for name in theirs),
+        "ratio to their defaults": best / max(rates[name] for name in by_default),
+        "alike": alike,
+    }
 
 
 def _verdict(row: dict) -> str:
     if row["agree"] is None:
         return "alone"
-    return f"{row['ratio']:.1f} times as fast" if row["agree"] else f"NOT ALIKE: {row['differences']}"
+    if not row["agree"]:
+        return f"NOT ALIKE: {row['differences']}"
+    return f"{row['ratio']:.1f} times as fast, {row['ratio to their defaults']:.1f} without our options for them"
 
 
 if __name__ == "__main__":

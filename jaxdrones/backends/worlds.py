@@ -50,7 +50,7 @@ def over_worlds(
             Results have worlds first.
         one_kernel: False for a function with matrix products, sorting or solvers (networks, `rates`, `Cells`). Of these
             XLA cannot make one kernel, and says UNIMPLEMENTED, "Failed to materialize symbols" or "Incorrect number of
-            arguments".
+            arguments". Gradients through contacts or downwash need `KERNEL_OPTIONS`.
         devices: each flies an equal share of the worlds. A CPU is one device, unless JAX is told before its first use:
             `jax.config.update("jax_num_cpu_devices", 2)`.
 

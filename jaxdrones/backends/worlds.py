@@ -50,7 +50,7 @@ def over_worlds(
             Results have worlds first.
         one_kernel: False for a function with matrix products, sorting or solvers (networks, `rates`, `Cells`). Of these
             XLA cannot make one kernel, and says UNIMPLEMENTED, "Failed to materialize symbols" or "Incorrect number of
-            arguments". Gradients through contacts or downwash need `KERNEL_OPTIONS`.
+            arguments". Gradients of teams, or through contacts or downwash, need `KERNEL_OPTIONS`.
         devices: each flies an equal share of the worlds. A CPU is one device, unless JAX is told before its first use:
             `jax.config.update("jax_num_cpu_devices", 2)`.
 
@@ -66,8 +66,7 @@ def over_worlds(
         if jax.default_backend() != "cpu":
             share = jax.vmap(function, axes)
         else:
-            share = _chunk_by_chunk(function, chunk, axes)
-            share = _as_one_kernel(share) if one_kernel else share
+            share = _chunk_by_chunk(function, chunk, axes, one_kernel)
         if len(devices) < 2:
             return share(*arguments)
         if worlds % len(devices):
@@ -96,7 +95,7 @@ def _worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
     return found.pop()
 
 
-def _chunk_by_chunk(function: Callable, chunk: int, axes: tuple[int, ...]) -> Callable:
+def _chunk_by_chunk(function: Callable, chunk: int, axes: tuple[int, ...], one_kernel: bool) -> Callable:
     def flown(*arguments):
         worlds = _worlds(arguments, axes)
 
@@ -107,15 +106,18 @@ def _chunk_by_chunk(function: Callable, chunk: int, axes: tuple[int, ...]) -> Ca
             return jax.vmap(function, axes)(*map(cut, arguments, axes))
 
         chunks, rest = divmod(worlds, chunk)
-        if not chunks:
-            return part(0, rest)
-        done = jax.lax.map(lambda i: part(i * chunk, chunk), jnp.arange(chunks))
-        done = jax.tree.map(lambda x: x.reshape(chunks * chunk, *x.shape[2:]), done)
-        return jax.tree.map(lambda *x: jnp.concatenate(x), done, part(worlds - rest, rest)) if rest else done
+        done = [jax.lax.map(lambda i: part(i * chunk, chunk), jnp.arange(chunks))] if chunks else []
+        return done, [part(worlds - rest, rest)] if rest else []
 
-    return flown
+    def joined(*arguments):
+        done, rest = (_as_one_kernel(flown) if one_kernel else flown)(*arguments)
+        done = [jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), many) for many in done]
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *done, *rest)
+
+    return joined
 
 
 def _as_one_kernel(function: Callable) -> Callable:
-    called = jax.jit(function)
-    return lambda *arguments: set_xla_metadata(called(*arguments), **_ONE_KERNEL)
+    """The number beside the result makes that a tuple: a large array alone XLA would have several threads compute."""
+    called = jax.jit(lambda *arguments: (function(*arguments), jnp.zeros(())))
+    return lambda *arguments: jax.lax.optimization_barrier(set_xla_metadata(called(*arguments), **_ONE_KERNEL))[0]

@@ -61,6 +61,15 @@ def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all
     assert_close(around, at_once, 1e-12)
 
 
+@pytest.mark.parametrize("chunk", [300, 1000], ids=["with a rest", "all"])
+def test_a_large_gradient_alone_is_one_kernel_too(chunk):
+    many = jax.tree.map(lambda x: jnp.repeat(x, 200, axis=0), (starts, jnp.tile(commands, (1, 10, 1, 1))))
+    twice = jd.over_worlds(lambda start, commands: 2 * jax.grad(miss, 1)(start, commands), chunk)
+    gradient = jax.jit(twice, compiler_options=jd.KERNEL_OPTIONS)(*many)
+    one = jax.jit(jax.grad(miss, 1))(*jax.tree.map(lambda x: x[999], many))
+    assert_close(gradient[999], 2 * one, 1e-12)
+
+
 def test_with_our_options_gradients_through_contacts_and_downwash_are_one_kernel():
     meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
 

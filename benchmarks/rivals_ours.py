@@ -12,9 +12,6 @@ from jaxdrones import rotation
 from jaxdrones.control import pid
 from jaxdrones.learning import sharding
 
-CHUNK = 512
-"""Worlds that are flown by one kernel, and whose states fit the cache."""
-
 DRAG = np.array([0.015, 0.015, 0.02], np.float32)
 """N/(m/s), along the body axes."""
 
@@ -39,14 +36,14 @@ def flight(step: jd.Step, length: int) -> Callable:
     return fly
 
 
-def many(fly: Callable, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = (), axis: int = 0) -> Callable:
+def many(fly: Callable, chunks: bool = True, devices: Sequence[jax.Device] = (), axis: int = 0) -> Callable:
     """The same for many worlds of one vehicle: all at once or chunk after chunk, on one device or shared by several.
 
     `axis` is that over worlds of the commands.
     """
 
     def batched(params, start, commands):
-        ways = dict(chunk=chunk) if chunk else dict(chunk=len(start.pos), one_kernel=False)
+        ways = {} if chunks else dict(chunk=len(start.pos), one_kernel=False)
         return jd.over_worlds(partial(fly, params), in_axes=(0, axis), devices=devices, **ways)(start, commands)
 
     return batched
@@ -82,18 +79,21 @@ def attitudes(worlds: int, steps: int, key: jax.Array) -> tuple[np.ndarray, np.n
 
 def ways(fly: Callable, devices: Sequence[jax.Device], *inputs, axis: int = 0) -> dict[str, Callable[[], jd.State]]:
     """Compiled programs: all worlds at once, in chunks, and in chunks on all devices."""
-    programs = {"ours": program(fly, *inputs, chunk=None, axis=axis), "ours, chunks": program(fly, *inputs, axis=axis)}
+    programs = {
+        "ours": program(fly, *inputs, chunks=False, axis=axis),
+        "ours, chunks": program(fly, *inputs, axis=axis),
+    }
     if len(devices) > 1 and len(inputs[1].pos) % len(devices) == 0:
         programs[f"ours, chunks, {len(devices)} devices"] = program(fly, *inputs, devices=devices, axis=axis)
     return programs
 
 
 def program(
-    fly: Callable, *inputs, chunk: int | None = CHUNK, devices: Sequence[jax.Device] = (), axis: int = 0
+    fly: Callable, *inputs, chunks: bool = True, devices: Sequence[jax.Device] = (), axis: int = 0
 ) -> Callable[[], jd.State]:
     """Compiled with our options; a call without arguments flies from these inputs."""
     inputs = placed(devices, *inputs, axis=axis)
-    return partial(jax.jit(many(fly, chunk, devices, axis)).lower(*inputs).compile(jd.KERNEL_OPTIONS), *inputs)
+    return partial(jax.jit(many(fly, chunks, devices, axis)).lower(*inputs).compile(jd.KERNEL_OPTIONS), *inputs)
 
 
 def placed(devices: Sequence[jax.Device], params: jd.Params, start: jd.State, commands: jax.Array, axis: int = 0):

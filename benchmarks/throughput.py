@@ -23,7 +23,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     parser.add_argument("--drones", type=int, default=1, help="drones per world")
-    parser.add_argument("--chunk", type=int, default=512, help="worlds flown at a time")
+    parser.add_argument("--chunk", type=int, help="worlds flown at a time (128; 512 with --many-kernels)")
     parser.add_argument("--many-kernels", action="store_true", help="do not compile a chunk's flight as one kernel")
     parser.add_argument("--effects", default="drag", help="names as in `jaxdrones list`, or none")
     parser.add_argument("--rotors", default="instant")
@@ -48,7 +48,7 @@ def main() -> None:
         "effects": options.effects,
         "controller": "none, constant rotor speeds",
         "drones per world": options.drones,
-        "chunk": options.chunk,
+        "chunk": options.chunk or "as over_worlds chooses",
         "kernels": "as XLA cuts them" if options.many_kernels else "one for a chunk's flight",
         "dtype": "float64" if options.float64 else "float32",
         "gradient": f"of the mean squared final position in the rotor speeds of {GRADIENT_STEPS} steps",
@@ -80,7 +80,7 @@ def make_step(options) -> jd.Step:
 
 def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     """Rates in million drone-steps per second; the gradient is against the forward pass of the same rollout."""
-    n, chunk = options.drones, min(options.chunk, worlds)
+    n = options.drones
     params = jd.repeat(jd.load_params("cf2x"), n)
     i = jnp.arange(n)
     start = jd.State.at_rest(jnp.stack([0.2 * i, 0.0 * i, 1.0 + 0.3 * i], axis=-1))
@@ -101,15 +101,13 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     ours = None if options.many_kernels else jd.KERNEL_OPTIONS
 
     def in_chunks(world):
-        return jd.over_worlds(world, chunk, one_kernel=not options.many_kernels)
+        return jd.over_worlds(world, options.chunk, one_kernel=not options.many_kernels)
 
     forward, forward_compile = compiled(in_chunks(fly), starts, rpm, options=ours)
     time = seconds(forward, starts, rpm, repeats=options.repeats)
     steps = worlds * n * options.substeps / 1e6
 
-    few = min(
-        worlds, 16 * options.chunk
-    )  # of many worlds a part shows the same: memory grows with them, speed does not
+    few = min(worlds, 8192)  # of many worlds a part shows the same: memory grows with them, speed does not
     starts, rpms = jax.tree.map(lambda x: x[:few], (starts, jnp.repeat(rpm[:, None], grad_length, axis=1)))
     value, _ = compiled(in_chunks(loss), starts, rpms, options=ours)
     gradient, backward_compile = compiled(in_chunks(jax.value_and_grad(loss, 1)), starts, rpms, options=ours)

@@ -84,9 +84,9 @@ def measure(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int, 
     start, rpm = ours.starts(worlds, jax.random.key(0), params)
     fly = ours.flight(step, length)
     several = jax.devices()[: min(options.devices, worlds)]
-    ways = {"at once": dict(chunk=None), "chunks": {}}
+    ways = {"at once": dict(chunks=False), "chunks": {}}
     if len(several) > 1 and worlds % len(several) == 0:
-        ways[f"at once, {len(several)} devices"] = dict(chunk=None, devices=several)
+        ways[f"at once, {len(several)} devices"] = dict(chunks=False, devices=several)
         ways[f"chunks, {len(several)} devices"] = dict(devices=several)
 
     rows, command = native.rows_of(start), _command(rpm)

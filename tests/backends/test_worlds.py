@@ -70,6 +70,11 @@ def test_a_large_gradient_alone_is_one_kernel_too(chunk):
     assert_close(gradient[999], 2 * one, 1e-12)
 
 
+def test_an_argument_may_be_of_no_use():
+    twice = jax.jit(jd.over_worlds(lambda start, commands: 2 * start.pos, 2))
+    assert_close(twice(starts, commands), 2 * starts.pos, 1e-15)
+
+
 def test_with_our_options_gradients_through_contacts_and_downwash_are_one_kernel():
     meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
 

@@ -2,9 +2,9 @@
 
 Of a world's velocity `jax.vmap` makes an array (worlds, 3). XLA's CPU compiler shuffles vectors wherever a component of
 it is used, and computes in each expression anew what several share. Here every number in a loop is an array (worlds,)
-of its own, so that to stack, split or transpose is only to name, and what is shared is stored once. Gradients take half
-to a fifth of the time (by rk4 86 instead of 192 ns a step, through the paper's attitude loop 63 instead of 283, of two
-drones with downwash 139 instead of 758), flights between 0.4 of it and all.
+of its own, so that to stack, split or transpose is only to name, and what is shared is stored once. Gradients take
+three quarters to a quarter of the time (semi-implicit Euler 29 instead of 39 ns a step, rk4 85 instead of 190, through
+the paper's attitude loop 63 instead of 278), flights between 0.4 of it and all.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from jaxdrones.backends.shared import alone, store_shared
 _LARGEST = 36
 """Numbers of an array in a loop: the places of three drones' rotors. Arrays of four drones fill vectors as they are."""
 
-_MOST = 15_000
-"""Numbers that a passage of all loops computes; 13,000 compile in half a minute."""
+_MOST = 8_000
+"""Numbers that a passage of all loops computes; so many compile in a quarter of a minute, 13,000 in half a minute."""
 
 _ELEMENTWISE = frozenset(
     "abs add add_any and atan2 cbrt ceil clamp convert_element_type cos cosh div eq erf exp exp2 expm1 floor ge gt"

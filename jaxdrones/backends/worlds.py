@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.sharding import AxisType, PartitionSpec
 
 from jaxdrones.backends.soa import vmap_apart
@@ -100,8 +101,9 @@ def _worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
 def _chunk_by_chunk(function: Callable, chunk: int, axes: tuple[int, ...], one_kernel: bool) -> Callable:
     def flown(*arguments):
         worlds = _worlds(arguments, axes)
+        size = min(chunk, worlds)
 
-        def part(first, size):
+        def part(first):
             def cut(tree, axis):
                 return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size, axis), tree)
 
@@ -110,16 +112,22 @@ def _chunk_by_chunk(function: Callable, chunk: int, axes: tuple[int, ...], one_k
             last = [_moved(cut(tree, axis), axis, -1) for tree, axis in zip(arguments, axes, strict=True)]
             return _moved(vmap_apart(function)(*last), -1, 0)
 
-        chunks, rest = divmod(worlds, chunk)
-        done = [jax.lax.map(lambda i: part(i * chunk, chunk), jnp.arange(chunks))] if chunks else []
-        return done, [part(worlds - rest, rest)] if rest else []
+        # The last chunk starts where it is a whole one too: some worlds are flown twice, but one program is compiled.
+        return jax.lax.map(part, jnp.minimum(jnp.arange(0, worlds, size), worlds - size))
 
     def joined(*arguments):
-        done, rest = (_as_one_kernel(flown) if one_kernel else flown)(*arguments)
-        done = [jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), many) for many in done]
-        return jax.tree.map(lambda *x: jnp.concatenate(x), *done, *rest)
+        done = (_as_one_kernel(flown) if one_kernel else flown)(*arguments)
+        rest = _worlds(arguments, axes) % chunk
+        return jax.tree.map(lambda x: _joined(x, rest), done)
 
     return joined
+
+
+def _joined(chunks: jax.Array, rest: int) -> jax.Array:
+    """(chunks, worlds of a chunk, ...) as one axis; of the last chunk the last worlds, if they are a rest."""
+    if len(chunks) == 1 or not rest:
+        return chunks.reshape(-1, *chunks.shape[2:])
+    return jnp.concatenate([chunks[:-1].reshape(-1, *chunks.shape[2:]), chunks[-1, -rest:]])
 
 
 def _moved(tree, axis: int, to: int):
@@ -127,13 +135,23 @@ def _moved(tree, axis: int, to: int):
 
 
 def _as_one_kernel(function: Callable) -> Callable:
-    """Returned with the result, the arguments' first numbers keep XLA from failing.
+    """XLA would have several threads compute a single large result, and aborts where an argument is of no use.
 
-    It would have several threads compute a large array alone, and aborts where an argument is not used.
+    So the first number of each argument is returned too, and what the function closes over is an argument whose value
+    XLA does not see: it would put what is constant in its place.
     """
 
-    def with_firsts(*arguments):
-        return function(*arguments), [x.reshape(-1)[:1] for x in jax.tree.leaves(arguments)]
+    def kernel(*arguments):
+        traced, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
 
-    called = jax.jit(with_firsts)
-    return lambda *arguments: jax.lax.optimization_barrier(set_xla_metadata(called(*arguments), **_ONE_KERNEL))[0]
+        def with_firsts(inputs):
+            results = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, inputs[: len(traced.consts)]))(
+                *inputs[len(traced.consts) :]
+            )
+            return results, [x.reshape(-1)[:1] for x in inputs]
+
+        inputs = jax.lax.optimization_barrier([*traced.consts, *jax.tree.leaves(arguments)])
+        called = set_xla_metadata(jax.jit(with_firsts)(inputs), **_ONE_KERNEL)
+        return jax.tree.structure(shape).unflatten(jax.lax.optimization_barrier(called)[0])
+
+    return kernel

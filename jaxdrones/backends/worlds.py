@@ -26,8 +26,8 @@ one: gradients through contacts or downwash need it. Not JAX's default, and noth
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """To XLA's CPU compiler: make a single function of what this `jax.jit` calls, loops included. It would otherwise run
-every step of a scan as some twenty kernels, and hand each to a thread: 15.5 instead of (with `KERNEL_OPTIONS`) 9.4 ns a
-step of a drone with lagging rotors in each of 512 worlds; with gradients 143 and 57. Compiles in half the time."""
+every step of a scan as some twenty kernels, and hand each to a thread: 19 instead of (with `KERNEL_OPTIONS`) 11 ns a
+step of a drone with lagging rotors and drag, with gradients 117 and 35."""
 
 
 def over_worlds(
@@ -41,7 +41,7 @@ def over_worlds(
 
     On a CPU it is applied to one chunk of the worlds after another, whose states stay in the cache, all compiled as a
     single kernel, which keeps one core busy. So it should be a flight of many steps, or the gradient of one, not a
-    step. On other devices this is `jax.vmap`.
+    step. Derivatives belong in the function: around it they are those of `jax.vmap`. On other devices this is `jax.vmap`.
     `jax.jit(over_worlds(fly), compiler_options=jaxdrones.KERNEL_OPTIONS)` is faster still.
 
     Args:

@@ -48,7 +48,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("leader-follower", "ppo"): _ONE_D_PPO | dict(per_role=True, central_critic=True),
 }
 _REALISTIC: dict[tuple[str, str], dict[str, Any]] = {
-    ("hover", "bptt"): dict(updates=600, sizes=(64, 64), gradient="exact", learning_rate=2e-2),
+    ("hover", "bptt"): dict(updates=600, sizes=(64, 64), gradient="exact", learning_rate=2e-2, restart=0.2),
     ("hover", "ppo"): dict(updates=750, critic_sizes=(64, 64), informed_critic=True, change=0.01),
 }
 

@@ -41,7 +41,7 @@ def over_worlds(
 
     On a CPU it is applied to one chunk of the worlds after another, whose states stay in the cache, all compiled as a
     single kernel, which keeps one core busy. So it should be a flight of many steps, or the gradient of one, not a
-    step. Derivatives belong in the function: around it they are those of `jax.vmap`. On other devices this is `jax.vmap`.
+    step. Derivatives belong in the function: around it they are those of `jax.vmap`, which this is on other devices.
     `jax.jit(over_worlds(fly), compiler_options=jaxdrones.KERNEL_OPTIONS)` is faster still.
 
     Args:

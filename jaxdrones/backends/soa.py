@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, DropVar, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun, jaxprs_in_params
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun, jaxprs_in_params
 from jaxtyping import Array
 
 from jaxdrones.backends.shared import alone, store_shared
@@ -33,6 +33,7 @@ _ELEMENTWISE = frozenset(
     " integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow rem round rsqrt select_n sign sin"
     " sinh sqrt square stop_gradient sub tan tanh xor".split()
 )
+_SHAPES = frozenset("broadcast_in_dim concatenate pad reshape rev slice split squeeze transpose unstack".split())
 _NOTHING = frozenset("copy copy_p optimization_barrier xla_metadata_value".split())
 _REDUCTIONS = {
     "reduce_sum": operator.add,
@@ -87,13 +88,15 @@ def vmap_apart(function: Callable) -> Callable:
 
 
 def _sizes_in_loops(jaxpr: Jaxpr, inside: bool = False) -> list[int]:
-    """Numbers of each array that loops compute."""
+    """Numbers of each array that loops compute, or hand on."""
     sizes = []
     for eqn in jaxpr.eqns:
         inner = list(jaxprs_in_params(eqn.params))
         for each in inner:
             sizes += _sizes_in_loops(each, inside or eqn.primitive.name == "scan")
         sizes += [v.aval.size for v in eqn.outvars] if inside and not inner else []
+        if eqn.primitive.name == "scan":
+            sizes += [v.aval.size for v in eqn.outvars[: eqn.params["num_carry"]]]
     return sizes
 
 
@@ -118,12 +121,12 @@ def _equation(eqn: JaxprEqn, inputs: list[_Value], in_loop: bool) -> list[_Value
         return _scan(eqn, inputs)
     if called := eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr"):
         return _evaluate(ClosedJaxpr(called, ()) if isinstance(called, Jaxpr) else called, inputs, in_loop)
-    found = _number_by_number(eqn, [_apart(x) for x in inputs]) if in_loop else None
-    return _vmapped(eqn, [_whole(x) for x in inputs]) if found is None else found
+    if in_loop and eqn.primitive.name in _ELEMENTWISE | _REDUCTIONS.keys() | _SHAPES:
+        return _number_by_number(eqn, [_apart(x) for x in inputs])
+    return _vmapped(eqn, [_whole(x) for x in inputs])
 
 
-def _number_by_number(eqn: JaxprEqn, inputs: list[_Apart]) -> list[_Apart] | None:
-    """The results; nothing where there is no rule for what the equation does."""
+def _number_by_number(eqn: JaxprEqn, inputs: list[_Apart]) -> list[_Apart]:
     p, x = eqn.params, inputs[0] if inputs else None
     match eqn.primitive.name:
         case name if name in _ELEMENTWISE:
@@ -154,12 +157,14 @@ def _number_by_number(eqn: JaxprEqn, inputs: list[_Apart]) -> list[_Apart] | Non
         case "slice":
             strides = p["strides"] or (1,) * x.ndim
             return [x[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]]
-        case "pad" if all(low >= 0 and high >= 0 and not between for low, high, between in p["padding_config"]):
+        case "pad":
             shape = eqn.outvars[0].aval.shape
             padded = _of([inputs[1].item()] * int(np.prod(shape)), shape)
-            padded[tuple(slice(low, low + n) for n, (low, _, _) in zip(x.shape, p["padding_config"], strict=True))] = x
+            for i in np.ndindex(x.shape):
+                to = tuple(low + k * (1 + between) for k, (low, _, between) in zip(i, p["padding_config"], strict=True))
+                if all(0 <= k < n for k, n in zip(to, shape, strict=True)):
+                    padded[to] = x[i]
             return [padded]
-    return None
 
 
 def _elementwise(eqn: JaxprEqn, inputs: list[_Apart]) -> _Apart:
@@ -172,43 +177,38 @@ def _elementwise(eqn: JaxprEqn, inputs: list[_Apart]) -> _Apart:
     return _of([result(*numbers) for numbers in zip(*(x.flat for x in inputs), strict=True)], inputs[0].shape)
 
 
-def _vmapped(eqn: JaxprEqn, inputs: list[_Whole]) -> list[_Whole | None]:
+def _vmapped(eqn: JaxprEqn, inputs: list[_Whole]) -> list[_Whole]:
     """By `jax.vmap`, whatever the equation does."""
     variables = {v: x for v, x in zip(eqn.invars, inputs, strict=True) if not isinstance(v, Literal)}
-    results = [v for v in eqn.outvars if not isinstance(v, DropVar)]
-    function, varies = alone(eqn, variables, results), any(x.varies for x in variables.values())
+    function, varies = alone(eqn, variables, eqn.outvars), any(x.varies for x in variables.values())
     if varies:
         function = jax.vmap(function, tuple(-1 if x.varies else None for x in variables.values()), -1)
-    found = dict(zip(results, function(*(x.x for x in variables.values())), strict=True))
-    return [_Whole(found[v], varies) if v in found else None for v in eqn.outvars]
+    return [_Whole(x, varies) for x in function(*(x.x for x in variables.values()))]
 
 
 def _scan(eqn: JaxprEqn, inputs: list[_Value]) -> list[_Value]:
     p = eqn.params
     first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
     shapes = [v.aval.shape for v in p["jaxpr"].jaxpr.invars[first:last]]
-    consts, stacks = [_apart(x) for x in inputs[:first]], [_whole(x) for x in inputs[last:]]
-    known = [[x if isinstance(x, np.generic) else None for x in value.flat] for value in consts]
-    shared = [[x for x in value.flat if not isinstance(x, np.generic)] for value in consts]
+    consts = [
+        _apart(x) if v.aval.size <= _LARGEST else x for v, x in zip(eqn.invars[:first], inputs[:first], strict=True)
+    ]
+    stacks = [_whole(x) for x in inputs[last:]]
 
-    def body(carry, xs, shared):
-        """Of the numbers of each array, whole arrays, the numbers of constants; of the first two returns the next."""
-        constants = [
-            _of([next(unknown) if x is None else x for x in numbers], value.shape)
-            for value, numbers, unknown in zip(consts, known, map(iter, shared), strict=True)
-        ]
+    def body(carry, xs):
+        """Of the numbers of each array and whole arrays; returns the next ones."""
         xs = [_Whole(x, stack.varies) for x, stack in zip(xs, stacks, strict=True)]
-        results = _evaluate(p["jaxpr"], [*constants, *map(_of, carry, shapes), *xs], in_loop=True)
+        results = _evaluate(p["jaxpr"], [*consts, *map(_of, carry, shapes), *xs], in_loop=True)
         return [list(_apart(x).flat) for x in results[: len(carry)]], [_whole(x).x for x in results[len(carry) :]]
 
     def advance(carry, xs):
-        after, ys = store_shared(body)(carry, xs, shared)
+        after, ys = store_shared(body)(carry, xs)
         return jax.tree.map(lambda old, new: jnp.broadcast_to(new, old.shape), carry, after), ys
 
     carry, grown = None, [list(map(jnp.asarray, _apart(x).flat)) for x in inputs[first:last]]
     while carry is None or jax.tree.map(jnp.shape, grown) != jax.tree.map(jnp.shape, carry):
         carry = grown  # what is the same in all worlds at first need not stay so
-        after, _ = jax.eval_shape(body, carry, [jax.eval_shape(lambda x: x[0], stack.x) for stack in stacks], shared)
+        after, _ = jax.eval_shape(body, carry, [jax.eval_shape(lambda x: x[0], stack.x) for stack in stacks])
         grown = jax.tree.map(lambda x, new: jnp.broadcast_to(x, max(x.shape, new.shape, key=len)), carry, after)
     options = {name: p[name] for name in ("length", "reverse", "unroll")}
     carry, ys = jax.lax.scan(advance, carry, [stack.x for stack in stacks], **options)

@@ -31,6 +31,7 @@ BODIES = {
     "shapes": lambda x: jnp.flip(jnp.concatenate([x, 2 * x]).reshape(2, 3).T, 0)[:, 1] + jnp.pad(x[1:], (1, 0)),
     "parts": lambda x: jnp.stack([part[0] for part in jnp.split(x, 3)]) + sum(jnp.unstack(x)),
     "steps backwards": lambda x: x[::-2].sum() * x,
+    "padding": lambda x: jax.lax.pad(x, 2.0, [(1, -3, 1)])[:3] * x,
     "matrix products": lambda x: jnp.outer(x, x) @ x / (1 + x @ x),
     "sorting, which has no rule": lambda x: jnp.sort(x)[::-1],
     "a choice of functions": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x),
@@ -94,6 +95,17 @@ def test_in_loops_of_a_flight_every_array_is_a_number_of_each_world():
         computed = [eqn for eqn in loop.eqns if eqn.primitive.name in ("add", "mul", "div", "sqrt", "select_n")]
         assert len(computed) > 100
         assert {v.aval.shape for eqn in computed for v in eqn.outvars} <= {(5,), ()}
+
+
+def test_a_table_that_a_loop_looks_up_stays_whole():
+    table = jnp.arange(300.0).reshape(100, 3)
+
+    def looked_up(x):
+        return jax.lax.fori_loop(0, 10, lambda i, x: x + jnp.sin(table[7 * i]) * table[i + 1, 0], x)
+
+    assert_same(vmap_apart(looked_up)(start), jax.vmap(looked_up, -1, -1)(start))
+    (loop,) = bodies(jax.make_jaxpr(vmap_apart(looked_up))(start).jaxpr)
+    assert len(loop.eqns) < 100
 
 
 def test_large_teams_stay_whole():

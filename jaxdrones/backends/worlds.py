@@ -144,14 +144,12 @@ def _as_one_kernel(function: Callable) -> Callable:
     def kernel(*arguments):
         traced, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
 
-        def with_firsts(inputs):
-            results = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, inputs[: len(traced.consts)]))(
-                *inputs[len(traced.consts) :]
-            )
-            return results, [x.reshape(-1)[:1] for x in inputs]
+        def with_firsts(consts, leaves):
+            results = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, consts))(*leaves)
+            return results, [x.reshape(-1)[:1] for x in (*consts, *leaves)]
 
-        inputs = jax.lax.optimization_barrier([*traced.consts, *jax.tree.leaves(arguments)])
-        called = set_xla_metadata(jax.jit(with_firsts)(inputs), **_ONE_KERNEL)
+        inputs = jax.lax.optimization_barrier((traced.consts, jax.tree.leaves(arguments)))
+        called = set_xla_metadata(jax.jit(with_firsts)(*inputs), **_ONE_KERNEL)
         return jax.tree.structure(shape).unflatten(jax.lax.optimization_barrier(called)[0])
 
     return kernel

@@ -1,5 +1,7 @@
 """Loops over many worlds, each number an array of its own: what `jax.vmap` computes, and how it is laid out."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,9 @@ from jax.extend.core import jaxprs_in_params
 import jaxdrones as jd
 from jaxdrones.backends.soa import vmap_apart
 
-start, pushes = np.random.default_rng(0).normal(size=(2, 4, 3, 5))  # start[0] is (3, worlds)
-start = start[0]
-KEYS = jnp.moveaxis(jax.random.split(jax.random.key(1), 5), 0, -1)
+rng = np.random.default_rng(0)
+start, pushes = rng.normal(size=(3, 5)), rng.normal(size=(4, 3, 5))  # worlds last
+keys = jnp.moveaxis(jax.random.split(jax.random.key(1), 5), 0, -1)
 
 
 def looped(advance):
@@ -71,7 +73,7 @@ def test_random_numbers_are_those_of_vmap():
 
         return jax.lax.scan(advance, (key, x), length=3)[0][1]
 
-    assert_same(vmap_apart(noisy)(KEYS, start), jax.vmap(noisy, -1, -1)(KEYS, start))
+    assert_same(vmap_apart(noisy)(keys, start), jax.vmap(noisy, -1, -1)(keys, start))
 
 
 def test_what_is_the_same_in_all_worlds_is_given_to_each():
@@ -109,12 +111,21 @@ def test_a_table_that_a_loop_looks_up_stays_whole():
 
 
 def test_large_teams_stay_whole():
-    def summed(x):
-        return jax.lax.scan(lambda x, _: (jnp.outer(x, x).sum(0), None), x, length=2)[0]
-
-    teams = jnp.ones((7, 5))
-    (loop,) = bodies(jax.make_jaxpr(vmap_apart(summed))(teams).jaxpr)
+    (loop,) = repeated(lambda x: jnp.outer(x, x).sum(0), jnp.ones((7, 5)))
     assert any(v.aval.size == 7 * 7 * 5 for eqn in loop.eqns for v in eqn.outvars)
+
+
+@pytest.mark.parametrize(("operations", "axes"), [(100, {1}), (3_000, {2})], ids=["short", "long"])
+def test_programs_too_long_to_compile_number_by_number_stay_whole(operations, axes):
+    (loop,) = repeated(lambda x: functools.reduce(lambda y, _: y * x, range(operations), x), start)
+    assert {v.aval.ndim for eqn in loop.eqns if eqn.primitive.name == "mul" for v in eqn.outvars} == axes
+
+
+def repeated(advance, x):
+    """The bodies of the loop that repeats it in all worlds."""
+    return bodies(
+        jax.make_jaxpr(vmap_apart(lambda x: jax.lax.scan(lambda x, _: (advance(x), None), x, length=2)))(x).jaxpr
+    )
 
 
 def bodies(jaxpr):

@@ -4,8 +4,9 @@ from jaxdrones import rotation
 from jaxdrones.backends.cells import Cells
 from jaxdrones.backends.explicit import Step, make_step
 from jaxdrones.backends.rollout import rollout
-from jaxdrones.backends.worlds import KERNEL_OPTIONS, over_worlds
+from jaxdrones.backends.worlds import over_worlds
 from jaxdrones.backends.wrenches import Effect, Pair
+from jaxdrones.compiler import kernel_options
 from jaxdrones.dynamics import (
     downwash,
     downwash_paper,
@@ -62,3 +63,9 @@ __all__ = [
     "semi_implicit_euler",
     "stack",
 ]
+
+
+def __getattr__(name: str):
+    if name == "KERNEL_OPTIONS":  # the compiler of the device is asked, which importing should not start
+        return kernel_options()
+    raise AttributeError(f"module 'jaxdrones' has no attribute {name!r}")

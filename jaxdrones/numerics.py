@@ -7,8 +7,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Float
+
+from jaxdrones import compiler
 
 
 def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -24,7 +25,7 @@ def stored(tree):
     It would otherwise compute them anew in every expression that reads them, or read them there out of the stack of a
     `scan`, which it does not vectorise. It fuses nothing across a call: so they go through one that does nothing.
     """
-    return set_xla_metadata(_same(tree), inlineable="false") if jax.default_backend() == "cpu" else tree
+    return compiler.set_notes(_same(tree), inlineable="false") if jax.default_backend() == "cpu" else tree
 
 
 @jax.custom_jvp

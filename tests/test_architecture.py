@@ -11,7 +11,7 @@ import jaxdrones
 
 PACKAGE = Path(jaxdrones.__file__).parent
 
-NOUNS = ("assets", "checks", "numerics", "params", "rotation", "state", "urdf", "wrench")
+NOUNS = ("assets", "checks", "compiler", "numerics", "params", "rotation", "state", "urdf", "wrench")
 LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports another
     (NOUNS,),
     (("dynamics",), ("control",), ("sensing",)),
@@ -61,6 +61,17 @@ def test_imports_point_to_lower_layers(file):
         other_layer, other_peer = PLACE[module]
         allowed = other_layer < layer or (other_layer, other_peer) == (layer, peer)
         assert allowed, f"{file.name} imports jaxdrones.{module or '__init__'}, which is not below it"
+
+
+def test_what_jax_does_not_promise_to_keep_is_touched_in_one_file():
+    inner = ("jax._src", "jax.extend", "jax.interpreters", "jax.experimental.xla_metadata")
+    assert [f.name for f in FILES if any(name in f.read_text() for name in inner)] == ["compiler.py"]
+
+
+def test_importing_the_package_starts_no_device():
+    code = "import jax, jaxdrones.learning; jax.config.update('jax_num_cpu_devices', 3); print(len(jax.devices()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["3"]
 
 
 def test_the_imports_of_a_file_are_found():

@@ -1,15 +1,25 @@
 """What several expressions of a function use, stored once. XLA's CPU compiler computes it in each of them anew."""
 
-from collections.abc import Callable, Iterable, Sequence
+import collections
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun, jaxprs_in_params
+from jaxtyping import Array
 
+from jaxdrones import compiler
+from jaxdrones.compiler import Equation, Variable, is_literal
 from jaxdrones.numerics import stored
 
 _WORTH = 6
 """Operations that are saved where a number is stored."""
+
+_MOST_VIEWS = 8
+"""Of arrays in other orders that a body has; each may double what XLA's CPU compiler makes of it."""
+
+_REORDERING = frozenset("dynamic_slice gather pad rev slice".split())
 
 _COSTS = {"div": 4, "sqrt": 4, "broadcast_in_dim": 0, "convert_element_type": 0}
 """In operations, where it is not one."""
@@ -19,33 +29,36 @@ def store_shared(function: Callable) -> Callable:
     """The same function; what several of its equations use, and is not cheap, is stored."""
 
     def storing(*arguments):
-        traced, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-        same, equations = _without_repetition(traced.jaxpr)
-        uses, equations = _needed(traced.jaxpr, same, equations)
-        values = dict(zip(traced.jaxpr.constvars, traced.consts, strict=True))
-        values |= dict(zip(traced.jaxpr.invars, jax.tree.leaves(arguments), strict=True))
-        costs = dict.fromkeys(values, 0)
-        for eqn in equations:
-            variables = dict.fromkeys(v for v in eqn.invars if not isinstance(v, Literal))
-            results = [v for v in eqn.outvars if v in uses]
-            found = alone(eqn, variables, results)(*(values[same.get(v, v)] for v in variables))
-            cost = _COSTS.get(eqn.primitive.name, 1) + sum(costs[v] for v in {same.get(v, v) for v in variables})
-            for v, x in zip(results, found, strict=True):
-                worth = x.ndim == 1 and cost * (uses[v] - 1) >= _WORTH
-                values[v], costs[v] = (stored(x), 0) if worth else (x, cost)
-        results = [v.val if isinstance(v, Literal) else values[same.get(v, v)] for v in traced.jaxpr.outvars]
+        program, consts, shape = compiler.trace(function, *arguments)
+        same, equations = _without_repetition(program)
+        uses, equations = _needed(program, same, equations)
+
+        used = [
+            (eqn, [same.get(v, v) for v in eqn.invars if not is_literal(v)], [v for v in eqn.outvars if v in uses])
+            for eqn in equations
+        ]
+        chosen = _shared(used, uses)
+        values = dict(zip(program.constvars, consts, strict=True))
+        values |= dict(zip(program.invars, jax.tree.leaves(arguments), strict=True))
+        for eqn, _, results in used:
+            variables = dict.fromkeys(v for v in eqn.invars if not is_literal(v))
+            found = compiler.alone(eqn, variables, results)(*(values[same.get(v, v)] for v in variables))
+            values |= {v: stored(x) if v in chosen else x for v, x in zip(results, found, strict=True)}
+        results = [
+            np.asarray(v.val, v.aval.dtype) if is_literal(v) else values[same.get(v, v)] for v in program.outvars
+        ]
         return jax.tree.structure(shape).unflatten(results)
 
     return storing
 
 
-def _without_repetition(jaxpr: Jaxpr) -> tuple[dict[Var, Var], list[JaxprEqn]]:
+def _without_repetition(program: Any) -> tuple[dict[Variable, Variable], list[Equation]]:
     """Names of what was computed before, and the other equations."""
     same, known, equations = {}, {}, []
-    for eqn in jaxpr.eqns:
-        inputs = (_exactly(v) if isinstance(v, Literal) else same.get(v, v) for v in eqn.invars)
+    for eqn in program.eqns:
+        inputs = (_exactly(v) if is_literal(v) else same.get(v, v) for v in eqn.invars)
         key = (eqn.primitive, str(eqn.params), *inputs)
-        if any(jaxprs_in_params(eqn.params)) or eqn.effects or key not in known:
+        if any(compiler.held(eqn)) or eqn.effects or key not in known:
             known[key] = eqn.outvars
             equations.append(eqn)
         else:
@@ -53,17 +66,17 @@ def _without_repetition(jaxpr: Jaxpr) -> tuple[dict[Var, Var], list[JaxprEqn]]:
     return same, equations
 
 
-def _exactly(literal: Literal) -> str:
+def _exactly(literal: Any) -> str:
     return f"{np.asarray(literal.val).tolist()} {literal.aval}"
 
 
-def _needed(jaxpr: Jaxpr, same: dict[Var, Var], equations: list[JaxprEqn]) -> tuple[dict[Var, int], list[JaxprEqn]]:
+def _needed(program: Any, same: dict, equations: list[Equation]) -> tuple[dict[Variable, int], list[Equation]]:
     """How many equations use each variable that the results depend on, and the equations that compute them."""
 
     def names(variables):
-        return {same.get(v, v) for v in variables if not isinstance(v, Literal)}
+        return {same.get(v, v) for v in variables if not is_literal(v)}
 
-    uses, needed = dict.fromkeys(names(jaxpr.outvars), 1), []
+    uses, needed = dict.fromkeys(names(program.outvars), 1), []
     for eqn in reversed(equations):
         if any(v in uses for v in eqn.outvars):
             needed.append(eqn)
@@ -72,6 +85,70 @@ def _needed(jaxpr: Jaxpr, same: dict[Var, Var], equations: list[JaxprEqn]) -> tu
     return uses, needed[::-1]
 
 
-def alone(eqn: JaxprEqn, variables: Iterable[Var], results: Sequence[Var]) -> Callable:
-    """An equation as a function."""
-    return jaxpr_as_fun(ClosedJaxpr(Jaxpr((), [*variables], [*results], [eqn], eqn.effects), ()))
+_Used = tuple[Equation, list[Variable], list[Variable]]
+"""An equation, what it reads, and those of its results that are needed."""
+
+
+def _shared(equations: Sequence[_Used], uses: dict[Variable, int]) -> set[Variable]:
+    """Results that take more to compute again for every use than to store."""
+    costs, chosen = {}, set()
+    for eqn, inputs, results in equations:
+        cost = _COSTS.get(eqn.primitive.name, 1) + sum(costs.get(v, 0) for v in set(inputs))
+        worth = {v for v in results if v.aval.ndim and cost * (uses[v] - 1) >= _WORTH}
+        chosen |= worth
+        costs |= {v: 0 if v in worth else cost for v in results}
+    return chosen
+
+
+def without_copies(
+    program: Any, consts: Sequence[Array], *inputs: Array, rules: Mapping[str, Callable] | None = None
+) -> list[Array]:
+    """The results of a program for one world.
+
+    Arrays that it uses in another order too are stored where they are many: each might double what the compiler makes.
+
+    Args:
+        program: traced.
+        consts: what it closes over.
+        *inputs: of the program.
+        rules: how to evaluate equations of some primitives, `(equation, *inputs) -> results`. With rules, derivatives
+            are no longer those of the program.
+    """
+    viewed = _viewed(program)
+    values = dict(zip(program.constvars, consts, strict=True)) | dict(zip(program.invars, inputs, strict=True))
+    inlined = compiler.CALLS if rules else compiler.PLAIN_CALLS
+
+    def inner(*arguments):
+        return without_copies(*arguments, rules=rules)
+
+    def results(eqn, inputs):
+        name = eqn.primitive.name
+        if rules and name in rules:
+            return rules[name](eqn, *inputs)
+        if name == "scan":
+            return compiler.scan_of(eqn, inner, inputs)
+        if name in inlined and (called := compiler.called(eqn))[0].eqns:
+            return inner(*called, *inputs)
+        return compiler.evaluated(eqn, inputs)
+
+    def read(v):
+        return jnp.asarray(v.val, v.aval.dtype) if is_literal(v) else values[v]
+
+    for eqn in program.eqns:
+        found = zip(eqn.outvars, results(eqn, [read(v) for v in eqn.invars]), strict=True)
+        values |= {v: stored(x) if v in viewed else x for v, x in found}
+    return [read(v) for v in program.outvars]
+
+
+def has_copies(program: Any) -> bool:
+    """Whether `without_copies` stores something."""
+    return bool(_viewed(program)) or any(has_copies(inner) for eqn in program.eqns for inner in compiler.held(eqn))
+
+
+def _viewed(program: Any) -> set[Variable]:
+    """Variables that are used in another order beside another use; none where there are few."""
+    read = [v for eqn in program.eqns for v in eqn.invars if not is_literal(v)]
+    uses = collections.Counter(read)
+    views = [eqn.invars[0] for eqn in program.eqns if eqn.primitive.name in _REORDERING]
+    views = [v for v in views if not is_literal(v) and uses[v] > 1]
+    return set(views) if len(views) > _MOST_VIEWS else set()

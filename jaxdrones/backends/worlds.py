@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.sharding import AxisType, PartitionSpec
+from jaxtyping import Array
 
-from jaxdrones.backends.soa import vmap_apart
+from jaxdrones import compiler
+from jaxdrones.backends.shared import has_copies, without_copies
+from jaxdrones.backends.soa import NoKernel, fits_a_kernel, vmap_for_kernel
 from jaxdrones.checks import check_whole
-
-KERNEL_OPTIONS = {
-    "xla_cpu_prefer_vector_width": 512,
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_cpu_experimental_ynn_fusion_type": "",
-}
-"""For `jax.jit(over_worlds(...), compiler_options=...)` on a CPU: wider vectors where the CPU has them, and the elder
-emitters; together 1.3 to 1.5 times as many steps of a single kernel. And no sums by a library, which do not compile in
-one: gradients through contacts or downwash need it. Not JAX's default, and nothing to other devices.
-"""
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """To XLA's CPU compiler: make a single function of what this `jax.jit` calls, loops included. It would otherwise run
 every step of a scan as some twenty kernels, and hand each to a thread: 19 instead of (with `KERNEL_OPTIONS`) 11 ns a
 step of a drone with lagging rotors and drag, with gradients 117 and 35."""
+
+_KERNEL_CHUNK, _CHUNK = 128, 512
+"""Worlds whose states a cache holds in a flight as one kernel, and in one by many kernels."""
 
 
 def over_worlds(
@@ -39,10 +35,12 @@ def over_worlds(
 ) -> Callable[..., Any]:
     """A function of one world, for many: of arrays with an axis over worlds in place of its arguments.
 
-    On a CPU it is applied to one chunk of the worlds after another, whose states stay in the cache, all compiled as a
-    single kernel, which keeps one core busy. So it should be a flight of many steps, or the gradient of one, not a
-    step. Derivatives belong in the function: around it they are those of `jax.vmap`, which this is on other devices.
-    `jax.jit(over_worlds(fly), compiler_options=jaxdrones.KERNEL_OPTIONS)` is faster still.
+    It gives what `jax.vmap` gives, of every function. On a CPU the function is applied to one chunk of the worlds after
+    another, whose states stay in the cache. Where it has loops and is made of arithmetic, as flights and their
+    gradients are, it is compiled as a single kernel, which keeps one core busy; with sorting, matrix products, solvers,
+    random numbers or branches as usual. Derivatives belong in the function: around it they are those of `jax.vmap`,
+    which this is on other devices. `jax.jit(over_worlds(fly), compiler_options=jaxdrones.KERNEL_OPTIONS)` is faster
+    still.
 
     Args:
         function: of one world; what is the same for all worlds it closes over.
@@ -50,9 +48,7 @@ def over_worlds(
         in_axes: axis over worlds, of each argument or of all. Commands (steps, worlds, ...), that is 1, are read faster
             than (worlds, steps, ...): at 2,048 steps a flight under a controller takes two thirds of the time.
             Results have worlds first.
-        one_kernel: False for a function with matrix products, sorting or solvers (networks, `rates`, `Cells`). Of these
-            XLA cannot make one kernel, and says UNIMPLEMENTED, "Failed to materialize symbols" or "Incorrect number of
-            arguments". Gradients of teams, or through contacts or downwash, need `KERNEL_OPTIONS`.
+        one_kernel: False for many kernels in any case.
         devices: each flies an equal share of the worlds. A CPU is one device, unless JAX is told before its first use:
             `jax.config.update("jax_num_cpu_devices", 2)`.
 
@@ -60,17 +56,16 @@ def over_worlds(
         ValueError: chunk is not a whole number above zero. When called: other arguments than `in_axes` is of, arguments
             of unequal numbers of worlds, or a number that the devices do not divide.
     """
-    chunk = (128 if one_kernel else 512) if chunk is None else chunk
-    check_whole("chunk", chunk)
+    if chunk is not None:
+        check_whole("chunk", chunk)
 
     def many(*arguments):
         axes = tuple(in_axes) if isinstance(in_axes, Sequence) else (in_axes,) * len(arguments)
         worlds = _worlds(arguments, axes)
-        if jax.default_backend() != "cpu":
-            share = jax.vmap(function, axes)
-        else:
-            share = _chunk_by_chunk(function, chunk, axes, one_kernel)
-        if len(devices) < 2:
+        share = jax.vmap(function, axes)
+        if worlds and jax.default_backend() == "cpu" and _is_able():
+            share = _on_a_cpu(function, chunk, axes, one_kernel)
+        if not worlds or len(devices) < 2:
             return share(*arguments)
         if worlds % len(devices):
             raise ValueError(f"{worlds} worlds cannot be shared equally by {len(devices)} devices; give a multiple")
@@ -98,40 +93,94 @@ def _worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
     return found.pop()
 
 
-def _chunk_by_chunk(function: Callable, chunk: int, axes: tuple[int, ...], one_kernel: bool) -> Callable:
-    def flown(*arguments):
+def _is_able() -> bool:
+    if not compiler.AVAILABLE:
+        _warn("lacks an interface")
+    return compiler.AVAILABLE
+
+
+@functools.cache
+def _warn(why: str) -> None:
+    warnings.warn(
+        f"jaxdrones.over_worlds is jax.vmap here: JAX {jax.__version__} {why} that it knows",
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
+
+def _on_a_cpu(function: Callable, chunk: int | None, axes: tuple[int, ...], one_kernel: bool) -> Callable:
+    """The function of many worlds, chunk by chunk: as one kernel where it can be one, and where that is wanted."""
+
+    def share(*arguments):
+        leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, arguments))
         worlds = _worlds(arguments, axes)
-        size = min(chunk, worlds)
+        along = tuple(axis for argument, axis in zip(arguments, axes, strict=True) for _ in jax.tree.leaves(argument))
+        of_one_world = map(_without_axis, leaves, along)
+        program, consts, shape = compiler.trace(lambda *leaves: function(*tree.unflatten(leaves)), *of_one_world)
 
-        def part(first):
-            def cut(tree, axis):
-                return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, size, axis), tree)
+        def by_vmap(consts, leaves):
+            evaluate = without_copies if has_copies(program) else _as_it_is
+            of_many = jax.vmap(functools.partial(evaluate, program, consts), along)
+            if program.effects:
+                return of_many(*leaves)
+            return [_joined(x, worlds) for x in _chunks(of_many, leaves, along, chunk or _CHUNK)]
 
-            if not one_kernel:
-                return jax.vmap(function, axes)(*map(cut, arguments, axes))
-            last = [_moved(cut(tree, axis), axis, -1) for tree, axis in zip(arguments, axes, strict=True)]
-            return _moved(vmap_apart(function)(*last), -1, 0)
+        @_as_one_kernel
+        def chunks(consts, leaves):
+            def of_a_chunk(*leaves):
+                last = [jnp.moveaxis(x, axis, -1) for x, axis in zip(leaves, along, strict=True)]
+                return [jnp.moveaxis(x, -1, 0) for x in vmap_for_kernel(program, consts, last)]
 
-        # The last chunk starts where it is a whole one too: some worlds are flown twice, but one program is compiled.
-        return jax.lax.map(part, jnp.minimum(jnp.arange(0, worlds, size), worlds - size))
+            return _chunks(of_a_chunk, leaves, along, chunk or _KERNEL_CHUNK)
 
-    def joined(*arguments):
-        done = (_as_one_kernel(flown) if one_kernel else flown)(*arguments)
-        rest = _worlds(arguments, axes) % chunk
-        return jax.tree.map(lambda x: _joined(x, rest), done)
+        @jax.custom_jvp
+        def by_one_kernel(consts, leaves):
+            return [_joined(x, worlds) for x in chunks(consts, leaves)]
 
-    return joined
+        by_one_kernel.defjvp(lambda inputs, tangents: jax.jvp(by_vmap, inputs, tangents))
+        try:
+            fits = one_kernel and fits_a_kernel(program)
+            results = (by_one_kernel if fits else by_vmap)(consts, leaves)
+        except NoKernel:
+            results = by_vmap(consts, leaves)
+        except compiler.Unknown as error:
+            _warn(f"has an equation ({error}) other than those")
+            results = by_vmap(consts, leaves)
+        return jax.tree.structure(shape).unflatten(results)
+
+    return share
 
 
-def _joined(chunks: jax.Array, rest: int) -> jax.Array:
+def _as_it_is(program: Any, consts: Sequence[Array], *inputs: Array) -> list[Array]:
+    return compiler.as_function(program, consts)(*inputs)
+
+
+def _without_axis(x: Array, axis: int) -> jax.ShapeDtypeStruct:
+    shape = (*x.shape[:axis], *x.shape[axis + 1 :])
+    return jax.ShapeDtypeStruct(shape, x.dtype, weak_type=jax.typeof(x).weak_type)
+
+
+def _chunks(function: Callable, leaves: Sequence[Array], axes: tuple[int, ...], size: int) -> list[Array]:
+    """What a function of many worlds gives for chunks of them, (chunks, worlds of a chunk, ...)."""
+    worlds = leaves[0].shape[axes[0]]
+    size = min(size, worlds)
+
+    def chunk(first):
+        return function(
+            *(jax.lax.dynamic_slice_in_dim(x, first, size, axis) for x, axis in zip(leaves, axes, strict=True))
+        )
+
+    # The last chunk starts where it is a whole one too: some worlds are flown twice, but one program is compiled.
+    return jax.lax.map(chunk, jnp.minimum(jnp.arange(0, worlds, size), worlds - size))
+
+
+def _joined(chunks: Array, worlds: int) -> Array:
     """(chunks, worlds of a chunk, ...) as one axis; of the last chunk the last worlds, if they are a rest."""
-    if len(chunks) == 1 or not rest:
-        return chunks.reshape(-1, *chunks.shape[2:])
-    return jnp.concatenate([chunks[:-1].reshape(-1, *chunks.shape[2:]), chunks[-1, -rest:]])
-
-
-def _moved(tree, axis: int, to: int):
-    return jax.tree.map(lambda x: jnp.moveaxis(x, axis, to), tree)
+    count, size, *shape = chunks.shape
+    if count * size == worlds:
+        return chunks.reshape(worlds, *shape)
+    rest = worlds - (count - 1) * size
+    return jnp.concatenate([chunks[:-1].reshape(worlds - rest, *shape), chunks[-1, -rest:]])
 
 
 def _as_one_kernel(function: Callable) -> Callable:
@@ -141,15 +190,12 @@ def _as_one_kernel(function: Callable) -> Callable:
     XLA does not see: it would put what is constant in its place.
     """
 
-    def kernel(*arguments):
-        traced, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-
+    def kernel(consts, leaves):
         def with_firsts(consts, leaves):
-            results = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, consts))(*leaves)
-            return results, [x.reshape(-1)[:1] for x in (*consts, *leaves)]
+            return function(consts, leaves), [x.reshape(-1)[:1] for x in (*consts, *leaves)]
 
-        inputs = jax.lax.optimization_barrier((traced.consts, jax.tree.leaves(arguments)))
-        called = set_xla_metadata(jax.jit(with_firsts)(*inputs), **_ONE_KERNEL)
-        return jax.tree.structure(shape).unflatten(jax.lax.optimization_barrier(called)[0])
+        inputs = jax.lax.optimization_barrier((list(map(jnp.asarray, consts)), leaves))
+        called = compiler.set_notes(jax.jit(with_firsts)(*inputs), **_ONE_KERNEL)
+        return jax.lax.optimization_barrier(called)[0]
 
     return kernel

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.checks import check_whole
+from jaxdrones.compiler import training_options
 from jaxdrones.envs import Env
-from jaxdrones.learning.result import COMPILER_OPTIONS
 
 _CHUNK = 1000  # episodes flown at a time
 
@@ -53,15 +53,15 @@ def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -
     check_whole("episodes", episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, flax.struct.PyTreeNode):
-        flown = _fly_policy(env, policy, keys)
+        flown = _fly_policy()(env, policy, keys)
     else:
         flown = jax.jit(functools.partial(_fly, env, policy))(keys)
     return _report(env, jax.tree.map(np.asarray, flown))
 
 
-@functools.partial(jax.jit, static_argnums=0, compiler_options=COMPILER_OPTIONS)
-def _fly_policy(env, policy, keys):
-    return _fly(env, policy, keys)
+@functools.cache
+def _fly_policy() -> Callable:
+    return jax.jit(_fly, static_argnums=0, compiler_options=training_options())
 
 
 def _fly(env: Env, policy: Callable, keys: jax.Array):

@@ -14,9 +14,6 @@ from jaxtyping import Array
 from jaxdrones.envs import Env
 from jaxdrones.learning.networks import Policy
 
-COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
-"""For `jax.jit(train).lower(key).compile(...)`: a third less time to compile on a CPU, and the same speed after."""
-
 
 class Result(flax.struct.PyTreeNode):
     """A trained policy, and how it came about."""

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.compiler import training_options
 from jaxdrones.learning import hosts, sharding
 from jaxdrones.learning.evaluation import Report, evaluate
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.presets import ALGORITHMS
-from jaxdrones.learning.result import COMPILER_OPTIONS
 from jaxdrones.learning.runs import Progress, Recipe, Run, as_dict, size_of
 
 EVALUATIONS = 10  # in the course of training
@@ -64,8 +64,8 @@ class Trainer:
         init = jax.jit(self._init, in_shardings=same, out_shardings=placed)
         updates = jax.jit(self._updates, in_shardings=(placed, same, same), out_shardings=(placed, same))
         with jax.set_mesh(self.mesh):
-            self.start = init.lower(jax.random.key(0)).compile(COMPILER_OPTIONS)
-            self._advance = updates.lower(self.shapes, count, count).compile(COMPILER_OPTIONS)
+            self.start = init.lower(jax.random.key(0)).compile(training_options())
+            self._advance = updates.lower(self.shapes, count, count).compile(training_options())
         self.compile_seconds = time.perf_counter() - start
 
     def prepare(self, run: Run) -> None:

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from helpers import assert_close, flying, tape
 
 import jaxdrones as jd
+from jaxdrones import compiler
+from jaxdrones.backends import worlds
 from jaxdrones.control import pid, setpoint
 
 team = jd.repeat(jd.load_params("cf2x"), 2)
@@ -104,11 +107,103 @@ def test_a_controlled_flight_is_one_kernel():
     assert_close(jax.jit(jd.over_worlds(held, 2))(starts), jax.jit(jax.vmap(held))(starts), 1e-10)
 
 
-def test_a_function_with_a_solver_is_flown_without_the_single_kernel():
+@pytest.mark.parametrize("one_kernel", [True, False])
+def test_a_function_of_which_no_kernel_can_be_made_is_flown_by_many(one_kernel):
     def solved(start):
-        return jnp.linalg.solve(jnp.eye(3) + start.pos.T @ start.pos, start.vel.T)
+        return jnp.linalg.solve(jnp.eye(3) + start.pos.T @ start.pos, jnp.sort(start.vel).T)
 
-    assert_close(jax.jit(jd.over_worlds(solved, 2, one_kernel=False))(starts), jax.vmap(solved)(starts), 1e-12)
+    assert_close(jax.jit(jd.over_worlds(solved, 2, one_kernel=one_kernel))(starts), jax.vmap(solved)(starts), 1e-12)
+
+
+def summed_squares(x):
+    """2 + 3^2 and so on, by primitives that hold a program of their own."""
+    return jax.lax.reduce_window(x, 0.0, lambda a, b: a + b * b, (2,), (1,), "SAME")
+
+
+def test_programs_that_a_reduction_holds_are_no_calls():
+    x = jnp.array([[1.0, 2.0, 3.0], [2.0, 0.0, 1.0]])
+    looped = jd.over_worlds(lambda x: jax.lax.fori_loop(0, 1, lambda _, x: summed_squares(x), x))
+    np.testing.assert_array_equal(jax.jit(looped)(x), jax.vmap(summed_squares)(x))
+    np.testing.assert_array_equal(jax.jit(jd.over_worlds(summed_squares))(x)[0], [5, 13, 9])
+
+
+DEGENERATE = {
+    "no passage": (lambda x: jax.lax.scan(lambda x, _: (x + 1, x), x, length=0), jnp.ones((3, 2))),
+    "no number": (lambda x: jax.lax.scan(lambda x, _: (x + 1, x), x, length=2), jnp.ones((3, 0))),
+    "no world": (lambda x: jax.lax.scan(lambda x, _: (x + 1, x), x, length=2), jnp.ones((0, 2))),
+    "nothing of a world": (lambda x: jnp.arange(3), jnp.ones((2, 2))),
+    "no result": (lambda x: (), jnp.ones((2, 2))),
+    "numbers that take the type of others": (lambda x: x * jnp.ones(2, jnp.float16), 2.0 * jnp.arange(3)[:, None]),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_where_there_is_nothing_to_do_it_is_done_as_vmap_does_it(name):
+    function, x = DEGENERATE[name]
+    found, expected = jd.over_worlds(function)(x), jax.vmap(function)(x)
+    assert jax.tree.map(lambda y: (y.shape, y.dtype), found) == jax.tree.map(lambda y: (y.shape, y.dtype), expected)
+    assert_close(found, expected, 0)
+
+
+def lines(number, size):
+    """Each of them uses the vector in two orders."""
+
+    def function(x):
+        for _ in range(number):
+            x = jnp.sin(x) * 1.1 + x[::-1] * 0.1
+        return x
+
+    return function, jnp.linspace(0, 1, 2 * size).reshape(2, size)
+
+
+@pytest.mark.parametrize("options", [None, "ours"])
+@pytest.mark.parametrize("size", [3, 50], ids=["numbers apart", "whole"])
+@pytest.mark.parametrize("looped", [False, True], ids=["straight", "in a loop"])
+def test_a_line_does_not_double_the_program(looped, size, options):
+    function, x = lines(24, size)
+    if looped:
+        flown = jd.over_worlds(lambda x: jax.lax.fori_loop(0, 2, lambda _, x: function(x), x))
+    else:
+        flown = jd.over_worlds(function)
+    program = jax.jit(flown, compiler_options=options and jd.KERNEL_OPTIONS).lower(x).compile()  # else it takes hours
+    np.testing.assert_allclose(program(x)[0], flown(x[:1])[0], rtol=1e-12)
+
+
+def test_gradients_of_teams_are_one_kernel_without_options_too():
+    meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
+
+    def sunk(start, rpm):
+        return jnp.sum(jax.lax.scan(lambda s, rpm: (meeting(team, s, rpm), None), start, rpm)[0].pos ** 2)
+
+    inside = jax.jit(jd.over_worlds(jax.grad(sunk, 1)))(starts, commands)
+    assert_close(inside, jax.jit(jax.vmap(jax.grad(sunk, 1)))(starts, commands), 1e-12)
+
+
+def test_without_the_interfaces_that_it_needs_it_is_vmap_and_says_so_once(monkeypatch):
+    monkeypatch.setattr(compiler, "AVAILABLE", False)
+    worlds._warn.cache_clear()
+    with pytest.warns(RuntimeWarning, match="over_worlds is jax.vmap here") as caught:
+        for _ in range(2):
+            flown = jd.over_worlds(fly)(starts, commands)
+    assert len(caught) == 1
+    assert_close(flown, jax.vmap(fly)(starts, commands), 1e-11)
+
+
+def test_an_equation_that_is_not_as_expected_makes_it_vmap_too(monkeypatch):
+    def strange(equation):
+        raise compiler.Unknown("scan has x")
+
+    monkeypatch.setattr(compiler, "scan_counts", strange)
+    worlds._warn.cache_clear()
+    with pytest.warns(RuntimeWarning, match="scan has x"):
+        flown = jd.over_worlds(fly)(starts, commands)
+    assert_close(flown, jax.vmap(fly)(starts, commands), 1e-11)
+
+
+def test_options_are_those_that_the_compiler_knows():
+    known = compiler._known(xla_cpu_prefer_vector_width=512, xla_of_another_version=True)
+    assert known == {"xla_cpu_prefer_vector_width": 512}
+    jax.jit(lambda x: x, compiler_options=jd.KERNEL_OPTIONS)(1.0)
 
 
 @pytest.mark.parametrize("chunk", [0, 1.5])

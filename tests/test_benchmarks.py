@@ -41,6 +41,7 @@ def test_startup_loads_nothing_optional():
     assert result["loaded"] == [] and len(result["seconds"]) == 3
 
 
+@pytest.mark.needs("pybullet")
 def test_bullet_reports_four_rates():
     rates = quick("bullet.py")
     assert len(rates) == 4 and min(rates.values()) > 0
@@ -64,6 +65,7 @@ def test_learning_reports_every_seed():
     assert rows and all(0 <= row["success"] <= 1 for row in rows)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.slow
 def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():
     result = quick("transfer.py")

@@ -142,8 +142,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._auto = envs.autoreset(self.env)
-        self._reset = jax.jit(self._reset)
-        self._step = jax.jit(self._step, donate_argnums=1)
+        self._compiled_reset = jax.jit(self._reset)
+        self._compiled_step = jax.jit(self._step, donate_argnums=1)
         self._worlds = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -152,7 +152,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         _refuse(options)
         first = int(self.np_random.integers(SEEDS)) if seed is None else seed
         seeds = ((first + np.arange(self.num_envs)) % SEEDS).astype(np.uint32)
-        self._keys, self._worlds, obs = self._reset(seeds)
+        self._keys, self._worlds, obs = self._compiled_reset(seeds)
         return self._out(obs), {}
 
     def step(self, actions):
@@ -165,7 +165,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if self._worlds is None:
             raise gymnasium.error.ResetNeeded("step is called before reset; call reset")
         actions = self._layout.gather(actions, (self.num_envs,))
-        self._worlds, outcome = self._step(self._keys, self._worlds, actions)
+        self._worlds, outcome = self._compiled_step(self._keys, self._worlds, actions)
         obs, reward, terminated, truncated, info = self._out(outcome)
         return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
 

@@ -38,7 +38,8 @@ class VecEnv(vec_env.VecEnv):
         self.envs = gymnasium.VectorEnv(task, num_envs, **options)
         self.render_mode = None
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
-        self._seed, self._actions = seed, None
+        self._seed = seed
+        self._actions: np.ndarray
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the next reset."""

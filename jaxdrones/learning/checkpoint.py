@@ -42,7 +42,9 @@ def load(path: str | os.PathLike) -> Policy:
     kept = about(path)
     if "policy" not in kept:
         raise ValueError(f"{path} holds no policy; found {', '.join(kept)}")
-    settings = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()}
+    settings: dict[str, Any] = {
+        name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()
+    }
     network = VisionMLP(**settings) if "channels" in settings else MLP(**settings)
     numbers = _restored(path)
     return Policy(numbers["params"], Statistics(**numbers["statistics"]), network, kept["policy"]["per_role"])

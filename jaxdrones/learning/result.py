@@ -14,7 +14,7 @@ from jaxtyping import Array
 from jaxdrones.envs import Env
 from jaxdrones.learning.networks import Policy
 
-COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+COMPILER_OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 """For `jax.jit(train).lower(key).compile(...)`: a third less time to compile on a CPU, and the same speed after."""
 
 

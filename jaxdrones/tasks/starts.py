@@ -32,7 +32,7 @@ def standing_height(params: Params) -> Float[Array, " n"]:
 
 
 def thrown(
-    key: jax.Array, params: Params, pos: Float[Array, "n 3"], *, reach, speed: float, omega: float, tilt: float
+    key: jax.Array, params: Params, pos: Float[Array, "n 3"], *, reach, speed: float, omega: float, tilt: float | Array
 ) -> State:
     """Anywhere near `pos`, in any motion, with the rotors at hover speed.
 

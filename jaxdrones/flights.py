@@ -23,7 +23,7 @@ from jaxdrones.urdf import load_params
 _START_SPREAD = 0.01  # m; standard deviation of the start when a seed is given
 
 
-def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None = None, **options) -> Record:
+def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None = None, **options: Any) -> Record:
     """Fly one of the examples.
 
     Args:

@@ -151,7 +151,9 @@ class _Training(base.Wrapper):
         return after.replace(pipeline_state=place, obs=obs, done=_float(done), info=info)
 
 
-def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> base.Wrapper:
+def wrap_for_training(
+    env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
+) -> base.Wrapper:
     """The trainers' `wrap_env_fn`: many worlds, each episode from a fresh start, time limits told from ends.
 
     Brax's own starts every episode of a world from the same cached state. `info["truncation"]` and

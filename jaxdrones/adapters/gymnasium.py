@@ -30,7 +30,7 @@ class Env(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
 
     def __init__(
-        self, task: str | Task | envs.Env, *, dict_spaces: bool = False, render_mode: str | None = None, **options
+        self, task: str | Task | envs.Env, *, dict_spaces: bool = False, render_mode: str | None = None, **options: Any
     ):
         """Wrap an environment.
 
@@ -52,14 +52,14 @@ class Env(gymnasium.Env):
         self.observation_space, self.action_space = self._layout.observation, self._layout.action
         self._session = Session(self.env)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; the same seed starts the same one."""
         super().reset(seed=seed)
         _refuse(options)
         obs = self._session.reset(int(self.np_random.integers(SEEDS)) if seed is None else seed)
         return self._layout.arrange(obs), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One control step.
 
         Raises:
@@ -112,7 +112,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         dict_spaces: bool = False,
         numpy: bool = True,
         max_episode_steps: int | None = None,
-        **options,
+        **options: Any,
     ):
         """Wrap an environment.
 
@@ -146,7 +146,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._compiled_step = jax.jit(self._step, donate_argnums=1)
         self._worlds = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every world; the same seed starts the same ones."""
         super().reset(seed=seed)
         _refuse(options)
@@ -155,7 +155,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self._keys, self._worlds, obs = self._compiled_reset(seeds)
         return self._out(obs), {}
 
-    def step(self, actions):
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One control step in every world.
 
         Raises:
@@ -169,7 +169,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         obs, reward, terminated, truncated, info = self._out(outcome)
         return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
 
-    def close_extras(self, **kwargs) -> None:
+    def close_extras(self, **kwargs: Any) -> None:
         """End what is connected to Bullet."""
         self.env.close()
 

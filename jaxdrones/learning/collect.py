@@ -177,7 +177,7 @@ def progress(flight: Flight) -> dict[str, Array]:
     }
 
 
-def remember(statistics: Statistics, seen: Float[Array, "t w n d"], config, step: Array) -> Statistics:
+def remember(statistics: Statistics, seen: Float[Array, "t w n d"], config: Any, step: Array) -> Statistics:
     """The statistics of what was seen so far with those of a flight, until they are settled.
 
     Args:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax.typing import ArrayLike
 
 from jaxdrones import rotation
@@ -161,7 +162,9 @@ class BulletStep(HostStep):
         team = self._place(params, state)
         return of_drones(self.client, team, self._arms, camera, raw_depth)
 
-    def photo(self, params: Params, state: State, eye, target, camera: Camera = _FILM_CAMERA) -> np.ndarray:
+    def photo(
+        self, params: Params, state: State, eye: npt.ArrayLike, target: npt.ArrayLike, camera: Camera = _FILM_CAMERA
+    ) -> np.ndarray:
         """A picture of the team from `eye` towards `target` (3,) (m, world): RGB (height, width, 3) uint8."""
         self._place(params, state)
         return look(self.client, eye, target, camera, _FILM_NEAR)[0][..., :3]

@@ -35,10 +35,3 @@ LEARNING_TO_FLY_IN_SECONDS = Figure(
     "laptop",
     "Eschmann et al. 2023, arXiv 2311.13081, abstract",
 )
-IN_FLIGHT = Figure(
-    0.38,
-    "s",
-    "crazyflow, training of a recovery from a throw, from scratch",
-    "not named in the abstract",
-    "Schuck et al. 2026, arXiv 2606.01478, abstract",
-)

@@ -1,6 +1,7 @@
 """The pages name what there is, and what is written on them runs."""
 
 import ast
+import re
 
 import pytest
 from documents import LANGUAGES, PAGES, ROOT, blocks, run_python
@@ -23,6 +24,12 @@ def test_every_block_says_what_it_is_and_all_python_is_python(page):
         assert block.language in LANGUAGES, f"{block.name}: give the language, one of {', '.join(LANGUAGES)}"
         if block.language == "python":
             ast.parse(block.code)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_file_that_a_page_names_is_there(page):
+    named = re.findall(r"(?<![\w/])(?:assets|benchmarks|docs|notebooks|tests|\.ci)/[\w./-]*\w", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import jax
 
 try:
     from jax.experimental.xla_metadata import set_xla_metadata
-    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+    from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
     AVAILABLE = True
     """Whether this version of JAX has all that `over_worlds` needs beside `jax.vmap`."""
@@ -95,7 +95,14 @@ def as_function(program: Any, consts: Sequence) -> Callable[..., list]:
 
 def alone(equation: Equation, variables: Iterable[Variable], results: Iterable[Variable]) -> Callable[..., list]:
     """An equation as a function of some of its variables, that gives some of its results."""
-    return as_function(Jaxpr((), [*variables], [*results], [equation], equation.effects), ())
+    parts = dict(invars=[*variables], outvars=[*results], eqns=[equation], effects=equation.effects)
+    return as_function(opened(_nothing())[0].replace(**parts), ())
+
+
+@functools.cache
+def _nothing() -> Any:
+    """A program without equations, which has what a program must tell about its source."""
+    return jax.make_jaxpr(lambda: ())()
 
 
 def is_literal(variable: Variable) -> bool:

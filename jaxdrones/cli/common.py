@@ -42,7 +42,7 @@ def complain(message: str, code: int = 2) -> int:
     return code
 
 
-def bar(total: int, what: str, unit: str, initial: int = 0):
+def bar(total: int | None, what: str, unit: str, initial: int = 0):
     """A progress bar on stderr; nothing without a terminal, `None` without tqdm."""
     try:
         from tqdm import tqdm

@@ -29,7 +29,8 @@ def _compare(options: argparse.Namespace) -> int:
     names = options.backends.split(",")
     if len(names) != 2:
         raise ValueError(f"--backends is {options.backends!r}; give two, for example explicit,bullet")
-    rows = divergence(*(flown(options, backend=name) for name in names))
+    first, second = (flown(options, backend=name) for name in names)
+    rows = divergence(first, second)
     if options.json:
         print(json.dumps({"flight": options.flight, "backends": names, "divergence": rows}))
     else:

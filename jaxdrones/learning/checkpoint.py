@@ -20,7 +20,7 @@ from jaxdrones.learning.normalize import Statistics
 FORMAT = 1
 
 
-def save(path: str | os.PathLike, policy: Policy, **about) -> None:
+def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
     """Write `path`.msgpack and `path`.json, each whole or not at all.
 
     Args:
@@ -42,13 +42,15 @@ def load(path: str | os.PathLike) -> Policy:
     kept = about(path)
     if "policy" not in kept:
         raise ValueError(f"{path} holds no policy; found {', '.join(kept)}")
-    settings = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()}
+    settings: dict[str, Any] = {
+        name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()
+    }
     network = VisionMLP(**settings) if "channels" in settings else MLP(**settings)
     numbers = _restored(path)
     return Policy(numbers["params"], Statistics(**numbers["statistics"]), network, kept["policy"]["per_role"])
 
 
-def save_tree(path: str | os.PathLike, tree: Any, **about) -> None:
+def save_tree(path: str | os.PathLike, tree: Any, **about: Any) -> None:
     """Write any pytree, such as a training state, with what it means; keys are kept too."""
     path = Path(path)
     tree = _without_keys(tree)
@@ -57,7 +59,7 @@ def save_tree(path: str | os.PathLike, tree: Any, **about) -> None:
     save_bytes(_numbers(path), content, **about, versions=versions, shapes=_shapes(tree))
 
 
-def save_bytes(file: Path, content: bytes, **about) -> None:
+def save_bytes(file: Path, content: bytes, **about: Any) -> None:
     """Write a file, and beside it, as .json, what it means."""
     kept = {name: _plain(x) for name, x in about.items()} | {"format": FORMAT}
     file.parent.mkdir(parents=True, exist_ok=True)

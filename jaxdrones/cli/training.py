@@ -3,13 +3,12 @@
 import argparse
 import ast
 import contextlib
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import bar
-from jaxdrones.cli.evaluate import evaluation_table
+from jaxdrones.cli.common import as_json, bar
+from jaxdrones.cli.evaluate import evaluation_table, percent
 from jaxdrones.render import plots
 
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -38,37 +37,52 @@ def settings(texts: list[str]) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
+        if name in changes:
+            raise ValueError(f"--set {name} is given twice: {changes[name]} and {value}; give it once")
         try:
             changes[name] = ast.literal_eval(value)
-        except (ValueError, SyntaxError):
+        except (ValueError, SyntaxError, RecursionError, MemoryError):  # a word, which may be a name
             changes[name] = value
     return changes
 
 
+def once(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:
+    """The changes, and the number that --budget gave for one of them.
+
+    Raises:
+        ValueError: that one is changed by --set too.
+    """
+    if name in changes and (number is not None or seconds is not None):
+        raise ValueError(f"--set {name}={changes[name]} is given beside --budget; give one of them")
+    return changes if number is None else changes | {name: number}
+
+
 def check_free(run, overwrite: bool) -> None:
-    """Raise if a training that did not finish would be lost."""
-    if run.unfinished and not overwrite:
-        again = "go on with --resume, " if run.started else ""
-        raise ValueError(
-            f"{run.folder} holds a training that did not finish; {again}replace it with --overwrite, "
-            "or choose another --output"
-        )
+    """Raise if files of a run would be lost."""
+    if overwrite or not run.files:
+        return
+    if run.finished:
+        what, again = "a finished training", "train it longer with --resume --budget N, " if run.started else ""
+    else:
+        what, again = "a training that did not finish", "go on with --resume, " if run.started else ""
+    raise ValueError(f"{run.folder} holds {what}; {again}replace it with --overwrite, or choose another --output")
 
 
 class Shown(contextlib.ExitStack):
     """A live bar from the first news on, and a line for every evaluation."""
 
-    def __init__(self, total: int | None, what: str, say, unit: str = "update"):
+    def __init__(self, total: int | None, what: str, episodes: int, say, unit: str = "update"):
         """Show nothing yet.
 
         Args:
             total: number of `unit` to come, if that is known.
             what: is trained.
+            episodes: of an evaluation.
             say: prints a line.
             unit: what is counted.
         """
         super().__init__()
-        self._total, self._what, self._say, self._unit = total, what, say, unit
+        self._total, self._what, self._episodes, self._say, self._unit = total, what, episodes, say, unit
         self._bar, self._evaluated, self._begun = None, "", False
 
     def tell(self, count: int, now: dict[str, float]) -> None:
@@ -78,7 +92,8 @@ class Shown(contextlib.ExitStack):
             self._bar = self.enter_context(bar(self._total, self._what, self._unit, initial=count))
         pace = _pace(now["steps_per_s"])
         if "success" in now:
-            self._evaluated = f"return {now['evaluated_return']:.1f}, success {now['success']:.3f}"
+            success = percent(now["success"], self._episodes)
+            self._evaluated = f"return {now['evaluated_return']:.1f}, success {success}"
             of = "" if self._total is None else f"/{self._total}"
             line = f"{self._what}: {self._unit} {count:4}{of}  {self._evaluated}, "
             line += f"median error {now['evaluated_error']:.3f} m, {pace}, {now['seconds']:.1f} s"
@@ -101,7 +116,7 @@ def quiet(_: str) -> None:
 
 def kept(run) -> str:
     """Which policy an unfinished training leaves."""
-    return f"{run.folder / 'best'}.{run.policy_suffix} is the best policy, of update {run.about()['update']}"
+    return f"{run.folder / 'best'}.{run.policy_suffix} is the best policy, of update {run.told('best', 'update')}"
 
 
 def draw(options: argparse.Namespace, runs: dict, folder: Path) -> list[Path]:
@@ -122,19 +137,22 @@ def finish(options: argparse.Namespace, runs: dict, output: Path) -> int:
         runs: seed -> run.
         output: where the figure goes and, of several seeds, the best.
     """
+    from jaxdrones.learning.runs import Run
+    from jaxdrones.learning.training import best_of, score_of
+
     reports = {seed: run.report() for seed, run in runs.items()}
-    best = max(reports, key=lambda s: (reports[s]["evaluation"]["success"], reports[s]["evaluation"]["returned"]))
+    evaluations = [report["evaluation"] for report in reports.values()]
+    scores = [score_of(evaluation["success"], evaluation["returned"]) for evaluation in evaluations]
+    best = list(runs)[best_of(scores, min(evaluation["episodes"] for evaluation in evaluations))]
     run = runs[best]
     if len(runs) > 1:
-        from jaxdrones.learning.runs import Run
-
-        about = run.about()
-        Run(output).save_policy("best", run.policy(), **{k: about[k] for k in ("recipe", "seed", "update")})
-        (output / "report.json").write_text(json.dumps({"best_seed": best, "seeds": list(reports.values())}, indent=2))
+        about = {entry: run.told("best", entry) for entry in ("recipe", "seed", "update")}
+        Run(output).save_policy("best", run.policy(), **about)
+        Run(output).save_report({"best_seed": best, "seeds": list(reports.values())})
     files = [output / f"best.{run.policy_suffix}", output / "report.json", *draw(options, runs, output)]
     if options.json:
         result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
-        print(json.dumps(result | {"files": list(map(str, files))}))
+        print(as_json(result | {"files": list(map(str, files))}))
         return 0
     for seed, report in reports.items():
         spent = report["seconds"]

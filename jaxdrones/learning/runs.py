@@ -14,6 +14,7 @@ import csv
 import dataclasses
 import inspect
 import json
+import math
 import os
 from collections.abc import Collection
 from pathlib import Path
@@ -21,13 +22,14 @@ from typing import Any
 
 import jax
 
-from jaxdrones.checks import check_choice, check_whole
+from jaxdrones.checks import check_choice
 from jaxdrones.envs import TASKS, Env, make
 from jaxdrones.learning import checkpoint
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.events import PREFIX, EventFile
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.presets import ALGORITHMS, preset
+from jaxdrones.limits import LARGEST_COUNT, check_at_most
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Recipe:
         settings = {name: checked(name, x, getattr(config, name)) for name, x in settings.items()}
         config = dataclasses.replace(config, **settings)
         for name in ("updates", "worlds", "horizon"):
-            check_whole(name, getattr(config, name))
+            check_at_most(name, getattr(config, name), LARGEST_COUNT)
         return cls(task, algorithm, realistic, options, config)
 
     @property
@@ -82,10 +84,18 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, kept: dict[str, Any]) -> Recipe:
-        """What `as_dict` gave."""
-        check_choice("algorithm", kept["algorithm"], ALGORITHMS)
-        config = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["config"].items()}
-        return cls(**kept | {"config": ALGORITHMS[kept["algorithm"]].Config(**config)})
+        """What `as_dict` gave.
+
+        Raises:
+            ValueError: it is of another version of this library, or damaged.
+        """
+        try:
+            check_choice("task", kept["task"], TASKS)
+            check_choice("algorithm", kept["algorithm"], ALGORITHMS)
+            config = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["config"].items()}
+            return cls(**kept | {"config": ALGORITHMS[kept["algorithm"]].Config(**config)})
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"the recipe is not one of this version ({error!r}); train anew") from error
 
 
 def divided(task: str, changes: dict[str, Any], known: Collection[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -132,6 +142,14 @@ class Run:
         """Look at a folder; nothing is read or made yet."""
         self.folder = Path(folder)
 
+    @property
+    def files(self) -> list[Path]:
+        """What a run of whichever library wrote here: checkpoints, progress, report."""
+        endings = [f"{suffix}{new}" for suffix in ("msgpack", "zip", "json") for new in ("", ".new")]
+        names = [f"{name}.{ending}" for name in ("best", "last", "state") for ending in endings]
+        names += ["progress.csv", "report.json", "report.json.new"]
+        return [file for file in (*map(self.folder.joinpath, names), *self._events()) if file.exists()]
+
     def prepare(self, size: int) -> None:
         """Make the folder and see that `size` bytes can be written to it.
 
@@ -149,20 +167,29 @@ class Run:
 
     def clear(self) -> None:
         """Remove what an earlier run left, and nothing else."""
-        names = [f"{name}.{suffix}" for name in ("best", "last", "state") for suffix in ("msgpack", "zip", "json")]
-        for file in (*map(self.folder.joinpath, [*names, "progress.csv", "report.json"]), *self._events()):
-            file.unlink(missing_ok=True)
+        for file in self.files:
+            file.unlink()
 
     def about(self, name: str = "best") -> dict[str, Any]:
         """What is known of the checkpoint `best`, `last` or `state`."""
         return checkpoint.about(self.folder / name)
 
-    def recipe(self) -> Recipe:
+    def told(self, name: str, entry: str) -> Any:
+        """One entry of what is known of a checkpoint.
+
+        Raises:
+            FileNotFoundError: there is no such checkpoint.
+            ValueError: it lacks the entry.
+        """
+        about = self.about(name)
+        if entry not in about:
+            file = self.folder / f"{name}.json"
+            raise ValueError(f"{file} names no {entry}; it is not the {name} of a run of `jaxdrones train`")
+        return about[entry]
+
+    def recipe(self, name: str = "best") -> Recipe:
         """What was trained here."""
-        about = self.about()
-        if "recipe" not in about:
-            raise ValueError(f"{self.folder / 'best.json'} names no recipe; it is not of `jaxdrones train`")
-        return Recipe.from_dict(about["recipe"])
+        return Recipe.from_dict(self.told(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Policy:
         """The policy `best` or `last`.
@@ -187,9 +214,9 @@ class Run:
         return (self.folder / "state.json").exists()
 
     @property
-    def unfinished(self) -> bool:
-        """Whether a training began here, with whichever library, and did not come to its end."""
-        return (self.folder / "best.json").exists() and self.report() is None
+    def finished(self) -> bool:
+        """Whether a training came to its end here."""
+        return (self.folder / "report.json").exists()
 
     def save_policy(self, name: str, policy: Policy, **about) -> None:
         """Write `best` or `last`."""
@@ -205,20 +232,45 @@ class Run:
 
     def save_report(self, report: dict[str, Any]) -> None:
         """Write report.json."""
-        (self.folder / "report.json").write_text(json.dumps(report, indent=2))
+        checkpoint.write(self.folder / "report.json", json.dumps(report, indent=2).encode())
+
+    def drop_report(self) -> None:
+        """From now on the run counts as not finished."""
+        (self.folder / "report.json").unlink(missing_ok=True)
 
     def report(self) -> dict[str, Any] | None:
-        """What `save_report` wrote; `None` of a run that did not finish."""
+        """What `save_report` wrote; `None` of a run that did not finish.
+
+        Raises:
+            ValueError: it is damaged.
+        """
         file = self.folder / "report.json"
-        return json.loads(file.read_text()) if file.exists() else None
+        if not self.finished:
+            return None
+        try:
+            return json.loads(file.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise ValueError(f"{file} cannot be read: {error}; remove it and --resume, which writes it anew") from error
 
     def history(self) -> list[dict[str, float]]:
-        """The lines of progress.csv; numbers that were not measured in an update are left out."""
+        """The lines of progress.csv; numbers that were not measured in an update are left out.
+
+        Raises:
+            ValueError: it is damaged.
+        """
         path = self.folder / "progress.csv"
         if not path.exists():
             return []
-        with path.open(newline="") as file:
-            return [{name: float(x) for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
+        try:
+            with path.open(newline="") as file:
+                lines = [{name: x for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
+            rows = [{name: float(x) for name, x in line.items()} for line in lines]
+            if not all(math.isfinite(row.get("update", math.nan)) for row in rows):
+                raise ValueError("a line lacks its update")
+        except (OSError, ValueError, TypeError, csv.Error) as error:
+            what = checkpoint.line(error)
+            raise ValueError(f"{path} is damaged: {what}; remove it, training goes on without its lines") from error
+        return rows
 
     def _events(self) -> list[Path]:
         return sorted(self.folder.glob(f"{PREFIX}.*.jaxdrones"))
@@ -249,8 +301,8 @@ class Progress:
     """progress.csv and the event file of a run, open for more lines."""
 
     def __init__(self, run: Run, columns: list[str], update: int):
-        """Go on after an update; later lines, of a run that was killed, are dropped. There is a line per update."""
-        rows = run.history()[:update]
+        """Go on after an update; later lines, of a run that was killed, are dropped."""
+        rows = [row for row in run.history() if row["update"] <= update] if update else []
         for file in run._events():
             file.unlink()
         self._columns = columns
@@ -279,6 +331,7 @@ class Progress:
 def as_dict(report: Report) -> dict[str, Any]:
     """An evaluation for JSON."""
     kept = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
+    kept |= {"successes": round(report.success * report.episodes)}
     return kept | {"error_percentiles": {str(q): x for q, x in report.error_percentiles.items()}}
 
 

@@ -12,6 +12,8 @@ from typing import Any
 
 INTERRUPTED = 130  # exit code
 
+_LONGEST = 1000  # characters of a complaint
+
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
     "rms_error_m": ("rms (m)", "{:.4f}"),
@@ -39,19 +41,25 @@ class Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
 
     def error(self, message):  # noqa: D102
-        self.exit(2, f"jaxdrones: error: {message}; see {self.prog} --help\n")
+        self.exit(complain(f"{shortened(message)}; see {self.prog} --help"))
 
 
 def complain(message: str, code: int = 2) -> int:
     """One line on stderr; returns the exit code."""
-    print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{message}", file=sys.stderr)
+    print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{shortened(message)}", file=sys.stderr)
     return code
+
+
+def shortened(message: str) -> str:
+    """A message on one line, without the middle of what a user gave at great length."""
+    line = " ".join(message.split("\n"))
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
 
 
 def folder(text: str) -> Path:
     """A path as an option names it; an empty one, as of a variable that is not set, would be the current folder."""
     if not text:
-        raise argparse.ArgumentTypeError("an empty path; name a folder, or . for the current one")
+        raise argparse.ArgumentTypeError("the path is empty; name one, or leave the option out")
     return Path(text)
 
 

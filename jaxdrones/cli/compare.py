@@ -26,9 +26,9 @@ def add(commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    names = options.backends.split(",")
+    names = [name.strip() for name in options.backends.split(",")]
     if len(set(names)) != 2 or len(names) != 2:
-        raise ValueError(f"--backends is {options.backends!r}; give two, for example explicit,bullet")
+        raise ValueError(f"--backends is {options.backends!r}; give two different ones, for example explicit,bullet")
     for name in names:
         check_choice("backend", name, BACKENDS)
     records = [flown(options, backend=name) for name in names]

@@ -10,7 +10,7 @@ from jaxdrones.cli import hosts
 from jaxdrones.cli.common import INTERRUPTED, complain, folder
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
-from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, kept, once, quiet, settings
+from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, fitting, kept, once, quiet, settings
 from jaxdrones.envs import TASKS
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.render import plots
@@ -35,8 +35,8 @@ def add(commands) -> None:
         "  --resume                     go on with a run that was stopped, as it was asked for\n"
         "  --resume --budget 100        train a finished run 100 updates longer; 60s longer, stopped or finished\n"
         "  --resume --set updates=400   train on to 400 updates in all\n\n"
-        "A run that is trained longer goes on as if all updates had been asked for at the start: the learning rate rises\n"
-        "to what it would be then, and falls to the new end. The best policy of before stays unless a better one comes.\n\n"
+        "A run that is trained longer goes on as if all updates had been asked for at the start: the learning rate\n"
+        "rises to what it would be then, and falls to the new end. The best policy stays unless a better one comes.\n\n"
         "With --library sb3, Stable-Baselines3 trains the paper's network (512-512-256-128, ReLU); `hover` then is\n"
         "`paper-hover`, the one-dimensional hover of the paper's equation 12, and there is no state to resume from.",
         epilog="JAX_COMPILATION_CACHE_DIR=folder keeps compiled programs, so that a second training starts sooner.\n\n"
@@ -102,8 +102,9 @@ def _train(options: argparse.Namespace) -> int:
         updates, seconds = budget(options.budget, "updates", 300)
         asked = once("updates", settings(options.set), updates, seconds)
         runs = _runs(options, output)
-        recipe = _resumed(options, runs, asked, seconds) if options.resume else _fresh(options, runs, output, asked)
-        trainer = Trainer(recipe, _episodes(options, runs))
+        with fitting(asked, options.task):
+            recipe = _resumed(options, runs, asked, seconds) if options.resume else _fresh(options, runs, output, asked)
+            trainer = Trainer(recipe, _episodes(options, runs))
         for run in runs.values():
             if run.started and options.resume:
                 trainer.check(run)
@@ -155,6 +156,7 @@ def _check_numbers(options: argparse.Namespace) -> None:
     check_at_most("seeds", options.seeds, _MOST_SEEDS)
     if options.seed is not None:
         check_seed("seed", options.seed)
+        check_seed("the last seed", options.seed + options.seeds - 1)
     if options.episodes is not None:
         check_at_most("episodes", options.episodes, LARGEST_COUNT)
     if options.resume and options.overwrite:
@@ -187,7 +189,8 @@ def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
     from jaxdrones.learning.presets import algorithm_for
     from jaxdrones.learning.runs import Recipe, Run
 
-    recipe = Recipe.of(options.task, options.algo or algorithm_for(options.task), options.realistic, **asked)
+    algorithm = algorithm_for(options.task) if options.algo is None else options.algo
+    recipe = Recipe.of(options.task, algorithm, options.realistic, **asked)
     for run in (*runs.values(), Run(output)):
         check_free(run, options.overwrite)
     return recipe
@@ -205,7 +208,7 @@ def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: floa
     had = {"task": recipe.task, "algo": recipe.algorithm, "realistic": recipe.realistic}
     had |= vars(recipe.config) | recipe.options | {"episodes": started[0].told("state", "episodes")}
     wanted = {"task": options.task, **asked}
-    wanted |= {"algo": options.algo} if options.algo else {}
+    wanted |= {} if options.algo is None else {"algo": options.algo}
     wanted |= {"realistic": True} if options.realistic else {}
     wanted |= {} if options.episodes is None else {"episodes": options.episodes}
     if options.seed is not None and options.seeds == 1:

@@ -8,7 +8,7 @@ from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import INTERRUPTED, complain
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import SB3_ALGORITHMS
-from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, kept, once, quiet, settings
+from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, fitting, kept, once, quiet, settings
 from jaxdrones.envs import TASKS
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.render import plots
@@ -26,7 +26,8 @@ def train(options: argparse.Namespace) -> int:
     """
     begin = time.perf_counter()
     _refuse(options)
-    algorithm, task = options.algo or SB3_ALGORITHMS[0], _PAPER.get(options.task, options.task)
+    algorithm = SB3_ALGORITHMS[0] if options.algo is None else options.algo
+    task = _PAPER.get(options.task, options.task)
     check_choice("algorithm of sb3", algorithm, SB3_ALGORITHMS)
     check_choice("task", task, TASKS)
     episodes, seed = _EPISODES if options.episodes is None else options.episodes, options.seed or 0
@@ -41,11 +42,13 @@ def train(options: argparse.Namespace) -> int:
     from jaxdrones.learning.training import Diverged
 
     run = sb3.Run(options.output or Path("runs") / f"{options.task}-sb3-{algorithm}")
-    recipe = sb3.Recipe.of(task, algorithm, options.realistic, **asked)
+    with fitting(asked, task):
+        recipe = sb3.Recipe.of(task, algorithm, options.realistic, **asked)
     check_free(run, options.overwrite)
     say = quiet if options.json else print
     say(f"{_headline(recipe)}; compiling")
-    trainer = Trainer(recipe, seed, episodes)
+    with fitting(asked, task):
+        trainer = Trainer(recipe, seed, episodes)
     trainer.prepare(run)
     run.clear()
     total = recipe.config["steps"] if seconds is None else None

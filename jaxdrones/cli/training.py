@@ -11,6 +11,7 @@ from jaxdrones.cli.common import as_json, bar
 from jaxdrones.cli.evaluate import evaluation_table, percent
 from jaxdrones.render import plots
 
+_ARGUMENTS = ("cls", "task", "algorithm", "realistic")  # of `Recipe.of`, which other options of the command say
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -39,11 +40,36 @@ def settings(texts: list[str]) -> dict[str, Any]:
             raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
         if name in changes:
             raise ValueError(f"--set {name} is given twice: {changes[name]} and {value}; give it once")
-        try:
-            changes[name] = ast.literal_eval(value)
-        except (ValueError, SyntaxError, RecursionError, MemoryError):  # a word, which may be a name
-            changes[name] = value
+        if name in _ARGUMENTS:
+            raise ValueError(
+                f"--set {name} is no setting of a learner or of an environment; see jaxdrones train --help"
+            )
+        changes[name] = _value(value)
     return changes
+
+
+def _value(text: str) -> Any:
+    """A Python literal, or else a name; `nan` and `inf` are numbers."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        return float(text) if text.strip("+-") in ("nan", "inf") else text
+
+
+@contextlib.contextmanager
+def fitting(changes: dict[str, Any], task: str):
+    """Settings that break what is built with them are a mistake in what was asked.
+
+    Raises:
+        ValueError: in place of what Python or JAX said of them.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+        if not changes:
+            raise
+        given = ", ".join(f"{name}={x}" for name, x in changes.items())
+        raise ValueError(f"--set {given} does not fit {task}: {error}") from error
 
 
 def once(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:

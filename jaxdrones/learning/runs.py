@@ -59,7 +59,8 @@ class Recipe:
         """
         check_choice("task", task, TASKS)
         check_choice("algorithm", algorithm, ALGORITHMS)
-        known = {field.name for field in dataclasses.fields(ALGORITHMS[algorithm].Config)}
+        fields = dataclasses.fields(ALGORITHMS[algorithm].Config)
+        known = {field.name for field in fields if field.default is not None}  # a function has no place in JSON
         options, settings = divided(task, changes, known)
         _, config = fitting_preset(task, algorithm, realistic, options)
         settings = {name: checked(name, x, getattr(config, name)) for name, x in settings.items()}
@@ -128,6 +129,8 @@ def checked(name: str, value, now):
     """
     if isinstance(now, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
+    if isinstance(now, tuple) and isinstance(value, list):
+        value = tuple(value)
     if now is not None and type(value) is not type(now):
         raise ValueError(f"{name} is {value!r}; give something like {now!r}")
     return value

@@ -60,7 +60,7 @@ class Record:
         """
         miss, unit = self._miss()
         with np.errstate(over="ignore", invalid="ignore"):
-            error = np.linalg.norm(miss, axis=-1)
+            error = np.linalg.norm(miss.astype(np.float64), axis=-1)
             lost = error[self.late].max(axis=0) > error[0] + _LOST
             x, y = self.quat[self.late, :, 0], self.quat[self.late, :, 1]
             upside_down = (2 * (x**2 + y**2) > 1).any(axis=0)

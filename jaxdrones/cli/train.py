@@ -203,6 +203,9 @@ def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: floa
     started = [run for run in runs.values() if run.started]
     if not started:
         raise _nothing(next(iter(runs.values())))
+    for run in started:
+        run.verify("best")
+        run.verify("state")
     recipes = [Recipe.from_dict(run.told("state", "recipe")) for run in started]
     folder, recipe = started[0].folder, max(recipes, key=lambda recipe: recipe.config.updates)
     had = {"task": recipe.task, "algo": recipe.algorithm, "realistic": recipe.realistic}

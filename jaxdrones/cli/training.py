@@ -9,9 +9,11 @@ from typing import Any
 
 from jaxdrones.cli.common import as_json, bar
 from jaxdrones.cli.evaluate import evaluation_table, percent
+from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.render import plots
 
 _ARGUMENTS = ("cls", "task", "algorithm", "realistic")  # of `Recipe.of`, which other options of the command say
+_LONGEST = 3.6e6  # s
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -22,13 +24,15 @@ def budget(text: str | None, unit: str, example: int) -> tuple[int | None, float
     try:
         if text[-1:] in _UNITS:
             seconds = float(text[:-1]) * _UNITS[text[-1]]
-            if 0 < seconds < float("inf"):
+            if 0 < seconds <= _LONGEST:
                 return None, seconds
-        elif int(text) > 0:
+        elif 0 < int(text) <= LARGEST_COUNT:
             return int(text), None
     except ValueError:
         pass
-    raise ValueError(f"--budget is {text!r}; give {unit}, for example {example}, or time, for example 60s, 5m or 2h")
+    raise ValueError(
+        f"--budget is {text!r}; give {unit}, for example {example}, or time up to 1000h, for example 60s, 5m or 2h"
+    )
 
 
 def settings(texts: list[str]) -> dict[str, Any]:

@@ -29,7 +29,9 @@ from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.events import PREFIX, EventFile
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.presets import ALGORITHMS, preset
-from jaxdrones.limits import LARGEST_COUNT, check_at_most
+from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
+
+_DRONE_BYTES = 256  # of its parameters and state
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,6 +117,9 @@ def divided(task: str, changes: dict[str, Any], known: Collection[str]) -> tuple
 
 def fitting_preset(task: str, algorithm: str, realistic: bool, options: dict[str, Any]) -> tuple[Env, Any]:
     """`preset`, whose complaints of wrong values are a `ValueError`."""
+    drones = options.get("drones")
+    if isinstance(drones, int):
+        check_memory(f"a team of {drones:,} drones", drones * _DRONE_BYTES, "give fewer drones")
     try:
         return preset(task, algorithm, realistic, **options)
     except TypeError as error:
@@ -176,6 +181,15 @@ class Run:
     def about(self, name: str = "best") -> dict[str, Any]:
         """What is known of the checkpoint `best`, `last` or `state`."""
         return checkpoint.about(self.folder / name)
+
+    def verify(self, name: str) -> None:
+        """See that a checkpoint is whole.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: it is damaged.
+        """
+        checkpoint.load_bytes(self.folder / f"{name}.{self.policy_suffix}", self.about(name))
 
     def told(self, name: str, entry: str) -> Any:
         """One entry of what is known of a checkpoint.

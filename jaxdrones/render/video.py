@@ -29,7 +29,11 @@ def check_video(path: Path) -> None:
 
 
 def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
-    """Write RGB frames (height, width, 3) uint8 as a film; returns how many there were."""
+    """Write RGB frames (height, width, 3) uint8, at least one, as a film; returns how many there were.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     check_video(path)
     return (_write_mp4 if path.suffix == ".mp4" else _write_gif)(frames, path, fps)
 
@@ -41,12 +45,15 @@ def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
     try:
         for frame in frames:
             if writer is None:
-                writer = imageio_ffmpeg.write_frames(str(path), frame.shape[1::-1], fps=fps, quality=7)
+                writer = imageio_ffmpeg.write_frames(str(path.absolute()), frame.shape[1::-1], fps=fps, quality=7)
                 with warnings.catch_warnings():  # about forking a process with threads: it becomes ffmpeg at once
                     warnings.simplefilter("ignore", RuntimeWarning)
                     writer.send(None)
             writer.send(np.ascontiguousarray(frame))
             count += 1
+    except OSError as error:  # with all that ffmpeg printed
+        why = str(error).strip().splitlines()[-1]
+        raise OSError(f"{path} cannot be written, ffmpeg says: {why}") from error
     finally:
         if writer is not None:
             writer.close()

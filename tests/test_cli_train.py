@@ -290,6 +290,7 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
 )
 def test_a_mistake_is_one_line_before_anything_is_trained(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jaxdrones.limits.memory", lambda: 10**10)
     (tmp_path / "file").touch()
     try:
         code = main(arguments)

@@ -50,6 +50,11 @@ def complain(message: str, code: int = 2) -> int:
     return code
 
 
+def note(message: str) -> None:
+    """One line on stderr about what is done, but maybe not as it was meant."""
+    print(f"jaxdrones: warning: {shortened(message)}", file=sys.stderr)
+
+
 def shortened(message: str) -> str:
     """A message on one line, without the middle of what a user gave at great length."""
     line = " ".join(message.split("\n"))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
-from jaxdrones.cli.common import INTERRUPTED, complain, folder
+from jaxdrones.cli.common import INTERRUPTED, complain, folder, note
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
 from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, fitting, kept, once, quiet, settings
@@ -33,7 +33,8 @@ def add(commands) -> None:
         "Ctrl-C keeps the best policy and the state. A run that is in --output, finished or not, is never replaced\n"
         "without --overwrite.\n\n"
         "  --resume                     go on with a run that was stopped, as it was asked for\n"
-        "  --resume --budget 100        train a finished run 100 updates longer; 60s longer, stopped or finished\n"
+        "  --resume --budget 100        train a finished run 100 updates longer\n"
+        "  --resume --budget 60s        train on for 60 s, without compiling, a run that was stopped or finished\n"
         "  --resume --set updates=400   train on to 400 updates in all\n\n"
         "A run that is trained longer goes on as if all updates had been asked for at the start: the learning rate\n"
         "rises to what it would be then, and falls to the new end. The best policy stays unless a better one comes.\n\n"
@@ -115,7 +116,10 @@ def _train(options: argparse.Namespace) -> int:
     trainer.compile()
     made = max((run.told("state", "update") for run in runs.values() if run.started and options.resume), default=0)
     if seconds is not None:
-        trainer.fit(seconds - (time.perf_counter() - begin), made)
+        spent = 0.0 if options.resume else time.perf_counter() - begin
+        if spent > seconds:
+            note(f"compiling took all of --budget {options.budget}, so one update is made; --resume trains it longer")
+        trainer.fit(seconds - spent, made)
     total = trainer.recipe.config.updates
     say(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
     if not options.resume:

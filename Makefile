@@ -8,6 +8,8 @@ fly: .venv/installed  ## four Crazyflies on the paper's circle
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
 
 train: .venv/installed  ## full four-motor hover, by the gradient of the simulation; then one flight of it
+	@# An earlier run is kept: it moves to runs/hover-DATE-TIME.
+	if [ -e runs/hover ]; then mv runs/hover runs/hover-$$(date +%Y%m%d-%H%M%S); fi
 	$(BIN)/jaxdrones train hover --output runs/hover
 	$(BIN)/jaxdrones fly --policy runs/hover
 

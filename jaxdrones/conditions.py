@@ -9,10 +9,17 @@ import os
 from jaxdrones.checks import check_choice, check_positive, check_whole
 from jaxdrones.control import CONTROLLERS, pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.limits import check_at_most, check_memory, check_seed
 from jaxdrones.tasks.examples import FLIGHTS
 
 BACKENDS = ("explicit", "bullet")
 PHYSICS_HZ = 240  # at least; raised to a multiple of the control rate
+
+_HIGHEST_HZ = 20_000  # above it a float32 position of 1 m loses what 1 mm/s adds in a step
+_LONGEST = 1e5  # s; later float32 times are further apart than control steps at 120 Hz
+_LOG_BYTES = 400  # of a drone and a control step: trajectory, log, figure
+_PAIR_BYTES = 32  # of two drones, while the effects between them are summed
+_VARIANTS = ("_paper", "_world_axes")  # endings of the names of other models of the same effect
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,14 +68,19 @@ class Conditions:
     def _check(self) -> None:
         flight = FLIGHTS[self.flight]
         check_whole("drones", self.drones)
-        check_whole("control rate (Hz)", self.control_hz)
+        check_at_most("control rate (Hz)", self.control_hz, _HIGHEST_HZ)
         check_positive("duration", self.duration, "s")
+        if self.duration > _LONGEST:
+            raise ValueError(f"duration is {self.duration} s; give at most {_LONGEST:g} s")
+        if self.seed is not None:
+            check_seed("seed", self.seed)
         check_choice("controller", self.controller, CONTROLLERS)
         check_choice("rotors", self.rotors, ROTORS)
         check_choice("integrator", self.integrator, INTEGRATORS)
         check_choice("backend", self.backend, BACKENDS)
         for effect in self.effects:
             check_choice("effect", effect, EFFECTS | PAIRS)
+        _check_once(self.effects)
         if self.drones != flight.drones and not flight.any_number:
             who = ", ".join(flight.labels)
             raise ValueError(f"drones is {self.drones}; the {self.flight} flight takes {flight.drones}: {who}")
@@ -78,6 +90,14 @@ class Conditions:
             raise ValueError(
                 f"duration is {self.duration} s, less than half a control period; give {self.dt:.4g} s or more"
             )
+        size = self.drones * self.steps * _LOG_BYTES
+        if any(effect in PAIRS for effect in self.effects):
+            size += self.drones**2 * _PAIR_BYTES
+        check_memory(
+            f"a flight of {str(self.drones)[:30]} drones for {self.duration:g} s at {self.control_hz} Hz",
+            size,
+            "give fewer drones, a shorter duration or a lower control rate",
+        )
         if self.backend == "bullet" and self.integrator != "semi_implicit_euler":
             raise ValueError(
                 f"integrator is {self.integrator!r}; the bullet backend integrates by itself, leave it out"
@@ -118,3 +138,16 @@ class Conditions:
             f"{integrator} at {self.physics_hz} Hz, {self.rotors} rotors, "
             f"effects: {', '.join(self.effects) or 'none'}, {self.steps * self.dt:g} s"
         )
+
+
+def _check_once(effects: tuple[str, ...]) -> None:
+    """Raise if an effect would be counted twice."""
+    seen: dict[str, str] = {}
+    for effect in effects:
+        kind = effect
+        for ending in _VARIANTS:
+            kind = kind.removesuffix(ending)
+        if kind in seen:
+            both = "twice" if seen[kind] == effect else f"beside {seen[kind]!r}, another model of the same effect"
+            raise ValueError(f"effect {effect!r} is given {both}; give one of them, once")
+        seen[kind] = effect

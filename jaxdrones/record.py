@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.control.pid import rpm_to_pwm
+from jaxdrones.control.pid import VEHICLES, rpm_to_pwm
 
 _BAND = 0.1  # share of the steady error within which a response counts as settled
 _LEAST_BAND = 5e-3  # m or m/s
+_LOST = 1.0  # m or m/s that the error of a drone that diverged exceeds the error at the start
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,17 +32,45 @@ class Record:
     conditions: Any  # what was flown, and how: `as_dict()`, for JSON
 
     @property
+    def late(self) -> np.ndarray:
+        """(K,) whether a time is in the last quarter of the flight."""
+        return self.t >= self.t[-1] * 3 / 4
+
+    @property
     def error(self) -> np.ndarray:
         """(K, n, 1) distance to the target position, m."""
         return np.linalg.norm(self.pos - self.target_pos, axis=-1, keepdims=True)
 
-    def first_not_finite(self) -> tuple[float, str] | None:
-        """Time and name of the first drone whose state is not a number, if any."""
-        broken = ~np.isfinite(self.pos).all(-1)
-        if not broken.any():
-            return None
-        k, i = np.argwhere(broken)[0]
-        return float(self.t[k]), self.labels[i]
+    def not_finite(self) -> dict[str, str]:
+        """Drones whose state is not a number at some time, and from when on."""
+        states = (self.pos, self.quat, self.vel, self.omega, self.rpm)
+        broken = np.any([~np.isfinite(x).all(-1) for x in states], axis=0)
+        return {
+            self.labels[i]: f"the state of {self.labels[i]} is not finite from t = {self.t[broken[:, i]][0]:.3f} s on"
+            for i in np.flatnonzero(broken.any(axis=0))
+        }
+
+    def diverged(self) -> dict[str, str]:
+        """Drones that did not fly what was commanded, and in which way.
+
+        A drone diverged if its state is not finite at some time, or if at some time in the last quarter of the flight
+        it is upside down, or its error (the distance to the target position or the difference to the target velocity)
+        is 1 m or 1 m/s above its error at the start. The paper's four flights, flown well, stay below 0.4 m or m/s and
+        within 30 degrees of level; a drone that is lost is hundreds of metres off.
+        """
+        miss, unit = self._miss()
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.linalg.norm(miss.astype(np.float64), axis=-1)
+            lost = error[self.late].max(axis=0) > error[0] + _LOST
+            x, y = self.quat[self.late, :, 0], self.quat[self.late, :, 1]
+            upside_down = (2 * (x**2 + y**2) > 1).any(axis=0)
+        found = {}
+        for i, label in enumerate(self.labels):
+            if lost[i]:
+                found[label] = f"{label} is {error[self.late, i].max():.3g} {unit} off what was commanded"
+            elif upside_down[i]:
+                found[label] = f"{label} is upside down"
+        return found | self.not_finite()
 
     def results(self, after: float) -> list[dict[str, float | str | None]]:
         """One row of numbers per drone, taken from time `after` (s), or half of a shorter flight, to the end.
@@ -50,11 +79,10 @@ class Record:
         is its mean over the last quarter of the flight. It has settled when it stays within 10 % (or 5 mm, 5 mm/s) of
         that; `None` if it does not before the last quarter. Numbers that are not finite are `None` too.
         """
-        commanded_velocity = np.isnan(self.target_pos).any()
-        miss = self.vel - self.target_vel if commanded_velocity else self.pos - self.target_pos
-        unit = "m_s" if commanded_velocity else "m"
+        miss, unit = self._miss()
+        unit = unit.replace("/", "_")
         late = self.t >= (after if after < self.t[-1] else self.t[-1] / 2)
-        steady = self.t >= self.t[-1] * 3 / 4
+        steady = self.late
         with np.errstate(over="ignore", invalid="ignore"):  # of a drone that broke
             error, speed = np.linalg.norm(miss, axis=-1), np.linalg.norm(self.vel, axis=-1)
             columns = {
@@ -73,8 +101,20 @@ class Record:
             for i, label in enumerate(self.labels)
         ]
 
+    def _miss(self) -> tuple[np.ndarray, str]:
+        """(K, n, 3) difference to what was commanded, and its unit."""
+        if np.isnan(self.target_pos).any():
+            return self.vel - self.target_vel, "m/s"
+        return self.pos - self.target_pos, "m"
+
     def arrays(self, pwm: bool = False) -> dict[str, np.ndarray]:
-        """The log by name, the conditions as JSON; `pwm` adds the Crazyflie's PWM beside the RPM."""
+        """The log by name, the conditions as JSON; `pwm` adds the Crazyflie's PWM beside the RPM.
+
+        Raises:
+            ValueError: PWM is asked for and the vehicle is no Crazyflie.
+        """
+        if pwm:
+            check_pwm(self.conditions.vehicle)
         arrays = {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
         arrays["conditions"] = np.asarray(json.dumps(self.conditions.as_dict()))
         return arrays | {"pwm": rpm_to_pwm(self.rpm)} if pwm else arrays
@@ -95,6 +135,12 @@ class Record:
             for k, t in enumerate(self.t):
                 for i, label in enumerate(self.labels):
                     writer.writerow([t, label, *np.concatenate([array[k, i] for array in arrays.values()])])
+
+
+def check_pwm(vehicle: str) -> None:
+    """Raise unless the Crazyflie's PWM is known of a vehicle's motors."""
+    if vehicle not in VEHICLES:
+        raise ValueError(f"PWM is asked for of {vehicle!r}; it is known of {' and '.join(VEHICLES)} only, leave it out")
 
 
 def divergence(record: Record, other: Record, rows: int = 12) -> list[dict[str, float]]:

@@ -9,6 +9,7 @@ import pytest
 
 from jaxdrones import flights
 from jaxdrones.cli import main
+from jaxdrones.conditions import Conditions
 from jaxdrones.learning import presets
 
 SHORT = ["--duration", "0.25", "--drones", "2"]
@@ -52,15 +53,61 @@ def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypat
     assert main(["fly", "circle", "--no-figure", "--json", "--output", str(tmp_path)]) == 1
     captured = capsys.readouterr()
     assert "the state of drone 1 is not finite from t = 0.108 s on" in captured.err
-    rows = json.loads(captured.out)["results"]
+    assert captured.err.count("\n") == 1
+    report = json.loads(captured.out)
+    assert list(report["diverged"]) == ["drone 1"]
+    rows = report["results"]
     assert rows[0]["rms_error_m"] > 0 and rows[1]["rms_error_m"] is None
     assert (tmp_path / "log.npz").exists()
+
+
+@pytest.mark.parametrize("flight", ["circle", "velocity"])
+def test_a_flight_that_diverges_is_logged_and_reported(flight, tmp_path, capsys):
+    slow = ["fly", flight, "--drones", "2", "--control-hz", "7", "--duration", "4", "--output", str(tmp_path)]
+    assert main([*slow, "--json"]) == 1
+    captured = capsys.readouterr()
+    assert "the flight diverged: drone 0 is" in captured.err and "try a higher --control-hz" in captured.err
+    assert captured.err.count("\n") == 1
+    assert set(json.loads(captured.out)["diverged"]) <= {"drone 0", "drone 1"}
+    assert (tmp_path / "log.npz").exists() and (tmp_path / "flight.png").exists()
+
+
+def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
+    assert main(["fly", "circle", *SHORT, "--json", "--no-figure", "--output", str(tmp_path)]) == 0
+    assert json.loads(capsys.readouterr().out)["diverged"] == {}
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["fly", "cirle"], "did you mean 'circle'"),
+        (["fly", ""], "unknown flight ''"),
+        (["fly", "circle", "--duration", "inf"], "duration is inf"),
+        (["fly", "circle", "--duration", "1e12"], "duration is 1000000000000.0 s; give at most 100000 s"),
+        (["fly", "circle", "--duration", "99999", "--control-hz", "20000"], "needs about 3.2e+03 GB of memory"),
+        (["fly", "circle", "--duration", "1e308"], "give at most 100000 s"),
+        (["fly", "circle", "--drones", "99999999999"], "a flight of 99999999999 drones"),
+        (["fly", "circle", "--drones", "9" * 400], "more than a million GB of memory"),
+        (["fly", "circle", "--drones", "9" * 5000], "invalid int value"),
+        (["fly", "circle", "--drones", "999999", "--duration", "0.1", "--effects", "downwash"], "GB of memory"),
+        (["fly", "circle", "--control-hz", "1000000000"], "control rate (Hz) is 1000000000; give at most 20000"),
+        (["fly", "circle", "--control-hz", "0"], "control rate (Hz) is 0"),
+        (["fly", "circle", "--seed", "-1"], "seed is -1"),
+        (["fly", "circle", "--seed", str(2**70)], "give at most 2147483647"),
+        (["fly", "circle", "--effects", "drag,drag"], "effect 'drag' is given twice"),
+        (["fly", "circle", "--effects", "drag,drag_world_axes"], "'drag_world_axes' is given beside 'drag'"),
+        (["fly", "circle", "--effects", "downwash_paper,downwash"], "'downwash' is given beside 'downwash_paper'"),
+        (["fly", "circle", "--effects", "drag,"], "unknown effect ''"),
+        (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for of 'racer'"),
+        (["fly", "circle", "--video", "folder.mp4"], "--video folder.mp4 cannot be written: Is a directory"),
+        (["fly", "circle", "--video", "file/film.mp4"], "--video file/film.mp4 cannot be written"),
+        (["fly", "circle", "--video", "/proc/film.mp4"], "--video /proc/film.mp4 cannot be written"),
+        (["fly", "circle", "--video", ""], "the path is empty"),
+        (["fly", "circle", "--output", ""], "the path is empty"),
+        (["fly", "--policy", ""], "the path is empty"),
+        (["fly", "--policy", "file"], "file/best.json cannot be read: Not a directory"),
+        (["compare", "circle", "--backends", "explicit,explicit"], "give two different ones"),
+        (["compare", "circle", "--backends", "explicit,gazebo"], "unknown backend 'gazebo'"),
         (["fly", "circle", "--vehicle", "cf9"], "unknown vehicle 'cf9'"),
         (["fly", "circle", "--effects", "drag,magic"], "unknown effect 'magic'"),
         (["fly", "circle", "--integrator", "rk9"], "unknown integrator 'rk9'"),
@@ -81,19 +128,39 @@ def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypat
 )
 def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jaxdrones.cli.conditions.fly", flies_only_to_complain)
+    monkeypatch.setattr("jaxdrones.limits.memory", lambda: 10**10)
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.mp4").mkdir()
     try:
         code = main(arguments)
     except SystemExit as stop:
         code = stop.code
     captured = capsys.readouterr()
     assert code == 2 and captured.out == ""
-    assert message in captured.err and captured.err.count("\n") == 1
+    assert message in captured.err and captured.err.count("\n") == 1 and len(captured.err) < 1200
 
 
-def test_an_output_that_cannot_be_a_folder_is_refused_before_the_flight(tmp_path, capsys):
-    (tmp_path / "file").touch()
-    assert main(["fly", "circle", "--output", str(tmp_path / "file")]) == 2
-    assert "choose another --output" in capsys.readouterr().err
+def flies_only_to_complain(flight, gui=False, progress=None, **options):
+    """In place of `fly`, which would take long where a mistake is not seen at once."""
+    Conditions(flight, **options)
+    if not gui:
+        raise AssertionError("flown")
+    return flights.fly(flight, gui, progress, **options)
+
+
+@pytest.mark.parametrize("name", ["", "log.npz", "log.csv", "flight.png", "cameras"])
+def test_an_output_that_cannot_be_written_is_refused_before_the_flight(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("jaxdrones.cli.conditions.fly", flies_only_to_complain)
+    output = tmp_path / "output"
+    if name in ("", "cameras"):
+        (output / name).parent.mkdir(exist_ok=True)
+        (output / name).touch()
+    else:
+        (output / name).mkdir(parents=True)
+    assert main(["fly", "circle", "--csv", "--cameras", "--output", str(output)]) == 2
+    said = capsys.readouterr().err
+    assert f"{output / name}: " in said and "choose another --output" in said and said.count("\n") == 1
 
 
 def test_list_names_what_can_be_chosen(capsys):
@@ -121,7 +188,7 @@ def test_compare_prints_how_the_backends_part(capsys):
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_flight_in_bullet_is_filmed(tmp_path, capsys):
-    film = tmp_path / "flight.mp4"
+    film = tmp_path / "new" / "flight.mp4"
     arguments = ["fly", "circle", *SHORT, "--backend", "bullet", "--obstacles", "--video", str(film), "--cameras"]
     assert main([*arguments, "--no-figure", "--output", str(tmp_path)]) == 0
     assert film.stat().st_size > 1000 and (tmp_path / "cameras" / "drone 0" / "00000.png").exists()

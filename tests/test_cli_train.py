@@ -4,19 +4,23 @@ import contextlib
 import csv
 import io
 import json
+import shutil
 
 import jax
 import numpy as np
 import pytest
 
 from jaxdrones.cli import main
+from jaxdrones.cli.evaluate import percent, success
 from jaxdrones.learning import checkpoint, training
+from jaxdrones.learning.evaluation import wilson
 from jaxdrones.learning.runs import Run
 
 pytestmark = pytest.mark.float32
 
 SMALL = ["--set", "worlds=4", "--set", "horizon=4", "--set", "sizes=8,", "--set", "duration=0.2"]
 TRAIN = ["train", "hover", *SMALL, "--budget", "4", "--episodes", "8"]
+HOSTS = ["train", "hover", "--hosts", "2", "--host", "0", "--coordinator"]
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +82,132 @@ def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained,
     assert "trained to the end" in capsys.readouterr().err
 
 
+def contents(folder):
+    return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
+
+
+@pytest.fixture
+def nothing_compiles(monkeypatch):
+    def compile(self):
+        raise AssertionError("compiled")
+
+    monkeypatch.setattr(training.Trainer, "compile", compile)
+
+
+@pytest.mark.parametrize("more", [[], ["--seed", "3"], ["--seeds", "2"], ["--algo", "shac"], ["--budget", "1s"]])
+def test_a_finished_training_is_not_replaced_unasked(more, trained, nothing_compiles, capsys):
+    folder, _ = trained
+    before = contents(folder)
+    assert main([*TRAIN[:-4], *more, "--output", str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert f"{folder} holds a finished training; train it longer with --resume --budget N, replace it with" in said
+    assert said.count("\n") == 1 and contents(folder) == before
+
+
+def test_the_default_folder_and_those_of_seeds_are_not_replaced_unasked(
+    trained, tmp_path, nothing_compiles, capsys, monkeypatch
+):
+    folder, _ = trained
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(folder, "runs/hover/seed-1")
+    before = contents(tmp_path / "runs/hover/seed-1")
+    assert main(["train", "hover", "--seeds", "2"]) == 2
+    assert "seed-1 holds a finished training" in capsys.readouterr().err
+    assert main(["train", "hover", "--resume"]) == 2
+    assert "holds no training to go on with; give --seeds N, or leave out --resume" in capsys.readouterr().err
+    shutil.move("runs/hover/seed-1", "runs/moved")
+    shutil.rmtree("runs/hover")
+    shutil.move("runs/moved", "runs/hover")
+    assert main(["train", "hover"]) == 2
+    assert main(["train", "hover", "--seeds", "2", "--resume"]) == 2
+    assert "holds the training of one seed; leave out --seeds" in capsys.readouterr().err
+    assert contents(tmp_path / "runs/hover") == before
+
+
+@pytest.mark.parametrize(
+    "name", ["best.json", "last.msgpack", "state.msgpack", "best.zip", "progress.csv", "report.json"]
+)
+def test_whatever_is_left_of_a_run_is_not_replaced_unasked(name, nothing_compiles, tmp_path, capsys):
+    (tmp_path / name).write_text("mine")
+    assert main([*TRAIN, "--output", str(tmp_path)]) == 2
+    assert "replace it with --overwrite, or choose another --output" in capsys.readouterr().err
+    assert contents(tmp_path) == {name: b"mine"}
+
+
+def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, tmp_path, monkeypatch, capsys):
+    folder = shutil.copytree(trained[0], tmp_path / "hover")
+    (folder / "notes.txt").write_text("of other people")
+    before = contents(folder)
+    overwrite = [*TRAIN, "--output", str(folder), "--overwrite", "--no-figure"]
+
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Trainer, "compile", interrupted)
+        assert main(overwrite) == 130
+    for wrong in (["--set", "horizon=0"], ["--set", "gradient=steep"], ["--resume"]):
+        assert main([*overwrite, *wrong]) == 2
+    assert contents(folder) == before
+    assert main([*overwrite, "--seed", "5"]) == 0
+    after = contents(folder)
+    assert after["notes.txt"] == b"of other people" and after["best.msgpack"] != before["best.msgpack"]
+    assert Run(folder).told("state", "seed") == 5 and Run(folder).report()["updates"] == 4
+    assert [row["update"] for row in Run(folder).history()] == [1, 2, 3, 4]
+
+
+def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, tmp_path, capsys, monkeypatch):
+    folder = shutil.copytree(trained[0], tmp_path / "hover")
+    resume = ["train", "hover", "--output", str(folder), "--resume", "--no-figure"]
+    before, best = contents(folder), tuple(Run(folder).told("best", "score"))
+    for wrong, message in [
+        ([], "trained to the end, 4 updates; train longer with --budget N more or 60s"),
+        (["--set", "updates=4"], "trained to the end"),
+        (["--set", "updates=3"], "began with updates 4, not 3"),
+        (["--budget", "2147483647"], "updates is 2147483651; give at most"),
+        (["--budget", "2", "--episodes", "9"], "began with episodes 8, not 9"),
+        (["--budget", "2", "--set", "worlds=8"], "began with worlds 4, not 8"),
+        (["--budget", "2", "--seed", "1"], "began with seed 0, not 1"),
+    ]:
+        assert main([*resume, *wrong]) == 2
+        assert message in capsys.readouterr().err
+    assert contents(folder) == before
+
+    assert main([*resume, "--budget", "2"]) == 0
+    assert "updates: 6, 4 of them made" in capsys.readouterr().out
+    assert Run(folder).report()["updates"] == 6 == Run(folder).told("state", "update")
+    assert rewards(folder)[:4] == rewards(trained[0]) and len(rewards(folder)) == 6
+    assert at_least(Run(folder).told("best", "score"), best)
+
+    advance, calls = training.Trainer.advance, []
+
+    def interrupted(self, state, updates):
+        calls.append(updates)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return advance(self, state, updates)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Trainer, "advance", interrupted)
+        assert main([*resume, "--set", "updates=12"]) == 130
+    assert Run(folder).report() is None
+    made = Run(folder).told("state", "update")
+    assert 6 < made < 12
+    assert main([*resume, "--budget", "5"]) == 2
+    assert "began with updates 12, not 5" in capsys.readouterr().err
+    assert main([*resume, "--budget", "0.001s"]) == 0
+    assert Run(folder).report()["updates"] == made + 1 == len(rewards(folder))
+    assert at_least(Run(folder).told("best", "score"), best)
+
+
+def rewards(folder):
+    return [row["reward"] for row in Run(folder).history()]
+
+
+def at_least(score, before):
+    return score[0] > before[0] or score[1] >= before[1]
+
+
 def without_seconds(folder):
     with (folder / "progress.csv").open() as file:
         return [{name: x for name, x in row.items() if name != "seconds"} for row in csv.DictReader(file)]
@@ -95,7 +225,9 @@ def test_numbers_that_are_not_finite_stop_training_and_the_best_policy_stays(tmp
 def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     arguments = ["train", "hover", *SMALL, "--algo", "shac", "--budget", "0.001s", "--episodes", "8", "--seeds", "2"]
     assert main([*arguments, "--seed", "3", "--json", "--output", str(tmp_path)]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    captured = capsys.readouterr()
+    assert "warning: compiling took all of --budget 0.001s, so one update is made" in captured.err
+    printed = json.loads(captured.out)
     assert [report["seed"] for report in printed["seeds"]] == [3, 4] and printed["best_seed"] in (3, 4)
     assert all(report["updates"] == 1 for report in printed["seeds"])  # the least, when there is no time
     best = checkpoint.load(tmp_path / "best")
@@ -118,6 +250,39 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
         (["train", "hover", "--budget", "long"], "--budget is 'long'; give updates"),
         (["train", "hover", "--seeds", "0"], "seeds is 0"),
         (["train", "hover", "--resume"], "holds no training to go on with"),
+        (["train", "hover", "--resume", "--overwrite"], "--resume and --overwrite are given"),
+        (["train", "hover", "--algo", ""], "unknown algorithm ''"),
+        (["train", "hover", "--seed", "-1"], "seed is -1"),
+        (["train", "hover", "--seed", str(2**70)], "give at most 2147483647"),
+        (["train", "hover", "--seeds", "2", "--seed", str(2**31 - 1)], "the last seed is 2147483648"),
+        (["train", "hover", "--seeds", "1000000000"], "seeds is 1000000000; give at most 1000"),
+        (["train", "hover", "--episodes", "1000000000000"], "episodes is 1000000000000; give at most"),
+        (["train", "hover", "--episodes", "2000000000"], "2,000,000,000 episodes needs about 128 GB of memory"),
+        (["train", "hover", "--set", "worlds=1000000000000"], "worlds is 1000000000000; give at most"),
+        (
+            ["train", "hover", "--set", "worlds=2000000000"],
+            "2000000000 worlds x 64 control steps x 1 drones needs about",
+        ),
+        (["train", "hover", "--set", "sizes=1000000000,"], "smaller networks"),
+        (["train", "hover", "--set", "drones=1000000000000"], "a team of 1,000,000,000,000 drones needs about"),
+        (["train", "hover", "--set", "updates=3000000000"], "updates is 3000000000; give at most"),
+        (["train", "hover", "--set", "surrogate=3"], "unknown setting 'surrogate'"),
+        (["train", "hover", "--set", "task=x"], "--set task is no setting"),
+        (["train", "hover", "--set", "worlds=3", "--set", "worlds=4"], "--set worlds is given twice: 3 and 4"),
+        (["train", "hover", "--set", "updates=3", "--budget", "4"], "--set updates=3 is given beside --budget"),
+        (["train", "hover", "--set", "disturb=3"], "disturb"),
+        (["train", "hover", "--set", "worlds=" + "9" * 5000], "worlds is"),
+        (["train", "hover", "--budget", "1e30s"], "or time up to 1000h"),
+        (["train", "hover", "--budget", "99999999999"], "--budget is '99999999999'; give updates"),
+        (["train", "hover", "--output", ""], "the path is empty"),
+        (["train", "hover", "--hosts", "2"], "give all of --hosts, --host and --coordinator"),
+        ([*HOSTS, "127.0.0.1:99999"], "coordinator is '127.0.0.1:99999'; give ADDRESS:PORT"),
+        ([*HOSTS, "127.0.0.1:0"], "coordinator is '127.0.0.1:0'; give ADDRESS:PORT"),
+        ([*HOSTS, "x" * 300 + ":80"], "did not meet all others"),
+        (["eval", ""], "the path is empty"),
+        (["eval", "file"], "file/best.json cannot be read: Not a directory"),
+        (["eval", "nowhere", "--seed", "-1"], "seed is -1"),
+        (["eval", "nowhere", "--episodes", "1000000000000"], "episodes is 1000000000000"),
         (["train", "hover", "--output", "file"], "choose another --output"),
         (["eval", "nowhere"], "no checkpoint at nowhere/best"),
         (["fly", "--policy", "nowhere"], "no checkpoint at nowhere/best"),
@@ -127,10 +292,39 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
 )
 def test_a_mistake_is_one_line_before_anything_is_trained(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jaxdrones.limits.memory", lambda: 10**10)
     (tmp_path / "file").touch()
-    assert main(arguments) == 2
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = stop.code
     captured = capsys.readouterr()
-    assert captured.out == "" and message in captured.err and captured.err.count("\n") == 1
+    assert code == 2 and captured.out == "" and message in captured.err and captured.err.count("\n") == 1
+    assert len(captured.err) < 1200
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("successes", "episodes", "text"),
+    [
+        (9_999, 10_000, "99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %"),
+        (10_000, 10_000, "100.00 %, 10,000 of 10,000, 95 % interval 99.962 to 100.000 %"),
+        (999, 1000, "99.9 %, 999 of 1,000, 95 % interval 99.44 to 99.98 %"),
+        (1, 3, "33.3 %, 1 of 3, 95 % interval 6.15 to 79.23 %"),
+        (0, 1, "0.0 %, 0 of 1, 95 % interval 0.00 to 79.35 %"),
+    ],
+)
+def test_eval_counts_the_successes(successes, episodes, text):
+    assert (
+        success({"success": successes / episodes, "episodes": episodes, "interval": wilson(successes, episodes)})
+        == text
+    )
+
+
+@pytest.mark.parametrize("episodes", [2, 7, 199, 201, 1000, 1001, 5000, 10_000, 10_001, 123_456_789])
+def test_all_episodes_but_one_never_read_as_all_and_one_never_as_none(episodes):
+    assert float(percent((episodes - 1) / episodes, episodes).split()[0]) < 100
+    assert float(percent(1 / episodes, episodes).split()[0]) > 0
 
 
 def test_eval_prints_one_object(trained, capsys):
@@ -138,6 +332,7 @@ def test_eval_prints_one_object(trained, capsys):
     assert main(["eval", str(folder), "--episodes", "8", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["evaluation"]["episodes"] == 8 and printed["recipe"]["task"] == "hover"
+    assert printed["evaluation"]["successes"] == 0
     assert set(printed["evaluation"]["error_percentiles"]) == {"50", "95", "99"}
 
 

@@ -126,6 +126,11 @@ def test_an_interrupted_training_keeps_the_best_and_is_not_replaced_unasked(tmp_
     assert "did not finish; replace it with --overwrite" in capsys.readouterr().err
     assert main([*train, "--overwrite"]) == 0
     assert json.loads((tmp_path / "report.json").read_text())["updates"] == 2
+    capsys.readouterr()
+    assert main(train) == 2
+    assert (
+        "holds a finished training; replace it with --overwrite, or choose another --output" in capsys.readouterr().err
+    )
     assert main(["eval", str(tmp_path), "--episodes", "2", "--last"]) == 0
     assert "policy of update 2" in capsys.readouterr().out
 

@@ -21,12 +21,14 @@ def test_the_circle_is_flown_with_the_known_steady_lag(circle):
     error = np.linalg.norm(circle.pos - circle.target_pos, axis=-1)
     np.testing.assert_allclose(error[circle.t > 4].mean(0), 0.097, atol=0.003)
     np.testing.assert_allclose([row["rms_error_m"] for row in results(circle)], 0.0955, atol=0.0025)
+    assert circle.diverged() == {}
 
 
 def test_the_circle_has_smooth_rotors_at_120_hz_and_a_limit_cycle_at_48_hz(circle):
     assert max(row["rpm_std"] for row in results(circle)) < 1
     cycling = flights.fly("circle", drones=1, control_hz=48, duration=6)
     assert results(cycling)[0]["rpm_std"] > 300
+    assert cycling.diverged() == {}
 
 
 def test_every_drone_of_the_circle_flies_alike(circle):
@@ -37,6 +39,7 @@ def test_every_drone_of_the_circle_flies_alike(circle):
 
 def test_the_velocity_flight_reaches_its_steps_and_reverses_them():
     record = flights.fly("velocity")
+    assert record.diverged() == {}
     assert all(row["steady_error_m_s"] < 2e-3 for row in results(record))
     before, after = record.vel[np.searchsorted(record.t, 1.4)], record.vel[-1]
     np.testing.assert_allclose(np.linalg.norm(after, axis=-1), 0.99 * 0.25, atol=2e-3)
@@ -46,13 +49,17 @@ def test_the_velocity_flight_reaches_its_steps_and_reverses_them():
 def test_ground_effect_lifts_a_take_off_higher_and_faster():
     # The reference: 0.1758 against 0.1650 m and 0.4365 against 0.3607 m/s. It starts with an unpowered
     # control period and Bullet's damping, hence 2 mm and 2 mm/s.
-    rows = results(flights.fly("ground-effect"))
+    record = flights.fly("ground-effect")
+    rows = results(record)
+    assert record.diverged() == {}
     np.testing.assert_allclose([row["highest_z_m"] for row in rows], [0.1758, 0.1650], atol=2.5e-3)
     np.testing.assert_allclose([row["peak_vz_m_s"] for row in rows], [0.4365, 0.3607], atol=2.5e-3)
 
 
 def test_in_downwash_the_lower_drone_dips_and_the_upper_does_not():
-    upper, lower = results(flights.fly("downwash"))
+    record = flights.fly("downwash")
+    upper, lower = results(record)
+    assert record.diverged() == {}
     assert abs(lower["lowest_z_m"] - 0.472) < 2e-3  # the reference's dip from 0.5 m
     assert upper["lowest_z_m"] > 0.999
     free = results(flights.fly("downwash", effects=[]))[1]
@@ -66,8 +73,9 @@ def test_the_jet_model_pushes_less_than_equation_6_but_visibly():
 
 @pytest.mark.parametrize("vehicle", ["cf2p", "hb", "racer"])
 def test_every_vehicle_flies_the_circle(vehicle):
-    rows = results(flights.fly("circle", vehicle=vehicle, drones=2, duration=6.0))
-    assert all(row["steady_error_m"] < 0.125 for row in rows)
+    record = flights.fly("circle", vehicle=vehicle, drones=2, duration=6.0)
+    assert all(row["steady_error_m"] < 0.125 for row in results(record))
+    assert record.diverged() == {}
 
 
 def test_the_same_seed_is_the_same_flight_and_another_seed_another():

@@ -2,9 +2,17 @@
 
 import argparse
 import contextlib
+import errno
+import json
+import math
+import os
 import sys
+from pathlib import Path
+from typing import Any
 
 INTERRUPTED = 130  # exit code
+
+_LONGEST = 1000  # characters of a complaint
 
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
@@ -33,13 +41,61 @@ class Parser(argparse.ArgumentParser):
     """A parser whose complaints are one line."""
 
     def error(self, message):  # noqa: D102
-        self.exit(2, f"jaxdrones: error: {message}; see {self.prog} --help\n")
+        self.exit(complain(f"{shortened(message)}; see {self.prog} --help"))
 
 
 def complain(message: str, code: int = 2) -> int:
     """One line on stderr; returns the exit code."""
-    print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{message}", file=sys.stderr)
+    print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{shortened(message)}", file=sys.stderr)
     return code
+
+
+def note(message: str) -> None:
+    """One line on stderr about what is done, but maybe not as it was meant."""
+    print(f"jaxdrones: warning: {shortened(message)}", file=sys.stderr)
+
+
+def shortened(message: str) -> str:
+    """A message on one line, without the middle of what a user gave at great length."""
+    line = " ".join(message.split("\n"))
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+
+
+def folder(text: str) -> Path:
+    """A path as an option names it; an empty one, as of a variable that is not set, would be the current folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("the path is empty; name one, or leave the option out")
+    return Path(text)
+
+
+def as_json(results: dict[str, Any]) -> str:
+    """One line of JSON; numbers that are not finite, which JSON lacks, are null."""
+    return json.dumps(_finite(results), allow_nan=False)
+
+
+def _finite(x):
+    if isinstance(x, dict):
+        return {name: _finite(value) for name, value in x.items()}
+    if isinstance(x, list | tuple):
+        return [_finite(value) for value in x]
+    return None if isinstance(x, float) and not math.isfinite(x) else x
+
+
+def check_writable(file: Path) -> None:
+    """See that a file can be written, and make its folder; an old file stays until it is replaced.
+
+    Raises:
+        OSError: it cannot; names it.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if file.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
+    probe = file.with_name(f".{file.name}.probe")
+    try:
+        probe.touch()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(file)) from error
+    probe.unlink()
 
 
 def bar(total: int | None, what: str, unit: str, initial: int = 0):
@@ -56,6 +112,9 @@ def table(results: list[dict]) -> str:
     """Columns aligned under their headings, one line per drone."""
     names = list(results[0])
     rows = [[_COLUMNS[name][0] for name in names]]
-    rows += [["-" if row[name] is None else _COLUMNS[name][1].format(row[name]) for name in names] for row in results]
+    rows += [
+        ["-" if _finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names]
+        for row in results
+    ]
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)

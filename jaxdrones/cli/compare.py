@@ -1,10 +1,10 @@
 """`jaxdrones compare`."""
 
 import argparse
-import json
 
-from jaxdrones.cli.common import table
-from jaxdrones.cli.conditions import add_conditions, flown
+from jaxdrones.checks import check_choice
+from jaxdrones.cli.common import as_json, table
+from jaxdrones.cli.conditions import add_conditions, flown, warn
 from jaxdrones.conditions import BACKENDS
 from jaxdrones.record import divergence
 from jaxdrones.tasks.examples import FLIGHTS
@@ -26,14 +26,17 @@ def add(commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    names = options.backends.split(",")
-    if len(names) != 2:
-        raise ValueError(f"--backends is {options.backends!r}; give two, for example explicit,bullet")
-    first, second = (flown(options, backend=name) for name in names)
-    rows = divergence(first, second)
+    names = [name.strip() for name in options.backends.split(",")]
+    if len(set(names)) != 2 or len(names) != 2:
+        raise ValueError(f"--backends is {options.backends!r}; give two different ones, for example explicit,bullet")
+    for name in names:
+        check_choice("backend", name, BACKENDS)
+    records = [flown(options, backend=name) for name in names]
+    rows = divergence(*records)
+    diverged = {name: record.diverged() for name, record in zip(names, records, strict=True)}
     if options.json:
-        print(json.dumps({"flight": options.flight, "backends": names, "divergence": rows}))
+        print(as_json({"flight": options.flight, "backends": names, "divergence": rows, "diverged": diverged}))
     else:
         print(f"{options.flight}: {names[0]} against {names[1]}, largest difference over the drones")
         print(table(rows))
-    return 0
+    return warn(diverged[names[0]] or diverged[names[1]])

@@ -2,13 +2,16 @@
 
 import argparse
 import contextlib
+from typing import Any
 
 from jaxdrones import assets
-from jaxdrones.cli.common import bar
+from jaxdrones.cli.common import bar, complain
+from jaxdrones.conditions import Conditions
 from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights import fly
 from jaxdrones.record import Record
+from jaxdrones.urdf import load_params
 
 
 def add_conditions(parser: argparse.ArgumentParser) -> None:
@@ -27,20 +30,32 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
 def flown(options: argparse.Namespace, **more) -> Record:
     """The flight that was asked for, behind a progress bar."""
     with progress() as tell:
-        return fly(
-            options.flight,
-            vehicle=options.vehicle,
-            drones=options.drones,
-            effects=_names(options.effects),
-            controller=options.controller,
-            control_hz=options.control_hz,
-            duration=options.duration,
-            rotors=options.rotors,
-            integrator=options.integrator,
-            seed=options.seed,
-            progress=tell,
-            **more,
-        )
+        return fly(options.flight, progress=tell, **_asked(options), **more)
+
+
+def check_conditions(options: argparse.Namespace, **more) -> None:
+    """Raise `ValueError` if that flight cannot be flown."""
+    conditions = Conditions(options.flight, **_asked(options), **more)
+    load_params(conditions.vehicle)
+
+
+def _asked(options: argparse.Namespace) -> dict[str, Any]:
+    """Fields of `Conditions`."""
+    names = ("vehicle", "drones", "controller", "control_hz", "duration", "rotors", "integrator", "seed")
+    return {name: getattr(options, name) for name in names} | {"effects": _names(options.effects)}
+
+
+def warn(diverged: dict[str, str]) -> int:
+    """Say on stderr that a flight diverged; returns the exit code.
+
+    Args:
+        diverged: what `Record.diverged` found, by drone.
+    """
+    if not diverged:
+        return 0
+    others = f" (and {len(diverged) - 1} more)" if len(diverged) > 1 else ""
+    what = f"the flight diverged: {next(iter(diverged.values()))}{others}"
+    return complain(f"{what}; try a higher --control-hz, another --controller, or fewer --effects", 1)
 
 
 def _names(text: str | None) -> list[str] | None:

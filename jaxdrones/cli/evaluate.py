@@ -1,8 +1,9 @@
 """`jaxdrones eval`."""
 
 import argparse
-import json
-from pathlib import Path
+import math
+
+from jaxdrones.cli.common import as_json, folder
 
 
 def add(commands) -> None:
@@ -13,7 +14,9 @@ def add(commands) -> None:
         description="Fly the best policy of a run for many episodes: success with its 95 % interval, errors, ends.",
         allow_abbrev=False,
     )
-    parser.add_argument("policy", type=Path, metavar="RUN", help="folder of `jaxdrones train`, for example runs/hover")
+    parser.add_argument(
+        "policy", type=folder, metavar="RUN", help="folder of `jaxdrones train`, for example runs/hover"
+    )
     parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="(1000)")
     parser.add_argument("--seed", type=int, default=0, metavar="K", help="of starts and noise (0)")
     parser.add_argument("--last", action="store_true", help="the newest policy in place of the best")
@@ -24,20 +27,21 @@ def add(commands) -> None:
 def _evaluate(options: argparse.Namespace) -> int:
     import jax
 
-    from jaxdrones.checks import check_whole
     from jaxdrones.learning import evaluate
     from jaxdrones.learning.runs import as_dict, run_in
+    from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 
-    check_whole("episodes", options.episodes)
+    check_at_most("episodes", options.episodes, LARGEST_COUNT)
+    check_seed("seed", options.seed)
     run, name = run_in(options.policy), "last" if options.last else "best"
-    recipe, about = run.recipe(), run.about(name)
+    recipe, update = run.recipe(name), run.told(name, "update")
     env = recipe.env()
     report = as_dict(evaluate(env, run.policy(name, env), jax.random.key(1_000_000 + options.seed), options.episodes))
     if options.json:
-        kept = {"run": str(options.policy), "policy": name, "update": about["update"], "seed": options.seed}
-        print(json.dumps(kept | {"recipe": recipe.as_dict(), "evaluation": report}))
+        kept = {"run": str(options.policy), "policy": name, "update": update, "seed": options.seed}
+        print(as_json(kept | {"recipe": recipe.as_dict(), "evaluation": report}))
     else:
-        print(f"{described(recipe)}: policy of update {about['update']}")
+        print(f"{described(recipe)}: policy of update {update}")
         print(evaluation_table(report))
     return 0
 
@@ -50,13 +54,12 @@ def described(recipe) -> str:
 
 def evaluation_table(report: dict) -> str:
     """What `runs.as_dict` made of an evaluation, in lines."""
-    low, high = report["interval"]
-    error = report["error_percentiles"]
-    ends = ", ".join(f"{name} {100 * share:.1f} %" for name, share in report["ends"].items()) or "none"
+    episodes, error = report["episodes"], report["error_percentiles"]
+    ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["ends"].items()) or "none"
     others = ", ".join(f"{name} {x:.3g}" for name, x in report["metrics"].items() if name not in ("error",))
     rows = [
-        ["episodes", f"{report['episodes']}, {report['length']:.2f} s long on average"],
-        ["success", f"{100 * report['success']:.1f} %, 95 % interval {100 * low:.1f} to {100 * high:.1f} %"],
+        ["episodes", f"{episodes:,}, {report['length']:.2f} s long on average"],
+        ["success", success(report)],
         [
             "error in the end",
             f"median {_length(error['50'])}, 95 % {_length(error['95'])}, 99 % {_length(error['99'])}",
@@ -68,6 +71,25 @@ def evaluation_table(report: dict) -> str:
     ]
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"  {name.ljust(width)}  {text}" for name, text in rows if text)
+
+
+def success(report: dict) -> str:
+    """Share, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
+    episodes = report["episodes"]
+    low, high = (100 * x for x in report["interval"])
+    digits = _digits(episodes) + 1
+    count = f"{round(report['success'] * episodes):,} of {episodes:,}"
+    return f"{percent(report['success'], episodes)}, {count}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"
+
+
+def percent(share: float, episodes: int) -> str:
+    """A share of the episodes, with so many digits that all but one of them do not read as all."""
+    return f"{100 * share:.{_digits(episodes)}f} %"
+
+
+def _digits(episodes: int) -> int:
+    """After the point of a percentage: one episode is at least one unit of the last digit."""
+    return max(1, math.ceil(math.log10(episodes)) - 2)
 
 
 def _length(x: float) -> str:

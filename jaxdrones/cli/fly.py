@@ -2,16 +2,16 @@
 
 import argparse
 import functools
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import complain, table
-from jaxdrones.cli.conditions import add_conditions, flown, progress
+from jaxdrones.cli.common import as_json, check_writable, complain, folder, table
+from jaxdrones.cli.conditions import add_conditions, check_conditions, flown, progress, warn
 from jaxdrones.conditions import BACKENDS
 from jaxdrones.flights import scene_of
-from jaxdrones.record import Record
+from jaxdrones.limits import check_seed
+from jaxdrones.record import Record, check_pwm
 from jaxdrones.render import plots, video
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.tasks.examples import FLIGHTS
@@ -28,20 +28,26 @@ def add(commands) -> None:
         description="Fly one of the paper's control examples, or an episode of a trained policy (--policy RUN);\n"
         "writes a log and a figure, prints a table of results.\n\n"
         + "\n".join(f"  {name:14} {flight.summary}" for name, flight in FLIGHTS.items()),
-        epilog="What is left out is the flight's own. `jaxdrones list` shows the names to choose from.",
+        epilog="What is left out is the flight's own. `jaxdrones list` shows the names to choose from.\n\n"
+        "Exit code 1 says that a flight diverged: at the end a drone is upside down, or its error is 1 m (or 1 m/s)\n"
+        "larger than at the start. Files of an earlier flight in --output are replaced, other files stay.",
         allow_abbrev=False,
     )
     parser.add_argument("flight", metavar="FLIGHT", nargs="?", help=", ".join(FLIGHTS))
     add_conditions(parser)
-    parser.add_argument("--policy", type=Path, metavar="RUN", help="in place of FLIGHT: a folder of `jaxdrones train`")
+    parser.add_argument(
+        "--policy", type=folder, metavar="RUN", help="in place of FLIGHT: a folder of `jaxdrones train`"
+    )
     parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
     parser.add_argument("--obstacles", action="store_true", help="put the paper's obstacles up (bullet)")
     parser.add_argument("--gui", action="store_true", help="watch in Bullet's window, with motor sliders (bullet)")
-    parser.add_argument("--video", type=Path, metavar="FILE", help="film the flight as .mp4 or .gif; either backend")
+    parser.add_argument("--video", type=folder, metavar="FILE", help="film the flight as .mp4 or .gif; either backend")
     parser.add_argument("--cameras", action="store_true", help="write what each drone sees as PNG; either backend")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="folder of log and figure (runs/FLIGHT, RUN/flight)")
+    parser.add_argument(
+        "--output", type=folder, metavar="DIR", help="folder of log and figure (runs/FLIGHT, RUN/flight)"
+    )
     parser.add_argument("--csv", action="store_true", help="write the log as CSV too")
-    parser.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM beside the RPM")
+    parser.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM beside the RPM (cf2x, cf2p)")
     parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=functools.partial(_fly, parser))
@@ -61,17 +67,24 @@ def _fly(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         plots.check_matplotlib()
     if options.video:
         video.check_video(options.video)
+    if options.video or options.cameras:
+        from jaxdrones.render import replay  # noqa: F401  says which extra to install
     return _fly_policy(options) if options.policy is not None else _fly_example(options)
 
 
 def _fly_example(options: argparse.Namespace) -> int:
+    check_choice("flight", options.flight, FLIGHTS)
+    if options.pwm:
+        check_pwm(options.vehicle)
     output = options.output or Path("runs") / options.flight
-    output.mkdir(parents=True, exist_ok=True)
+    check_conditions(options, backend=options.backend, obstacles=options.obstacles)
+    _check_files(options, output)
     record = flown(options, backend=options.backend, obstacles=options.obstacles, gui=options.gui)
     example = FLIGHTS[options.flight]
     title = f"{options.flight}: {example.summary}"
     files = _write(record, options, output, title, example.panels, scene_of(record.conditions))
-    return _report(options, record, record.results(example.settled), files)
+    _report(options, record, record.results(example.settled), files, record.diverged())
+    return warn(record.diverged())
 
 
 def _fly_policy(options: argparse.Namespace) -> int:
@@ -83,10 +96,15 @@ def _fly_policy(options: argparse.Namespace) -> int:
     check_choice("backend", options.backend, BACKENDS)
     run, seed = run_in(options.policy), options.seed or 0
     recipe = run.recipe()
+    check_seed("seed", seed)
+    vehicle = str(recipe.options.get("vehicle", "cf2x"))
+    if options.pwm:
+        check_pwm(vehicle)
     output = options.output or options.policy / "flight"
-    output.mkdir(parents=True, exist_ok=True)
     with recipe.env(backend=options.backend) as env, progress() as tell:
-        episode = fly_episode(env, run.policy(env=env), jax.random.key(seed), tell or (lambda share: None))
+        policy = run.policy(env=env)
+        _check_files(options, output)
+        episode = fly_episode(env, policy, jax.random.key(seed), tell or (lambda share: None))
     conditions = PolicyFlight(
         str(options.policy),
         recipe.task,
@@ -94,7 +112,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
         recipe.realistic,
         options.backend,
         seed,
-        str(recipe.options.get("vehicle", "cf2x")),
+        vehicle,
         recipe.options,
     )
     record = record_of(episode, conditions)
@@ -108,16 +126,23 @@ def _fly_policy(options: argparse.Namespace) -> int:
         "duration": float(record.t[-1]),
         "metrics": {name: x[-1].astype(float).tolist() for name, x in episode.metrics.items()},
     }
-    return _report(options, record, results, files, end)
+    broken = record.not_finite()
+    _report(options, record, results, files, broken, end)
+    return complain(next(iter(broken.values())), 1) if broken else 0
 
 
 def _report(
-    options: argparse.Namespace, record: Record, results: list, files: list[Path], end: dict | None = None
-) -> int:
+    options: argparse.Namespace,
+    record: Record,
+    results: list,
+    files: list[Path],
+    diverged: dict[str, str],
+    end: dict | None = None,
+) -> None:
     """Print what came of it; `end` is of an episode."""
     if options.json:
         about = record.conditions.as_dict() | (end or {})
-        print(json.dumps(about | {"results": results, "files": list(map(str, files))}))
+        print(as_json(about | {"results": results, "diverged": diverged, "files": list(map(str, files))}))
     else:
         print(record.conditions)
         print(table(results))
@@ -127,10 +152,20 @@ def _report(
             print(f"(from {_LATE * end['duration']:.2f} s on)")
             print(f"{how}: return {end['return']:.1f}, {end['duration']:.2f} s, {why}")
         print("wrote " + ", ".join(map(str, files)))
-    broken = record.first_not_finite()
-    if broken:
-        return complain(f"the state of {broken[1]} is not finite from t = {broken[0]:.3f} s on", 1)
-    return 0
+
+
+def _check_files(options: argparse.Namespace, output: Path) -> None:
+    """See that all that is asked for can be written, before anything is flown."""
+    names = ["log.npz", *["log.csv"] * options.csv, *["flight.png"] * (not options.no_figure)]
+    for name in names:
+        check_writable(output / name)
+    if options.cameras:
+        (output / "cameras").mkdir(exist_ok=True)
+    if options.video:
+        try:
+            check_writable(options.video)
+        except OSError as error:
+            raise ValueError(f"--video {options.video} cannot be written: {error.strerror}; choose another") from None
 
 
 def _write(

@@ -1,17 +1,21 @@
 """`jaxdrones train`."""
 
 import argparse
+import dataclasses
 import time
 from pathlib import Path
 
-from jaxdrones.checks import check_choice, check_whole
+from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
-from jaxdrones.cli.common import INTERRUPTED, complain
+from jaxdrones.cli.common import INTERRUPTED, complain, folder, note
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
-from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, kept, quiet, settings
+from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, fitting, kept, once, quiet, settings
 from jaxdrones.envs import TASKS
+from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.render import plots
+
+_MOST_SEEDS = 1000
 
 
 def add(commands) -> None:
@@ -26,7 +30,14 @@ def add(commands) -> None:
         "  progress.csv   a line per update; the events file beside it is for TensorBoard\n"
         "  curve.png      how training went\n"
         "  report.json    the evaluation, and what it took\n\n"
-        "Ctrl-C keeps the best policy and the state.\n\n"
+        "Ctrl-C keeps the best policy and the state. A run that is in --output, finished or not, is never replaced\n"
+        "without --overwrite.\n\n"
+        "  --resume                     go on with a run that was stopped, as it was asked for\n"
+        "  --resume --budget 100        train a finished run 100 updates longer\n"
+        "  --resume --budget 60s        train on for 60 s, without compiling, a run that was stopped or finished\n"
+        "  --resume --set updates=400   train on to 400 updates in all\n\n"
+        "A run that is trained longer goes on as if all updates had been asked for at the start: the learning rate\n"
+        "rises to what it would be then, and falls to the new end. The best policy stays unless a better one comes.\n\n"
         "With --library sb3, Stable-Baselines3 trains the paper's network (512-512-256-128, ReLU); `hover` then is\n"
         "`paper-hover`, the one-dimensional hover of the paper's equation 12, and there is no state to resume from.",
         epilog="JAX_COMPILATION_CACHE_DIR=folder keeps compiled programs, so that a second training starts sooner.\n\n"
@@ -58,9 +69,15 @@ def add(commands) -> None:
         "of the environment (vehicle, period, drones)",
     )
     parser.add_argument("--episodes", type=int, metavar="N", help="of every evaluation (1000, with sb3 100)")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="folder of the run (runs/TASK, runs/TASK-sb3-ALGO)")
-    parser.add_argument("--resume", action="store_true", help="go on with the run in --output, as it was asked for")
-    parser.add_argument("--overwrite", action="store_true", help="replace a run in --output that did not finish")
+    parser.add_argument(
+        "--output", type=folder, metavar="DIR", help="folder of the run (runs/TASK, runs/TASK-sb3-ALGO)"
+    )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with the run in --output; with --budget train a finished one longer",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
     hosts.add_options(parser)
     parser.add_argument("--no-figure", action="store_true", help="draw no learning curve; needs no matplotlib")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
@@ -81,28 +98,38 @@ def _train(options: argparse.Namespace) -> int:
     with checked():
         if not options.no_figure:
             plots.check_matplotlib()
-        check_whole("seeds", options.seeds)
         output = options.output or Path("runs") / options.task
+        _check_numbers(options)
         updates, seconds = budget(options.budget, "updates", 300)
-        asked = settings(options.set) | ({} if updates is None else {"updates": updates})
+        asked = once("updates", settings(options.set), updates, seconds)
         runs = _runs(options, output)
-        recipe = _resumed(options, runs, asked) if options.resume else _fresh(options, runs, output, asked)
-        trainer = Trainer(recipe, _episodes(options, runs))
+        with fitting(asked, options.task):
+            recipe = _resumed(options, runs, asked, seconds) if options.resume else _fresh(options, runs, output, asked)
+            trainer = Trainer(recipe, _episodes(options, runs))
+        for run in runs.values():
+            if run.started and options.resume:
+                trainer.check(run)
         for run in (*runs.values(), Run(output)):
             trainer.prepare(run)
-            if not options.resume:
-                run.clear()
     say = quiet if options.json else print
     say(f"{_headline(recipe)}; compiling")
     trainer.compile()
-    if seconds is not None and not options.resume:
-        trainer.fit(seconds - (time.perf_counter() - begin))
-    say(f"compiled in {trainer.compile_seconds:.1f} s; updates: {trainer.recipe.config.updates}")
+    made = max((run.told("state", "update") for run in runs.values() if run.started and options.resume), default=0)
+    if seconds is not None:
+        spent = 0.0 if options.resume else time.perf_counter() - begin
+        if spent > seconds:
+            note(f"compiling took all of --budget {options.budget}, so one update is made; --resume trains it longer")
+        trainer.fit(seconds - spent, made)
+    total = trainer.recipe.config.updates
+    say(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
+    if not options.resume:
+        for run in (*runs.values(), Run(output)):
+            run.clear()
 
     for seed, run in runs.items():
-        if options.resume and run.report() is not None:
+        if run.finished and run.told("state", "update") >= total:
             continue
-        shown = Shown(trainer.recipe.config.updates, f"seed {seed}" if len(runs) > 1 else "training", say)
+        shown = Shown(total, f"seed {seed}" if len(runs) > 1 else "training", trainer.episodes, say)
         try:
             with shown:
                 trainer.train(run, seed, shown.tell)
@@ -113,7 +140,7 @@ def _train(options: argparse.Namespace) -> int:
             again = f"jaxdrones train {options.task} --output {output} --resume"
             again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
             return complain(
-                f"interrupted at update {run.about('state')['update']}; {kept(run)}; go on with: {again}", INTERRUPTED
+                f"interrupted at update {run.told('state', 'update')}; {kept(run)}; go on with: {again}", INTERRUPTED
             )
         except Diverged as error:
             draw(options, {seed: run}, run.folder)
@@ -129,18 +156,36 @@ def _headline(recipe) -> str:
     return f"{what}: {config.worlds} worlds x {config.horizon} control steps an update"
 
 
+def _check_numbers(options: argparse.Namespace) -> None:
+    check_at_most("seeds", options.seeds, _MOST_SEEDS)
+    if options.seed is not None:
+        check_seed("seed", options.seed)
+        check_seed("the last seed", options.seed + options.seeds - 1)
+    if options.episodes is not None:
+        check_at_most("episodes", options.episodes, LARGEST_COUNT)
+    if options.resume and options.overwrite:
+        raise ValueError("--resume and --overwrite are given; one goes on with a run, the other replaces it")
+
+
 def _runs(options: argparse.Namespace, output: Path) -> dict:
     """Seed -> run."""
     from jaxdrones.learning.runs import Run
 
+    run = Run(output)
     if options.seeds > 1:
+        if options.resume and run.started:
+            raise ValueError(f"{output} holds the training of one seed; leave out --seeds to --resume it")
         first = options.seed or 0
         return {seed: Run(output / f"seed-{seed}") for seed in range(first, first + options.seeds)}
-    run = Run(output)
     if options.resume and not run.started:
-        raise ValueError(f"{output} holds no training to go on with; leave out --resume")
-    seed = run.about("state")["seed"] if options.resume else options.seed or 0
+        raise _nothing(run)
+    seed = run.told("state", "seed") if options.resume else options.seed or 0
     return {seed: run}
+
+
+def _nothing(run) -> ValueError:
+    several = "give --seeds N, or " if list(run.folder.glob("seed-*/state.json")) else ""
+    return ValueError(f"{run.folder} holds no training to go on with; {several}leave out --resume")
 
 
 def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
@@ -148,38 +193,73 @@ def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
     from jaxdrones.learning.presets import algorithm_for
     from jaxdrones.learning.runs import Recipe, Run
 
-    recipe = Recipe.of(options.task, options.algo or algorithm_for(options.task), options.realistic, **asked)
+    algorithm = algorithm_for(options.task) if options.algo is None else options.algo
+    recipe = Recipe.of(options.task, algorithm, options.realistic, **asked)
     for run in (*runs.values(), Run(output)):
         check_free(run, options.overwrite)
     return recipe
 
 
-def _resumed(options: argparse.Namespace, runs: dict, asked: dict):
-    """The recipe that the runs began with; what is asked for must not differ."""
+def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: float | None):
+    """The recipe that the runs began with, and maybe more updates; nothing else that is asked for may differ."""
     from jaxdrones.learning.runs import Recipe
 
     started = [run for run in runs.values() if run.started]
     if not started:
-        raise ValueError(f"{next(iter(runs.values())).folder} holds no training to go on with; leave out --resume")
-    folder, recipe = started[0].folder, Recipe.from_dict(started[0].about("state")["recipe"])
-    if all(run.report() is not None for run in runs.values()):
-        raise ValueError(f"{folder} is trained to the end; leave out --resume to train anew")
+        raise _nothing(next(iter(runs.values())))
+    for run in started:
+        run.verify("best")
+        run.verify("state")
+    recipes = [Recipe.from_dict(run.told("state", "recipe")) for run in started]
+    folder, recipe = started[0].folder, max(recipes, key=lambda recipe: recipe.config.updates)
     had = {"task": recipe.task, "algo": recipe.algorithm, "realistic": recipe.realistic}
-    had |= vars(recipe.config) | recipe.options
+    had |= vars(recipe.config) | recipe.options | {"episodes": started[0].told("state", "episodes")}
     wanted = {"task": options.task, **asked}
-    wanted |= {"algo": options.algo} if options.algo else {}
+    wanted |= {} if options.algo is None else {"algo": options.algo}
     wanted |= {"realistic": True} if options.realistic else {}
+    wanted |= {} if options.episodes is None else {"episodes": options.episodes}
     if options.seed is not None and options.seeds == 1:
         had, wanted = had | {"seed": next(iter(runs))}, wanted | {"seed": options.seed}
+    updates = wanted.pop("updates", None)
     for name, x in wanted.items():
         if had.get(name) != x:
             raise ValueError(f"{folder} began with {name} {had.get(name)}, not {x}; leave that out to --resume")
-    return recipe
+    finished = len(started) == len(runs) and all(
+        run.finished and run.told("state", "update") >= recipe.config.updates for run in started
+    )
+    total = _total(recipe.config.updates, updates, options.budget is not None, finished)
+    if finished and seconds is None and total == recipe.config.updates:
+        raise ValueError(
+            f"{folder} is trained to the end, {total} updates; train longer with --budget N more or 60s, or anew with "
+            "--overwrite in place of --resume"
+        )
+    return dataclasses.replace(recipe, config=dataclasses.replace(recipe.config, updates=total))
+
+
+def _total(had: int, asked: int | None, more: bool, finished: bool) -> int:
+    """Updates of a run that goes on.
+
+    Args:
+        had: updates that it was begun with.
+        asked: updates that are asked for.
+        more: whether they come on top of those of a finished run, as --budget says, or are all, as --set says.
+        finished: whether it made all that it was begun with.
+    """
+    if asked is None:
+        return had
+    check_at_most("updates", asked, LARGEST_COUNT)
+    if more and finished:
+        asked += had
+    elif asked < had or (more and asked != had):
+        raise ValueError(
+            f"the run began with updates {had}, not {asked}; leave that out to --resume, or give a larger number by "
+            "--set updates=N"
+        )
+    check_at_most("updates", asked, LARGEST_COUNT)
+    return asked
 
 
 def _episodes(options: argparse.Namespace, runs: dict) -> int:
     """Of an evaluation; when resuming, as many as before, so that the best stays comparable."""
-    if options.episodes is not None:
-        check_whole("episodes", options.episodes)
-        return options.episodes
-    return next((run.about("state")["episodes"] for run in runs.values() if run.started and options.resume), 1000)
+    begun = (run.told("state", "episodes") for run in runs.values() if run.started and options.resume)
+    return next(begun, 1000 if options.episodes is None else options.episodes)

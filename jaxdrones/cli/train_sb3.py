@@ -4,12 +4,13 @@ import argparse
 import time
 from pathlib import Path
 
-from jaxdrones.checks import check_choice, check_whole
+from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import INTERRUPTED, complain
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import SB3_ALGORITHMS
-from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, kept, quiet, settings
+from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, fitting, kept, once, quiet, settings
 from jaxdrones.envs import TASKS
+from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.render import plots
 
 _PAPER = {"hover": "paper-hover"}  # what the paper's own command means by the name
@@ -25,13 +26,15 @@ def train(options: argparse.Namespace) -> int:
     """
     begin = time.perf_counter()
     _refuse(options)
-    algorithm, task = options.algo or SB3_ALGORITHMS[0], _PAPER.get(options.task, options.task)
+    algorithm = SB3_ALGORITHMS[0] if options.algo is None else options.algo
+    task = _PAPER.get(options.task, options.task)
     check_choice("algorithm of sb3", algorithm, SB3_ALGORITHMS)
     check_choice("task", task, TASKS)
     episodes, seed = _EPISODES if options.episodes is None else options.episodes, options.seed or 0
-    check_whole("episodes", episodes)
+    check_at_most("episodes", episodes, LARGEST_COUNT)
+    check_seed("seed", seed)
     steps, seconds = budget(options.budget, "control steps", 100_000)
-    asked = settings(options.set) | ({} if steps is None else {"steps": steps})
+    asked = once("steps", settings(options.set), steps, seconds)
     if not options.no_figure:
         plots.check_matplotlib()
     from jaxdrones.learning import sb3
@@ -39,20 +42,22 @@ def train(options: argparse.Namespace) -> int:
     from jaxdrones.learning.training import Diverged
 
     run = sb3.Run(options.output or Path("runs") / f"{options.task}-sb3-{algorithm}")
-    recipe = sb3.Recipe.of(task, algorithm, options.realistic, **asked)
+    with fitting(asked, task):
+        recipe = sb3.Recipe.of(task, algorithm, options.realistic, **asked)
     check_free(run, options.overwrite)
     say = quiet if options.json else print
     say(f"{_headline(recipe)}; compiling")
-    trainer = Trainer(recipe, seed, episodes)
+    with fitting(asked, task):
+        trainer = Trainer(recipe, seed, episodes)
     trainer.prepare(run)
     run.clear()
     total = recipe.config["steps"] if seconds is None else None
     say(f"compiled in {trainer.compile_seconds:.1f} s; control steps: {total or 'as many as the time allows'}")
     try:
-        with Shown(total, "training", say, "step") as shown:
+        with Shown(total, "training", episodes, say, "step") as shown:
             trainer.train(run, shown.tell, None if seconds is None else begin + seconds)
     except KeyboardInterrupt:
-        if not run.unfinished:
+        if not run.files:
             return complain("interrupted before the first evaluation; nothing is kept", INTERRUPTED)
         draw(options, {seed: run}, run.folder)
         return complain(f"interrupted; {kept(run)}", INTERRUPTED)

@@ -3,15 +3,17 @@
 import argparse
 import ast
 import contextlib
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import bar
-from jaxdrones.cli.evaluate import evaluation_table
+from jaxdrones.cli.common import as_json, bar
+from jaxdrones.cli.evaluate import evaluation_table, percent
+from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.render import plots
 
+_ARGUMENTS = ("cls", "task", "algorithm", "realistic")  # of `Recipe.of`, which other options of the command say
+_LONGEST = 3.6e6  # s
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -22,13 +24,15 @@ def budget(text: str | None, unit: str, example: int) -> tuple[int | None, float
     try:
         if text[-1:] in _UNITS:
             seconds = float(text[:-1]) * _UNITS[text[-1]]
-            if 0 < seconds < float("inf"):
+            if 0 < seconds <= _LONGEST:
                 return None, seconds
-        elif int(text) > 0:
+        elif 0 < int(text) <= LARGEST_COUNT:
             return int(text), None
     except ValueError:
         pass
-    raise ValueError(f"--budget is {text!r}; give {unit}, for example {example}, or time, for example 60s, 5m or 2h")
+    raise ValueError(
+        f"--budget is {text!r}; give {unit}, for example {example}, or time up to 1000h, for example 60s, 5m or 2h"
+    )
 
 
 def settings(texts: list[str]) -> dict[str, Any]:
@@ -38,37 +42,77 @@ def settings(texts: list[str]) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
-        try:
-            changes[name] = ast.literal_eval(value)
-        except (ValueError, SyntaxError):
-            changes[name] = value
+        if name in changes:
+            raise ValueError(f"--set {name} is given twice: {changes[name]} and {value}; give it once")
+        if name in _ARGUMENTS:
+            raise ValueError(
+                f"--set {name} is no setting of a learner or of an environment; see jaxdrones train --help"
+            )
+        changes[name] = _value(value)
     return changes
 
 
+def _value(text: str) -> Any:
+    """A Python literal, or else a name; `nan` and `inf` are numbers."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        return float(text) if text.strip("+-") in ("nan", "inf") else text
+
+
+@contextlib.contextmanager
+def fitting(changes: dict[str, Any], task: str):
+    """Settings that break what is built with them are a mistake in what was asked.
+
+    Raises:
+        ValueError: in place of what Python or JAX said of them.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+        if not changes:
+            raise
+        given = ", ".join(f"{name}={x}" for name, x in changes.items())
+        raise ValueError(f"--set {given} does not fit {task}: {error}") from error
+
+
+def once(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:
+    """The changes, and the number that --budget gave for one of them.
+
+    Raises:
+        ValueError: that one is changed by --set too.
+    """
+    if name in changes and (number is not None or seconds is not None):
+        raise ValueError(f"--set {name}={changes[name]} is given beside --budget; give one of them")
+    return changes if number is None else changes | {name: number}
+
+
 def check_free(run, overwrite: bool) -> None:
-    """Raise if a training that did not finish would be lost."""
-    if run.unfinished and not overwrite:
-        again = "go on with --resume, " if run.started else ""
-        raise ValueError(
-            f"{run.folder} holds a training that did not finish; {again}replace it with --overwrite, "
-            "or choose another --output"
-        )
+    """Raise if files of a run would be lost."""
+    if overwrite or not run.files:
+        return
+    if run.finished:
+        what, again = "a finished training", "train it longer with --resume --budget N, " if run.started else ""
+    else:
+        what, again = "a training that did not finish", "go on with --resume, " if run.started else ""
+    raise ValueError(f"{run.folder} holds {what}; {again}replace it with --overwrite, or choose another --output")
 
 
 class Shown(contextlib.ExitStack):
     """A live bar from the first news on, and a line for every evaluation."""
 
-    def __init__(self, total: int | None, what: str, say, unit: str = "update"):
+    def __init__(self, total: int | None, what: str, episodes: int, say, unit: str = "update"):
         """Show nothing yet.
 
         Args:
             total: number of `unit` to come, if that is known.
             what: is trained.
+            episodes: of an evaluation.
             say: prints a line.
             unit: what is counted.
         """
         super().__init__()
-        self._total, self._what, self._say, self._unit = total, what, say, unit
+        self._total, self._what, self._episodes, self._say, self._unit = total, what, episodes, say, unit
         self._bar: Any = None
         self._evaluated, self._begun = "", False
 
@@ -79,7 +123,8 @@ class Shown(contextlib.ExitStack):
             self._bar = self.enter_context(bar(self._total, self._what, self._unit, initial=count))
         pace = _pace(now["steps_per_s"])
         if "success" in now:
-            self._evaluated = f"return {now['evaluated_return']:.1f}, success {now['success']:.3f}"
+            success = percent(now["success"], self._episodes)
+            self._evaluated = f"return {now['evaluated_return']:.1f}, success {success}"
             of = "" if self._total is None else f"/{self._total}"
             line = f"{self._what}: {self._unit} {count:4}{of}  {self._evaluated}, "
             line += f"median error {now['evaluated_error']:.3f} m, {pace}, {now['seconds']:.1f} s"
@@ -102,7 +147,7 @@ def quiet(_: str) -> None:
 
 def kept(run) -> str:
     """Which policy an unfinished training leaves."""
-    return f"{run.folder / 'best'}.{run.policy_suffix} is the best policy, of update {run.about()['update']}"
+    return f"{run.folder / 'best'}.{run.policy_suffix} is the best policy, of update {run.told('best', 'update')}"
 
 
 def draw(options: argparse.Namespace, runs: dict, folder: Path) -> list[Path]:
@@ -123,19 +168,22 @@ def finish(options: argparse.Namespace, runs: dict, output: Path) -> int:
         runs: seed -> run.
         output: where the figure goes and, of several seeds, the best.
     """
+    from jaxdrones.learning.runs import Run
+    from jaxdrones.learning.training import best_of, score_of
+
     reports = {seed: run.report() for seed, run in runs.items()}
-    best = max(reports, key=lambda s: (reports[s]["evaluation"]["success"], reports[s]["evaluation"]["returned"]))
+    evaluations = [report["evaluation"] for report in reports.values()]
+    scores = [score_of(evaluation["success"], evaluation["returned"]) for evaluation in evaluations]
+    best = list(runs)[best_of(scores, min(evaluation["episodes"] for evaluation in evaluations))]
     run = runs[best]
     if len(runs) > 1:
-        from jaxdrones.learning.runs import Run
-
-        about = run.about()
-        Run(output).save_policy("best", run.policy(), **{k: about[k] for k in ("recipe", "seed", "update")})
-        (output / "report.json").write_text(json.dumps({"best_seed": best, "seeds": list(reports.values())}, indent=2))
+        about = {entry: run.told("best", entry) for entry in ("recipe", "seed", "update")}
+        Run(output).save_policy("best", run.policy(), **about)
+        Run(output).save_report({"best_seed": best, "seeds": list(reports.values())})
     files = [output / f"best.{run.policy_suffix}", output / "report.json", *draw(options, runs, output)]
     if options.json:
         result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
-        print(json.dumps(result | {"files": list(map(str, files))}))
+        print(as_json(result | {"files": list(map(str, files))}))
         return 0
     for seed, report in reports.items():
         spent = report["seconds"]

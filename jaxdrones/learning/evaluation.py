@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_whole
 from jaxdrones.compiler import training_options
 from jaxdrones.envs import Env
+from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 
 _CHUNK = 1000  # episodes flown at a time
+_EPISODE_BYTES = 64  # of a drone, that an evaluation keeps until its end
 
 
 class Report(flax.struct.PyTreeNode):
@@ -49,14 +50,23 @@ def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -
         policy: observations (n, d), or a dictionary with images, -> actions (n, a); a pytree, or any function.
         key: random key.
         episodes: number of them.
+
+    Raises:
+        ValueError: so many cannot be flown.
     """
-    check_whole("episodes", episodes)
+    check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, flax.struct.PyTreeNode):
         flown = _fly_policy()(env, policy, keys)
     else:
         flown = jax.jit(functools.partial(_fly, env, policy))(keys)
     return _report(env, jax.tree.map(np.asarray, flown))
+
+
+def check_episodes(env: Env, episodes: int) -> None:
+    """Raise unless so many episodes can be flown at once."""
+    check_at_most("episodes", episodes, LARGEST_COUNT)
+    check_memory(f"an evaluation of {episodes:,} episodes", episodes * env.drones * _EPISODE_BYTES, "give fewer")
 
 
 @functools.cache

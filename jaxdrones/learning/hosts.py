@@ -37,12 +37,12 @@ def together(hosts: int, host: int, coordinator: str, patience: float = _PATIENC
     if not 0 <= host < hosts:
         raise ValueError(f"host is {host}; give 0 to {hosts - 1}, another one to each of the {hosts} hosts")
     name, _, port = coordinator.rpartition(":")
-    if not (name and port.isdecimal()):
+    if not (name and port.isdecimal() and 0 < int(port) < 2**16):
         raise ValueError(f"coordinator is {coordinator!r}; give ADDRESS:PORT of host 0, for example 127.0.0.1:9911")
     deadline = time.monotonic() + patience
     try:  # before JAX does, which ends the process if it waits in vain
         _await_calls((name, int(port)), hosts, deadline) if host == 0 else _call((name, int(port)), host, deadline)
-    except OSError as error:
+    except (OSError, TypeError, UnicodeError) as error:  # the last two of a name that can be none
         raise ValueError(
             f"host {host} of {hosts} did not meet all others at {coordinator} within {patience:g} s ({error}); start "
             f"the same command with --host 0 to --host {hosts - 1}, with the --coordinator that host 0 can listen at"

@@ -14,6 +14,7 @@ import csv
 import dataclasses
 import inspect
 import json
+import math
 import os
 from collections.abc import Collection
 from pathlib import Path
@@ -21,13 +22,16 @@ from typing import Any
 
 import jax
 
-from jaxdrones.checks import check_choice, check_whole
+from jaxdrones.checks import check_choice
 from jaxdrones.envs import TASKS, Env, make
 from jaxdrones.learning import checkpoint
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.events import PREFIX, EventFile
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.presets import ALGORITHMS, preset
+from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
+
+_DRONE_BYTES = 256  # of its parameters and state
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +61,14 @@ class Recipe:
         """
         check_choice("task", task, TASKS)
         check_choice("algorithm", algorithm, ALGORITHMS)
-        known = {field.name for field in dataclasses.fields(ALGORITHMS[algorithm].Config)}
+        fields = dataclasses.fields(ALGORITHMS[algorithm].Config)
+        known = {field.name for field in fields if field.default is not None}  # a function has no place in JSON
         options, settings = divided(task, changes, known)
         _, config = fitting_preset(task, algorithm, realistic, options)
         settings = {name: checked(name, x, getattr(config, name)) for name, x in settings.items()}
         config = dataclasses.replace(config, **settings)
         for name in ("updates", "worlds", "horizon"):
-            check_whole(name, getattr(config, name))
+            check_at_most(name, getattr(config, name), LARGEST_COUNT)
         return cls(task, algorithm, realistic, options, config)
 
     @property
@@ -82,10 +87,18 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, kept: dict[str, Any]) -> Recipe:
-        """What `as_dict` gave."""
-        check_choice("algorithm", kept["algorithm"], ALGORITHMS)
-        config = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["config"].items()}
-        return cls(**kept | {"config": ALGORITHMS[kept["algorithm"]].Config(**config)})
+        """What `as_dict` gave.
+
+        Raises:
+            ValueError: it is of another version of this library, or damaged.
+        """
+        try:
+            check_choice("task", kept["task"], TASKS)
+            check_choice("algorithm", kept["algorithm"], ALGORITHMS)
+            config = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["config"].items()}
+            return cls(**kept | {"config": ALGORITHMS[kept["algorithm"]].Config(**config)})
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(f"the recipe is not one of this version ({error!r}); train anew") from error
 
 
 def divided(task: str, changes: dict[str, Any], known: Collection[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -104,6 +117,9 @@ def divided(task: str, changes: dict[str, Any], known: Collection[str]) -> tuple
 
 def fitting_preset(task: str, algorithm: str, realistic: bool, options: dict[str, Any]) -> tuple[Env, Any]:
     """`preset`, whose complaints of wrong values are a `ValueError`."""
+    drones = options.get("drones")
+    if isinstance(drones, int):
+        check_memory(f"a team of {drones:,} drones", drones * _DRONE_BYTES, "give fewer drones")
     try:
         return preset(task, algorithm, realistic, **options)
     except TypeError as error:
@@ -118,6 +134,8 @@ def checked(name: str, value, now):
     """
     if isinstance(now, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
+    if isinstance(now, tuple) and isinstance(value, list):
+        value = tuple(value)
     if now is not None and type(value) is not type(now):
         raise ValueError(f"{name} is {value!r}; give something like {now!r}")
     return value
@@ -131,6 +149,14 @@ class Run:
     def __init__(self, folder: str | os.PathLike):
         """Look at a folder; nothing is read or made yet."""
         self.folder = Path(folder)
+
+    @property
+    def files(self) -> list[Path]:
+        """What a run of whichever library wrote here: checkpoints, progress, report."""
+        endings = [f"{suffix}{new}" for suffix in ("msgpack", "zip", "json") for new in ("", ".new")]
+        names = [f"{name}.{ending}" for name in ("best", "last", "state") for ending in endings]
+        names += ["progress.csv", "report.json", "report.json.new"]
+        return [file for file in (*map(self.folder.joinpath, names), *self._events()) if file.exists()]
 
     def prepare(self, size: int) -> None:
         """Make the folder and see that `size` bytes can be written to it.
@@ -149,20 +175,38 @@ class Run:
 
     def clear(self) -> None:
         """Remove what an earlier run left, and nothing else."""
-        names = [f"{name}.{suffix}" for name in ("best", "last", "state") for suffix in ("msgpack", "zip", "json")]
-        for file in (*map(self.folder.joinpath, [*names, "progress.csv", "report.json"]), *self._events()):
-            file.unlink(missing_ok=True)
+        for file in self.files:
+            file.unlink()
 
     def about(self, name: str = "best") -> dict[str, Any]:
         """What is known of the checkpoint `best`, `last` or `state`."""
         return checkpoint.about(self.folder / name)
 
-    def recipe(self) -> Recipe:
+    def verify(self, name: str) -> None:
+        """See that a checkpoint is whole.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: it is damaged.
+        """
+        checkpoint.load_bytes(self.folder / f"{name}.{self.policy_suffix}", self.about(name))
+
+    def told(self, name: str, entry: str) -> Any:
+        """One entry of what is known of a checkpoint.
+
+        Raises:
+            FileNotFoundError: there is no such checkpoint.
+            ValueError: it lacks the entry.
+        """
+        about = self.about(name)
+        if entry not in about:
+            file = self.folder / f"{name}.json"
+            raise ValueError(f"{file} names no {entry}; it is not the {name} of a run of `jaxdrones train`")
+        return about[entry]
+
+    def recipe(self, name: str = "best") -> Recipe:
         """What was trained here."""
-        about = self.about()
-        if "recipe" not in about:
-            raise ValueError(f"{self.folder / 'best.json'} names no recipe; it is not of `jaxdrones train`")
-        return Recipe.from_dict(about["recipe"])
+        return Recipe.from_dict(self.told(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Policy:
         """The policy `best` or `last`.
@@ -187,9 +231,9 @@ class Run:
         return (self.folder / "state.json").exists()
 
     @property
-    def unfinished(self) -> bool:
-        """Whether a training began here, with whichever library, and did not come to its end."""
-        return (self.folder / "best.json").exists() and self.report() is None
+    def finished(self) -> bool:
+        """Whether a training came to its end here."""
+        return (self.folder / "report.json").exists()
 
     def save_policy(self, name: str, policy: Policy, **about) -> None:
         """Write `best` or `last`."""
@@ -205,20 +249,45 @@ class Run:
 
     def save_report(self, report: dict[str, Any]) -> None:
         """Write report.json."""
-        (self.folder / "report.json").write_text(json.dumps(report, indent=2))
+        checkpoint.write(self.folder / "report.json", json.dumps(report, indent=2).encode())
+
+    def drop_report(self) -> None:
+        """From now on the run counts as not finished."""
+        (self.folder / "report.json").unlink(missing_ok=True)
 
     def report(self) -> dict[str, Any] | None:
-        """What `save_report` wrote; `None` of a run that did not finish."""
+        """What `save_report` wrote; `None` of a run that did not finish.
+
+        Raises:
+            ValueError: it is damaged.
+        """
         file = self.folder / "report.json"
-        return json.loads(file.read_text()) if file.exists() else None
+        if not self.finished:
+            return None
+        try:
+            return json.loads(file.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise ValueError(f"{file} cannot be read: {error}; remove it and --resume, which writes it anew") from error
 
     def history(self) -> list[dict[str, float]]:
-        """The lines of progress.csv; numbers that were not measured in an update are left out."""
+        """The lines of progress.csv; numbers that were not measured in an update are left out.
+
+        Raises:
+            ValueError: it is damaged.
+        """
         path = self.folder / "progress.csv"
         if not path.exists():
             return []
-        with path.open(newline="") as file:
-            return [{name: float(x) for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
+        try:
+            with path.open(newline="") as file:
+                lines = [{name: x for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
+            rows = [{name: float(x) for name, x in line.items()} for line in lines]
+            if not all(math.isfinite(row.get("update", math.nan)) for row in rows):
+                raise ValueError("a line lacks its update")
+        except (OSError, ValueError, TypeError, csv.Error) as error:
+            what = checkpoint.line(error)
+            raise ValueError(f"{path} is damaged: {what}; remove it, training goes on without its lines") from error
+        return rows
 
     def _events(self) -> list[Path]:
         return sorted(self.folder.glob(f"{PREFIX}.*.jaxdrones"))
@@ -249,8 +318,8 @@ class Progress:
     """progress.csv and the event file of a run, open for more lines."""
 
     def __init__(self, run: Run, columns: list[str], update: int):
-        """Go on after an update; later lines, of a run that was killed, are dropped. There is a line per update."""
-        rows = run.history()[:update]
+        """Go on after an update; later lines, of a run that was killed, are dropped."""
+        rows = [row for row in run.history() if row["update"] <= update] if update else []
         for file in run._events():
             file.unlink()
         self._columns = columns
@@ -279,6 +348,7 @@ class Progress:
 def as_dict(report: Report) -> dict[str, Any]:
     """An evaluation for JSON."""
     kept = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
+    kept |= {"successes": round(report.success * report.episodes)}
     return kept | {"error_percentiles": {str(q): x for q, x in report.error_percentiles.items()}}
 
 

@@ -86,9 +86,17 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, kept: dict[str, Any]) -> Recipe:
-        """What `as_dict` gave."""
-        check_choice("algorithm", kept["algorithm"], ALGORITHMS)
-        return cls(**kept)
+        """What `as_dict` gave.
+
+        Raises:
+            ValueError: it is of another version of this library, or damaged.
+        """
+        try:
+            check_choice("task", kept["task"], TASKS)
+            check_choice("algorithm", kept["algorithm"], ALGORITHMS)
+            return cls(**kept)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"the recipe is not one of this version ({error!r}); train anew") from error
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -174,9 +182,9 @@ class Run(runs.Run):
 
     policy_suffix = "zip"
 
-    def recipe(self) -> Any:
+    def recipe(self, name: str = "best") -> Any:
         """What was trained here."""
-        return Recipe.from_dict(self.about()["recipe"])
+        return Recipe.from_dict(self.told(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Any:
         """The policy `best` or `last`; raises as `load` does, and if it does not fit `env`."""
@@ -193,16 +201,18 @@ class Run(runs.Run):
 
         Raises:
             FileNotFoundError: there is none.
-            ValueError: it is damaged.
+            ValueError: it is damaged, or has numbers that are not finite.
         """
         file = self.folder / f"{name}.zip"
-        algorithm = ALGORITHMS[Recipe.from_dict(self.about(name)["recipe"]).algorithm]
+        algorithm = ALGORITHMS[self.recipe(name).algorithm]
+        content = checkpoint.load_bytes(file, self.about(name))
         try:
-            return algorithm.load(file, device="cpu")
-        except FileNotFoundError:
-            raise FileNotFoundError(f"no checkpoint at {self.folder / name}: {file} does not exist") from None
+            model = algorithm.load(io.BytesIO(content), device="cpu")
         except Exception as error:  # zip, pickle and torch have several of their own
-            raise ValueError(f"{file} is damaged: {error}; take another checkpoint") from error
+            raise ValueError(f"{file} cannot be loaded: {checkpoint.line(error)}; {checkpoint.ANOTHER}") from error
+        if not all(torch.isfinite(x).all() for x in model.policy.parameters()):
+            raise ValueError(f"{file} holds numbers that are not finite; {checkpoint.ANOTHER}")
+        return model
 
     def save_model(self, name: str, model: BaseAlgorithm, **about) -> None:
         """Write `best` or `last`."""

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxdrones.adapters.sb3 import VecEnv
-from jaxdrones.learning.evaluation import Report, evaluate
+from jaxdrones.learning.evaluation import Report, check_episodes, evaluate
 from jaxdrones.learning.runs import Progress, as_dict
 from jaxdrones.learning.sb3 import Actor, Recipe, Run
 from jaxdrones.learning.training import Diverged, Tell
@@ -40,6 +40,7 @@ class Trainer:
         self.recipe, self.seed, self.episodes = recipe, seed, episodes
         start = time.perf_counter()
         self.env = recipe.env()
+        check_episodes(self.env, episodes)
         self.worlds = VecEnv(self.env, recipe.config["worlds"])
         self.model = recipe.model(self.worlds, seed)
         self.worlds.reset()

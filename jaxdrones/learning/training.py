@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,11 @@ import numpy as np
 
 from jaxdrones.compiler import training_options
 from jaxdrones.learning import hosts, sharding
-from jaxdrones.learning.evaluation import Report, evaluate
+from jaxdrones.learning.evaluation import Report, check_episodes, evaluate, wilson
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.presets import ALGORITHMS
 from jaxdrones.learning.runs import Progress, Recipe, Run, as_dict, size_of
+from jaxdrones.limits import LARGEST_COUNT, check_memory
 
 EVALUATIONS = 10  # in the course of training
 _LONGEST_CALL = 64  # updates
@@ -24,11 +26,16 @@ _CALL = 0.3  # s that a call takes about; Ctrl-C waits for it
 _SAVE = 30.0  # s between training states, at most
 _PATIENCE = 10  # updates in a row that are not finite
 _PROBE = 4  # times the size of the training state that must fit on the disk
+_NEAR = 1.0  # standard errors within which two shares of successes are the same but for chance
 _CHOICE, _REPORT = 1, 2  # what a seed's key is folded with
 _EVALUATED = ("success", "evaluated_return", "evaluated_error")
 
 Tell = Callable[[int, dict[str, float]], None]
 """Is told the number of updates made and the newest numbers."""
+
+
+Score = tuple[float, float]
+"""Share of successes, and return, of an evaluation."""
 
 
 class Diverged(RuntimeError):
@@ -46,7 +53,7 @@ class Trainer:
             episodes: of an evaluation.
 
         Raises:
-            ValueError: the devices cannot share the worlds equally.
+            ValueError: the devices cannot share the worlds equally, or have too little memory for them.
         """
         self.recipe, self.episodes = recipe, episodes
         self.mesh = sharding.devices(recipe.config.worlds)
@@ -54,6 +61,8 @@ class Trainer:
         self.learner = ALGORITHMS[recipe.algorithm]
         self.compile_seconds = 0.0
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
+        check_episodes(self.env, episodes)
+        self._check_memory()
         self.metrics = sorted(jax.eval_shape(self._one, self.shapes)[1])
 
     def compile(self) -> None:
@@ -76,14 +85,24 @@ class Trainer:
         """
         run.prepare(_PROBE * size_of(self.shapes))
 
-    def fit(self, seconds: float) -> None:
-        """Choose the number of updates that take about so many seconds."""
+    def check(self, run: Run) -> None:
+        """See that training can go on from what a run holds.
+
+        Raises:
+            FileNotFoundError: a file is missing.
+            ValueError: a file is damaged, or they are not of one run.
+        """
+        self._held(run)
+        run.history()
+
+    def fit(self, seconds: float, made: int = 0) -> None:
+        """Choose the number of updates: so many as were `made`, and what takes about so many seconds."""
         state, _ = self.advance(self.start(jax.random.key(0)), 1)
         start = time.perf_counter()
         self.advance(state, 3)
         pace = (time.perf_counter() - start) / 3
-        config = dataclasses.replace(self.recipe.config, updates=max(1, int(hosts.agreed(seconds / pace))))
-        self.recipe = dataclasses.replace(self.recipe, config=config)
+        updates = min(made + max(1, int(hosts.agreed(seconds / pace))), LARGEST_COUNT)
+        self.recipe = dataclasses.replace(self.recipe, config=dataclasses.replace(self.recipe.config, updates=updates))
 
     def advance(self, state, updates: int):
         """Make some updates in one call: the state after them, and (updates,) of every metric."""
@@ -104,6 +123,8 @@ class Trainer:
             KeyboardInterrupt: as it came; the state is saved, unless other hosts would have to help.
         """
         course = _Course(self, run, seed)
+        run.drop_report()
+        course.save()
         try:
             course.go(tell)
         except KeyboardInterrupt:
@@ -111,6 +132,28 @@ class Trainer:
                 course.save()
             raise
         course.finish()
+
+    def _held(self, run: Run) -> tuple[Any, float, Score, float]:
+        """State, seconds trained, score of the best policy and highest success of a run that was begun."""
+        state = run.load_state(self.shapes)
+        if not _finite(state):
+            raise ValueError(f"{run.folder / 'state'} holds numbers that are not finite; train anew with --overwrite")
+        run.policy("best", self.env)
+        for entry in ("seed", "episodes"):
+            if run.told("best", entry) != run.told("state", entry):
+                raise _of_two_runs(run)
+        if _begun(run.told("best", "recipe")) != _begun(run.told("state", "recipe")):
+            raise _of_two_runs(run)
+        score = tuple(run.told("best", "score"))
+        return state, run.told("state", "seconds"), score, max(score[0], run.told("state", "highest"))
+
+    def _check_memory(self) -> None:
+        """Raise if the worlds, and what they observe and do in an update, are more than there is memory for."""
+        config, env = self.recipe.config, self.env
+        numbers = config.worlds * config.horizon * env.drones * (env.observation_size + env.action_size)
+        size = size_of(self.shapes) + numbers * jnp.zeros(()).dtype.itemsize
+        what = f"a training of {config.worlds} worlds x {config.horizon} control steps x {env.drones} drones"
+        check_memory(what, size // jax.process_count(), "give fewer worlds, a shorter horizon or smaller networks")
 
     def _init(self, key: jax.Array):
         return self.learner.init(key, self.practice, self.recipe.config)
@@ -145,17 +188,15 @@ class _Course:
         self.about = {"recipe": trainer.recipe.as_dict(), "seed": seed, "episodes": trainer.episodes}
         self.evaluating = 0.0  # s
         self.unbroken = 0  # updates in a row that were not finite
-        self.best = None  # score
+        self.best: Score | None = None
+        self.highest = 0.0  # success of any evaluation
         if run.started:
-            state = run.load_state(trainer.shapes)
+            state, self.seconds, self.best, self.highest = trainer._held(run)
             self.state = sharding.placed(trainer.mesh, state)
-            self.seconds = run.about("state")["seconds"]
-            self.best = tuple(run.about("best")["score"])
             self.update = int(self.state.step)
         else:
             self.state, self.seconds, self.update = trainer.start(self.key), 0.0, 0
             self.judge(self.state.policy, 0)
-            self.save()
 
     def go(self, tell: Tell) -> None:
         """Make all updates that are left."""
@@ -201,8 +242,9 @@ class _Course:
         """Evaluate a policy, always on the same episodes; keep it if it is the best."""
         policy = sharding.whole(self.trainer.mesh, policy)
         report = self._evaluate(policy, _CHOICE)
-        score = (report.success, report.returned if math.isfinite(report.returned) else -math.inf)
-        if self.best is None or score > self.best:
+        score = score_of(report.success, report.returned)
+        self.highest = max(self.highest, report.success)
+        if self.best is None or best_of([self.best, score], self.trainer.episodes, self.highest) == 1:
             self.best = score
             self.run.save_policy("best", policy, **self.about, update=update, score=score)
         return dict(zip(_EVALUATED, (report.success, report.returned, report.error_percentiles[50]), strict=True))
@@ -211,7 +253,7 @@ class _Course:
         """Write the newest policy and the training state."""
         state = sharding.whole(self.trainer.mesh, self.state)
         self.run.save_policy("last", state.policy, **self.about, update=self.update)
-        self.run.save_state(state, **self.about, update=self.update, seconds=self.seconds)
+        self.run.save_state(state, **self.about, update=self.update, seconds=self.seconds, highest=self.highest)
 
     def finish(self) -> None:
         """Evaluate the best policy on other episodes than it was chosen by, and write the report."""
@@ -223,7 +265,7 @@ class _Course:
         }
         self.run.save_report(
             self.about
-            | {"best_update": self.run.about()["update"], "updates": self.update, "seconds": seconds}
+            | {"best_update": self.run.told("best", "update"), "updates": self.update, "seconds": seconds}
             | {"evaluation": as_dict(report)}
         )
 
@@ -240,6 +282,45 @@ class _Course:
         report = evaluate(self.trainer.env, policy, jax.random.fold_in(self.key, purpose), self.trainer.episodes)
         self.evaluating += time.perf_counter() - start
         return report
+
+
+def score_of(success: float, returned: float) -> Score:
+    """Of an evaluation; a return that is not a number is the worst."""
+    return success, returned if math.isfinite(returned) else -math.inf
+
+
+def best_of(scores: Sequence[Score], episodes: int, highest: float = 0.0) -> int:
+    """Index of the policy to keep.
+
+    Of the policies whose success is as high as the highest but for chance, it is the one with the highest return, and
+    of equal returns the first. Two shares are the same but for chance where their Wilson intervals of one standard
+    error overlap: a difference of 1 in 1,000 decides nothing, one of 5 in 1,000 does.
+
+    Args:
+        scores: of all policies to choose from.
+        episodes: that each was evaluated in.
+        highest: success of a policy that is not among them, which was evaluated in as many; so that small losses do
+            not add up from one choice to the next.
+    """
+
+    def interval(success: float) -> tuple[float, float]:
+        return wilson(round(success * episodes), episodes, _NEAR)
+
+    least = max(interval(success)[0] for success in (highest, *(success for success, _ in scores)))
+    near = [i for i, (success, _) in enumerate(scores) if interval(success)[1] >= least]
+    return max(near or range(len(scores)), key=lambda i: scores[i][1])
+
+
+def _begun(recipe: dict) -> dict:
+    """What a recipe was begun with, which training longer does not change."""
+    return recipe | {"config": recipe["config"] | {"updates": None}}
+
+
+def _of_two_runs(run: Run) -> ValueError:
+    return ValueError(
+        f"{run.folder}: best.json and state.json are of two runs; restore the files of one, or train anew with "
+        "--overwrite"
+    )
 
 
 def _diverged(update: int) -> Diverged:

@@ -18,6 +18,7 @@ FPS = 24  # frames per simulated second; the paper's camera rate
 _DIRECTION = np.array([-0.6, -0.7, 0.4])  # from the middle of the flight to the camera
 _DISTANCE = 1.6  # of the camera, over the extent of the flight
 _LEAST_EXTENT = 0.6  # m
+_FAR = 1e6  # m; a drone that diverged is not followed further
 
 
 def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS) -> int:
@@ -31,9 +32,15 @@ def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS)
 
     Returns:
         The number of frames.
+
+    Raises:
+        ValueError: there is nothing to film, as the flight broke at once.
     """
     video.check_video(path)
-    low, high = record.pos.min(axis=(0, 1)), record.pos.max(axis=(0, 1))
+    if not len(_finite(record)):
+        raise ValueError(f"{path} is not written: no state of the flight is finite")
+    pos = record.pos[_finite(record)]
+    low, high = pos.min(axis=(0, 1)), pos.max(axis=(0, 1))
     middle = (low + high) / 2
     eye = middle + _DIRECTION * _DISTANCE * max(_LEAST_EXTENT, float(np.linalg.norm(high - low)))
     with bullet.make_step(scene=scene) as step:
@@ -61,8 +68,15 @@ def _params(record: Record):
     return repeat(load_params(record.conditions.vehicle), len(record.labels))
 
 
+def _finite(record: Record) -> np.ndarray:
+    """Rows in which the pose of every drone is a number that Bullet can show."""
+    poses = np.concatenate([record.pos, record.quat], axis=-1)
+    return np.flatnonzero((np.abs(poses) < _FAR).all(axis=(1, 2)))
+
+
 def _states(record: Record, fps: int) -> Iterator[State]:
-    """The recorded state nearest to every frame's time."""
-    for time in np.arange(round(record.t[-1] * fps)) / fps:
-        k = int(np.abs(record.t - time).argmin())
+    """The recorded state nearest to every frame's time, one at least; of those that can be shown."""
+    rows = _finite(record)
+    for time in np.arange(max(1, round(record.t[-1] * fps))) / fps:
+        k = rows[np.abs(record.t[rows] - time).argmin()]
         yield State(record.pos[k], record.quat[k], record.vel[k], record.omega[k], record.rpm[k])

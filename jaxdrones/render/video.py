@@ -29,7 +29,11 @@ def check_video(path: Path) -> None:
 
 
 def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
-    """Write RGB frames (height, width, 3) uint8 as a film; returns how many there were."""
+    """Write RGB frames (height, width, 3) uint8, at least one, as a film; returns how many there were.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     check_video(path)
     return (_write_mp4 if path.suffix == ".mp4" else _write_gif)(frames, path, fps)
 
@@ -37,19 +41,30 @@ def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
 def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
     import imageio_ffmpeg
 
+    new = path.absolute().with_name(f".{path.stem.replace('%', '')}.new.mp4")  # absolute: not an option, no protocol
     writer, count = None, 0
     try:
         for frame in frames:
             if writer is None:
-                writer = imageio_ffmpeg.write_frames(str(path), frame.shape[1::-1], fps=fps, quality=7)
+                size = frame.shape[1::-1]
+                writer = imageio_ffmpeg.write_frames(str(new), size, fps=fps, quality=7, ffmpeg_log_level="quiet")
                 with warnings.catch_warnings():  # about forking a process with threads: it becomes ffmpeg at once
                     warnings.simplefilter("ignore", RuntimeWarning)
                     writer.send(None)
             writer.send(np.ascontiguousarray(frame))
             count += 1
+        writer.close()
+        if imageio_ffmpeg.count_frames_and_secs(new)[0] != count:
+            raise OSError("frames are missing")
+        new.replace(path)
+    except (OSError, RuntimeError) as error:  # RuntimeError: of a file that is no film
+        raise OSError(
+            f"{path} cannot be written, ffmpeg broke off; is the disk full, or the folder read-only?"
+        ) from error
     finally:
         if writer is not None:
             writer.close()
+        new.unlink(missing_ok=True)
     return count
 
 

@@ -54,6 +54,27 @@ def test_a_damaged_or_missing_model_is_named(tmp_path):
         run.policy("last")
     with pytest.raises(ValueError, match=r"another version of leader-follower.*train anew"):
         run.policy(env=sb3.Recipe.of("leader-follower").env())
-    (tmp_path / "best.zip").write_bytes(b"no zip")
-    with pytest.raises(ValueError, match=r"best\.zip is damaged"):
+    content = (tmp_path / "best.zip").read_bytes()
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 1
+    for damaged in (b"no zip", b"", content[:-1], content + b"x", bytes(flipped)):
+        (tmp_path / "best.zip").write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"best\.zip is damaged"):
+            run.policy()
+    (tmp_path / "best.zip").write_bytes(content)
+    run.policy()
+    sidecar = (tmp_path / "best.json").read_text()
+    (tmp_path / "best.json").write_text(sidecar.replace('"n_steps": 4', '"n_steps": 5'))
+    with pytest.raises(ValueError, match=r"best\.json is damaged, or was edited"):
+        run.recipe()
+
+
+def test_a_model_with_numbers_that_are_not_finite_is_refused(tmp_path):
+    recipe = sb3.Recipe.of("paper-hover", net_arch=(8,), worlds=2, n_steps=4, batch_size=8)
+    model = recipe.model(VecEnv(recipe.env(), 2), seed=0)
+    with torch.no_grad():
+        next(model.policy.parameters()).fill_(float("nan"))
+    run = sb3.Run(tmp_path)
+    run.save_model("best", model, recipe=recipe.as_dict())
+    with pytest.raises(ValueError, match=r"best\.zip holds numbers that are not finite; take another"):
         run.policy()

@@ -1,5 +1,8 @@
 """Films and on-board pictures of recorded flights."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -44,6 +47,47 @@ def test_a_film_may_be_a_gif(record, tmp_path):
         assert picture.n_frames == 12
         durations = [picture.seek(frame) or picture.info["duration"] for frame in range(12)]
     assert sum(durations) == 1500  # ms, in whole hundredths of a second
+
+
+@pytest.mark.parametrize("name", ["short.mp4", "short.gif", "-x:y %d.mp4"])
+def test_the_shortest_flight_is_one_frame_whatever_its_file_is_called(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert replay.film(flights.fly("circle", drones=2, duration=0.01), Path(name)) == 1
+    assert (tmp_path / name).stat().st_size > 100
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
+def test_a_flight_that_breaks_is_filmed_until_then(wrong, record):
+    pos = np.array(record.pos)
+    pos[60:, 1] = wrong
+    states = list(replay._states(dataclasses.replace(record, pos=pos), fps=10))
+    assert len(states) == 15
+    np.testing.assert_array_equal(states[-1].pos, record.pos[59])
+    with pytest.raises(ValueError, match=r"film\.gif is not written: no state of the flight is finite"):
+        replay.film(dataclasses.replace(record, pos=np.full_like(pos, wrong)), Path("film.gif"))
+
+
+@pytest.mark.parametrize("fault", ["no file", "no film", "a folder"])
+def test_a_film_that_ffmpeg_cannot_write_is_one_line_and_leaves_the_old_one(
+    fault, record, tmp_path, monkeypatch, capfd
+):
+    film = tmp_path / "film.mp4"
+    film.mkdir() if fault == "a folder" else film.write_bytes(b"old")
+    counted = imageio_ffmpeg.count_frames_and_secs
+
+    def count(new):
+        if fault == "no file":
+            new.unlink()
+        elif fault == "no film":
+            new.write_bytes(b"half")
+        return counted(new)
+
+    monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", count)
+    with pytest.raises(OSError, match=r"film\.mp4 cannot be written, ffmpeg broke off; is the disk full") as error:
+        replay.film(record, film, fps=2)
+    assert "\n" not in str(error.value) and capfd.readouterr().err == ""
+    assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
+    assert fault == "a folder" or film.read_bytes() == b"old"
 
 
 def test_frames_are_in_step_with_simulated_time(record):

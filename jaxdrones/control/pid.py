@@ -93,7 +93,7 @@ def init(n: int) -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, between 9,440 and 21,666.
+    """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 
     Args:
         gains: of the two loops.
@@ -148,6 +148,6 @@ def attitude_loop(
 
 
 def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-    """RPM of a thrust per rotor and a torque (PWM), each rotor's PWM cut to the Crazyflie's range."""
+    """RPM of a thrust per rotor and a torque (PWM), each rotor's PWM cut to the Crazyflie's range, and `max_rpm`."""
     pwm = jnp.clip(thrust + jax.vmap(rotation.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
-    return _PWM_TO_RPM * pwm + _PWM_OFFSET
+    return jnp.minimum(_PWM_TO_RPM * pwm + _PWM_OFFSET, params.max_rpm)

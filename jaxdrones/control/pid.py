@@ -9,6 +9,7 @@ from __future__ import annotations
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
@@ -20,9 +21,11 @@ from jaxdrones.control.single import check_single
 from jaxdrones.numerics import safe_sqrt, stored
 from jaxdrones.params import Params
 from jaxdrones.state import State
+from jaxdrones.urdf import load_params
 
 VEHICLES = ("cf2x", "cf2p")
 
+_LIKENESS = np.log(1.25)  # between the numbers of a vehicle that the gains suit and those of cf2x
 _PWM_TO_RPM = 0.2685  # RPM per unit of the 16-bit PWM
 _PWM_OFFSET = 4070.3  # RPM
 _PWM_RANGE = (20000.0, 65535.0)
@@ -82,6 +85,29 @@ def gains(vehicle: str = "cf2x") -> Gains:
         rpy_i=jnp.array([0.0, 0.0, 500.0]),
         rpy_d=jnp.array([20000.0, 20000.0, 12000.0]),
     )
+
+
+def fits(params: Params) -> bool:
+    """Whether the gains suit a drone, or every drone of a team: a Crazyflie by its numbers, whatever its name.
+
+    That is, mass, inertia, arm, thrust and torque coefficient are within a quarter of those of `cf2x` or of `cf2p`.
+
+    Raises:
+        ValueError: the parameters are being traced.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
+        raise ValueError(
+            "params are being traced, so their numbers cannot be looked at; give values, outside of jax.jit"
+        )
+    numbers = _numbers(params)
+    unlike = [np.max(np.abs(np.log(numbers / _numbers(load_params(vehicle)))), axis=-1) for vehicle in VEHICLES]
+    return bool(np.all(np.min(unlike, axis=0) <= _LIKENESS))
+
+
+def _numbers(params: Params) -> np.ndarray:
+    """What the gains depend on: (7,) of one drone, (n, 7) of a team."""
+    scalars = np.stack([params.mass, params.arm, params.kf, params.km], axis=-1)
+    return np.concatenate([scalars, params.inertia], axis=-1)
 
 
 def init(n: int) -> Memory:

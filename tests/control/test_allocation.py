@@ -45,20 +45,20 @@ def test_roll_pitch_and_yaw_of_the_mixer_turn_about_their_own_axis(vehicle):
     np.testing.assert_allclose(torque, np.diag(np.diagonal(torque)), rtol=0, atol=1e-12 * np.min(np.diagonal(torque)))
 
 
-@pytest.mark.parametrize("name", golden_data.names("nnls_*"))
+@pytest.mark.parametrize("name", golden_data.names("infeasible"))
 def test_recorded_allocations_agree(name):
     case = golden_data.load(name)
     action = jnp.array(case.arrays["action"])
     assert 0 < case.arrays["infeasible"].sum() < len(action)
-    rpm = allocate_all(unlimited(recorded_vehicle(case)), action[:, 0], action[:, 1:])
+    rpm = allocate_all(golden_data.unlimited(recorded_vehicle(case)), action[:, 0], action[:, 1:])
     np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 1e-11
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("name", golden_data.names("nnls_*"))
+@pytest.mark.parametrize("name", golden_data.names("infeasible"))
 def test_recorded_allocations_agree_in_float32(name):
     case = golden_data.load(name)
-    params = unlimited(recorded_vehicle(case))
+    params = golden_data.unlimited(recorded_vehicle(case))
     action = jnp.array(case.arrays["action"])
     rpm = allocate_all(params, action[:, 0], action[:, 1:])
     # Thrusts are differences of terms of the size of the largest, so it is squares that agree: a few roundings of 6e-8.
@@ -84,7 +84,7 @@ def test_what_rotors_without_a_limit_cannot_is_missed_by_the_least_squares(vehic
     """SciPy minimises the same, and no step to squares that are not negative comes closer."""
     params = jaxdrones.load_params(vehicle)
     thrust, torque = wild_wrenches(params, seed=1)
-    params = unlimited(params)
+    params = golden_data.unlimited(params)
     squares = np.asarray(allocate_all(params, thrust, torque)) ** 2
     matrix, target = least_squares_problem(params, thrust, torque)
     scale = np.max(np.abs(target), axis=-1)
@@ -203,11 +203,10 @@ def test_gradients_of_the_allocation_are_zero_at_rest(thrust):
 
 def test_gradients_of_the_allocation_are_finite_without_a_limit_and_with_equal_demands():
     params = jaxdrones.load_params("cf2x")
+    slopes = jax.jit(jax.jacrev(rpm_from_wrench, argnums=(0, 1, 2)))
     for limit, thrust in (jnp.inf, params.weight), (1e3, params.weight), (2e4, params.max_thrust):
-        limited = params.replace(max_rpm=jnp.asarray(limit, float))
         for torque in jnp.zeros(3), jnp.full(3, 1e-3):
-            gradients = jax.jacrev(rpm_from_wrench, argnums=(0, 1, 2))(limited, thrust, torque)
-            assert_finite(gradients)
+            assert_finite(slopes(params.replace(max_rpm=jnp.asarray(limit, float)), thrust, torque))
 
 
 def test_compiled_and_batched_allocations_equal_single_ones():
@@ -244,11 +243,6 @@ def gradients_and_differences(params, unit, wrench):
     h = 1e-6
     there, back = (jax.vmap(squares)(wrench[None] + sign * h * jnp.eye(4)) for sign in (1, -1))
     return jax.jacrev(squares)(wrench), (there - back).T / (2 * h)
-
-
-def unlimited(params):
-    """The drone with motors without a limit, as the reference's allocation is recorded."""
-    return params.replace(max_rpm=jnp.array(jnp.inf))
 
 
 def at_work(params):

@@ -31,7 +31,7 @@ class Params(flax.struct.PyTreeNode):
     km: Array
     """() torque coefficient, N m/RPM^2."""
     max_rpm: Array
-    """() highest rotor speed, RPM; does not follow the mass."""
+    """() highest rotor speed, RPM; does not follow the mass. Infinity stands for motors without a limit."""
     rotor_rise_time: Array
     """() time constant of a lagging rotor that speeds up, s."""
     rotor_fall_time: Array

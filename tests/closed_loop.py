@@ -90,10 +90,16 @@ def distance(flown: State, pos) -> np.ndarray:
     return np.linalg.norm(np.asarray(flown.pos) - np.asarray(pos), axis=-1)
 
 
-def reaches(controller: ModuleType, vehicles, target, seconds: int, hz: int, start=None, memory=None) -> np.ndarray:
-    """Distance from a fixed target, m, after each control step of a flight that starts in hover: (length, n)."""
-    team = team_of(*vehicles)
+def reaches(
+    controller: ModuleType, vehicles, target, seconds: int, hz: int, start=None, memory=None, **constants
+) -> np.ndarray:
+    """Distance from a fixed target, m, after each control step of a flight that starts in hover: (length, n).
+
+    `constants` are parameters that replace those of every vehicle.
+    """
     n = len(vehicles)
+    team = team_of(*vehicles)
+    team = team.replace(**{name: jnp.full_like(getattr(team, name), value) for name, value in constants.items()})
     start = hovering(team) if start is None else start
     memory = controller.init(n) if memory is None else memory
     targets = always(at(n, target), seconds * hz)

@@ -86,8 +86,9 @@ def test_roll_pitch_yaw_come_back():
     np.testing.assert_allclose(each(rotation.to_rpy, each(rotation.from_rpy, rpy)), rpy, atol=1e-12)
 
 
-def test_conversions_agree_with_recorded_ones():
-    recorded = golden_data.load("attitude_conversions").arrays
+@pytest.mark.parametrize("name", golden_data.names("euler_intrinsic_xyz"))
+def test_conversions_agree_with_recorded_ones(name):
+    recorded = golden_data.load(name).arrays
     np.testing.assert_allclose(each(rotation.to_matrix, recorded["quat"]), recorded["rot"], atol=ROUND_OFF)
     np.testing.assert_allclose(
         up_to_sign(each(rotation.from_rpy, recorded["rpy_in"])), up_to_sign(recorded["quat_out"]), atol=ROUND_OFF

@@ -12,6 +12,7 @@ from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_tota
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
+from jaxdrones.dynamics.rotors import limited
 from jaxdrones.numerics import stored, stored_for_derivatives
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -41,7 +42,9 @@ def make_step(
 
     Returns:
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
-        rpm (n, 4) the commanded rotor speeds. It does not clip the command. It raises `ValueError` on a wrong shape.
+        rpm (n, 4) the commanded rotor speeds. The rotors limit them to [0, `params.max_rpm`], and so the speeds that
+        a state starts with. There is no floor: drones fall through z = 0 unless `ground_contact` is among the
+        effects. It raises `ValueError` on a wrong shape.
 
     Raises:
         ValueError: `dt` or `substeps` not positive, or an argument that should be a function and is not.
@@ -62,7 +65,7 @@ def make_step(
     def step(params: Params, state: State, rpm: ArrayLike) -> State:
         rpm = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
         check_team(params, state, rpm)
-        speed, _ = jax.vmap(rotors)(params, state.rpm, rpm)
+        speed, _ = jax.vmap(rotors)(params, jax.vmap(limited)(params, state.rpm), rpm)
         state = state.replace(rpm=speed)
 
         # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxdrones.backends.explicit import Step
 from jaxdrones.backends.host import HostStep, is_traced
+from jaxdrones.backends.team import check_constants
 from jaxdrones.checks import check_finite, check_whole
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -46,7 +47,7 @@ def rollout(
     """
     check_whole("length", length)
     check_finite("state", state)
-    check_finite("params", params)
+    check_constants(params)
 
     if isinstance(step, HostStep) and not is_traced((params, state, memory)):
         return _loop(step, control, params, state, memory, length)

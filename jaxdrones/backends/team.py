@@ -4,11 +4,12 @@ import dataclasses
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_finite, check_shape
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -34,6 +35,19 @@ def check_team(params: Params, state: State, rpm: Any) -> None:
         hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
         check_shape(f"params.{name}", leaf, (n, *_SHAPES.get(name, ())), hint)
     check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")
+
+
+def check_constants(params: Params) -> None:
+    """Raise `ValueError` unless the parameters are finite; `max_rpm` may be infinite, and is not negative.
+
+    Traced values cannot be looked at.
+    """
+    if not isinstance(params.max_rpm, jax.core.Tracer):
+        max_rpm = np.asarray(params.max_rpm)
+        if np.any(max_rpm < 0):
+            raise ValueError(f"params.max_rpm is {max_rpm.tolist()}; give at least 0 RPM, or infinity for no limit")
+        params = params.replace(max_rpm=np.where(max_rpm == np.inf, 0, max_rpm))
+    check_finite("params", params)
 
 
 def flatten(params: Params) -> Float[Array, "n k"]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxdrones import rotation
 from jaxdrones.backends.cells import Cells
-from jaxdrones.dynamics import rotor_wrench
+from jaxdrones.dynamics import drone_contact, rotor_wrench
 from jaxdrones.numerics import stored
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -18,6 +18,7 @@ Effect = Callable[[Params, State], Wrench]
 Pair = Callable[[Params, State, Params, State], Wrench]
 
 _OUT_OF_REACH = 1e3  # m
+_BESIDE = 2.0**-13  # m; 0.1 mm, which float32 adds to 1 km without rounding
 _SHORT = 32  # terms
 _EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}
 
@@ -51,6 +52,7 @@ def make_total_wrench(
 
     def total_wrench(params: Params, state: State) -> Wrench:
         wrench = jax.vmap(alone)(params, state)
+        state = _side_by_side(state) if drone_contact in pairs else state
         return sum((_from_others(pair, params, state, cells) for pair in pairs), wrench)
 
     return total_wrench
@@ -96,6 +98,20 @@ def _from_others(pair: Pair, params: Params, state: State, cells: Cells | None) 
     components = [_stored(x) for x in components]
     force, torque = components[:3], components[3:]
     return Wrench(jnp.stack(force, axis=-1), jnp.stack(torque, axis=-1))
+
+
+def _side_by_side(state: State) -> State:
+    """The team with drones that are in exactly the same place a little above each other, in the order of their indices.
+
+    Contact could not tell them apart: they would push each other nowhere, and stay. As all pairs see the same places,
+    action stays equal to reaction.
+    """
+    x, y, z = state.pos.T
+    same = (x[:, None] == x[None]) & (y[:, None] == y[None]) & (z[:, None] == z[None])
+    rank = jnp.sum(jnp.tril(same, -1), axis=1)  # how many of lower index are there
+    rounding = jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(state.pos), axis=1)
+    up = rank * jnp.maximum(_BESIDE, 16 * rounding)
+    return state.replace(pos=state.pos + jax.lax.stop_gradient(up[:, None] * jax.vmap(rotation.z_axis)(state.quat)))
 
 
 def _sum(x: jax.Array) -> jax.Array:

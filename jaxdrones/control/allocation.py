@@ -9,6 +9,7 @@ from jaxdrones.checks import check_shape
 from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 
+_LEAST_SHARE = 0.01  # of thrust or yaw that a rotor must make to be relieved by less of it; usually all make 0.25
 _ACTIVE_SETS = np.array([[i >> k & 1 for k in range(4)] for i in range(16)], bool)  # which rotors turn
 
 
@@ -19,11 +20,15 @@ def mixer(params: Params) -> Float[Array, "4 3"]:
 
 
 def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Rotor speeds that produce a thrust (N, body z) and a torque (N m, body), as nearly as rotors that only push can.
+    """Rotor speeds in [0, `max_rpm`] that produce a thrust (N, body z) and a torque (N m, body) as nearly as they can.
 
-    Where the exact inverse asks for a negative thrust it is the non-negative least-squares solution of
-    A P^2 = b, with rows 1, y/L, -x/L, spin and b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). There is no
-    upper limit. Differentiable; where a rotor is held at zero its derivative is zero.
+    What the rotors can produce they do. Beyond that, yaw torque is given up first: as much of it as it takes for no
+    rotor to turn backwards or faster than `max_rpm`. Then thrust is given up where it is too high, and roll and pitch
+    torque keep their direction (the priorities of Faessler, Falanga and Scaramuzza 2017). Where thrust is too low for
+    roll and pitch, it is the non-negative least-squares solution of A P^2 = b, with rows 1, y/L, -x/L, spin and
+    b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` it is that solution for every
+    demand, as in the reference, whose allocation has no upper limit. Differentiable; where a rotor is held at a limit
+    its derivative is zero.
 
     Raises:
         ValueError: arrays of a team (use `jax.vmap`).
@@ -35,15 +40,54 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
     matrix = jnp.stack([jnp.ones_like(x), y / arm, -x / arm, params.rotor_spin])
     torque_scale = jnp.stack([params.kf * arm, params.kf * arm, params.km])
     target = jnp.append(thrust / params.kf, torque / torque_scale)
-    return safe_sqrt(_non_negative_least_squares(matrix, target))
+    inverses = _inverses(matrix)
+    inverse, limit = inverses[-1], _square_of_limit(params)
+    target = _within_authority(inverse, target, limit)
+    squares = _non_negative_least_squares(matrix, inverses, target)
+    squares = squares - _excess(squares, limit, inverse[:, 0]) * inverse[:, 0]
+    return jnp.minimum(safe_sqrt(squares), params.max_rpm)
 
 
-def _non_negative_least_squares(matrix: Float[Array, "4 4"], target: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The x >= 0 that minimises |A x - b| for a regular A, by trying all sixteen sets of positive unknowns.
+def _square_of_limit(params: Params) -> Float[Array, ""]:
+    """The square of `max_rpm`, RPM^2; infinite, with a zero gradient, where that is."""
+    unlimited = jnp.isinf(params.max_rpm)
+    return jnp.where(unlimited, jnp.inf, jnp.where(unlimited, 0, params.max_rpm) ** 2)
 
-    The minimum is the best of the least-squares solutions on each set among those that are not negative. The
-    exact inverse is the full set with residual zero. The sixteen inverses depend on the vehicle alone, so they are
-    computed once however many drones of that vehicle there are.
+
+def _within_authority(
+    inverse: Float[Array, "4 4"], target: Float[Array, "4"], limit: Float[Array, ""]
+) -> Float[Array, "4"]:
+    """The demand with roll and pitch scaled down to what rotors can do, and then yaw to what they can do beside.
+
+    Otherwise least squares would trade thrust for torques that cannot be had. Without a limit nothing changes.
+    """
+    turning = inverse[:, 1:3] @ target[1:3]
+    exact = inverse @ target
+    spread = jnp.max(turning) - jnp.min(turning)
+    spread = jnp.minimum(spread, jnp.maximum(jnp.max(exact), 0) - jnp.minimum(jnp.min(exact), 0))
+    share = 1 / jnp.maximum(spread / jnp.maximum(limit, 1), 1)
+    target = jnp.stack([target[0], share * target[1], share * target[2], target[3]])
+    squares, sign = inverse @ target, jnp.sign(target[3])
+    yaw = sign * inverse[:, 3]
+    too_fast = _excess(squares, limit, yaw)
+    backwards = jnp.where(jnp.isinf(limit), 0, _excess(-squares, 0, -yaw))
+    given_up = jnp.minimum(jnp.maximum(too_fast, backwards), jnp.abs(target[3]))
+    return target.at[3].add(-sign * given_up)
+
+
+def _excess(
+    squares: Float[Array, "4"], limit: Float[Array, ""] | float, direction: Float[Array, "4"]
+) -> Float[Array, ""]:
+    """How far to go back along a direction until none of the rotors that it raises is above the limit, RPM^2."""
+    raises = direction > _LEAST_SHARE
+    beyond = jnp.maximum(squares - limit, 0) / jnp.where(raises, direction, 1)
+    return jnp.max(jnp.where(raises, beyond, 0))
+
+
+def _inverses(matrix: Float[Array, "4 4"]) -> Float[Array, "16 4 4"]:
+    """Least-squares inverses of A on all sixteen sets of unknowns that are not zero; the last one is the inverse.
+
+    They depend on the vehicle alone, so they are computed once however many drones of that vehicle there are.
     """
 
     def solve_on(active):
@@ -51,8 +95,14 @@ def _non_negative_least_squares(matrix: Float[Array, "4 4"], target: Float[Array
         normal = part.T @ part + jnp.diag(1.0 - active)
         return jnp.linalg.solve(normal, part.T)
 
-    active_sets = jnp.asarray(_ACTIVE_SETS, matrix.dtype)
-    candidates = jax.vmap(solve_on)(active_sets) @ target
+    return jax.vmap(solve_on)(jnp.asarray(_ACTIVE_SETS, matrix.dtype))
+
+
+def _non_negative_least_squares(
+    matrix: Float[Array, "4 4"], inverses: Float[Array, "16 4 4"], target: Float[Array, "4"]
+) -> Float[Array, "4"]:
+    """The x >= 0 that minimises |A x - b| for a regular A: the best that is not negative of the sixteen candidates."""
+    candidates = inverses @ target
     residuals = jnp.sum((candidates @ matrix.T - target[None]) ** 2, axis=-1)
     feasible = jnp.all(candidates >= 0, axis=-1)
     return candidates[jnp.argmin(jnp.where(feasible, residuals, jnp.inf))]

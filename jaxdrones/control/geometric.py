@@ -82,5 +82,4 @@ def control(
         - rotation.cross(state.omega, omega_target)
     )
     torque = params.inertia * omega_rate + rotation.cross(state.omega, params.inertia * state.omega)
-    rpm = rpm_from_wrench(params, jnp.maximum(thrust, 0), torque)
-    return memory, jnp.minimum(rpm, params.max_rpm)
+    return memory, rpm_from_wrench(params, jnp.maximum(thrust, 0), torque)

@@ -11,6 +11,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
@@ -22,9 +23,11 @@ from jaxdrones.control.single import check_single
 from jaxdrones.numerics import safe_sqrt, stored
 from jaxdrones.params import Params
 from jaxdrones.state import State
+from jaxdrones.urdf import load_params
 
 VEHICLES = ("cf2x", "cf2p")
 
+_LIKENESS = np.log(1.25)  # between the numbers of a vehicle that the gains suit and those of cf2x
 _PWM_TO_RPM = 0.2685  # RPM per unit of the 16-bit PWM
 _PWM_OFFSET = 4070.3  # RPM
 _PWM_RANGE = (20000.0, 65535.0)
@@ -86,6 +89,29 @@ def gains(vehicle: str = "cf2x") -> Gains:
     )
 
 
+def fits(params: Params) -> bool:
+    """Whether the gains suit a drone, or every drone of a team: a Crazyflie by its numbers, whatever its name.
+
+    That is, mass, inertia, arm, thrust and torque coefficient are within a quarter of those of `cf2x` or of `cf2p`.
+
+    Raises:
+        ValueError: the parameters are being traced.
+    """
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
+        raise ValueError(
+            "params are being traced, so their numbers cannot be looked at; give values, outside of jax.jit"
+        )
+    numbers = _numbers(params)
+    unlike = [np.max(np.abs(np.log(numbers / _numbers(load_params(vehicle)))), axis=-1) for vehicle in VEHICLES]
+    return bool(np.all(np.min(unlike, axis=0) <= _LIKENESS))
+
+
+def _numbers(params: Params) -> np.ndarray:
+    """What the gains depend on: (7,) of one drone, (n, 7) of a team."""
+    scalars = np.stack([params.mass, params.arm, params.kf, params.km], axis=-1)
+    return np.concatenate([scalars, params.inertia], axis=-1)
+
+
 def init(n: int) -> Memory:
     """Fresh memory for a team of n drones."""
     check_whole("number of drones", n)
@@ -95,7 +121,7 @@ def init(n: int) -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, between 9,440 and 21,666.
+    """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 
     Args:
         gains: of the two loops.
@@ -150,6 +176,6 @@ def attitude_loop(
 
 
 def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-    """RPM of a thrust per rotor and a torque (PWM), each rotor's PWM cut to the Crazyflie's range."""
+    """RPM of a thrust per rotor and a torque (PWM), each rotor's PWM cut to the Crazyflie's range, and `max_rpm`."""
     pwm = jnp.clip(thrust + jax.vmap(rotation.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
-    return _PWM_TO_RPM * pwm + _PWM_OFFSET
+    return jnp.minimum(_PWM_TO_RPM * pwm + _PWM_OFFSET, params.max_rpm)

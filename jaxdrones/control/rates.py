@@ -94,5 +94,4 @@ def follow(
     check_shape("omega", omega, (3,), "body rates of one drone; use jax.vmap for a team")
     gyroscopic = rotation.cross(state.omega, params.inertia * state.omega)
     torque = params.inertia * gains.rate * (omega - state.omega) + gyroscopic
-    rpm = rpm_from_wrench(params, jnp.maximum(params.mass * collective, 0), torque)
-    return jnp.minimum(rpm, params.max_rpm)
+    return rpm_from_wrench(params, jnp.maximum(params.mass * collective, 0), torque)

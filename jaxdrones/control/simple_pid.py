@@ -69,7 +69,7 @@ def init(n: int) -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM; not limited.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`; the reference's are not limited.
 
     Heads north: of the setpoint only `pos` is used. Derivatives are differences of errors, so the first call kicks.
     With the Hummingbird's own inertia it needs 60 calls per second; the paper's 48 go with a fivefold one.

@@ -34,9 +34,12 @@ def control(
     """
     check_single(params, state)
     check_shape("action", action, (4,), "direction (3) and magnitude of one drone; use jax.vmap for a team")
-    yaw = rotation.to_rpy(state.quat)[2]
-    setpoint = Setpoint.at(state.pos, vel=commanded(params, action), yaw=yaw)
-    return pid.control(gains, params, memory, state, setpoint, dt=dt)
+    return pid.control(gains, params, memory, state, setpoint(params, state, action), dt=dt)
+
+
+def setpoint(params: Params, state: State, action: Float[Array, "4"]) -> Setpoint:
+    """What an action asks of a controller: to be where the drone is, headed as it is, at the commanded velocity."""
+    return Setpoint.at(state.pos, vel=commanded(params, action), yaw=rotation.to_rpy(state.quat)[2])
 
 
 def commanded(params: Params, action: Float[Array, "4"]) -> Float[Array, "3"]:

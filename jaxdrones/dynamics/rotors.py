@@ -9,18 +9,30 @@ from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
 
+def limited(params: Params, rpm: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The nearest speeds at which rotors can turn, RPM: from 0 to `max_rpm`, which may be infinite.
+
+    A rotor does not turn backwards, where the square of its speed would lift all the same. The derivative is zero
+    beyond the limits and one on them, so that a gradient finds back from there.
+    """
+    return jnp.where(rpm < 0, 0, jnp.where(rpm > params.max_rpm, params.max_rpm, rpm))
+
+
 def instant_rotors(
     params: Params, rpm: Float[Array, "4"], command: Float[Array, "4"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """The paper's rotors: the command (RPM) acts at once. Returns the speed and its rate, RPM and RPM/s."""
-    return command, jnp.zeros_like(command)
+    """The paper's rotors: the limited command (RPM) acts at once. Returns the speed and its rate, RPM and RPM/s."""
+    return limited(params, command), jnp.zeros_like(command)
 
 
 def lagging_rotors(
     params: Params, rpm: Float[Array, "4"], command: Float[Array, "4"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """First-order lag with separate rise and fall times. Returns the speed and its rate, RPM and RPM/s."""
-    error = command - rpm
+    """First-order lag behind the limited command, with separate rise and fall times.
+
+    Returns the speed and its rate, RPM and RPM/s.
+    """
+    error = limited(params, command) - rpm
     tau = jnp.where(error > 0, params.rotor_rise_time, params.rotor_fall_time)
     return rpm, error / tau
 

@@ -10,10 +10,11 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.control import Setpoint, attitude, pid, rates, velocity
+from jaxdrones.control import Setpoint, attitude, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -35,6 +36,16 @@ class Action:
     """(params, memory, state, action (size,), setpoint of the task, control period) -> (memory, rotor speeds, RPM)."""
     init: Callable[[int], Any] = _no_memory
     """Number of drones -> fresh memory of the team."""
+    for_vehicle: Callable[[Params], Action] | None = None
+    """Nominal parameters of the team -> the action type as they need it; `None` where it is the same for all."""
+
+    def fitted(self, params: Params) -> Action:
+        """The action type as a vehicle needs it.
+
+        Raises:
+            ValueError: it does not fit the vehicle.
+        """
+        return self if self.for_vehicle is None else self.for_vehicle(params)
 
 
 def rpm(near_hover: float | None = None) -> Action:
@@ -56,11 +67,16 @@ def one_d_rpm(near_hover: float | None = 0.05) -> Action:
 
 
 def thrust_and_torques(torque_share: float = 0.05) -> Action:
-    """Collective thrust from zero to twice the weight, and torques up to a share of the largest."""
+    """Collective thrust from zero to twice the weight, and torques up to a share of the largest.
+
+    Allocated as by the paper, which knows no limit but that no rotor turns backwards, and then limited.
+    """
 
     def command(params, memory, state, action, setpoint, dt):
         limits = torque_share * jnp.stack([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
-        return memory, rpm_from_wrench(params, params.weight * (1 + action[0]), limits * action[1:])
+        unlimited = params.replace(max_rpm=jnp.full_like(params.max_rpm, jnp.inf))
+        rpm = rpm_from_wrench(unlimited, params.weight * (1 + action[0]), limits * action[1:])
+        return memory, jnp.minimum(rpm, params.max_rpm)
 
     return Action(4, command)
 
@@ -76,39 +92,32 @@ def one_d_thrust(share: float = 0.05) -> Action:
 
 
 def velocity_input() -> Action:
-    """The paper's velocity input (equation 8): a direction and a share of the speed limit, flown by the PID."""
-    return _by_pid(
-        4, lambda params, memory, state, action, dt: velocity.control(pid.gains(), params, memory, state, action, dt=dt)
-    )
+    """The paper's velocity input (equation 8): a direction and a share of the speed limit."""
+    return _setpoint(4, velocity.setpoint)
 
 
 def one_d_velocity() -> Action:
     """The velocity input along z alone."""
 
-    def command(params, memory, state, action, dt):
+    def target(params, state, action):
         vertical = jnp.stack([0 * action[0], 0 * action[0], jnp.sign(action[0]), jnp.abs(action[0])])
-        return velocity.control(pid.gains(), params, memory, state, vertical, dt=dt)
+        return velocity.setpoint(params, state, vertical)
 
-    return _by_pid(1, command)
+    return _setpoint(1, target)
 
 
 def position(step: float = 0.1) -> Action:
-    """A place up to `step` (m) away along each axis, flown to by the PID."""
-
-    def command(params, memory, state, action, dt):
-        return pid.control(pid.gains(), params, memory, state, Setpoint.at(state.pos + step * action), dt=dt)
-
-    return _by_pid(3, command)
+    """A place up to `step` (m) away along each axis."""
+    return _setpoint(3, lambda params, state, action: Setpoint.at(state.pos + step * action))
 
 
 def one_d_position(step: float = 0.1) -> Action:
-    """A place up to `step` (m) above or below, flown to by the PID."""
+    """A place up to `step` (m) above or below."""
 
-    def command(params, memory, state, action, dt):
-        up = jnp.stack([0 * action[0], 0 * action[0], step * action[0]])
-        return pid.control(pid.gains(), params, memory, state, Setpoint.at(state.pos + up), dt=dt)
+    def target(params, state, action):
+        return Setpoint.at(state.pos + jnp.stack([0 * action[0], 0 * action[0], step * action[0]]))
 
-    return _by_pid(1, command)
+    return _setpoint(1, target)
 
 
 def destination(stride: float = 1.0) -> Action:
@@ -117,13 +126,12 @@ def destination(stride: float = 1.0) -> Action:
     The `pid` action of today's version of the paper's simulator.
     """
 
-    def command(params, memory, state, action, dt):
+    def target(params, state, action):
         way = action - state.pos
         length = jnp.maximum(rotation.dot(way, rotation.unit(way)), stride)
-        setpoint = Setpoint.at(state.pos + way * stride / length)
-        return pid.control(pid.gains(), params, memory, state, setpoint, dt=dt)
+        return Setpoint.at(state.pos + way * stride / length)
 
-    return _by_pid(3, command)
+    return _setpoint(3, target)
 
 
 def pid_gains() -> Action:
@@ -134,7 +142,15 @@ def pid_gains() -> Action:
         scaled = pid.Gains(*((1 + a) * gain for a, gain in zip(action, vars(own).values(), strict=True)))
         return pid.control(scaled, params, memory, state, setpoint, dt=dt)
 
-    return Action(6, command, pid.init)
+    def for_vehicle(params):
+        if pid.fits(params):
+            return Action(6, command, pid.init)
+        raise ValueError(
+            f"the action type 'pid_gains' scales the gains of the PID, which suit {', '.join(pid.VEHICLES)} and no "
+            "vehicle of other mass, inertia, arm or coefficients; take one of these, or another action type"
+        )
+
+    return Action(6, command, pid.init, for_vehicle)
 
 
 def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
@@ -160,9 +176,50 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
     return Action(4, command)
 
 
-def _by_pid(size: int, command: Callable) -> Action:
-    """An action type that the PID flies, whatever the task."""
-    return Action(size, lambda params, memory, state, a, setpoint, dt: command(params, memory, state, a, dt), pid.init)
+_LONGEST_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie, at 15 Hz the geometric controller holds any vehicle
+_SLOWEST_ROTORS = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
+
+
+def _setpoint(size: int, target: Callable[[Params, State, Array], Setpoint]) -> Action:
+    """An action type that asks for a setpoint, whatever the task.
+
+    The PID flies there with vehicles that its gains suit, the geometric controller with all others.
+    """
+
+    def flown_by(controller) -> Action:
+        def command(params, memory, state, action, setpoint, dt):
+            wanted = target(params, state, action)
+            return controller.control(controller.gains(), params, memory, state, wanted, dt=dt)
+
+        return Action(size, command, controller.init, lambda params: flown_by(pid if pid.fits(params) else geometric))
+
+    return flown_by(pid)
+
+
+def check_loop(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:
+    """Raise `ValueError` if the controller of an action type would be called too seldom, or its rotors lag too much.
+
+    Args:
+        name: of the action type.
+        action: the action type.
+        params: nominal ones of the vehicle.
+        lagging: whether the rotors lag.
+        dt: control period, s.
+    """
+    if action.for_vehicle is None:
+        return
+    if dt > _LONGEST_PERIOD * (1 + 1e-6):
+        raise ValueError(
+            f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
+            f"{1 / _LONGEST_PERIOD:g} or more"
+        )
+    time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
+    if lagging and time > _SLOWEST_ROTORS * (1 + 1e-6):
+        raise ValueError(
+            f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
+            f"{_SLOWEST_ROTORS} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
+            "action type that commands rotors, thrust and torques, or rates"
+        )
 
 
 def _rotor_speed(params: Params, action: Array, near_hover: float | None) -> Array:

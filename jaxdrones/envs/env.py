@@ -81,7 +81,7 @@ class Env:
         if not observation:
             raise ValueError("observation is empty; name at least one part")
         self.task, self.params, self.dt, self.drones = task, params, dt, task.drones
-        self.action, self.action_size = action, action.size
+        self.action, self.action_size = action.fitted(params), action.size
         self.steps = round(task.duration / dt) + task.overtime
         self._parts, self._laws, self._noise, self._disturb = tuple(observation), tuple(laws), noise, disturb
         self.kept = () if laws or disturb else ("params",)

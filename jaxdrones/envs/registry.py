@@ -7,9 +7,18 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from jaxdrones.backends.explicit import Step, make_step
-from jaxdrones.checks import check_choice, check_positive, check_whole
-from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS, drone_contact, external_push, ground_contact
-from jaxdrones.envs.actions import ACTIONS, Action
+from jaxdrones.checks import check_choice, check_finite, check_positive, check_whole
+from jaxdrones.dynamics import (
+    EFFECTS,
+    INTEGRATORS,
+    PAIRS,
+    ROTORS,
+    drone_contact,
+    external_push,
+    ground_contact,
+    lagging_rotors,
+)
+from jaxdrones.envs.actions import ACTIONS, Action, check_loop
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.envs.randomize import REALISTIC_DELAY, REALISTIC_LAWS, Disturbance, Law, Noise, sensor_noise
@@ -85,7 +94,8 @@ def make(
         **options: of the task, for example `drones`.
 
     Raises:
-        ValueError: an unknown name, a number out of range, an option that the task does not have.
+        ValueError: an unknown name, a number out of range, an option that the task does not have, an action type that
+            is flown by a controller that the vehicle, its rotors or the control rate do not suit.
         ImportError: the Bullet backend is asked for and pybullet is not installed.
     """
     check_choice("backend", backend, BACKENDS)
@@ -96,6 +106,7 @@ def make(
     check_whole("substeps", substeps)
     dt = 1 / control_hz
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
+    check_finite("vehicle", nominal)
 
     preset = _REALISTIC if realistic else _PLAIN
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
@@ -103,6 +114,7 @@ def make(
     if disturb is not None:
         effects = [*effects, external_push]
     pairs = [_named("pair effect", pair, PAIRS) for pair in pairs]
+    action = _action(task.action if action is None else action, nominal, rotors is lagging_rotors, dt)
     physics: dict[str, Any] = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
     step: Step
     if backend == "bullet":
@@ -118,14 +130,13 @@ def make(
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
-    chosen = _named("action", task.action if action is None else action, ACTIONS)
     parts = [_part(name, task) for name in (task.observation if observation is None else observation)]
     return Env(
         task,
         nominal,
         step,
         dt=dt,
-        action=chosen if isinstance(chosen, Action) else chosen(),
+        action=action,
         observation=parts,
         laws=(*task.laws, *(preset["laws"] if laws is None else laws)),
         noise=preset["noise"] if noise is None else noise,
@@ -158,6 +169,14 @@ def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
         return value
     check_choice(kind, value, table)
     return table[value]
+
+
+def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> Action:
+    """The action type as the vehicle needs it, and an error if its controller cannot fly that."""
+    kind = _named("action", action, ACTIONS)
+    kind = kind if isinstance(kind, Action) else kind()
+    check_loop(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
+    return kind.fitted(nominal)
 
 
 def _part(name: str | Part, task: Task) -> Part:

@@ -1,5 +1,7 @@
 """Laws of the step: teams, worlds, substeps, compilation."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,10 +55,46 @@ def test_hover_speed_hovers(vehicle):
     assert_same_motion(end, start.replace(rpm=rpm), ROUND_OFF)
 
 
-def test_a_step_turns_the_rotors_as_commanded_and_does_not_clip():
+def test_a_step_turns_the_rotors_as_commanded():
     team = jaxdrones.repeat(cf2x, 1)
-    for rpm in jnp.full((1, 4), 2 * cf2x.max_rpm), jnp.zeros((1, 4)):
+    for rpm in jnp.full((1, 4), cf2x.max_rpm), jnp.zeros((1, 4)):
         np.testing.assert_array_equal(single_step(team, State.at_rest([[0.0, 0, 1]]), rpm).rpm, rpm)
+
+
+@pytest.mark.parametrize("step", [single_step, full_step], ids=["instant", "lagging"])
+def test_a_command_out_of_range_flies_as_its_nearest_limit(step):
+    """Of each vehicle, for a quarter of a second: twice the highest speed as that speed, -1,000 RPM as none."""
+    start, top = flying(mixed), jnp.broadcast_to(mixed.max_rpm[:, None], (len(VEHICLES), 4))
+    out = jnp.stack([jnp.where(jnp.arange(4) % 2 == k, 2 * top, -1000.0) for k in (0, 1)])
+    within = jnp.clip(out, 0, top[None])
+    flights = [fly(step, mixed, start, jnp.repeat(rpm, 30, axis=0)) for rpm in (out, within)]
+    assert_close(*flights, atol=0)
+    assert jnp.all((flights[0].rpm >= 0) & (flights[0].rpm <= top[None]))
+
+
+def test_a_start_with_rotor_speeds_out_of_range_flies_as_one_on_the_limit():
+    """So a rotor that is said to turn backwards does not lift."""
+    start = flying(mixed)
+    out = jnp.tile(jnp.array([[-1e4, 0, 1e5, 2e3]]), (len(VEHICLES), 1))
+    starts = [start.replace(rpm=rpm) for rpm in (out, jnp.clip(out, 0, mixed.max_rpm[:, None]))]
+    assert_close(*(fly(full_step, mixed, s, tape(mixed, 30)) for s in starts), atol=0)
+
+
+@pytest.mark.parametrize("step", [single_step, full_step], ids=["instant", "lagging"])
+def test_without_a_limit_motors_follow_and_the_gradient_of_a_flight_is_finite(step):
+    """As recordings of versions that did not limit are flown; `rollout` takes an infinite `max_rpm` for a number."""
+    team = mixed.replace(max_rpm=jnp.full(len(VEHICLES), jnp.inf))
+    rpm = jnp.broadcast_to(2 * mixed.max_rpm[:, None], (len(VEHICLES), 4))
+    start = flying(mixed).replace(rpm=rpm)
+    end, _ = jaxdrones.rollout(step, lambda params, memory, state, k: (memory, rpm), team, start, None, 2)
+    np.testing.assert_array_equal(end.rpm, rpm)
+
+    @jax.jit
+    @partial(jax.grad, argnums=(0, 1, 2))
+    def slopes(team, start, rpm):
+        return jnp.sum(fly(step, team, start, jnp.stack([rpm] * 3)).pos)
+
+    assert_finite(slopes(team, start, rpm))
 
 
 def test_whole_numbers_and_lists_are_rotor_speeds_too():

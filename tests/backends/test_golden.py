@@ -13,21 +13,22 @@ from jaxdrones import State
 
 ATOL = 1e-9  # SI units; both sides are float64 and round differently over up to 1000 steps (measured: 4e-13)
 
-make_step = lru_cache(lambda dt: jaxdrones.make_step(dt=dt))
+make_step = lru_cache(lambda dt, substeps=1: jaxdrones.make_step(dt=dt, substeps=substeps))
 
 
-@pytest.mark.parametrize("name", golden_data.names("dyn_main_*"))
+@pytest.mark.parametrize("name", golden_data.names(kind="open_loop_rollout", physics="dyn", variant="main"))
 def test_whole_rollouts_agree(name):
     case = golden_data.load(name)
     pos, quat, vel, omega = (jnp.array(case.arrays[key]) for key in ("pos", "quat", "vel", "body_rates"))
-    rpm = jnp.array(case.arrays["rpm_applied"])
-    start = State(pos[0], quat[0], vel[0], omega[0], jnp.zeros_like(rpm[0]))
-    team = jaxdrones.repeat(golden_data.explicit_params(case), len(rpm[0]))
-    flown = fly(make_step(1 / case.about["physics_freq_hz"]), team, start, rpm)
-    assert_same_motion(flown, State(pos[1:], quat[1:], vel[1:], omega[1:], rpm), ATOL)
+    start = State(pos[0], quat[0], vel[0], omega[0], jnp.zeros((len(pos[0]), 4)))
+    params, rpm = golden_data.flown(case, golden_data.explicit_params(case))
+    step = make_step(1 / case.about["physics_freq_hz"], case.about["physics_steps_per_record"])
+    flown = fly(step, jaxdrones.repeat(params, len(pos[0])), start, jnp.array(rpm))
+    applied = jnp.array(case.arrays["rpm_applied"])
+    assert_same_motion(flown, State(pos[1:], quat[1:], vel[1:], omega[1:], applied), ATOL)
 
 
-@pytest.mark.parametrize("name", golden_data.names("onestep_dyn_main_*"))
+@pytest.mark.parametrize("name", golden_data.names("pos_in", physics="dyn", variant="main"))
 def test_single_steps_agree(name):
     case = golden_data.load(name)
     pos, quat, vel, omega = (
@@ -36,7 +37,7 @@ def test_single_steps_agree(name):
     assert_same_motion(_one_step(case), State(pos, quat, vel, omega, jnp.array(case.arrays["rpm"])), ATOL)
 
 
-@pytest.mark.parametrize("name", golden_data.names("onestep_dyn_paper_*"))
+@pytest.mark.parametrize("name", golden_data.names("pos_in", physics="dyn", variant="paper"))
 def test_single_steps_of_the_paper_agree_in_velocity_and_body_rates(name):
     """Its attitudes take body rates for rates of Euler angles and are not ours."""
     case = golden_data.load(name)
@@ -46,7 +47,7 @@ def test_single_steps_of_the_paper_agree_in_velocity_and_body_rates(name):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("name", golden_data.names("onestep_dyn_main_*"))
+@pytest.mark.parametrize("name", golden_data.names("pos_in", physics="dyn", variant="main"))
 def test_single_steps_agree_in_float32(name):
     case = golden_data.load(name)
     stepped = _one_step(case)
@@ -61,5 +62,5 @@ def _one_step(case):
     """All samples at once: a team of drones that do not feel each other."""
     inputs = (jnp.array(case.arrays[f"{key}_in"]) for key in ("pos", "quat", "vel", "body_rates"))
     rpm = jnp.array(case.arrays["rpm"])
-    team = jaxdrones.repeat(golden_data.explicit_params(case), len(rpm))
+    team = jaxdrones.repeat(golden_data.unlimited(golden_data.explicit_params(case)), len(rpm))
     return make_step(case.about["dt"])(team, State(*inputs, jnp.zeros_like(rpm)), rpm)

@@ -96,6 +96,12 @@ def test_constants_that_are_not_finite_are_named(name):
         jaxdrones.rollout(step, replay, broken, start, None, 1)
 
 
+def test_a_highest_rotor_speed_below_zero_is_named():
+    broken = team.replace(max_rpm=jnp.array([2e4, -1.0]))
+    with pytest.raises(ValueError, match=r"params\.max_rpm is .*-1\.0.*at least 0 RPM, or infinity for no limit"):
+        jaxdrones.rollout(step, replay, broken, start, None, 1)
+
+
 def test_a_controller_of_one_drone_in_a_team_of_two_is_told_so():
     with pytest.raises(ValueError, match=r"rpm has shape \(4,\); expected \(2, 4\)"):
         jaxdrones.rollout(step, lambda params, memory, state, k: (memory, commands[0, 0]), team, start, None, 1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from closed_loop import mirrored, recorded_vehicle
-from helpers import VEHICLES
+from helpers import VEHICLES, assert_finite
 
 import jaxdrones
 from jaxdrones import State
@@ -45,20 +45,20 @@ def test_roll_pitch_and_yaw_of_the_mixer_turn_about_their_own_axis(vehicle):
     np.testing.assert_allclose(torque, np.diag(np.diagonal(torque)), rtol=0, atol=1e-12 * np.min(np.diagonal(torque)))
 
 
-@pytest.mark.parametrize("name", golden_data.names("nnls_*"))
+@pytest.mark.parametrize("name", golden_data.names("infeasible"))
 def test_recorded_allocations_agree(name):
     case = golden_data.load(name)
     action = jnp.array(case.arrays["action"])
     assert 0 < case.arrays["infeasible"].sum() < len(action)
-    rpm = allocate_all(recorded_vehicle(case), action[:, 0], action[:, 1:])
+    rpm = allocate_all(golden_data.unlimited(recorded_vehicle(case)), action[:, 0], action[:, 1:])
     np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=1e-6)  # RPM; measured: 1e-11
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("name", golden_data.names("nnls_*"))
+@pytest.mark.parametrize("name", golden_data.names("infeasible"))
 def test_recorded_allocations_agree_in_float32(name):
     case = golden_data.load(name)
-    params = recorded_vehicle(case)
+    params = golden_data.unlimited(recorded_vehicle(case))
     action = jnp.array(case.arrays["action"])
     rpm = allocate_all(params, action[:, 0], action[:, 1:])
     # Thrusts are differences of terms of the size of the largest, so it is squares that agree: a few roundings of 6e-8.
@@ -80,10 +80,11 @@ def test_what_rotors_can_produce_is_produced(vehicle):
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
-def test_what_they_cannot_is_missed_by_the_least_squares(vehicle):
+def test_what_rotors_without_a_limit_cannot_is_missed_by_the_least_squares(vehicle):
     """SciPy minimises the same, and no step to squares that are not negative comes closer."""
     params = jaxdrones.load_params(vehicle)
     thrust, torque = wild_wrenches(params, seed=1)
+    params = golden_data.unlimited(params)
     squares = np.asarray(allocate_all(params, thrust, torque)) ** 2
     matrix, target = least_squares_problem(params, thrust, torque)
     scale = np.max(np.abs(target), axis=-1)
@@ -101,17 +102,76 @@ def test_what_they_cannot_is_missed_by_the_least_squares(vehicle):
         assert np.all(miss(np.maximum(squares + size * step, 0)) >= miss(squares) - 1e-12)
 
 
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_no_rotor_is_asked_for_more_than_its_highest_speed(vehicle):
+    """However large the wrench, up to a thousand times the largest, and whatever the drone weighs."""
+    params = jaxdrones.load_params(vehicle)
+    thrust, torque = wild_wrenches(params, seed=5)
+    for size in (1, 10, 1000):
+        rpm = allocate_all(params.replace(mass=10 * params.mass), size * thrust, size * torque)
+        assert jnp.all((rpm >= 0) & (rpm <= params.max_rpm))
+        assert jnp.mean(jnp.any(rpm > 0.999 * params.max_rpm, axis=1)) > 0.3, "many should be at the limit"
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_yaw_is_given_up_first(vehicle):
+    """Thrust, roll and pitch that the rotors can produce do not feel a demand for yaw that is too large."""
+    params = jaxdrones.load_params(vehicle)
+    wanted = wrenches_of(params, at_work(params))
+    for yaw in (-100, -0.9, 0.9, 100):
+        torque = wanted.torque.at[:, 2].set(yaw * params.max_z_torque)
+        wrench = wrenches_of(params, allocate_all(params, wanted.force[:, 2], torque))
+        np.testing.assert_allclose(wrench.force[:, 2] / params.max_thrust, wanted.force[:, 2] / params.max_thrust)
+        scaled = (wrench.torque - wanted.torque)[:, :2] / params.max_xy_torque
+        np.testing.assert_allclose(scaled, 0, atol=1e-12)
+        share = wrench.torque[:, 2] / torque[:, 2]
+        assert jnp.all((share > -1e-12) & (share < 1 + 1e-12)) and jnp.mean(share < 0.9) > 0.9
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_thrust_is_given_up_before_roll_and_pitch(vehicle):
+    """As little of it as there must be: the fastest rotor is at its limit."""
+    params = jaxdrones.load_params(vehicle)
+    wanted = wrenches_of(params, at_work(params))
+    for thrust in (1.2, 100):
+        rpm = allocate_all(params, jnp.full(N, thrust * params.max_thrust), wanted.torque)
+        scaled = (wrenches_of(params, rpm).torque - wanted.torque)[:, :2] / params.max_xy_torque
+        np.testing.assert_allclose(scaled, 0, atol=1e-12 * thrust)
+        np.testing.assert_allclose(jnp.max(rpm, axis=1), params.max_rpm)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_too_much_roll_and_pitch_keep_their_direction(vehicle):
+    """With half of the highest thrust and a hundred times the torque: all that the rotors have."""
+    params = jaxdrones.load_params(vehicle)
+    angle = jnp.linspace(0, 2 * jnp.pi, N)
+    torque = 100 * params.max_xy_torque * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=1)
+    rpm = allocate_all(params, jnp.full(N, params.max_thrust / 2), torque)
+    wrench = wrenches_of(params, rpm)
+    x, y, z = wrench.torque.T
+    np.testing.assert_allclose(jnp.cos(jnp.arctan2(y, x) - angle), 1, atol=1e-12)
+    np.testing.assert_allclose(z / params.max_z_torque, 0, atol=1e-12)
+    np.testing.assert_allclose(wrench.force[:, 2], params.max_thrust / 2)
+    np.testing.assert_allclose(jnp.max(rpm, axis=1), params.max_rpm)
+    np.testing.assert_allclose(jnp.min(rpm, axis=1) / params.max_rpm, 0, atol=1e-7)
+
+
 def test_nothing_is_asked_of_rotors_that_should_pull():
     params = jaxdrones.load_params("cf2x")
     np.testing.assert_array_equal(allocate(params, -params.weight, jnp.zeros(3)), 0)
 
 
-def test_rotor_speeds_are_continuous_where_a_wrench_stops_being_feasible():
-    """From hover to a torque far beyond it; the squares of a least-squares solution are Lipschitz in the target."""
+@pytest.mark.parametrize("limit", [1.5, np.inf])
+def test_rotor_speeds_are_continuous_where_a_wrench_stops_being_feasible(limit):
+    """From hover to a torque far beyond it; the squares of a least-squares solution are Lipschitz in the target.
+
+    With rotors of up to 1.5 times the hover speed, and with rotors without a limit.
+    """
     params = jaxdrones.load_params("cf2x")
+    params = params.replace(max_rpm=limit * params.hover_rpm)
     share = jnp.linspace(0, 3, 3001)
     thrust = jnp.full(len(share), params.weight)
-    torque = share[:, None] * params.weight * params.arm * jnp.array([[0.7, 0.5, 0.0]])
+    torque = share[:, None] * params.weight * params.arm * jnp.array([[0.7, 0.5, 0.05]])
     squares = allocate_all(params, thrust, torque) ** 2 / params.hover_rpm**2
     assert jnp.any(jnp.min(squares, axis=1) > 0.1) and jnp.any(jnp.min(squares, axis=1) == 0)
     assert jnp.max(jnp.abs(jnp.diff(squares, axis=0))) < 5 * 4 * (share[1] - share[0])
@@ -141,14 +201,22 @@ def test_gradients_of_the_allocation_are_zero_at_rest(thrust):
         np.testing.assert_array_equal(gradient, 0)
 
 
+def test_gradients_of_the_allocation_are_finite_without_a_limit_and_with_equal_demands():
+    params = jaxdrones.load_params("cf2x")
+    slopes = jax.jit(jax.jacrev(rpm_from_wrench, argnums=(0, 1, 2)))
+    for limit, thrust in (jnp.inf, params.weight), (1e3, params.weight), (2e4, params.max_thrust):
+        for torque in jnp.zeros(3), jnp.full(3, 1e-3):
+            assert_finite(slopes(params.replace(max_rpm=jnp.asarray(limit, float)), thrust, torque))
+
+
 def test_compiled_and_batched_allocations_equal_single_ones():
     params = jaxdrones.load_params("racer")
     thrust, torque = wild_wrenches(params, seed=4)
     batched = allocate_all(params, thrust, torque)
     for i in range(5):
-        eager = rpm_from_wrench(params, thrust[i], torque[i])
-        np.testing.assert_allclose(batched[i], eager, rtol=0, atol=1e-6)  # RPM; sums in another order, then a root
-        np.testing.assert_allclose(allocate(params, thrust[i], torque[i]), eager, rtol=0, atol=1e-6)
+        squares = rpm_from_wrench(params, thrust[i], torque[i]) ** 2 / params.max_rpm**2
+        for other in batched[i], allocate(params, thrust[i], torque[i]):  # sums in another order
+            np.testing.assert_allclose(other**2 / params.max_rpm**2, squares, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(("name", "thrust", "torque"), [("thrust", (2,), (3,)), ("torque", (), (2, 3))])
@@ -175,6 +243,14 @@ def gradients_and_differences(params, unit, wrench):
     h = 1e-6
     there, back = (jax.vmap(squares)(wrench[None] + sign * h * jnp.eye(4)) for sign in (1, -1))
     return jax.jacrev(squares)(wrench), (there - back).T / (2 * h)
+
+
+def at_work(params):
+    """Rotor speeds (N, 4) without yaw torque."""
+    rng = np.random.default_rng(6)
+    middle = rng.uniform(0.1, 0.9, (N, 1))
+    a, b = (0.99 * np.minimum(middle, 1 - middle) * rng.uniform(-1, 1, (N, 1)) for _ in range(2))
+    return params.max_rpm * np.sqrt(np.hstack([middle + a, middle + b, middle - a, middle - b]))
 
 
 def wild_wrenches(params, seed):

@@ -56,6 +56,23 @@ def test_a_drone_where_it_should_be_gets_hover_speed(loop):
 
 
 @each_controller
+def test_rotor_speeds_are_within_what_the_motors_can_in_any_state(loop):
+    """Of every vehicle, also one that is too heavy to fly, in gentle states and in wild ones."""
+    team = team_of(*5 * VEHICLES)
+    team = team.replace(mass=team.mass * jnp.repeat(jnp.array([1.0, 1, 1, 1, 20]), 4))
+    rng = np.random.default_rng(9)
+    for size in (0.01, 1, 100, 1e4):
+        state = flying(team, seed=int(100 * size))
+        state = state.replace(vel=size * state.vel, omega=size * state.omega)
+        offset = [jnp.array(size * x) for x in rng.normal(size=(4, N, 3))]
+        target = Setpoint(state.pos + offset[0], offset[1], offset[2], offset[3][:, 0], offset[3])
+        target = jnp.column_stack([offset[0], offset[1][:, 0]]) if loop in VELOCITY else target
+        memory = jax.tree.map(lambda x, size=size: jnp.array(size * rng.normal(size=x.shape)), loop.init(N))
+        _, rpm = call(loop.control, loop.gains(), team, memory, state, target)
+        assert jnp.all((rpm >= 0) & (rpm <= team.max_rpm[:, None]))
+
+
+@each_controller
 def test_a_compiled_batch_equals_a_loop_over_drones(loop):
     team, memory, state, target = in_flight(loop)
     batch = call(loop.control, loop.gains(), team, memory, state, target)

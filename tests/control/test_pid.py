@@ -16,7 +16,7 @@ from jaxdrones.control.setpoint import Setpoint
 INPUTS = ("pos", "quat", "vel", "target_pos", "target_rpy", "target_vel", "target_rpy_rates", "dt")
 
 
-@pytest.mark.parametrize("name", golden_data.names("pid_independent_*"))
+@pytest.mark.parametrize("name", golden_data.names("thrust_pwm"))
 def test_recorded_single_calls_agree(name):
     """Also with many times between calls in one batch: `dt` may be an array."""
     case = golden_data.load(name)
@@ -29,7 +29,7 @@ def test_recorded_single_calls_agree(name):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("name", golden_data.names("pid_independent_*"))
+@pytest.mark.parametrize("name", golden_data.names("thrust_pwm"))
 def test_recorded_single_calls_agree_in_float32(name):
     case = golden_data.load(name)
     _, rpm, _ = call_fresh(recorded_vehicle(case), *inputs(case))
@@ -37,7 +37,7 @@ def test_recorded_single_calls_agree_in_float32(name):
     np.testing.assert_allclose(rpm, case.arrays["rpm"], rtol=0, atol=2e-2)
 
 
-@pytest.mark.parametrize("name", golden_data.names("pid_sequence_*"))
+@pytest.mark.parametrize("name", golden_data.names("last_rpy", "dt"))
 def test_recorded_sequences_agree_in_speeds_and_memory(name):
     case = golden_data.load(name)
     keys = ("pos", "quat", "vel", "target_pos", "target_rpy", "target_vel")

@@ -23,7 +23,7 @@ def command_all(params, *rows):
     return jax.vmap(one_command)(*rows)
 
 
-@pytest.mark.parametrize("name", golden_data.names("ctbr_*"))
+@pytest.mark.parametrize("name", golden_data.names("ctbr"))
 def test_recorded_commands_agree(name):
     case = golden_data.load(name)
     collective, omega = command_all(jaxdrones.load_params("racer"), *(jnp.array(case.arrays[key]) for key in INPUTS))
@@ -32,7 +32,7 @@ def test_recorded_commands_agree(name):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("name", golden_data.names("ctbr_*"))
+@pytest.mark.parametrize("name", golden_data.names("ctbr"))
 def test_recorded_commands_agree_in_float32(name):
     case = golden_data.load(name)
     collective, omega = command_all(jaxdrones.load_params("racer"), *(jnp.array(case.arrays[key]) for key in INPUTS))

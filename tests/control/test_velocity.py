@@ -11,7 +11,7 @@ from jaxdrones import State
 from jaxdrones.control import pid, velocity
 
 
-@pytest.mark.parametrize("name", golden_data.names("velocity_action_*"))
+@pytest.mark.parametrize("name", golden_data.names("action", "rpm", speed_limit=float))
 def test_recorded_sequences_agree(name):
     case = golden_data.load(name)
     rows = [jnp.array(case.arrays[key]) for key in ("pos", "quat", "vel", "action")]

@@ -40,7 +40,7 @@ def hovering(height, tilt=0.0):
     )
 
 
-@pytest.mark.parametrize("name", golden_data.names("aero_forces_main_*"))
+@pytest.mark.parametrize("name", golden_data.names("ground_force", variant="main"))
 def test_forces_of_the_paper_are_the_recorded_ones(name):
     """1e-9 N and 1e-9 relative; measured 3e-17 N."""
     case = golden_data.load(name)

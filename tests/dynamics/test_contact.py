@@ -11,6 +11,7 @@ from helpers import assert_finite
 import jaxdrones
 from jaxdrones import State, drone_contact, ground_contact, rotation
 from jaxdrones.backends import bullet
+from jaxdrones.backends.wrenches import make_total_wrench
 
 VEHICLES = {name: jaxdrones.load_params(name) for name in ("cf2x", "hb", "racer")}
 CRAZYFLIE = VEHICLES["cf2x"]
@@ -266,6 +267,60 @@ def test_drones_that_crash_stop_each_other_and_gain_nothing(vehicle, speed, towa
     past = np.sum((states.pos[:, -1, 0] - states.pos[:, -1, 1]) * path, axis=1) < 0
     if vehicle == "hb" or (speed, towards) != (3.0, (1, 0, 0)):
         assert past.sum() <= 1
+
+
+@partial(jax.jit, static_argnames="cells")
+def part(params, start, cells=None):
+    """A fifth of a second of a team without weight and with its rotors at rest."""
+    team = jaxdrones.repeat(params.replace(gravity=jnp.zeros_like(params.gravity)), len(start.pos))
+    still = jnp.zeros_like(start.rpm)
+    step = jaxdrones.make_step(pairs=(drone_contact,), dt=STEP, cells=cells)
+    return jax.lax.scan(lambda state, _: (step(team, state, still), None), start, length=48)[0]
+
+
+def in_one_place(n, quat=(0.0, 0, 0, 1), pos=(0.3, -0.2, 1.0)):
+    start = State.at_rest(np.tile(pos, (n, 1)))
+    return start.replace(quat=jnp.tile(jnp.array([quat]), (n, 1)))
+
+
+def smallest_gap(state):
+    """Between the centres of any two drones, m."""
+    pos = np.asarray(state.pos)
+    return min(np.linalg.norm(a - b) for i, a in enumerate(pos) for b in pos[:i])
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+@pytest.mark.parametrize(
+    "quat", [(0.0, 0, 0, 1), (0.5, 0.5, 0.5, 0.5), (0.0, 0.6, 0, 0.8)], ids=["level", "edge", "tilt"]
+)
+@pytest.mark.parametrize("n", [2, 5])
+def test_drones_in_exactly_the_same_place_come_apart_and_keep_their_momentum(vehicle, n, quat):
+    """By the height of the bodies at least, in the order of their indices, the same way every time."""
+    params = VEHICLES[vehicle]
+    end = part(params, in_one_place(n, quat))
+    assert smallest_gap(end) > params.collision_height
+    axis = rotation.z_axis(jnp.array(quat))
+    assert np.all(np.diff(end.pos @ axis) > 0)
+    np.testing.assert_allclose(jnp.sum(end.vel, axis=0), 0, atol=1e-9)
+
+
+@pytest.mark.float32
+def test_drones_in_the_same_place_come_apart_in_single_precision_far_away_and_with_cells():
+    params = jaxdrones.load_params("cf2x")
+    for cells in None, jaxdrones.Cells(reach=0.5):
+        for pos in (0.0, 0.0, 1.0), (5000.0, 100.0, 20.0):
+            end = part(params, in_one_place(3, pos=pos), cells)
+            assert smallest_gap(end) > params.collision_height
+
+
+def test_gradients_of_drones_in_the_same_place_are_finite():
+    wrench = make_total_wrench((), (drone_contact,))
+
+    def sums(state, params):
+        return sum(jnp.sum(x) for x in jax.tree.leaves(wrench(params, state)))
+
+    team, start = jaxdrones.repeat(CRAZYFLIE, 2), in_one_place(2)
+    assert_finite(jax.jit(jax.grad(sums, (0, 1)))(start, team))
 
 
 def test_a_drone_lies_on_another():

@@ -34,7 +34,7 @@ def on_lower(upper, lower=lower, params=params, other=params, pair=downwash):
 probe = params.replace(rotor_pos=jnp.zeros((4, 3)))  # all rotors in the centre of the drone
 
 
-@pytest.mark.parametrize("name", golden_data.names("aero_forces_main_*"))
+@pytest.mark.parametrize("name", golden_data.names("downwash_on_0", variant="main"))
 def test_forces_of_the_paper_are_the_recorded_ones(name):
     """1e-9 N and 1e-9 relative; some values are tens of newtons."""
     case = golden_data.load(name)

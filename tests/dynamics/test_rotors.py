@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import VEHICLES
+from helpers import VEHICLES, assert_finite, name_of
 
 import jaxdrones
 from jaxdrones import State, instant_rotors, lagging_rotors
@@ -37,6 +37,40 @@ def test_instant_rotors_turn_as_commanded():
     rpm, rate = instant_rotors(params, jnp.full(4, 9.0), command)
     np.testing.assert_array_equal(rpm, command)
     np.testing.assert_array_equal(rate, 0)
+
+
+@pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
+def test_rotors_turn_neither_backwards_nor_faster_than_they_can(rotors):
+    params = jaxdrones.load_params("cf2x")
+    speed = jnp.array([0.0, 5000, 10000, 20000])
+    command = jnp.array([-1000.0, 2 * params.max_rpm, jnp.inf, -jnp.inf])
+    within = jnp.array([0, params.max_rpm, params.max_rpm, 0])
+    for beyond, limit in zip(rotors(params, speed, command), rotors(params, speed, within), strict=True):
+        np.testing.assert_array_equal(beyond, limit)
+
+
+@pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
+def test_rotors_without_a_limit_follow_any_command_forwards_and_have_finite_gradients(rotors):
+    """`max_rpm` is infinite for recordings of motors that were not limited."""
+    params = jaxdrones.load_params("cf2x").replace(max_rpm=jnp.array(jnp.inf))
+    command = jnp.array([1e5, 0.0, -1.0, 2e4])
+
+    def sums(params, rpm, command):
+        return sum(jnp.sum(x) for x in rotors(params, rpm, command))
+
+    arguments = params, jnp.full(4, 3e4), command
+    if rotors is instant_rotors:
+        np.testing.assert_array_equal(rotors(*arguments)[0], [1e5, 0, 0, 2e4])
+    gradients = jax.grad(sums, (0, 1, 2))(*arguments)
+    assert_finite(gradients)
+    np.testing.assert_array_equal(gradients[2] != 0, [True, True, False, True])
+
+
+def test_a_command_beyond_the_limits_has_no_gradient_and_one_on_them_has():
+    params = jaxdrones.load_params("cf2x")
+    command = jnp.array([-1.0, 0.0, params.max_rpm, params.max_rpm + 1])
+    gradient = jax.grad(lambda c: jnp.sum(instant_rotors(params, jnp.zeros(4), c)[0]))(command)
+    np.testing.assert_array_equal(gradient, [0, 1, 1, 0])
 
 
 @pytest.mark.parametrize(

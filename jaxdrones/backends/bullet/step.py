@@ -20,6 +20,7 @@ from jaxdrones.backends.team import check_team, flatten, unflatten
 from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_total_wrench
 from jaxdrones.checks import check_finite, check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors
+from jaxdrones.dynamics.rotors import limited
 from jaxdrones.params import Params
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
@@ -61,7 +62,8 @@ def make_step(
         gui: open a window, in which the cameras render too.
 
     Returns:
-        `step(params, state, rpm) -> state`, a context manager that closes the connection.
+        `step(params, state, rpm) -> state`, a context manager that closes the connection. The rotors limit the
+        commanded speeds to [0, `params.max_rpm`].
 
     Raises:
         ValueError: an argument out of range.
@@ -80,7 +82,7 @@ def make_step(
         """Force and torque (world) and the next rotor speeds of every drone: (n, 10)."""
         params = unflatten(flat_params)
         state = State(**{name: team[:, columns] for name, columns in _COLUMNS.items()})
-        speed, speed_rate = jax.vmap(rotors)(params, state.rpm, team[:, _COMMAND])
+        speed, speed_rate = jax.vmap(rotors)(params, jax.vmap(limited)(params, state.rpm), team[:, _COMMAND])
         omega = jax.vmap(rotation.rotate_inverse)(state.quat, state.omega)
         wrench = total_wrench(params, state.replace(omega=omega, rpm=speed))
         force = jax.vmap(rotation.rotate)(state.quat, wrench.force).at[:, 2].add(-params.weight)

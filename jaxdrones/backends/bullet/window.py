@@ -23,6 +23,7 @@ class Window(HostStep):
         self._step, self._dt, self._count = step, control_dt, 0
         p, client = step.client.p, step.client.id
         rpm_max, hover = float(params.max_rpm[0]), float(params.hover_rpm[0])
+        rpm_max = rpm_max if np.isfinite(rpm_max) else 2 * hover
         self._sliders = [
             p.addUserDebugParameter(f"rotor {i} (RPM)", 0, rpm_max, hover, physicsClientId=client) for i in range(4)
         ]

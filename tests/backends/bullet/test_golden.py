@@ -31,15 +31,28 @@ def step_of(physics: str, dt: float = 1 / 240):
     return make_step(effects=tuple(f for f in chosen if f not in pairs), pairs=pairs, dt=dt, damping=DAMPING)
 
 
+def of_bullet(physics: str) -> bool:
+    return physics.startswith("pyb")
+
+
+def falls(motion: str) -> bool:
+    return "fall" in motion
+
+
+def collides(velocities: list) -> bool:
+    return np.any(velocities)
+
+
 def body_rates(quat, ang_vel):
     return jax.vmap(jax.vmap(rotation.rotate_inverse))(jnp.asarray(quat), jnp.asarray(ang_vel))
 
 
-@pytest.mark.parametrize("name", golden_data.names("onestep_pyb_*main*"))
+@pytest.mark.parametrize("name", golden_data.names("pos_in", physics=of_bullet, variant="main"))
 def test_single_steps_agree(name):
     case = golden_data.load(name)
     a, physics = case.arrays, case.about["physics"]
-    params, previous = jaxdrones.repeat(golden_data.recorded_params(case), 1), a.get("rpm_previous")
+    params = jaxdrones.repeat(golden_data.unlimited(golden_data.recorded_params(case)), 1)
+    previous = a.get("rpm_previous")
 
     def drag_of_the_step_before(params, state):  # the reference's drag sees the rotor speeds of the step before
         return jaxdrones.drag_world_axes(params, state.replace(rpm=params.max_speed * jnp.ones(4)))
@@ -61,22 +74,23 @@ def test_single_steps_agree(name):
                 np.testing.assert_allclose(actual, a[f"{key}_out"][k], rtol=0, atol=1e-9, err_msg=f"{key} of row {k}")
 
 
-def of_single_steps(names: list[str]) -> list[str]:
-    """The cases that recorded every physics step."""
-    return [name for name in names if golden_data.load(name).about["physics_steps_per_record"] == 1]
-
-
-@pytest.mark.parametrize("name", of_single_steps(golden_data.names("pyb_*main_*")))
+@pytest.mark.parametrize(
+    "name",
+    golden_data.names(
+        kind="open_loop_rollout", physics=of_bullet, variant="main", physics_steps_per_record=1, contact_free=True
+    ),
+)
 def test_rows_of_rollouts_agree_but_for_the_stale_link_frame(name):
     """The reference turns a force with the attitude of the step before, which is |omega| dt away from ours."""
     case = golden_data.load(name)
     a, dt = case.arrays, 1 / case.about["physics_freq_hz"]
     step = step_of(case.about["physics"], dt)
-    params = jaxdrones.repeat(golden_data.recorded_params(case), a["pos"].shape[1])
+    params, commands = golden_data.flown(case, golden_data.recorded_params(case))
+    params = jaxdrones.repeat(params, a["pos"].shape[1])
     rates, rpm = body_rates(a["quat"], a["ang_vel"]), a["rpm_applied"]
     for k in range(1, len(rpm), 4):
         state = State(*(jnp.asarray(x[k]) for x in (a["pos"], a["quat"], a["vel"], rates)), rpm=jnp.asarray(rpm[k - 1]))
-        after = step(params, state, rpm[k])
+        after = step(params, state, commands[k])
         thrust = np.sum(np.asarray(params.kf)[:, None] * rpm[k] ** 2, axis=-1)
         mass, spin = np.asarray(params.mass), np.linalg.norm(a["ang_vel"][k], axis=-1)
         bound = thrust / mass * spin * dt**2 + 1e-9
@@ -101,7 +115,9 @@ def energy(params, state) -> float:
     return float(jnp.sum(kinetic + params.mass * params.gravity * state.pos[:, 2]))
 
 
-@pytest.mark.parametrize("name", golden_data.names("collision_*main*drop*"))
+@pytest.mark.parametrize(
+    "name", golden_data.names(physics="pyb", variant="main", contact_free=False, motion=falls, num_drones=1)
+)
 def test_a_fall_ends_at_the_recorded_height_and_gains_no_energy(name):
     case = golden_data.load(name)
     a, step = case.arrays, step_of("pyb")
@@ -119,19 +135,28 @@ def test_a_fall_ends_at_the_recorded_height_and_gains_no_energy(name):
     assert upright.all() and np.all(np.abs(state.pos[:, 2] - rest) < 2e-3)
 
 
-def test_drones_that_meet_head_on_rebound_by_no_more_than_a_twentieth():
-    case = golden_data.load("collision_main_cf2x_headon")
-    a, step = case.arrays, step_of("pyb")
-    params = jaxdrones.repeat(golden_data.recorded_params(case), 2)
+@pytest.mark.parametrize(
+    "name", golden_data.names(physics="pyb", variant="main", contact_free=False, initial_vel=collides, num_drones=2)
+)
+def test_drones_that_meet_head_on_rebound_by_no_more_than_a_twentieth(name):
+    case = golden_data.load(name)
+    a, step = case.arrays, step_of("pyb", 1 / case.about["physics_freq_hz"])
+    params, rpm = golden_data.flown(case, golden_data.recorded_params(case))
+    params = jaxdrones.repeat(params, 2)
     state = State(*(jnp.asarray(x[0]) for x in (a["pos"], a["quat"], a["vel"])), jnp.zeros((2, 3)), jnp.zeros((2, 4)))
-    touched = False
-    for rpm in a["rpm_applied"]:
-        state = step(params, state, rpm)
-        closing = float(state.vel[0, 0] - state.vel[1, 0])
-        touched = touched or closing < 1.0
+    towards = a["pos"][0, 1] - a["pos"][0, 0]
+    towards /= np.linalg.norm(towards)
+
+    def closing(vel):
+        return float((np.asarray(vel[0]) - np.asarray(vel[1])) @ towards)
+
+    at_first, touched = closing(a["vel"][0]), False
+    for command in rpm:
+        state = step(params, state, command)
+        touched = touched or closing(state.vel) < at_first / 2
         if touched:
-            assert closing >= -0.05 * 2.0  # of the 2 m/s at which they met
-        assert state.pos[0, 0] < state.pos[1, 0]
+            assert closing(state.vel) >= -0.05 * at_first
+        assert (np.asarray(state.pos[1]) - np.asarray(state.pos[0])) @ towards > 0
     assert touched
 
 

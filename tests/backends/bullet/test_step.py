@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, assert_same_motion, flying, tape
+from helpers import assert_close, assert_finite, assert_same_motion, flying, tape
 
 import jaxdrones
 from jaxdrones import State
@@ -45,6 +45,23 @@ def test_free_flight_equals_the_explicit_backend(team, rotors):
         for command in commands:  # half a second
             ours, theirs = explicit(team, ours, command), step(team, theirs, command)
     assert_same_motion(theirs, ours, 1e-9)  # both integrate the same equations in float64 (measured: 1e-14)
+
+
+@pytest.mark.parametrize("rotors", [jaxdrones.instant_rotors, jaxdrones.lagging_rotors])
+def test_motors_are_limited_as_on_the_explicit_backend(team, rotors):
+    """Commands of twice the highest speed and of -1,000 RPM, and a start out of range, fly as the nearest limits."""
+    top = np.broadcast_to(np.asarray(team.max_rpm)[:, None], (4, 4))
+    out = np.where(np.arange(4) % 2, 2 * top, -1000.0)
+    starts = [apart(flying(team)).replace(rpm=jnp.asarray(rpm)) for rpm in (out, np.clip(out, 0, top))]
+    with bullet.make_step(rotors=rotors) as step:
+        ends = [step(team, step(team, start, out), out) for start in starts]
+        assert_close(ends[1], step(team, step(team, starts[1], starts[1].rpm), starts[1].rpm), 0)
+        unlimited = step(team.replace(max_rpm=jnp.full(4, jnp.inf)), starts[1], 2 * top)
+    assert_close(*ends, 0)
+    explicit = jaxdrones.make_step(rotors=rotors)
+    assert_same_motion(ends[0], explicit(team, explicit(team, starts[0], out), out), 1e-9)
+    assert_finite(unlimited)
+    assert np.all(unlimited.rpm > ends[0].rpm)
 
 
 def test_substeps_are_repeated_steps(team, step):

@@ -1,0 +1,124 @@
+"""Action types that ask for a setpoint: every vehicle flies there, or the environment is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import VEHICLES, make_step
+
+import jaxdrones
+from jaxdrones import State, assets
+from jaxdrones.control import pid, velocity
+from jaxdrones.envs import ACTIONS, make
+
+HZ, SECONDS = 100, 6
+START = np.array([0.2, -0.1, 1.0])
+GOAL = np.array([0.5, -0.4, 0.8])
+CRAZYFLIE = jaxdrones.load_params("cf2x")
+HEAVY = CRAZYFLIE.replace(mass=1.4 * CRAZYFLIE.mass)
+TEAMS = {  # flown by the PID, and by the geometric controller
+    "pid": [jaxdrones.load_params(vehicle) for vehicle in pid.VEHICLES],
+    "geometric": [HEAVY, *(jaxdrones.load_params(vehicle) for vehicle in ("hb", "racer"))],
+}
+ON = {  # action type: which of the coordinates it commands, and the action towards the goal
+    "position": (slice(0, 3), lambda way: jnp.clip(way / 0.1, -1, 1)),
+    "one_d_position": (slice(2, 3), lambda way: jnp.clip(way[2:] / 0.1, -1, 1)),
+    "destination": (slice(0, 3), lambda way: jnp.asarray(GOAL)),
+    "velocity": (slice(0, 3), lambda way: jnp.append(way, jnp.clip(5 * jnp.max(jnp.abs(way)), 0, 1))),
+    "one_d_velocity": (slice(2, 3), lambda way: jnp.clip(5 * way[2:], -1, 1)),
+}
+
+
+def fly(team, name, act):
+    """Positions (length, n, 3) of a team that moves a little at the start, under actions `act(way to the goal)`."""
+    n = len(team.mass)
+    action = ACTIONS[name]().fitted(team)
+    rpm = jnp.broadcast_to(team.hover_rpm[:, None], (n, 4))
+    vel = jnp.tile(jnp.array([[0.1, -0.05, 0.05]]), (n, 1))
+    start = State.at_rest(np.tile(START, (n, 1))).replace(rpm=rpm, vel=vel)
+
+    def control(params, memory, state, k):
+        def of_one(params, memory, state):
+            return action.rpm(params, memory, state, act(GOAL - state.pos), None, 1 / HZ)
+
+        return jax.vmap(of_one)(params, memory, state)
+
+    step = make_step(dt=1 / HZ / 3, substeps=3)
+    rollout = jax.jit(lambda team, start: jaxdrones.rollout(step, control, team, start, action.init(n), SECONDS * HZ))
+    return np.asarray(rollout(team, start)[1].pos)
+
+
+@pytest.mark.parametrize("controller", TEAMS)
+@pytest.mark.parametrize("name", ON)
+def test_every_vehicle_goes_where_an_action_asks_and_stays_where_none_does(name, controller):
+    """A nominal 3 % of the top speed, 0.25 m/s of a Crazyflie, covers the 0.47 m in time."""
+    axes, act = ON[name]
+    pos = fly(jaxdrones.stack(TEAMS[controller]), name, act)[-1]
+    np.testing.assert_allclose(pos[:, axes], np.broadcast_to(GOAL[axes], pos[:, axes].shape), rtol=0, atol=0.05)
+    if name != "destination":  # for which zero is the origin
+        still = fly(jaxdrones.stack(TEAMS[controller]), name, lambda way: 0 * act(way))
+        assert np.max(np.linalg.norm(still - START, axis=-1)) < 0.1
+
+
+def test_the_pid_flies_crazyflies_by_their_numbers_whatever_their_name(tmp_path):
+    copy = tmp_path / "mine.urdf"
+    copy.write_text(assets.vehicles()["cf2p"].read_text())
+    suits = {vehicle: pid.fits(jaxdrones.load_params(vehicle)) for vehicle in (*VEHICLES, copy)}
+    assert suits == {"cf2x": True, "cf2p": True, "hb": False, "racer": False, copy: True}
+    assert pid.fits(CRAZYFLIE.replace(mass=1.1 * CRAZYFLIE.mass)) and not pid.fits(HEAVY)
+    assert not pid.fits(jaxdrones.stack([CRAZYFLIE, HEAVY]))
+
+
+@pytest.mark.parametrize("vehicle", ["hb", "racer"])
+def test_hover_with_a_large_vehicle_stays_at_its_start_under_no_action(vehicle):
+    """The environment by its name, from any of its starts: it slows down from up to 1 m/s and stays."""
+    env = make("hover", vehicle=vehicle, action="position")
+
+    @jax.jit
+    def fly(key):
+        _, start = env.reset(key)
+        action = jnp.zeros((1, env.action_size))
+        return start, jax.lax.fori_loop(0, 500, lambda k, world: env.step(key, world, action)[1], start)
+
+    start, end = jax.vmap(fly)(jax.random.split(jax.random.key(0), 20))
+    assert jnp.all(jnp.linalg.norm(end.drones.vel, axis=-1) < 0.01)
+    assert jnp.all(jnp.linalg.norm(end.drones.pos - start.drones.pos, axis=-1) < 1.5)
+
+
+@pytest.mark.parametrize("vehicle", ["hb", HEAVY])
+def test_gains_of_a_pid_that_does_not_suit_the_vehicle_cannot_be_scaled(vehicle):
+    with pytest.raises(ValueError, match=r"'pid_gains' scales .* suit cf2x, cf2p .* another action type"):
+        make("hover", vehicle=vehicle, action="pid_gains")
+    with pytest.raises(ValueError, match="'pid_gains' scales"):
+        make("tune", vehicle=vehicle)
+
+
+@pytest.mark.parametrize("name", [*ON, "pid_gains"])
+def test_what_a_controller_cannot_hold_is_refused(name):
+    """A Crazyflie whose rotors lag as they do, and too few calls per second."""
+    for lagging in dict(rotors="lagging"), dict(realistic=True):
+        with pytest.raises(ValueError, match=rf"'{name}' .* rotors with a time constant .* have 0\.15 s; give rotors="):
+            make("hover", action=name, **lagging)
+    with pytest.raises(ValueError, match=rf"control_hz is 20; the action type '{name}' .* needs 30 or more"):
+        make("hover", action=name, control_hz=20)
+    if name != "pid_gains":
+        make("hover", vehicle="racer", action=name, realistic=True)
+        make("hover", vehicle="racer", action=ACTIONS[name](), control_hz=30)
+
+
+def test_the_numbers_of_a_vehicle_must_be_known_where_a_controller_is_chosen_by_them():
+    with pytest.raises(ValueError, match=r"params are being traced.*outside of jax\.jit"):
+        jax.jit(lambda mass: ACTIONS["position"]().fitted(CRAZYFLIE.replace(mass=mass)).size)(0.03)
+
+
+def test_an_environment_has_motors_with_a_limit():
+    with pytest.raises(ValueError, match=r"vehicle\.max_rpm is not finite"):
+        make("hover", vehicle=CRAZYFLIE.replace(max_rpm=jnp.array(jnp.inf)))
+
+
+def test_a_velocity_is_that_of_the_paper_whoever_flies():
+    action = jnp.array([3.0, 0, 4, 0.5])
+    for vehicle in VEHICLES:
+        params = jaxdrones.load_params(vehicle)
+        asked = velocity.commanded(params, action)
+        np.testing.assert_allclose(asked, 0.015 * params.max_speed * jnp.array([0.6, 0, 0.8]), rtol=1e-6)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import assets
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import check_choice, shown
 from jaxdrones.params import Params
 
 GRAVITY = 9.8  # m/s^2, the reference's value
@@ -44,6 +44,8 @@ def load_params(vehicle: str | os.PathLike) -> Params:
     Raises:
         ValueError: an unknown vehicle, or a URDF that lacks something or holds nonsense; says what.
     """
+    if not isinstance(vehicle, str | os.PathLike):
+        raise ValueError(f"vehicle is {shown(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
     path = Path(vehicle)
     if path.suffix != ".urdf":
         check_choice("vehicle", str(vehicle), assets.vehicles())

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones.backends.cells import Cells
-from jaxdrones.backends.team import check_team
-from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_total_wrench
+from jaxdrones.backends.host import is_traced
+from jaxdrones.backends.team import check_given, check_team
+from jaxdrones.backends.wrenches import Effect, Pair, check_functions, describe, make_total_wrench
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
@@ -40,7 +41,8 @@ def make_step(
 
     Returns:
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
-        rpm (n, 4) the commanded rotor speeds. It does not clip the command. It raises `ValueError` on a wrong shape.
+        rpm (n, 4) the commanded rotor speeds. It does not clip the command. It raises `ValueError` on a wrong shape,
+        and where it is called with values, on constants that do not fly and on quaternions that are no attitude.
 
     Raises:
         ValueError: `dt` or `substeps` not positive, or an argument that should be a function and is not.
@@ -49,6 +51,7 @@ def make_step(
     check_whole("substeps", substeps)
     check_functions("rotors", [rotors])
     check_functions("integrator", [integrator])
+    effects, pairs = check_functions("effects", effects), check_functions("pairs", pairs)
     total_wrench = make_total_wrench(effects, pairs, cells)
 
     def derivative(params: Params, state: State, command: jax.Array) -> State:
@@ -72,4 +75,28 @@ def make_step(
 
         return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, length=substeps)[0]
 
-    return jax.jit(step, inline=True)
+    text = f"{describe([integrator])} at {1 / (dt * substeps):.4g} Hz x {substeps}, {describe([rotors])}"
+    text += f", effects: {describe(effects)}, pairs: {describe(pairs)}" + (f", {cells}" if cells else "")
+    return _ExplicitStep(jax.jit(step, inline=True), text)
+
+
+class _ExplicitStep:
+    """A compiled step that looks at what it is given, where that has values."""
+
+    def __init__(self, compiled: Step, text: str):
+        self._compiled, self._text = compiled, text
+        self._params: Params | None = None  # what was looked at last, and the attitude that was flown to
+        self._quat: jax.Array | None = None
+
+    def __call__(self, params: Params, state: State, rpm: jax.Array) -> State:
+        if is_traced((params, state, rpm)):
+            return self._compiled(params, state, rpm)
+        if params is not self._params or state.quat is not self._quat:
+            check_team(params, state, rpm)
+            check_given(params, state)
+        state = self._compiled(params, state, rpm)
+        self._params, self._quat = params, state.quat
+        return state
+
+    def __repr__(self) -> str:
+        return f"<step: {self._text}>"

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -25,6 +25,8 @@ _STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
 
 def check_team(params: Params, state: State, rpm) -> None:
     """Raise `ValueError` unless the arrays are those of one team of n drones."""
+    check_arrays("state", vars(state))
+    check_arrays("params", vars(params))
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap")
     n = len(state.pos)
     for name, width in _STATE.items():
@@ -33,6 +35,13 @@ def check_team(params: Params, state: State, rpm) -> None:
         hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
         check_shape(f"params.{name}", leaf, (n, *_SHAPES.get(name, ())), hint)
     check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")
+
+
+def check_given(params: Params, state: State) -> None:
+    """Raise `ValueError` where values, not shapes, make no flight: constants, and attitudes that are none."""
+    check_params(params)
+    check_arrays("state", vars(state))
+    check_quaternion("state.quat", state.quat)
 
 
 def flatten(params: Params) -> Float[Array, "n k"]:

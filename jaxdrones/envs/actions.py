@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.checks import check_callable, check_number, check_shape, check_whole
 from jaxdrones.control import Setpoint, attitude, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.params import Params
@@ -36,9 +37,15 @@ class Action:
     init: Callable[[int], Any] = _no_memory
     """Number of drones -> fresh memory of the team."""
 
+    def __post_init__(self):
+        check_whole("size of an action type", self.size)
+        check_callable("rpm of an action type", self.rpm, "jaxdrones.envs.ACTIONS['rpm']().rpm")
+        check_callable("init of an action type", self.init, "lambda n: None")
+
 
 def rpm(near_hover: float | None = None) -> Action:
     """Four rotor speeds: -1 stands still, 0 hovers, 1 is full speed; or hover speed times 1 +- `near_hover`."""
+    _check_share("near_hover", near_hover)
 
     def command(params, memory, state, action, setpoint, dt):
         return memory, _rotor_speed(params, action, near_hover)
@@ -48,6 +55,7 @@ def rpm(near_hover: float | None = None) -> Action:
 
 def one_d_rpm(near_hover: float | None = 0.05) -> Action:
     """One speed for all rotors; the paper's range is 5 % about hover."""
+    _check_share("near_hover", near_hover)
 
     def command(params, memory, state, action, setpoint, dt):
         return memory, jnp.broadcast_to(_rotor_speed(params, action, near_hover), (4,))
@@ -57,6 +65,7 @@ def one_d_rpm(near_hover: float | None = 0.05) -> Action:
 
 def thrust_and_torques(torque_share: float = 0.05) -> Action:
     """Collective thrust from zero to twice the weight, and torques up to a share of the largest."""
+    _check_share("torque_share", torque_share)
 
     def command(params, memory, state, action, setpoint, dt):
         limits = torque_share * jnp.stack([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
@@ -67,6 +76,7 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
 
 def one_d_thrust(share: float = 0.05) -> Action:
     """Collective thrust, the weight times 1 +- `share`."""
+    _check_share("share", share)
 
     def command(params, memory, state, action, setpoint, dt):
         thrust = params.weight * (1 + share * action[0])
@@ -94,6 +104,7 @@ def one_d_velocity() -> Action:
 
 def position(step: float = 0.1) -> Action:
     """A place up to `step` (m) away along each axis, flown to by the PID."""
+    check_number("step", step, "m", above=0)
 
     def command(params, memory, state, action, dt):
         return pid.control(pid.gains(), params, memory, state, Setpoint.at(state.pos + step * action), dt=dt)
@@ -103,6 +114,7 @@ def position(step: float = 0.1) -> Action:
 
 def one_d_position(step: float = 0.1) -> Action:
     """A place up to `step` (m) above or below, flown to by the PID."""
+    check_number("step", step, "m", above=0)
 
     def command(params, memory, state, action, dt):
         up = jnp.stack([0 * action[0], 0 * action[0], step * action[0]])
@@ -116,6 +128,7 @@ def destination(stride: float = 1.0) -> Action:
 
     The `pid` action of today's version of the paper's simulator.
     """
+    check_number("stride", stride, "m", above=0)
 
     def command(params, memory, state, action, dt):
         way = action - state.pos
@@ -139,6 +152,9 @@ def pid_gains() -> Action:
 
 def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
     """Collective thrust (-1 none, 0 the weight, 1 all there is) and body rates up to `max_rate` (rad/s)."""
+    check_shape("max_rate", max_rate, (3,), "about x, y and z, rad/s")
+    for rate in max_rate:
+        check_number("an entry of max_rate", rate, "rad/s", above=0)
 
     def command(params, memory, state, action, setpoint, dt):
         omega = jnp.array(max_rate, action.dtype) * action[1:]
@@ -149,6 +165,7 @@ def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -
 
 def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
     """Collective thrust as above, roll and pitch up to `max_tilt` (degrees), yaw up to half a turn."""
+    check_number("max_tilt", max_tilt, "degrees", above=0, at_most=180)
 
     def command(params, memory, state, action, setpoint, dt):
         limits = jnp.array([jnp.radians(max_tilt), jnp.radians(max_tilt), jnp.pi], action.dtype)
@@ -158,6 +175,11 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
         return memory, rates.follow(gains, params, state, _collective(params, action[0]), omega)
 
     return Action(4, command)
+
+
+def _check_share(name: str, share: float | None) -> None:
+    if share is not None:
+        check_number(name, share, above=0, at_most=1)
 
 
 def _by_pid(size: int, command: Callable) -> Action:

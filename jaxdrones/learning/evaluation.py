@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_whole
+from jaxdrones.checks import check_key, check_whole
 from jaxdrones.envs import Env
 from jaxdrones.learning.result import COMPILER_OPTIONS
 
@@ -49,7 +49,11 @@ def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -
         policy: observations (n, d), or a dictionary with images, -> actions (n, a); a pytree, or any function.
         key: random key.
         episodes: number of them.
+
+    Raises:
+        ValueError: no random key, or no episode.
     """
+    check_key("key", key)
     check_whole("episodes", episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, flax.struct.PyTreeNode):

@@ -68,6 +68,7 @@ def test_memory_may_be_any_pytree():
 
 def test_rollouts_of_many_worlds_come_from_vmap():
     worlds = jax.tree.map(lambda x: jnp.stack([x, 0.9 * x]), start)
+    worlds = worlds.replace(quat=jnp.stack([start.quat, start.quat[::-1]]))
     final, _ = jax.vmap(lambda s: jaxdrones.rollout(step, replay, team, s, None, 5))(worlds)
     for i in range(2):
         world = jax.tree.map(lambda x, i=i: x[i], worlds)

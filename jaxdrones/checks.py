@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+_SMALLEST = np.finfo(np.float64).tiny
 _LONGEST = 120  # characters of a value in an error
 _UNIT_LENGTH = 1e-3  # by which the length of a unit quaternion may be off; float32 and integrators stay far below
 _NUMBERS = "biuf"  # kinds of dtypes
@@ -21,13 +22,15 @@ POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_
 """Constants of a vehicle without which nothing flies."""
 _NOT_NEGATIVE = ("km", "gravity", "air_density")
 _MAY_BE_INFINITE = ("max_rpm",)
+_NO_ARRAYS = (list, tuple, dict, str, type(None))
+_UNKNOWN = (jax.core.Tracer, jax.ShapeDtypeStruct)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def is_known(value) -> bool:
     """Whether something has a value that can be looked at."""
-    return not isinstance(value, jax.core.Tracer | jax.ShapeDtypeStruct) and type(value) is not object
+    return not isinstance(value, _UNKNOWN) and type(value) is not object
 
 
 def shown(value) -> str:
@@ -189,24 +192,32 @@ def check_keywords(function: Function) -> Function:
 def check_arrays(name: str, tree: dict[str, Any]) -> None:
     """Raise unless every entry is an array or a number: JAX takes lists, tuples and `None` apart, not as one array."""
     for field, leaf in tree.items():
-        if isinstance(leaf, list | tuple | dict | str | None):
+        if isinstance(leaf, _NO_ARRAYS):
             raise ValueError(f"{name}.{field} is {shown(leaf)}; give an array, for example with jax.numpy.array(...)")
 
 
-def check_params(params) -> None:
-    """Raise if constants of a drone or a team are not those of something that flies, where they can be looked at."""
+def check_params(params, finite: bool = True) -> None:
+    """Raise if constants of a drone or a team are not those of something that flies, where they can be looked at.
+
+    Args:
+        params: of a drone or a team.
+        finite: whether to look at all of them, not only at those that must be positive.
+    """
     constants = vars(params)
     check_arrays("params", constants)
-    for field, leaf in constants.items():
-        if not is_known(leaf):
-            continue
-        leaf = np.asarray(leaf)
-        name = f"params.{field}"
-        check_finite(name, leaf[~np.isposinf(leaf)] if field in _MAY_BE_INFINITE else leaf)
-        if field in POSITIVE and not np.all(leaf > 0):
-            raise ValueError(f"{name} is {shown(leaf)}; give positive numbers")
-        if field in _NOT_NEGATIVE and not np.all(leaf >= 0):
-            raise ValueError(f"{name} is {shown(leaf)}; give numbers of at least 0")
+    if finite:
+        check_finite(
+            "params", params.replace(**{name: _without_infinity(constants[name]) for name in _MAY_BE_INFINITE})
+        )
+    for bound, words, names in (0, "positive numbers", POSITIVE), (-_SMALLEST, "numbers of at least 0", _NOT_NEGATIVE):
+        for name in names:
+            leaf = constants[name]
+            if is_known(leaf) and not (np.asarray(leaf) > bound).all():
+                raise ValueError(f"params.{name} is {shown(leaf)}; give {words}")
+
+
+def _without_infinity(leaf):
+    return np.where(np.isposinf(leaf), 0, leaf) if is_known(leaf) else leaf
 
 
 def check_quaternion(name: str, quat) -> None:
@@ -214,9 +225,9 @@ def check_quaternion(name: str, quat) -> None:
     if not is_known(quat) or np.shape(quat)[-1:] != (4,):  # what else it is, is said where shapes are checked
         return
     quat = np.asarray(quat, float)
-    length = np.sqrt(np.sum(quat**2, axis=-1))
+    length = np.sqrt((quat * quat).sum(axis=-1))
     off = ~(np.abs(length - 1) <= _UNIT_LENGTH)
-    if np.any(off):
+    if off.any():
         given, length = quat[off][0].tolist(), np.atleast_1d(length[off])[0]
         raise ValueError(f"{name} has length {length:g}: {given}; give a unit quaternion (x, y, z, w)")
 

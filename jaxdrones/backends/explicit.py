@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxdrones.backends.cells import Cells
 from jaxdrones.backends.host import is_traced
-from jaxdrones.backends.team import check_given, check_team
+from jaxdrones.backends.team import check_team, check_values
 from jaxdrones.backends.wrenches import Effect, Pair, check_functions, describe, make_total_wrench
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
@@ -92,8 +92,7 @@ class _ExplicitStep:
         if is_traced((params, state, rpm)):
             return self._compiled(params, state, rpm)
         if params is not self._params or state.quat is not self._quat:
-            check_team(params, state, rpm)
-            check_given(params, state)
+            check_values(params, state)
         state = self._compiled(params, state, rpm)
         self._params, self._quat = params, state.quat
         return state

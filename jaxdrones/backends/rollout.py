@@ -9,8 +9,15 @@ import numpy as np
 
 from jaxdrones.backends.explicit import Step
 from jaxdrones.backends.host import HostStep, is_traced
-from jaxdrones.backends.team import check_given
-from jaxdrones.checks import check_callable, check_finite, check_whole, shown
+from jaxdrones.checks import (
+    check_arrays,
+    check_callable,
+    check_finite,
+    check_params,
+    check_quaternion,
+    check_whole,
+    shown,
+)
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -48,8 +55,10 @@ def rollout(
     """
     check_whole("length", length)
     check_callable("control", control, "lambda params, memory, state, k: (memory, rpm)")
+    check_params(params)
+    check_arrays("state", vars(state))
     check_finite("state", state)
-    check_given(params, state)
+    check_quaternion("state.quat", state.quat)
 
     if isinstance(step, HostStep) and not is_traced((params, state, memory)):
         return _loop(step, control, params, state, memory, length)

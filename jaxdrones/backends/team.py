@@ -37,9 +37,9 @@ def check_team(params: Params, state: State, rpm) -> None:
     check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")
 
 
-def check_given(params: Params, state: State) -> None:
-    """Raise `ValueError` where values, not shapes, make no flight: constants, and attitudes that are none."""
-    check_params(params)
+def check_values(params: Params, state: State) -> None:
+    """Raise `ValueError` where values, not shapes, make no flight, and can be looked at: constants and attitudes."""
+    check_params(params, finite=False)
     check_arrays("state", vars(state))
     check_quaternion("state.quat", state.quat)
 

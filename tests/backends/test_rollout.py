@@ -127,3 +127,21 @@ def test_checkpoints_change_memory_and_neither_the_flight_nor_its_gradient():
 def test_a_checkpoint_divides_the_flight(every):
     with pytest.raises(ValueError, match="checkpoint"):
         jaxdrones.rollout(step, replay, team, start, None, 20, every)
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        (lambda *_: commands[0], r"control returned an array of shape \(2, 4\); return \(memory, rpm\)"),
+        (lambda *_: None, r"control returned None; return \(memory, rpm\)"),
+        (lambda *_: (None, commands[0], 1), r"control returned \(None, .*; return \(memory, rpm\)"),
+        (
+            lambda *_: ({"a": 1}, commands[0]),
+            r"control was given the memory .* and returned .*'a'.* of the same structure",
+        ),
+        ("replay", r"control: 'replay' is not a function; give for example lambda params, memory, state, k"),
+    ],
+)
+def test_a_controller_that_answers_something_else_is_told_what_to_return(control, message):
+    with pytest.raises(ValueError, match=message):
+        jaxdrones.rollout(step, control, team, start, None, 2)

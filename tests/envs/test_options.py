@@ -93,7 +93,7 @@ def test_numbers_of_make_are_refused_where_they_make_no_sense(option):
         (dict(vehicel="hb"), r"unknown option of hover 'vehicel'; did you mean 'vehicle'\?"),
         (dict(drone=2), r"unknown option of hover 'drone'; did you mean 'drones'\?"),
     ],
-    ids=str,
+    ids=range(21),
 )
 def test_a_mistake_in_an_option_is_named(options, message):
     with pytest.raises(ValueError, match=message):
@@ -158,3 +158,11 @@ def test_a_key_is_one_random_key_typed_or_raw():
             with pytest.raises(ValueError, match=r"key has shape \(3.*; give one key, and use jax\.vmap for many"):
                 take(many)
     assert jax.eval_shape(jax.vmap(env.reset), jax.random.split(raw, 3))[0].shape[0] == 3
+
+
+def test_a_world_with_a_quaternion_that_is_no_attitude_is_refused():
+    env = make("hover")
+    _, world = env.reset(KEY)
+    broken = world.replace(drones=world.drones.replace(quat=jnp.zeros((1, 4))))
+    with pytest.raises(ValueError, match=r"state\.quat has length 0: .*give a unit quaternion"):
+        env.step(KEY, broken, jnp.zeros((1, 4)))

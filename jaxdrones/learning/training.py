@@ -24,7 +24,7 @@ _CALL = 0.3  # s that a call takes about; Ctrl-C waits for it
 _SAVE = 30.0  # s between training states, at most
 _PATIENCE = 10  # updates in a row that are not finite
 _PROBE = 4  # times the size of the training state that must fit on the disk
-_CHOICE, _REPORT = 1, 2  # what a seed's key is folded with
+CHOICE, REPORT = 2**31, 2**31 + 1  # what a seed's key is folded with; splitting it gives what 0, 1, 2, ... give
 _EVALUATED = ("success", "evaluated_return", "evaluated_error")
 
 Tell = Callable[[int, dict[str, float]], None]
@@ -200,7 +200,7 @@ class _Course:
     def judge(self, policy: Policy, update: int) -> dict[str, float]:
         """Evaluate a policy, always on the same episodes; keep it if it is the best."""
         policy = sharding.whole(self.trainer.mesh, policy)
-        report = self._evaluate(policy, _CHOICE)
+        report = self._evaluate(policy, CHOICE)
         score = (report.success, report.returned if math.isfinite(report.returned) else -math.inf)
         if self.best is None or score > self.best:
             self.best = score
@@ -215,7 +215,7 @@ class _Course:
 
     def finish(self) -> None:
         """Evaluate the best policy on other episodes than it was chosen by, and write the report."""
-        report = self._evaluate(self.run.policy(), _REPORT)
+        report = self._evaluate(self.run.policy(), REPORT)
         seconds = {
             "training": self.seconds,
             "compiling": self.trainer.compile_seconds,

@@ -70,6 +70,7 @@ class Env:
         disturb: Disturbance | None = None,
         delay: float = 0.0,
         vision: Vision | None = None,
+        vehicle: str = "drones",
     ):
         """Put an environment together; `jaxdrones.make` does it by name.
 
@@ -85,6 +86,10 @@ class Env:
             disturb: sets the surroundings before every control step: pushes.
             delay: between action and command, s.
             vision: cameras; only with the Bullet backend.
+            vehicle: what the drones are, for people.
+
+        Raises:
+            ValueError: an argument of another kind, or a number out of range; says what to give.
         """
         _check_kinds(task, params, action)
         check_positive("dt", dt, "s")
@@ -112,13 +117,21 @@ class Env:
         """What of a world is the same in every episode."""
         self._delay = _nearly_whole(delay / dt)
         self._history = max(math.ceil(self._delay) + 1, *(part.history for part in observation))
-        self.physics, self.vision = step, vision
+        self.physics, self.vision, self._vehicle = step, vision, vehicle
         self._before, self._after, self._start = jax.jit(self._before), jax.jit(self._after), jax.jit(self._start)
         widths = self._widths()
         bound = [np.broadcast_to(part.bound, (width,)) for part, width in zip(self._parts, widths, strict=True)]
         self.observation_bound = np.concatenate(bound).astype(np.float32)
         """(d,) largest magnitude of every entry of the observation."""
         self.observation_size = len(self.observation_bound)
+
+    def __repr__(self) -> str:
+        backend = "bullet" if isinstance(self.physics, HostStep) else "explicit"
+        images = "".join(f" and {image}" for image in (self.vision.images if self.vision else ()))
+        return (
+            f"<Env {self.task.name}: {self.drones} x {self._vehicle}, dt {self.dt:.4g} s, {self.steps} steps, "
+            f"{self.action_size} actions and {self.observation_size} observations{images} a drone, {backend} backend>"
+        )
 
     def reset(self, key: jax.Array) -> tuple[Obs, World]:
         """The first observation, and the world at the start of an episode.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from jaxdrones.backends.explicit import make_step
 from jaxdrones.checks import check_choice, check_positive, check_sequence, check_switch, check_whole, hint
@@ -136,6 +137,7 @@ def make(
         disturb=disturb,
         delay=preset["delay"] if delay is None else delay,
         vision=_vision(step, backend, vision, vision_hz, control_hz),
+        vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
     )
 
 

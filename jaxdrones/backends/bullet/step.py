@@ -98,6 +98,9 @@ class BulletStep(HostStep):
         self._flat_params: jax.Array | None = None  # one array is handed over faster than twenty
         self._arms: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        return f"<step: Bullet at {1 / (self._dt * self._substeps):.4g} Hz x {self._substeps}>"
+
     def __enter__(self) -> BulletStep:
         return self
 

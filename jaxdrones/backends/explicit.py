@@ -81,7 +81,7 @@ def make_step(
 
 
 class _ExplicitStep:
-    """A compiled step that looks at what it is given, where that has values."""
+    """A compiled step that looks at what it is given, where that has values: once at constants and at a start."""
 
     def __init__(self, compiled: Step, text: str):
         self._compiled, self._text = compiled, text
@@ -89,12 +89,11 @@ class _ExplicitStep:
         self._quat: jax.Array | None = None
 
     def __call__(self, params: Params, state: State, rpm: jax.Array) -> State:
-        if is_traced((params, state, rpm)):
-            return self._compiled(params, state, rpm)
         if params is not self._params or state.quat is not self._quat:
             check_values(params, state)
         state = self._compiled(params, state, rpm)
-        self._params, self._quat = params, state.quat
+        if not is_traced(state.quat):
+            self._params, self._quat = params, state.quat
         return state
 
     def __repr__(self) -> str:

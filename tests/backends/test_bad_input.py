@@ -198,6 +198,8 @@ def test_constants_with_which_nothing_flies_are_named_where_they_can_be_looked_a
     for look in (lambda: step(broken, start, rpm), lambda: flown_once(broken, start)):
         with pytest.raises(ValueError, match=rf"params\.{name} is \[.*; give (positive )?numbers"):
             look()
+    with pytest.raises(ValueError, match=rf"params\.{name} is"):  # closed over, they have values in `jit`, too
+        jax.jit(lambda state: step(broken, state, rpm))(start)
     jax.eval_shape(lambda params: flown_once(params, start), broken)
 
 

@@ -1,11 +1,43 @@
-"""Errors that finish the sentence: what was wrong, what was given, what to do."""
+"""Errors that finish the sentence: what was wrong, what was given, what to do.
+
+What JAX traces has no value yet and passes; so do the placeholders with which JAX rebuilds a tree.
+"""
 
 import difflib
-from collections.abc import Iterable
-from typing import Any
+import functools
+import inspect
+import operator
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+_SMALLEST = np.finfo(np.float64).tiny
+_LONGEST = 120  # characters of a value in an error
+_UNIT_LENGTH = 1e-3  # by which the length of a unit quaternion may be off; float32 and integrators stay far below
+_NUMBERS = "biuf"  # kinds of dtypes
+POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_rpm")
+"""Constants of a vehicle without which nothing flies."""
+_NOT_NEGATIVE = ("km", "gravity", "air_density")
+_MAY_BE_INFINITE = ("max_rpm",)
+_NO_ARRAYS = (list, tuple, dict, str, type(None))
+_UNKNOWN = (jax.core.Tracer, jax.ShapeDtypeStruct)
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def is_known(value) -> bool:
+    """Whether something has a value that can be looked at."""
+    return not isinstance(value, _UNKNOWN) and type(value) is not object
+
+
+def shown(value) -> str:
+    """A value in one short line: of an array its numbers, not its address or type."""
+    text = repr(np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic | jax.Array) else value)
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: str) -> None:
@@ -22,27 +54,196 @@ def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: st
 def check_finite(name: str, tree: Any) -> None:
     """Raise if a concrete array of `tree` holds NaN or infinity; traced values cannot be looked at."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if not isinstance(leaf, jax.core.Tracer) and not np.all(np.isfinite(leaf)):
+        if is_known(leaf) and not np.all(np.isfinite(leaf)):
             where = name + jax.tree_util.keystr(path)
-            raise ValueError(f"{where} is not finite: {np.asarray(leaf).tolist()}; give finite numbers")
+            raise ValueError(f"{where} is not finite: {shown(leaf)}; give finite numbers")
+
+
+def check_number(
+    name: str,
+    value,
+    unit: str = "",
+    *,
+    at_least: float | None = None,
+    above: float | None = None,
+    at_most: float | None = None,
+    below: float | None = None,
+    infinite: bool = False,
+) -> None:
+    """Raise unless `value` is one real number within the bounds, also once it is rounded to float32.
+
+    Args:
+        name: of what is given.
+        value: number, or something traced, which passes.
+        unit: for the error.
+        at_least: lower bound that is allowed.
+        above: lower bound that is not allowed.
+        at_most: upper bound that is allowed.
+        below: upper bound that is not allowed.
+        infinite: whether infinity is allowed.
+    """
+    if not is_known(value):
+        return
+    bounds = {"at least": at_least, "above": above, "at most": at_most, "below": below}
+    bounds = {word: bound for word, bound in bounds.items() if bound is not None}
+    if not (_is_number(value) and _within(float(value), bounds, infinite)):
+        words = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items())
+        wanted = {"": "a finite number", "above 0": "a positive number"}.get(words, f"a number of {words}")
+        wanted = wanted.replace("number of above", "number above").replace("number of below", "number below")
+        raise ValueError(f"{name} is {shown(value)}; give {wanted}" + (f" ({unit})" if unit else ""))
+
+
+def _is_number(value) -> bool:
+    if isinstance(value, bool | str | bytes) or np.shape(value) != ():
+        return False
+    return np.asarray(value).dtype.kind in _NUMBERS
+
+
+def _within(value: float, bounds: dict[str, float], infinite: bool) -> bool:
+    with np.errstate(over="ignore", under="ignore"):
+        rounded = float(np.float32(value))
+    if np.isnan(value) or (not infinite and not np.isfinite(rounded)):
+        return False
+    if bounds.get("above") == 0 and rounded == 0:
+        return False
+    holds = {"at least": operator.ge, "above": operator.gt, "at most": operator.le, "below": operator.lt}
+    return all(holds[word](value, bound) for word, bound in bounds.items())
 
 
 def check_positive(name: str, value: float, unit: str) -> None:
     """Raise unless a number is positive and finite; a traced one cannot be looked at."""
-    if not isinstance(value, jax.core.Tracer) and not (np.isfinite(value) and value > 0):
-        raise ValueError(f"{name} is {value}; give a positive number ({unit})")
+    check_number(name, value, unit, above=0)
 
 
 def check_whole(name: str, value: int, minimum: int = 1) -> None:
     """Raise unless `value` is an integer of at least `minimum`."""
-    if not isinstance(value, int | np.integer) or value < minimum:
-        raise ValueError(f"{name} is {value!r}; give a whole number of at least {minimum}")
+    try:
+        whole = not isinstance(value, bool) and operator.index(value) >= minimum
+    except TypeError:
+        whole = False
+    if not whole:
+        raise ValueError(f"{name} is {shown(value)}; give a whole number of at least {minimum}")
+
+
+def check_switch(name: str, value: bool) -> None:
+    """Raise unless `value` is true or false."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} is {shown(value)}; give True or False")
 
 
 def check_choice(kind: str, name: str, known: Iterable[str]) -> None:
     """Raise unless `name` is one of the `known` names."""
     known = sorted(known)
     if name not in known:
-        close = difflib.get_close_matches(str(name), known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"unknown {kind} {name!r}{hint} (known: {', '.join(known)})")
+        raise ValueError(f"unknown {kind} {name!r}{hint(name, known)} (known: {', '.join(known)})")
+
+
+def hint(name: str, known: Iterable[str]) -> str:
+    """What may have been meant by an unknown name; nothing, if none is close."""
+    close = difflib.get_close_matches(str(name), known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def check_sequence(name: str, value, example: str) -> tuple:
+    """The entries of a sequence, or an error if something single stands in its place."""
+    if isinstance(value, str) or callable(value) or not isinstance(value, Iterable):
+        raise ValueError(f"{name} is {shown(value)}; give a sequence, for example ({example},)")
+    return tuple(value)
+
+
+def check_callable(name: str, value, example: str) -> None:
+    """Raise unless `value` is a function."""
+    if not callable(value):
+        raise ValueError(f"{name}: {shown(value)} is not a function; give for example {example}")
+
+
+def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], hint: str = "") -> None:
+    """Raise unless a function can be called with so many arguments; one without a signature passes."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        called = getattr(function, "__name__", repr(function))
+        wanted = f"give a function of ({', '.join(arguments)})"
+        raise ValueError(f"{name}: {called} takes {signature}; {wanted}{hint}") from None
+
+
+def check_keywords(function: Function) -> Function:
+    """The same function or class; a keyword that it does not have is an error that names the closest one."""
+    called = function.__init__ if isinstance(function, type) else function
+    name = function.__qualname__
+    known = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
+
+    @functools.wraps(called)
+    def checked(*args, **kwargs):
+        for keyword in kwargs:
+            check_choice(f"argument of {name}", keyword, known)
+        return called(*args, **kwargs)
+
+    if isinstance(function, type):
+        function.__init__ = checked
+        return function
+    return checked
+
+
+def check_arrays(name: str, tree: dict[str, Any]) -> None:
+    """Raise unless every entry is an array or a number: JAX takes lists, tuples and `None` apart, not as one array."""
+    for field, leaf in tree.items():
+        if isinstance(leaf, _NO_ARRAYS):
+            raise ValueError(f"{name}.{field} is {shown(leaf)}; give an array, for example with jax.numpy.array(...)")
+
+
+def check_params(params, finite: bool = True) -> None:
+    """Raise if constants of a drone or a team are not those of something that flies, where they can be looked at.
+
+    Args:
+        params: of a drone or a team.
+        finite: whether to look at all of them, not only at those that must be positive.
+    """
+    constants = vars(params)
+    check_arrays("params", constants)
+    if finite:
+        check_finite(
+            "params", params.replace(**{name: _without_infinity(constants[name]) for name in _MAY_BE_INFINITE})
+        )
+    for bound, words, names in (0, "positive numbers", POSITIVE), (-_SMALLEST, "numbers of at least 0", _NOT_NEGATIVE):
+        for name in names:
+            leaf = constants[name]
+            if is_known(leaf) and not (np.asarray(leaf) > bound).all():
+                raise ValueError(f"params.{name} is {shown(leaf)}; give {words}")
+
+
+def _without_infinity(leaf):
+    return np.where(np.isposinf(leaf), 0, leaf) if is_known(leaf) else leaf
+
+
+def check_quaternion(name: str, quat) -> None:
+    """Raise unless quaternions (..., 4) have unit length, where they can be looked at."""
+    if not is_known(quat) or np.shape(quat)[-1:] != (4,):  # what else it is, is said where shapes are checked
+        return
+    quat = np.asarray(quat, float)
+    length = np.sqrt((quat * quat).sum(axis=-1))
+    off = ~(np.abs(length - 1) <= _UNIT_LENGTH)
+    if off.any():
+        given, length = quat[off][0].tolist(), np.atleast_1d(length[off])[0]
+        raise ValueError(f"{name} has length {length:g}: {given}; give a unit quaternion (x, y, z, w)")
+
+
+def check_key(name: str, key) -> None:
+    """Raise unless `key` is one random key, typed or raw; what is traced has a shape, too."""
+    example = "give a random key, for example jax.random.key(0)"
+    if not isinstance(key, jax.Array | np.ndarray):
+        raise ValueError(f"{name} is {shown(key)}; {example}")
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    one = () if typed else _raw_key_shape()
+    if not typed and (key.dtype != np.uint32 or key.shape[key.ndim - len(one) :] != one):
+        raise ValueError(f"{name} is an array of {key.dtype} and shape {key.shape}; {example}")
+    if key.shape != one:
+        raise ValueError(f"{name} has shape {key.shape}; give one key, and use jax.vmap for many")
+
+
+def _raw_key_shape() -> tuple[int, ...]:
+    return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0))).shape

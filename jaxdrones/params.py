@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.checks import check_shape, check_whole
+from jaxdrones.checks import check_params, check_shape, check_whole, shown
 
 
 class Params(flax.struct.PyTreeNode):
@@ -98,11 +98,11 @@ def stack(team: Sequence[Params]) -> Params:
     """A team of any vehicles: every array gains a leading drone axis.
 
     Raises:
-        ValueError: an empty sequence, or a member that is already a team.
+        ValueError: an empty sequence, or a member that is already a team or cannot fly.
     """
     check_whole("number of drones", len(team))
     for i, params in enumerate(team):
-        check_shape(f"mass of drone {i}", params.mass, (), "stack takes the parameters of single drones")
+        _check_single(f"mass of drone {i}", params, "stack takes the parameters of single drones")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *team)
 
 
@@ -110,8 +110,15 @@ def repeat(params: Params, n: int) -> Params:
     """A team of `n` equal drones.
 
     Raises:
-        ValueError: `n` < 1, or `params` is already a team.
+        ValueError: `n` < 1, or `params` is already a team or cannot fly.
     """
     check_whole("number of drones", n)
-    check_shape("mass", params.mass, (), "repeat takes the parameters of a single drone")
+    _check_single("mass", params, "repeat takes the parameters of a single drone")
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), params)
+
+
+def _check_single(name: str, params: Params, meaning: str) -> None:
+    if not isinstance(params, Params):
+        raise ValueError(f"{shown(params)} is given; {meaning}, for example of jaxdrones.load_params")
+    check_params(params)
+    check_shape(name, params.mass, (), meaning)

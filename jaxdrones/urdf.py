@@ -2,10 +2,12 @@
 
 Mass and inertia are the base link's, rotor positions are the origins of the fixed joints `rotor0` to
 `rotor3`, the collision cylinder is the base link's, and what URDF has no word for stands in a
-`<properties>` tag.
+`<properties>` tag. What a file says and `Params` cannot hold (tilted rotors, a mass on another link) is an error,
+and so is a drone that cannot fly.
 """
 
 import os
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -13,26 +15,42 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import assets
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import check_choice, shown
 from jaxdrones.params import Params
 
 GRAVITY = 9.8  # m/s^2, the reference's value
 AIR_DENSITY = 1.225  # kg/m^3, standard atmosphere at sea level
 
-_PROPERTIES = {  # attribute: (length, meaning and unit, lowest value)
-    "kf": (1, "thrust coefficient, N/RPM^2", "positive"),
-    "km": (1, "torque coefficient, N m/RPM^2", "positive"),
-    "thrust2weight": (1, "highest thrust over weight", "positive"),
-    "max_speed_kmh": (1, "highest speed, km/h", "positive"),
-    "rotor_spin": (4, "signs of the reaction torques about body z", "signs"),
-    "rotor_rise_time": (1, "rotor time constant when speeding up, s", "positive"),
-    "rotor_fall_time": (1, "rotor time constant when slowing down, s", "positive"),
-    "drag_coeff": (3, "rotor drag, N per m/s and rad/s", "any"),
-    "ground_effect_coeff": (1, "k_G of equation 5", "any"),
-    "downwash_coeff": (3, "k_D1 (N), k_D2, k_D3 (m) of equation 6", "any"),
-    "inflow_loss": (1, "share of thrust lost per m/s of downwash, s/m", "any"),
-    "prop_radius": (1, "propeller radius, m", "positive"),
+_ANY = (-np.inf, np.inf)
+_SIGN = (-1, 1)
+_LENGTH = (1e-4, 100)  # m
+_PLACE = (-100, 100)  # m
+_TIME_CONSTANT = (0.0025, 10)  # s; an explicit step of 1/240 s is unstable below 2.1 ms
+_PROPERTIES = {  # attribute: (length, meaning and unit, range)
+    "kf": (1, "thrust coefficient, N/RPM^2", (1e-20, 1)),
+    "km": (1, "torque coefficient, N m/RPM^2", (1e-20, 1)),
+    "thrust2weight": (1, "highest thrust over weight", (0, 100)),
+    "max_speed_kmh": (1, "highest speed, km/h", (0.001, 1e5)),
+    "rotor_spin": (4, "signs of the reaction torques about body z", _SIGN),
+    "rotor_rise_time": (1, "rotor time constant when speeding up, s", _TIME_CONSTANT),
+    "rotor_fall_time": (1, "rotor time constant when slowing down, s", _TIME_CONSTANT),
+    "drag_coeff": (3, "rotor drag, N per m/s and rad/s", (0, 1)),
+    "ground_effect_coeff": (1, "k_G of equation 5", (0, 100)),
+    "downwash_coeff": (3, "k_D1 (N), k_D2, k_D3 (m) of equation 6", (-1e6, 1e6)),
+    "inflow_loss": (1, "share of thrust lost per m/s of downwash, s/m", (0, 10)),
+    "prop_radius": (1, "propeller radius, m", _LENGTH),
 }
+"""The ranges are those of anything from an insect to an airliner; within them single precision holds a flight."""
+
+_MASS = (1e-6, 1e6)  # kg
+_INERTIA = (1e-15, 1e9)  # kg m^2
+_MAX_RPM = (10, 1e6)
+_ANGULAR_ACCELERATION = (0.01, 3e4)  # rad/s^2 at the largest torque; the bundled vehicles reach 14 to 600
+_UNBALANCED = 100.0  # rad/s^2 with all rotors at hover speed; controllers cannot be expected to hold more
+_CONDITION = 20.0  # of the map from thrusts to thrust and torques; 1 for a cross, 1.3 for the racer
+_DRAG_RATE = 100.0  # 1/s, speed lost to drag with all rotors at full speed
+_BASE = "link[@name='base_link']"
+_ROTORS = tuple(f"rotor{i}" for i in range(4))
 
 
 def load_params(vehicle: str | os.PathLike) -> Params:
@@ -44,6 +62,8 @@ def load_params(vehicle: str | os.PathLike) -> Params:
     Raises:
         ValueError: an unknown vehicle, or a URDF that lacks something or holds nonsense; says what.
     """
+    if not isinstance(vehicle, str | os.PathLike):
+        raise ValueError(f"vehicle is {shown(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
     path = Path(vehicle)
     if path.suffix != ".urdf":
         check_choice("vehicle", str(vehicle), assets.vehicles())
@@ -52,27 +72,21 @@ def load_params(vehicle: str | os.PathLike) -> Params:
 
 
 def _params(urdf: "_Urdf") -> Params:
-    inertial = "link[@name='base_link']/inertial"
-    cylinder = "link[@name='base_link']/collision/geometry/cylinder"
+    inertial, cylinder = f"{_BASE}/inertial", f"{_BASE}/collision/geometry/cylinder"
     properties = {name: urdf.property(name) for name in _PROPERTIES}
-    mass = urdf.number(f"{inertial}/mass", "value", "mass, kg", "positive")
-    weight = mass * GRAVITY
-    for product in ("ixy", "ixz", "iyz"):
-        if urdf.number(f"{inertial}/inertia", product, "product of inertia, kg m^2", default="0") != 0:
-            raise ValueError(f"{urdf.name}: {product} is not zero; turn the body axes into principal axes")
-    kf = properties["kf"]
+    mass = urdf.number(f"{inertial}/mass", "value", "mass, kg", _MASS)
+    kf, thrust2weight = properties["kf"], properties["thrust2weight"]
     values = dict(
         mass=mass,
-        inertia=[
-            urdf.number(f"{inertial}/inertia", f"i{a}{a}", "moment of inertia, kg m^2", "positive") for a in "xyz"
-        ],
+        inertia=[urdf.number(f"{inertial}/inertia", f"i{a}{a}", "moment of inertia, kg m^2", _INERTIA) for a in "xyz"],
         rotor_pos=[
-            urdf.numbers(f"joint[@name='rotor{i}']/origin", "xyz", 3, f"position of rotor {i}, m") for i in range(4)
+            urdf.numbers(f"joint[@name='rotor{i}']/origin", "xyz", 3, f"position of rotor {i}, m", _PLACE)
+            for i in range(4)
         ],
         rotor_spin=properties["rotor_spin"],
         kf=kf,
         km=properties["km"],
-        max_rpm=np.sqrt(properties["thrust2weight"] * weight / (4 * kf)),
+        max_rpm=np.sqrt(thrust2weight * mass * GRAVITY / (4 * kf)),
         rotor_rise_time=properties["rotor_rise_time"],
         rotor_fall_time=properties["rotor_fall_time"],
         gravity=GRAVITY,
@@ -85,13 +99,73 @@ def _params(urdf: "_Urdf") -> Params:
         inflow_loss=properties["inflow_loss"],
         prop_radius=properties["prop_radius"],
         max_speed=properties["max_speed_kmh"] / 3.6,
-        collision_radius=urdf.number(cylinder, "radius", "collision radius, m", "positive"),
-        collision_height=urdf.number(cylinder, "length", "collision height, m", "positive"),
+        collision_radius=urdf.number(cylinder, "radius", "collision radius, m", _LENGTH),
+        collision_height=urdf.number(cylinder, "length", "collision height, m", _LENGTH),
         collision_offset=urdf.numbers(
-            "link[@name='base_link']/collision/origin", "xyz", 3, "centre of the collision cylinder, m", default="0 0 0"
+            f"{_BASE}/collision/origin", "xyz", 3, "centre of the collision cylinder, m", _PLACE, default="0 0 0"
         )[2],
     )
+    urdf.check_what_params_cannot_hold()
+    _check_flies(urdf.name, {name: np.asarray(value, float) for name, value in values.items()}, thrust2weight)
     return Params(**{name: jnp.asarray(value, float) for name, value in values.items()})
+
+
+def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> None:
+    """Raise unless the rotors lift the drone and turn it about every axis, and the moments are those of a body."""
+
+    def demand(condition, problem: str, remedy: str) -> None:
+        if not condition:
+            raise ValueError(f"{file}: {problem}; {remedy}")
+
+    demand(
+        thrust2weight > 1,
+        f"thrust2weight is {thrust2weight:g}, with which a drone cannot hover",
+        "give the highest thrust over the weight, above 1",
+    )
+    weight, inertia, max_rpm = v["mass"] * GRAVITY, v["inertia"], v["max_rpm"]
+    demand(
+        _MAX_RPM[0] <= max_rpm <= _MAX_RPM[1],
+        f"mass, kf and thrust2weight make a highest rotor speed of {max_rpm:.4g} RPM",
+        f"expected {_MAX_RPM[0]:g} to {_MAX_RPM[1]:g}; give kf in N/RPM^2 and the mass in kg",
+    )
+    largest = np.max(inertia)
+    demand(
+        largest <= (np.sum(inertia) - largest) * (1 + 1e-6),
+        f"the moments of inertia {shown(inertia)} are those of no body",
+        "each is at most the sum of the other two",
+    )
+    x, y, _ = v["rotor_pos"].T
+    spin = v["rotor_spin"]
+    demand(
+        np.sum(spin) == 0,
+        f'rotor_spin="{" ".join(f"{s:g}" for s in spin)}" makes a drone that spins when it hovers',
+        "let two rotors turn either way",
+    )
+    arm = np.mean(np.hypot(x, y))
+    allocation = np.stack([np.ones(4), y / max(arm, _LENGTH[0]), x / max(arm, _LENGTH[0]), spin])
+    values = np.linalg.svd(allocation, compute_uv=False)
+    demand(
+        values[0] <= _CONDITION * values[-1],
+        f"rotors at {shown(v['rotor_pos'])} m with rotor_spin {shown(spin)} cannot turn a drone about every axis",
+        "place them around the centre of mass, with neighbours that turn opposite ways",
+    )
+    full = v["kf"] * max_rpm**2
+    torque = np.array([full * np.sum(np.abs(y)) / 2, full * np.sum(np.abs(x)) / 2, 2 * v["km"] * max_rpm**2])
+    for axis, acceleration in zip(("roll", "pitch", "yaw"), torque / inertia, strict=True):
+        demand(
+            _ANGULAR_ACCELERATION[0] <= acceleration <= _ANGULAR_ACCELERATION[1],
+            f"its rotors accelerate it in {axis} by up to {acceleration:.3g} rad/s^2",
+            f"expected {_ANGULAR_ACCELERATION[0]:g} to {_ANGULAR_ACCELERATION[1]:g}; look at inertia, kf, km and mass",
+        )
+    tumbling = weight * np.hypot(np.mean(y) / inertia[0], np.mean(x) / inertia[1])
+    demand(
+        tumbling <= _UNBALANCED,
+        f"its rotors are centred on ({np.mean(x):.3g}, {np.mean(y):.3g}) m and tumble it by {tumbling:.3g} rad/s^2 "
+        "when they carry its weight",
+        "centre them on the centre of mass, the origin of base_link",
+    )
+    rate = np.max(v["drag_coeff"]) * 4 * max_rpm * 2 * np.pi / 60 / v["mass"]
+    demand(rate <= _DRAG_RATE, f"drag takes {rate:.3g} of the speed per second", f"expected at most {_DRAG_RATE:g}")
 
 
 class _Urdf:
@@ -100,37 +174,109 @@ class _Urdf:
     def __init__(self, path: Path):
         self.name = path.name
         try:
-            self._root = ET.parse(path).getroot()
+            self._root = ET.fromstring(path.read_bytes())
         except OSError as error:
             raise ValueError(f"{path}: cannot be read ({error.strerror}); give the path of a URDF file") from None
         except ET.ParseError as error:
             raise ValueError(f"{path}: is not well-formed XML ({error}); mend the file") from None
+        except (LookupError, ValueError) as error:  # of its encoding, or of its name
+            raise ValueError(f"{shown(str(path))[1:-1]}: cannot be read ({error}); save it as UTF-8") from None
+        if self._root.tag != "robot":
+            raise ValueError(f"{path}: is no URDF, its root is <{self._root.tag}>; give a file with <robot>")
+
+    def check_what_params_cannot_hold(self) -> None:
+        """Raise on what would be flown differently than the file says."""
+        for joint in self._root.iter("joint"):
+            if re.fullmatch(r"rotor\d+", joint.get("name", "")) and joint.get("name") not in _ROTORS:
+                raise ValueError(
+                    f"{self.name}: has a joint {joint.get('name')!r}; only quadrotors fly, rotor0 to rotor3"
+                )
+        for rotor in _ROTORS:
+            path = f"joint[@name='{rotor}']"
+            parent = self._tag(f"{path}/parent")
+            if parent is not None and parent.get("link") != "base_link":
+                raise ValueError(
+                    f"{self.name}: {rotor} hangs on {parent.get('link')!r}; give its place relative to base_link"
+                )
+            self._check_zero(f"{path}/origin", "rpy", slice(2), "rotors push along body z; give no roll and pitch")
+        origin, collision = f"{_BASE}/inertial/origin", f"{_BASE}/collision/origin"
+        self._check_zero(origin, "xyz", slice(3), "put the origin of base_link at the centre of mass")
+        self._check_zero(origin, "rpy", slice(3), "turn the body axes into principal axes")
+        self._check_zero(collision, "xyz", slice(2), "centre the cylinder on body z")
+        self._check_zero(collision, "rpy", slice(2), "the cylinder stands along body z; give no roll and pitch")
+        for product in ("ixy", "ixz", "iyz"):
+            path = f"{_BASE}/inertial/inertia"
+            if self.number(path, product, "product of inertia, kg m^2", default="0") != 0:
+                raise ValueError(f"{self.name}: {product} is not zero; turn the body axes into principal axes")
+        for link in self._root.findall("link"):
+            mass = link.find("inertial/mass")
+            if link.get("name") != "base_link" and mass is not None and not _is_zero(mass.get("value", "0")):
+                raise ValueError(
+                    f"{self.name}: the link {link.get('name')!r} has a mass of its own, {mass.get('value')} kg; "
+                    "add it, and its inertia, to those of base_link"
+                )
 
     def property(self, name: str) -> float | np.ndarray:
-        length, meaning, kind = _PROPERTIES[name]
-        values = self.numbers("properties", name, length, meaning, kind)
+        length, meaning, within = _PROPERTIES[name]
+        values = self.numbers("properties", name, length, meaning, within)
         return values[0] if length == 1 else values
 
-    def number(self, path: str, attribute: str, meaning: str, kind: str = "any", default: str | None = None) -> float:
-        return self.numbers(path, attribute, 1, meaning, kind, default)[0]
+    def number(
+        self, path: str, attribute: str, meaning: str, within: tuple = _ANY, default: str | None = None
+    ) -> float:
+        return self.numbers(path, attribute, 1, meaning, within, default)[0]
 
     def numbers(
-        self, path: str, attribute: str, length: int, meaning: str, kind: str = "any", default: str | None = None
+        self, path: str, attribute: str, length: int, meaning: str, within: tuple = _ANY, default: str | None = None
     ) -> np.ndarray:
-        tag = self._root.find(path)
+        tag = self._tag(path)
         text = default if tag is None else tag.get(attribute, default)
         if text is None:
             there = "the tag is missing" if tag is None else f"found {', '.join(tag.keys()) or 'no attribute'}"
             raise ValueError(f"{self.name}: <{path}> lacks '{attribute}' ({meaning}); {there}")
-        where = f'{self.name}: <{path}> {attribute}="{text}" ({meaning})'
+        where = f'{self.name}: <{path}> {attribute}="{shown(text)[1:-1]}" ({meaning})'
         try:
-            values = np.array([float(word) for word in text.split()])
+            values = np.array([_float(word) for word in text.split()])
         except ValueError:
             raise ValueError(f"{where} is not a list of numbers; give {length}") from None
         if len(values) != length or not np.all(np.isfinite(values)):
             raise ValueError(f"{where} should be {length} finite number(s)")
-        if kind == "positive" and not np.all(values > 0):
-            raise ValueError(f"{where} should be positive")
-        if kind == "signs" and not np.all(np.abs(values) == 1):
+        if within == _SIGN and not np.all(np.abs(values) == 1):
             raise ValueError(f"{where} should be +1 or -1 each")
+        low, high = within
+        if low > 0 and not np.all(values > 0):
+            raise ValueError(f"{where} should be positive")
+        if not np.all((values >= low) & (values <= high)):
+            raise ValueError(f"{where} should be {low:g} to {high:g}")
         return values
+
+    def _check_zero(self, path: str, attribute: str, entries: slice, remedy: str) -> None:
+        values = self.numbers(path, attribute, 3, "origin, m or rad", default="0 0 0")
+        if np.any(values[entries] != 0):
+            raise ValueError(f"{self.name}: <{path}> {attribute} is {shown(values)}; {remedy}")
+
+    def _tag(self, path: str) -> ET.Element | None:
+        """The only tag at a path, whose parts are the only ones, too; `None` if it is missing."""
+        tag = self._root
+        for part in path.split("/"):
+            found = tag.findall(part)
+            if len(found) > 1:
+                raise ValueError(f"{self.name}: <{part}> of <{path}> is there {len(found)} times; leave one")
+            if not found:
+                return None
+            tag = found[0]
+        return tag
+
+
+def _float(word: str) -> float:
+    """The number that a word of XML is; Python's 1_000 is none."""
+    if "_" in word:
+        raise ValueError(word)
+    return float(word)
+
+
+def _is_zero(text: str) -> bool:
+    try:
+        return _float(text) == 0
+    except ValueError:
+        return False

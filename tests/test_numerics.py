@@ -92,3 +92,22 @@ def test_what_is_stored_is_computed_once():
         return jax.jit(used_twice).lower(jnp.ones(1024)).compile().cost_analysis()["flops"]
 
     assert products(stored) < products(lambda y: y)
+
+
+def test_gradients_are_zero_where_an_angle_has_none():
+    """At the origin, and at the ends of the arcsine; first and second ones, however they are taken."""
+    origin, ends = jnp.zeros(2), jnp.array([-1.0, 1.0])
+    for derived in (jax.jacrev, jax.jacfwd, jax.hessian):
+        np.testing.assert_array_equal(jax.jit(derived(lambda p: atan2(p[0], p[1])))(origin), 0)
+    for derived in (jax.grad, jax.jacfwd, jax.hessian):
+        np.testing.assert_array_equal(jax.jit(jax.vmap(derived(asin)))(ends), 0)
+    assert np.isfinite(jax.jit(jax.grad(lambda x: atan2(x * 0, x * 0) + asin(x / x)))(3.0))
+
+
+def test_derivatives_of_the_arcsine_are_those_of_the_library_between_its_ends():
+    s = np.concatenate([np.linspace(-0.999, 0.999, 1001), 1 - np.logspace(-12, -1, 50)])
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(asin)))(s), 1 / np.sqrt((1 - s) * (1 + s)), rtol=1e-9)
+
+
+def test_what_has_no_arcsine_is_not_a_number():
+    assert np.isnan(asin(jnp.array([-1.1, 1.1, jnp.nan]))).all()

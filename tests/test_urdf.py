@@ -1,9 +1,13 @@
 """Bundled vehicles against the constants recorded from the reference, and files that are wrong."""
 
+import re
+
 import golden_data
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import VEHICLES, assert_close
+from helpers import VEHICLES, assert_close, assert_finite
 
 import jaxdrones
 from jaxdrones import assets
@@ -98,7 +102,81 @@ def test_a_missing_file_says_what_to_give(tmp_path):
         ('ixy="0"', 'ixy="1e-6"', r"ixy is not zero; turn the body axes"),
         ('name="rotor2"', 'name="tail"', r"rotor2.*lacks 'xyz' \(position of rotor 2, m\)"),
         ('name="base_link"', 'name="body"', r"base_link.*lacks 'value' \(mass"),
+        ('kf="3.16e-10"', 'kf="1e-50"', r'kf="1e-50".*should be 1e-20 to 1'),
+        ('kf="3.16e-10"', 'kf="1e50"', r'kf="1e50".*should be 1e-20 to 1'),
+        ('kf="3.16e-10"', 'kf="1e-19"', r"highest rotor speed of 1.22e\+09 RPM; expected 10 to 1e\+06"),
+        ('km="7.94e-12"', 'km="1_0"', r'km="1_0".*is not a list of numbers'),
+        ('kf="3.16e-10"', f'kf="{"9" * 999}"', r"kf=\"9{100,}\.*.* should be 1 finite"),
+        ('thrust2weight="2.25"', 'thrust2weight="0.9"', r"thrust2weight is 0.9, with which a drone cannot hover; give"),
+        ('thrust2weight="2.25"', 'thrust2weight="1"', r"thrust2weight is 1, with which a drone cannot hover"),
+        ('rotor_fall_time="0.249"', 'rotor_fall_time="1e-4"', r"rotor_fall_time.* should be 0.0025 to 10"),
+        ('drag_coeff="9.1785e-7', 'drag_coeff="-9.1785e-7', r"drag_coeff.* should be 0 to 1"),
+        (
+            'drag_coeff="9.1785e-7',
+            'drag_coeff="0.01',
+            r"drag takes 3.37e\+03 of the speed per second; expected at most",
+        ),
+        ('rotor_spin="-1 1 -1 1"', 'rotor_spin="1 1 1 1"', r"spins when it hovers; let two rotors turn either way"),
+        ('rotor_spin="-1 1 -1 1"', 'rotor_spin="1 1 -1 1"', r'rotor_spin="1 1 -1 1" makes a drone that spins'),
+        ('rotor_spin="-1 1 -1 1"', 'rotor_spin="1 1 -1 -1"', r"cannot turn a drone about every axis; place them"),
+        (
+            'izz="2.17e-5"',
+            'izz="2.9e-5"',
+            r"moments of inertia \[1.4e-05, .* are those of no body; each is at most the sum",
+        ),
+        ('ixx="1.4e-5"', 'ixx="1.4e-8"', r"are those of no body"),
+        (
+            'ixx="1.4e-5" ixy="0" ixz="0" iyy="1.4e-5" iyz="0" izz="2.17e-5"',
+            'ixx="9" iyy="9" izz="9"',
+            r"in roll by up to",
+        ),
+        ('xyz="0.028072139213105935 -', 'xyz="0.09 -', r"centred on \(0.0155, 0\) m and tumble it by .* centre them"),
+        ('length="0.025"/></geometry> <!--', 'length="-1"/></geometry> <!--', r'length="-1".*should be positive'),
+        ('name="rotor2"', 'name="rotor1"', r"<joint\[@name='rotor1'\]> of .* is there 2 times; leave one"),
+        ("  <properties", "  <properties/><properties", r"<properties> of <properties> is there 2 times; leave one"),
+        ("  <inertial>", "<inertial/><inertial>", r"<inertial> of .* is there 2 times; leave one"),
+        ('  <link name="prop0"/>', '<link name="base_link"/>', r"<link\[@name='base_link'\]> of .* is there 2 times"),
+        ('  <link name="prop0"/>', '<joint name="rotor4"/>', r"has a joint 'rotor4'; only quadrotors fly"),
+        (
+            '<link name="prop0"/>',
+            '<link name="prop0"><inertial><mass value="0.001"/></inertial></link>',
+            r"the link 'prop0' has a mass of its own, 0.001 kg; add it",
+        ),
+        (
+            '<child link="prop0"/>\n    <origin',
+            '<origin rpy="0.1 0 0"',
+            r"rpy is \[0.1, 0.0, 0.0\]; rotors push along body z",
+        ),
+        (
+            '<parent link="base_link"/>\n    <child link="prop0"',
+            '<parent link="arm"/><child link="prop0"',
+            r"hangs on 'arm'",
+        ),
+        (
+            '<inertial>\n      <origin xyz="0 0 0"/>',
+            '<inertial><origin xyz="0 0 1"/>',
+            r"xyz is .*; put the origin of base_link",
+        ),
+        (
+            '<inertial>\n      <origin xyz="0 0 0"/>',
+            '<inertial><origin rpy="0 1 0"/>',
+            r"rpy is .*; turn the body axes",
+        ),
+        (
+            '<collision>\n      <origin xyz="0 0 0"/>',
+            '<collision><origin xyz="1 0 0"/>',
+            r"xyz is .*; centre the cylinder",
+        ),
+        (
+            '<collision>\n      <origin xyz="0 0 0"/>',
+            '<collision><origin rpy="1 0 0"/>',
+            r"rpy is .*; the cylinder stands",
+        ),
+        ('robot name="cf2x"', 'sdf name="cf2x"', r"is not well-formed XML"),
+        ("kf=", "&lots;kf=", r"is not well-formed XML"),
+        ('"30"', '"&lots;"', r"is not well-formed XML \(undefined entity"),
     ],
+    ids=str,
 )
 def test_a_wrong_urdf_says_where_and_what(tmp_path, old, new, message):
     text = (assets.folder() / "cf2x.urdf").read_text()
@@ -108,3 +186,89 @@ def test_a_wrong_urdf_says_where_and_what(tmp_path, old, new, message):
     with pytest.raises(ValueError, match=f"(?s){message}") as error:
         jaxdrones.load_params(path)
     assert "broken.urdf" in str(error.value)
+
+
+ENTITIES = "".join(f'<!ENTITY a{i + 1} "{f"&a{i};" * 10}">' for i in range(12))
+BOMB = f'<!DOCTYPE r [<!ENTITY a0 "lots">{ENTITIES}]><robot name="&a12;"/>'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is not well-formed XML"),
+        (bytes(range(256)) * 40, "is not well-formed XML"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(1000), "is not well-formed XML"),
+        ("<robot name='é'/>".encode("latin-1"), "is not well-formed XML"),
+        (
+            b'<?xml version="1.0" encoding="foo"?><robot/>',
+            r"cannot be read \(unknown encoding: foo\); save it as UTF-8",
+        ),
+        (b'<?xml version="1.0" encoding="utf-7"?><robot/>', "cannot be read .*save it as UTF-8|not well-formed"),
+        (b'<?xml version="1.0" encoding="big5"?><robot/>', "cannot be read .*save it as UTF-8"),
+        (b"<sdf/>", r"is no URDF, its root is <sdf>; give a file with <robot>"),
+        (b'<!DOCTYPE r [<!ENTITY a SYSTEM "file:///etc/passwd">]><robot>&a;</robot>', "undefined entity"),
+        (BOMB.encode(), "is not well-formed XML"),
+    ],
+    ids=range(10),
+)
+def test_a_file_that_is_no_urdf_is_named(tmp_path, content, message):
+    path = tmp_path / "broken.urdf"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=rf"broken\.urdf: .*{message}"):
+        jaxdrones.load_params(path)
+
+
+def test_a_folder_and_a_name_that_no_file_has_are_named(tmp_path):
+    (tmp_path / "folder.urdf").mkdir()
+    for path in (tmp_path / "folder.urdf", "a\0b.urdf", "x" * 5000 + ".urdf"):
+        with pytest.raises(ValueError, match=r"cannot be read"):
+            jaxdrones.load_params(path)
+
+
+NUMBER = re.compile(r'(?<=[" ])-?\d+\.?\d*(?:e-?\d+)?(?=[" ])')
+VALUES = ("0", "-1", "1", "1e-50", "1e50", "1e-5", "1e5", "nan", "-inf", "", "abc", "1 2", "0.05", "3")
+
+
+def mutations(text):
+    """Every number replaced by others, every line left out or doubled, bytes that flip, and ends that are missing."""
+    for match in NUMBER.finditer(text):
+        yield from (text[: match.start()] + value + text[match.end() :] for value in VALUES)
+    lines = text.split("\n")
+    for i in range(len(lines)):
+        yield "\n".join(lines[:i] + lines[i + 1 :])
+        yield "\n".join([*lines[: i + 1], *lines[i:]])
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        flipped = np.frombuffer(text.encode(), np.uint8).copy()
+        flipped[rng.integers(len(flipped), size=2)] = rng.integers(256, size=2)
+        yield flipped.tobytes()
+        yield text[: rng.integers(len(text))]
+
+
+@jax.jit
+def hovered(params):
+    """A team after a second at hover speed, and one that starts with its rotors at rest."""
+    team = jaxdrones.repeat(params, 1)
+    rpm = jnp.broadcast_to(team.hover_rpm[:, None], (1, 4))
+    start = jaxdrones.State.at_rest([[0.0, 0, 1]])
+    step = jaxdrones.make_step((jaxdrones.drag, jaxdrones.ground_effect), rotors=jaxdrones.lagging_rotors)
+    fly = jax.vmap(
+        lambda rpms: jaxdrones.rollout(step, lambda *_: (None, rpm), team, start.replace(rpm=rpms), None, 240)[0]
+    )
+    return fly(jnp.stack([rpm, 0 * rpm]))
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("vehicle", ["cf2x", "racer"])
+def test_whatever_is_changed_in_a_urdf_it_flies_or_one_line_says_why_not(tmp_path, vehicle):
+    path, flown = tmp_path / "changed.urdf", 0
+    for changed in mutations((assets.folder() / f"{vehicle}.urdf").read_text()):
+        path.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
+        try:
+            params = jaxdrones.load_params(path)
+        except ValueError as error:
+            assert "changed.urdf" in str(error) and "\n" not in str(error) and len(str(error)) < 700
+        else:
+            assert_finite(hovered(params))
+            flown += 1
+    assert flown > 100

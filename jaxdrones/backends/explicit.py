@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from jaxdrones.backends.cells import Cells
-from jaxdrones.backends.team import check_team
-from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_total_wrench
+from jaxdrones.backends.host import is_traced
+from jaxdrones.backends.team import check_team, check_values
+from jaxdrones.backends.wrenches import Effect, Pair, check_functions, describe, make_total_wrench
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
@@ -44,7 +45,8 @@ def make_step(
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
         rpm (n, 4) the commanded rotor speeds. The rotors limit them to [0, `params.max_rpm`], and so the speeds that
         a state starts with. There is no floor: drones fall through z = 0 unless `ground_contact` is among the
-        effects. It raises `ValueError` on a wrong shape.
+        effects. It raises `ValueError` on a wrong shape, and where it is called with values, on constants that do not
+        fly and on quaternions that are no attitude.
 
     Raises:
         ValueError: `dt` or `substeps` not positive, or an argument that should be a function and is not.
@@ -53,6 +55,7 @@ def make_step(
     check_whole("substeps", substeps)
     check_functions("rotors", [rotors])
     check_functions("integrator", [integrator])
+    effects, pairs = check_functions("effects", effects), check_functions("pairs", pairs)
     total_wrench = make_total_wrench(effects, pairs, cells)
 
     def derivative(params: Params, state: State, command: jax.Array) -> State:
@@ -76,4 +79,26 @@ def make_step(
 
         return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, length=substeps)[0]
 
-    return jax.jit(step, inline=True)
+    text = f"{describe([integrator])} at {1 / (dt * substeps):.4g} Hz x {substeps}, {describe([rotors])}"
+    text += f", effects: {describe(effects)}, pairs: {describe(pairs)}" + (f", {cells}" if cells else "")
+    return _ExplicitStep(jax.jit(step, inline=True), text)
+
+
+class _ExplicitStep:
+    """A compiled step that looks at what it is given, where that has values: once at constants and at a start."""
+
+    def __init__(self, compiled: Step, text: str):
+        self._compiled, self._text = compiled, text
+        self._params: Params | None = None  # what was looked at last, and the attitude that was flown to
+        self._quat: jax.Array | None = None
+
+    def __call__(self, params: Params, state: State, rpm: jax.Array) -> State:
+        if params is not self._params or state.quat is not self._quat:
+            check_values(params, state)
+        state = self._compiled(params, state, rpm)
+        if not is_traced(state.quat):
+            self._params, self._quat = params, state.quat
+        return state
+
+    def __repr__(self) -> str:
+        return f"<step: {self._text}>"

@@ -9,8 +9,15 @@ import numpy as np
 
 from jaxdrones.backends.explicit import Step
 from jaxdrones.backends.host import HostStep, is_traced
-from jaxdrones.backends.team import check_constants
-from jaxdrones.checks import check_finite, check_whole
+from jaxdrones.checks import (
+    check_arrays,
+    check_callable,
+    check_finite,
+    check_params,
+    check_quaternion,
+    check_whole,
+    shown,
+)
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -42,19 +49,23 @@ def rollout(
         The final state, and the state after every control step: arrays (length, n, ...).
 
     Raises:
-        ValueError: `length` < 1 or no multiple of `checkpoint`, wrong shapes, or numbers that are not finite (where
-            they can be looked at).
+        ValueError: `length` < 1 or no multiple of `checkpoint`, wrong shapes, a controller that answers something
+            else, or numbers that do not fly (where they can be looked at): not finite, a mass that is not positive, a
+            quaternion that is not of unit length.
     """
     check_whole("length", length)
+    check_callable("control", control, "lambda params, memory, state, k: (memory, rpm)")
+    check_params(params)
+    check_arrays("state", vars(state))
     check_finite("state", state)
-    check_constants(params)
+    check_quaternion("state.quat", state.quat)
 
     if isinstance(step, HostStep) and not is_traced((params, state, memory)):
         return _loop(step, control, params, state, memory, length)
 
     def advance(carry: tuple[Any, State], k: jax.Array) -> tuple[tuple[Any, State], State]:
         memory, state = carry
-        memory, rpm = control(params, memory, state, k)
+        memory, rpm = _commanded(control, params, memory, state, k)
         state = step(params, state, rpm)
         return (memory, state), state
 
@@ -72,6 +83,22 @@ def rollout(
     return final, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), legs)
 
 
+def _commanded(control: Control, params: Params, memory: Any, state: State, k: jax.Array) -> tuple[Any, jax.Array]:
+    """What a controller answers, or an error if that is something else than memory and rotor speeds."""
+    answer = control(params, memory, state, k)
+    if not (isinstance(answer, tuple | list) and len(answer) == 2):
+        given = f"an array of shape {np.shape(answer)}" if isinstance(answer, jax.Array | np.ndarray) else shown(answer)
+        raise ValueError(
+            f"control returned {given}; return (memory, rpm), with memory as it was given if there is none"
+        )
+    if jax.tree.structure(answer[0]) != jax.tree.structure(memory):
+        raise ValueError(
+            f"control was given the memory {jax.tree.structure(memory)} and returned {jax.tree.structure(answer[0])}; "
+            "return (memory, rpm) with memory of the same structure"
+        )
+    return answer
+
+
 def _loop(
     step: HostStep, control: Control, params: Params, state: State, memory: Any, length: int
 ) -> tuple[State, State]:
@@ -79,7 +106,7 @@ def _loop(
     control = jax.jit(control)
     states = []
     for k in range(length):
-        memory, rpm = control(params, memory, state, k)
+        memory, rpm = _commanded(control, params, memory, state, k)
         state = step(params, state, rpm)
         states.append(state)
     return state, jax.tree.map(lambda *leaves: np.stack(leaves), *states)

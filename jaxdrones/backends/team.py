@@ -4,12 +4,11 @@ import dataclasses
 import math
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_finite, check_shape
+from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -27,6 +26,8 @@ _STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
 
 def check_team(params: Params, state: State, rpm: Any) -> None:
     """Raise `ValueError` unless the arrays are those of one team of n drones."""
+    check_arrays("state", vars(state))
+    check_arrays("params", vars(params))
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap")
     n = len(state.pos)
     for name, width in _STATE.items():
@@ -37,17 +38,11 @@ def check_team(params: Params, state: State, rpm: Any) -> None:
     check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")
 
 
-def check_constants(params: Params) -> None:
-    """Raise `ValueError` unless the parameters are finite; `max_rpm` may be infinite, and is not negative.
-
-    Traced values cannot be looked at.
-    """
-    if not isinstance(params.max_rpm, jax.core.Tracer):
-        max_rpm = np.asarray(params.max_rpm)
-        if np.any(max_rpm < 0):
-            raise ValueError(f"params.max_rpm is {max_rpm.tolist()}; give at least 0 RPM, or infinity for no limit")
-        params = params.replace(max_rpm=np.where(max_rpm == np.inf, 0, max_rpm))
-    check_finite("params", params)
+def check_values(params: Params, state: State) -> None:
+    """Raise `ValueError` where values, not shapes, make no flight, and can be looked at: constants and attitudes."""
+    check_params(params, finite=False)
+    check_arrays("state", vars(state))
+    check_quaternion("state.quat", state.quat)
 
 
 def flatten(params: Params) -> Float[Array, "n k"]:

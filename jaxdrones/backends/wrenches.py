@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from jaxdrones import rotation
 from jaxdrones.backends.cells import Cells
+from jaxdrones.checks import check_arguments, check_sequence, check_shape, shown
 from jaxdrones.dynamics import drone_contact, rotor_wrench
 from jaxdrones.numerics import stored
 from jaxdrones.params import Params
@@ -21,6 +22,16 @@ _OUT_OF_REACH = 1e3  # m
 _BESIDE = 2.0**-13  # m; 0.1 mm, which float32 adds to 1 km without rounding
 _SHORT = 32  # terms
 _EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}
+_ARGUMENTS = {
+    "effects": ("params", "state"),
+    "pairs": ("params", "state", "other", "other_state"),
+    "rotors": ("params", "rpm", "command"),
+    "integrator": ("derivative", "state", "dt"),
+}
+_ELSEWHERE = {
+    "effects": "; what depends on another drone belongs to pairs",
+    "pairs": "; what depends on one drone alone belongs to effects",
+}
 
 
 def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable, ...]:
@@ -28,11 +39,28 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
     example = f"jaxdrones.{_EXAMPLE[name]}"
     if callable(functions):
         raise ValueError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
-    functions = tuple(functions)
+    functions = check_sequence(name, functions, example)
     for function in functions:
         if not callable(function):
             raise ValueError(f"{name}: {function!r} is not a function; give for example {example}")
+        check_arguments(name, function, _ARGUMENTS[name], _ELSEWHERE.get(name, ""))
     return functions
+
+
+def _checked(name: str, function: Callable, wrench: Wrench) -> Wrench:
+    """What an effect returned, or an error if it is no wrench on one drone."""
+    called = f"{name}: {describe([function])}"
+    if not isinstance(wrench, Wrench):
+        given = f"an array of shape {wrench.shape}" if isinstance(wrench, jax.Array) else shown(wrench)
+        raise ValueError(f"{called} returned {given}; return jaxdrones.Wrench(force, torque), N and N m in body axes")
+    for part in ("force", "torque"):
+        check_shape(f"{called}: {part}", getattr(wrench, part), (3,), "x, y, z of one drone, in body axes")
+    return wrench
+
+
+def describe(functions: Sequence[Callable]) -> str:
+    """Names of functions, for people."""
+    return ", ".join(getattr(function, "__name__", type(function).__name__) for function in functions) or "none"
 
 
 def make_total_wrench(
@@ -48,7 +76,8 @@ def make_total_wrench(
         raise ValueError(f"cells is {cells!r}; give for example jaxdrones.Cells(reach=3.0), or leave it out")
 
     def alone(params: Params, state: State) -> Wrench:
-        return sum((effect(params, state) for effect in effects), rotor_wrench(params, state))
+        own = (_checked("effects", effect, effect(params, state)) for effect in effects)
+        return sum(own, rotor_wrench(params, state))
 
     def total_wrench(params: Params, state: State) -> Wrench:
         wrench = jax.vmap(alone)(params, state)
@@ -76,7 +105,7 @@ def _from_others(pair: Pair, params: Params, state: State, cells: Cells | None) 
             counts &= x * x + y * y < cells.reach**2
         away = jnp.where(counts, 0, _OUT_OF_REACH)
         pos = jnp.stack([x + away for x in rotation.unstack(other_state.pos)])
-        wrench = pair(own_params, own_state, other, other_state.replace(pos=pos))
+        wrench = _checked("pairs", pair, pair(own_params, own_state, other, other_state.replace(pos=pos)))
         components = rotation.unstack(wrench.force) + rotation.unstack(wrench.torque)
         return [jnp.where(counts, x, 0) for x in components]
 

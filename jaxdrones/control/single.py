@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jaxdrones.checks import check_shape
+from jaxdrones.checks import check_quaternion, check_shape
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -16,6 +16,7 @@ def check_single(params: Params, state: State, setpoint: Setpoint | None = None,
     """Raise `ValueError` unless the arrays are those of one drone; what is `None` is not looked at."""
     for name, shape in _STATE.items():
         check_shape(f"state.{name}", getattr(state, name), shape, _HINT)
+    check_quaternion("state.quat", state.quat)
     check_shape("params.mass", params.mass, (), _HINT)
     for name, shape in _SETPOINT.items() if setpoint is not None else ():
         check_shape(f"setpoint.{name}", getattr(setpoint, name), shape, "one target for one drone")

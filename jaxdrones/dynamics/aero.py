@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.dynamics.rotors import thrust
+from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
@@ -47,9 +48,12 @@ def ground_effect(params: Params, state: State) -> Wrench:
 
 def ground_effect_paper(params: Params, state: State) -> Wrench:
     """Equation 5 with the reference's clip of the height and its gate at 90 degrees of roll or pitch."""
-    clip = params.prop_radius / 4 * jnp.sqrt(15 / 4 * params.ground_effect_coeff)
+    clip = params.prop_radius / 4 * safe_sqrt(15 / 4 * params.ground_effect_coeff)
     height = jnp.maximum(_rotor_heights(params, state), clip)
-    gain = params.ground_effect_coeff * (params.prop_radius / (4 * height)) ** 2
+    above = height > 0  # below the ground there is no clip where the coefficient is zero
+    gain = jnp.where(
+        above, params.ground_effect_coeff * (params.prop_radius / (4 * jnp.where(above, height, 1))) ** 2, 0
+    )
     roll, pitch, _ = rotation.to_rpy(state.quat)
     upright = (jnp.abs(roll) < jnp.pi / 2) & (jnp.abs(pitch) < jnp.pi / 2)
     return Wrench.of_thrusts(params.rotor_pos, jnp.where(upright, gain * thrust(params, state), 0))

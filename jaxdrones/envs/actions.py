@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.checks import check_callable, check_number, check_shape, check_whole
 from jaxdrones.control import Setpoint, attitude, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.params import Params
@@ -47,9 +48,15 @@ class Action:
         """
         return self if self.for_vehicle is None else self.for_vehicle(params)
 
+    def __post_init__(self):
+        check_whole("size of an action type", self.size)
+        check_callable("rpm of an action type", self.rpm, "jaxdrones.envs.ACTIONS['rpm']().rpm")
+        check_callable("init of an action type", self.init, "lambda n: None")
+
 
 def rpm(near_hover: float | None = None) -> Action:
     """Four rotor speeds: -1 stands still, 0 hovers, 1 is full speed; or hover speed times 1 +- `near_hover`."""
+    _check_share("near_hover", near_hover)
 
     def command(params, memory, state, action, setpoint, dt):
         return memory, _rotor_speed(params, action, near_hover)
@@ -59,6 +66,7 @@ def rpm(near_hover: float | None = None) -> Action:
 
 def one_d_rpm(near_hover: float | None = 0.05) -> Action:
     """One speed for all rotors; the paper's range is 5 % about hover."""
+    _check_share("near_hover", near_hover)
 
     def command(params, memory, state, action, setpoint, dt):
         return memory, jnp.broadcast_to(_rotor_speed(params, action, near_hover), (4,))
@@ -71,6 +79,7 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
 
     Allocated as by the paper, which knows no limit but that no rotor turns backwards, and then limited.
     """
+    _check_share("torque_share", torque_share)
 
     def command(params, memory, state, action, setpoint, dt):
         limits = torque_share * jnp.stack([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
@@ -83,6 +92,7 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
 
 def one_d_thrust(share: float = 0.05) -> Action:
     """Collective thrust, the weight times 1 +- `share`."""
+    _check_share("share", share)
 
     def command(params, memory, state, action, setpoint, dt):
         thrust = params.weight * (1 + share * action[0])
@@ -108,11 +118,13 @@ def one_d_velocity() -> Action:
 
 def position(step: float = 0.1) -> Action:
     """A place up to `step` (m) away along each axis."""
+    check_number("step", step, "m", above=0)
     return _setpoint(3, lambda params, state, action: Setpoint.at(state.pos + step * action))
 
 
 def one_d_position(step: float = 0.1) -> Action:
     """A place up to `step` (m) above or below."""
+    check_number("step", step, "m", above=0)
 
     def target(params, state, action):
         return Setpoint.at(state.pos + jnp.stack([0 * action[0], 0 * action[0], step * action[0]]))
@@ -125,6 +137,7 @@ def destination(stride: float = 1.0) -> Action:
 
     The `pid` action of today's version of the paper's simulator.
     """
+    check_number("stride", stride, "m", above=0)
 
     def target(params, state, action):
         way = action - state.pos
@@ -155,6 +168,9 @@ def pid_gains() -> Action:
 
 def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
     """Collective thrust (-1 none, 0 the weight, 1 all there is) and body rates up to `max_rate` (rad/s)."""
+    check_shape("max_rate", max_rate, (3,), "about x, y and z, rad/s")
+    for rate in max_rate:
+        check_number("an entry of max_rate", rate, "rad/s", above=0)
 
     def command(params, memory, state, action, setpoint, dt):
         omega = jnp.array(max_rate, action.dtype) * action[1:]
@@ -165,6 +181,7 @@ def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -
 
 def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
     """Collective thrust as above, roll and pitch up to `max_tilt` (degrees), yaw up to half a turn."""
+    check_number("max_tilt", max_tilt, "degrees", above=0, at_most=180)
 
     def command(params, memory, state, action, setpoint, dt):
         limits = jnp.array([jnp.radians(max_tilt), jnp.radians(max_tilt), jnp.pi], action.dtype)
@@ -220,6 +237,11 @@ def check_loop(name: str, action: Action, params: Params, lagging: bool, dt: flo
             f"{_SLOWEST_ROTORS} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
             "action type that commands rotors, thrust and torques, or rates"
         )
+
+
+def _check_share(name: str, share: float | None) -> None:
+    if share is not None:
+        check_number(name, share, above=0, at_most=1)
 
 
 def _rotor_speed(params: Params, action: Array, near_hover: float | None) -> Array:

@@ -37,6 +37,9 @@ class AutoReset:
         self.env = env
         self._drawn = _where_needed(self._draw)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.env!r}>"
+
     def reset(self, key: jax.Array) -> tuple[Obs, Episode]:
         """Start the first episode."""
         obs, world = self.env.reset(key)

@@ -15,7 +15,17 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.backends.explicit import Step
 from jaxdrones.backends.host import HostStep
-from jaxdrones.checks import check_finite, check_positive, check_shape
+from jaxdrones.checks import (
+    check_callable,
+    check_finite,
+    check_key,
+    check_number,
+    check_params,
+    check_positive,
+    check_sequence,
+    check_shape,
+    shown,
+)
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.randomize import Disturbance, Law, Noise, delayed, draw
 from jaxdrones.envs.vision import Vision
@@ -24,6 +34,8 @@ from jaxdrones.state import State
 from jaxdrones.tasks.task import Part, Task, World
 
 DISTURB, NOISE, START, LAWS, RESET = range(5)  # what a key is folded with: only the draws that are used cost time
+
+_MOST_STEPS = 1e9  # of an episode
 
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
 
@@ -58,6 +70,7 @@ class Env:
         disturb: Disturbance | None = None,
         delay: float = 0.0,
         vision: Vision | None = None,
+        vehicle: str = "drones",
     ):
         """Put an environment together; `jaxdrones.make` does it by name.
 
@@ -73,22 +86,38 @@ class Env:
             disturb: sets the surroundings before every control step: pushes.
             delay: between action and command, s.
             vision: cameras; only with the Bullet backend.
+            vehicle: what the drones are, for people.
+
+        Raises:
+            ValueError: an argument of another kind, or a number out of range; says what to give.
         """
+        _check_kinds(task, params, action)
         check_positive("dt", dt, "s")
+        check_params(params)
         check_shape("params.mass", params.mass, (task.drones,), f"the task {task.name} has {task.drones} drones")
-        if not (math.isfinite(delay) and delay >= 0):
-            raise ValueError(f"delay is {delay}; give a number of at least 0 (s)")
-        if not observation:
+        check_number("delay", delay, "s, less than an episode", at_least=0, below=task.duration)
+        parts = check_sequence("observation", observation, "OBSERVATIONS['position_error']")
+        if not parts:
             raise ValueError("observation is empty; name at least one part")
+        for part in parts:
+            if not isinstance(part, Part):
+                raise ValueError(f"observation: {shown(part)} is not a part; give a name or part of OBSERVATIONS")
+        laws = check_sequence("laws", laws, "scaled('mass', 0.9, 1.1)")
+        for law in laws:
+            check_callable("laws", law, "scaled('mass', 0.9, 1.1)")
+        if noise is not None:
+            check_callable("noise", noise, "sensor_noise()")
+        if disturb is not None:
+            check_callable("disturb", disturb, "pushes(0.3)")
         self.task, self.params, self.dt, self.drones = task, params, dt, task.drones
         self.action, self.action_size = action.fitted(params), action.size
-        self.steps = round(task.duration / dt) + task.overtime
-        self._parts, self._laws, self._noise, self._disturb = tuple(observation), tuple(laws), noise, disturb
+        self.steps = _steps(task, dt)
+        self._parts, self._laws, self._noise, self._disturb = parts, laws, noise, disturb
         self.kept = () if laws or disturb else ("params",)
         """What of a world is the same in every episode."""
         self._delay = _nearly_whole(delay / dt)
         self._history = max(math.ceil(self._delay) + 1, *(part.history for part in observation))
-        self.physics, self.vision = step, vision
+        self.physics, self.vision, self._vehicle = step, vision, vehicle
         self._start, self._before, self._after = jax.jit(self._draw), jax.jit(self._commanded), jax.jit(self._outcome)
         widths = self._widths()
         bound = [np.broadcast_to(part.bound, (width,)) for part, width in zip(self._parts, widths, strict=True)]
@@ -96,8 +125,21 @@ class Env:
         """(d,) largest magnitude of every entry of the observation."""
         self.observation_size = len(self.observation_bound)
 
+    def __repr__(self) -> str:
+        backend = "bullet" if isinstance(self.physics, HostStep) else "explicit"
+        images = "".join(f" and {image}" for image in (self.vision.images if self.vision else ()))
+        return (
+            f"<Env {self.task.name}: {self.drones} x {self._vehicle}, dt {self.dt:.4g} s, {self.steps} steps, "
+            f"{self.action_size} actions and {self.observation_size} observations{images} a drone, {backend} backend>"
+        )
+
     def reset(self, key: jax.Array) -> tuple[Obs, World]:
-        """The first observation, and the world at the start of an episode."""
+        """The first observation, and the world at the start of an episode.
+
+        Raises:
+            ValueError: `key` is not one random key.
+        """
+        check_key("key", key)
         world, obs = self._start(key)
         if self.vision:
             world = world.replace(images=self.vision.look(world.params, world.drones))
@@ -118,8 +160,9 @@ class Env:
             (), whether it was cut; and info: `rewards` by name (n,), `metrics` by name (n,), `ends` by name ().
 
         Raises:
-            ValueError: wrong shape, or not a number (where it can be looked at).
+            ValueError: no random key, a wrong shape, or not a number (where it can be looked at).
         """
+        check_key("key", key)
         check_shape("action", action, (self.drones, self.action_size), "one row of the action type's size per drone")
         check_finite("action", action)
         world, rpm = self._before(key, world, action)
@@ -223,6 +266,22 @@ class Env:
 
     def _seen(self, obs: Array, world: World) -> Obs:
         return obs if self.vision is None else {"state": obs, **world.images}
+
+
+def _check_kinds(task: Task, params: Params, action: Action) -> None:
+    for name, given, kind in ("task", task, Task), ("params", params, Params), ("action", action, Action):
+        if not isinstance(given, kind):
+            raise ValueError(f"{name} is {shown(given)}; give an object of {kind.__name__}, or use jaxdrones.make")
+
+
+def _steps(task: Task, dt: float) -> int:
+    """Control steps of an episode, which are counted by an integer of 32 bits."""
+    steps = task.duration / dt
+    if not 0.5 < steps < _MOST_STEPS:
+        raise ValueError(
+            f"duration is {task.duration} s, {steps:.3g} control steps of {dt:.4g} s; give 1 to {_MOST_STEPS:.0e}"
+        )
+    return round(steps) + task.overtime
 
 
 def _deviation(value: Array, nominal: Array) -> Array:

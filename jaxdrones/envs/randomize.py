@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import POSITIVE, check_choice, check_number
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -21,6 +21,8 @@ Disturbance = Callable[[jax.Array, Params, float], Params]
 
 def _check_law(field: str, low: float, high: float) -> None:
     check_choice("parameter", field, Params.__dataclass_fields__)
+    check_number(f"lower bound of {field}", low)
+    check_number(f"upper bound of {field}", high)
     if not low <= high:
         raise ValueError(f"the range of {field} is ({low}, {high}); give the lower bound first")
 
@@ -29,9 +31,11 @@ def scaled(field: str, low: float, high: float) -> Law:
     """The nominal value times U(low, high), one factor for the whole array.
 
     Raises:
-        ValueError: unknown field, or `low` above `high`.
+        ValueError: unknown field, `low` above `high`, or a factor that makes something positive negative or zero.
     """
     _check_law(field, low, high)
+    if field in POSITIVE:
+        check_number(f"lower bound of {field}", low, "a factor", above=0)
 
     def law(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
@@ -56,7 +60,12 @@ def shifted(field: str, low: float, high: float) -> Law:
 
 
 def constant_wind(speed: float) -> Law:
-    """Wind U(-speed, speed) (m/s) along x and y, a quarter of that along z, the whole episode through."""
+    """Wind U(-speed, speed) (m/s) along x and y, a quarter of that along z, the whole episode through.
+
+    Raises:
+        ValueError: a negative speed.
+    """
+    check_number("speed of the wind", speed, "m/s", at_least=0)
 
     def law(key: jax.Array, params: Params) -> Params:
         wind = jax.random.uniform(key, (3,), params.wind.dtype, -speed, speed)
@@ -78,7 +87,12 @@ def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, om
 
     The defaults for position and velocity are those of Huang et al.'s swarm simulator; angle and rates of an
     attitude filter on the Crazyflie are of this size (L2F: 1 mrad and 2 mrad/s; DiffAero: 2.4e-2 rad/s).
+
+    Raises:
+        ValueError: a negative standard deviation.
     """
+    for name, value, unit in ("pos", pos, "m"), ("vel", vel, "m/s"), ("angle", angle, "rad"), ("omega", omega, "rad/s"):
+        check_number(f"{name} of the noise", value, unit, at_least=0)
 
     def noise(key: jax.Array, state: State) -> State:
         n = len(state.pos)
@@ -98,7 +112,13 @@ def pushes(force: float, every: float = 1.0, lasting: float = 0.1) -> Disturbanc
     """Pushes of random direction and up to `force` (share of the weight), one in `every` seconds on average.
 
     Each lasts `lasting` seconds on average: a push comes and goes by chance, whatever came before.
+
+    Raises:
+        ValueError: a negative force, or times that are not positive.
     """
+    check_number("force of a push", force, "share of the weight", at_least=0)
+    check_number("every", every, "s", above=0, infinite=True)
+    check_number("lasting", lasting, "s", above=0, infinite=True)
 
     def disturb(key: jax.Array, params: Params, dt: float) -> Params:
         n = len(params.mass)

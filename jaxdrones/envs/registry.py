@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from jaxdrones.backends.explicit import Step, make_step
-from jaxdrones.checks import check_choice, check_finite, check_positive, check_whole
+from jaxdrones.checks import (
+    check_choice,
+    check_finite,
+    check_positive,
+    check_sequence,
+    check_switch,
+    check_whole,
+    hint,
+)
 from jaxdrones.dynamics import (
     EFFECTS,
     INTEGRATORS,
@@ -99,6 +109,7 @@ def make(
         ImportError: the Bullet backend is asked for and pybullet is not installed.
     """
     check_choice("backend", backend, BACKENDS)
+    check_switch("realistic", realistic)
     task = _task(task, options)
     control_hz = task.control_hz if control_hz is None else control_hz
     substeps = task.substeps if substeps is None else substeps
@@ -110,10 +121,10 @@ def make(
 
     preset = _REALISTIC if realistic else _PLAIN
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
-    effects = [_named("effect", effect, EFFECTS) for effect in (preset["effects"] if effects is None else effects)]
+    effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
     if disturb is not None:
         effects = [*effects, external_push]
-    pairs = [_named("pair effect", pair, PAIRS) for pair in pairs]
+    pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
     action = _action(task.action if action is None else action, nominal, rotors is lagging_rotors, dt)
     physics: dict[str, Any] = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
     step: Step
@@ -130,7 +141,8 @@ def make(
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
-    parts = [_part(name, task) for name in (task.observation if observation is None else observation)]
+    observation = task.observation if observation is None else observation
+    parts = [_part(name, task) for name in check_sequence("observation", observation, "'position_error'")]
     return Env(
         task,
         nominal,
@@ -138,11 +150,15 @@ def make(
         dt=dt,
         action=action,
         observation=parts,
-        laws=(*task.laws, *(preset["laws"] if laws is None else laws)),
+        laws=(
+            *task.laws,
+            *check_sequence("laws", preset["laws"] if laws is None else laws, "scaled('mass', 0.9, 1.1)"),
+        ),
         noise=preset["noise"] if noise is None else noise,
         disturb=disturb,
         delay=preset["delay"] if delay is None else delay,
         vision=_vision(step, backend, vision, vision_hz, control_hz),
+        vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
     )
 
 
@@ -155,13 +171,27 @@ _REALISTIC: dict[str, Any] = dict(
 def _task(task: str | Task, options: dict) -> Task:
     if isinstance(task, Task):
         if options:
-            raise ValueError(f"options {', '.join(options)} are given beside a task; give them to the task")
+            meant = "".join(hint(option, _OWN_OPTIONS) for option in options)
+            raise ValueError(f"options {', '.join(options)} are given beside a task; give them to the task{meant}")
         return task
     check_choice("task", task, TASKS)
     known = TASKS[task].__annotations__.keys() - {"return"}
     for option in options:
-        check_choice(f"option of {task}", option, known)
+        check_choice(f"option of {task}", option, _OWN_OPTIONS | known)
     return TASKS[task](**options)
+
+
+_OWN_OPTIONS = {name for name in inspect.signature(make).parameters if name not in ("task", "options")}
+
+
+def _all_named(kind: str, values, table: dict, others: dict) -> list:
+    """Functions by name, of a table; what is in the table of others instead is given to another argument."""
+    values = check_sequence(kind, values, repr(next(iter(table))))
+    for value in values:
+        if isinstance(value, str) and value not in table and value in others:
+            other = "pairs" if kind == "effects" else "effects"
+            raise ValueError(f"{value!r} is given as one of {kind}; it is one of {other}, give {other}=({value!r},)")
+    return [_named("effect" if kind == "effects" else "pair effect", value, table) for value in values]
 
 
 def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
@@ -184,13 +214,16 @@ def _part(name: str | Part, task: Task) -> Part:
 
 
 def _vision(step, backend: str, images: Sequence[str], hz: float | None, control_hz: float) -> Vision | None:
+    images = check_sequence("vision", images, "'rgb'")
     for image in images:
         check_choice("image", image, IMAGES)
     if not images:
         return None
     if backend != "bullet":
         raise ValueError("vision is asked for; the explicit backend has no cameras, take backend='bullet'")
-    every = control_hz / (hz or control_hz)
+    if hz is not None:
+        check_positive("vision_hz", hz, "1/s")
+    every = 1 if hz is None else control_hz / hz
     if abs(every - round(every)) > 1e-6 or every < 1:
         raise ValueError(f"vision_hz is {hz}; give a divisor of the control rate, {control_hz:g}")
     return Vision(step, round(every), tuple(images))

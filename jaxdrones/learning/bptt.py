@@ -11,15 +11,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import check_key, check_keywords
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect
-from jaxdrones.learning.gradients import GRADIENTS, linked, with_gradient
+from jaxdrones.learning.gradients import linked, with_gradient
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import vector
 from jaxdrones.learning.result import Result, descent, scan_updates
+from jaxdrones.learning.settings import check_config, check_settings
 
 
+@check_keywords
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
@@ -51,7 +53,7 @@ class Config:
     """Step of the backward pass with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
 
     def __post_init__(self):
-        check_choice("gradient", self.gradient, GRADIENTS)
+        check_settings(self)
 
 
 class TrainState(flax.struct.PyTreeNode):
@@ -66,7 +68,13 @@ class TrainState(flax.struct.PyTreeNode):
 
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
-    """Before the first update."""
+    """Before the first update.
+
+    Raises:
+        ValueError: no random key, or settings of another learner.
+    """
+    check_key("key", key)
+    check_config(config, Config)
     key, policy_key = jax.random.split(key)
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
     return TrainState(
@@ -76,6 +84,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """One flight of all worlds and one step along its gradient."""
+    check_config(config, Config)
     key, restart_key, fly_key = jax.random.split(state.key, 3)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart)
     env = with_gradient(env, config)

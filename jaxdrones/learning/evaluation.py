@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.checks import check_key
 from jaxdrones.compiler import training_options
 from jaxdrones.envs import Env
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
@@ -52,8 +53,9 @@ def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -
         episodes: number of them.
 
     Raises:
-        ValueError: so many cannot be flown.
+        ValueError: no random key, or so many episodes cannot be flown.
     """
+    check_key("key", key)
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, flax.struct.PyTreeNode):

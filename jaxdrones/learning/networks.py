@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -9,9 +10,10 @@ import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import check_choice, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning.normalize import Statistics, on_vector, vector
@@ -137,6 +139,19 @@ class Policy(flax.struct.PyTreeNode):
         network = network_for(obs, sizes, env.action_size, scale=0.01)
         params = init_params(key, network, obs, env.drones if per_role else None)
         return cls(params, Statistics.none(env.observation_size), network, per_role)
+
+    def __repr__(self) -> str:
+        layers = (*np.shape(self.statistics.mean)[-1:], *self.network.sizes, self.network.outputs)
+        numbers = sum(math.prod(np.shape(x)) for x in jax.tree.leaves(self.params))
+        seen = self.statistics.count
+        known = isinstance(seen, jax.Array | np.ndarray) and is_known(seen) and seen.ndim == 0
+        counted = f", statistics of {float(seen):,.0f} observations" if known else ""
+        images = f" and images by {self.network.channels}" if isinstance(self.network, VisionMLP) else ""
+        whose = ", one network per drone" if self.per_role else ""
+        return (
+            f"<Policy {' -> '.join(map(str, layers))}{images}, {self.network.activation}, "
+            f"{numbers:,} parameters{whose}{counted}>"
+        )
 
     def __call__(self, obs: Obs) -> Float[Array, "*batch n a"]:
         """The action, in (-1, 1), of observations (*batch, n, d), or of a dictionary of such arrays with images."""

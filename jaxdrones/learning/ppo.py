@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
+from jaxdrones.checks import check_key, check_keywords, check_number, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect
@@ -19,12 +20,14 @@ from jaxdrones.learning.networks import MLP, Policy, VisionMLP, apply, central, 
 from jaxdrones.learning.normalize import on_vector, vector
 from jaxdrones.learning.result import Result, bounded, scan_updates
 from jaxdrones.learning.returns import advantages
+from jaxdrones.learning.settings import check_config, check_settings
 
 _HALF_LOG_2_PI = math.log(2 * math.pi) / 2
 _PACE = 1.2  # the learning rate grows or falls by
 _LARGEST_CHANGE = 10.0  # of a logarithm, far beyond what is rewarded; its exponential stays finite
 
 
+@check_keywords
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
@@ -78,6 +81,9 @@ class Config:
     """Largest norm of the gradient."""
 
     def __post_init__(self):
+        check_settings(self, valued=True)
+        if is_known(self.slowest):
+            check_number("fastest", self.fastest, "not slower than slowest", at_least=self.slowest)
         if self.worlds % self.batches:
             raise ValueError(f"worlds is {self.worlds}; give a multiple of batches, {self.batches}")
 
@@ -111,7 +117,13 @@ class Sample(flax.struct.PyTreeNode):
 
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
-    """Before the first update."""
+    """Before the first update.
+
+    Raises:
+        ValueError: no random key, or settings of another learner.
+    """
+    check_key("key", key)
+    check_config(config, Config)
     key, policy_key, critic_key = jax.random.split(key, 3)
     policy = Policy.init(policy_key, env, config.sizes, config.per_role)
     n, a = env.drones, env.action_size
@@ -128,6 +140,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Fly, then learn from what was flown."""
+    check_config(config, Config)
     key, restart_key, fly_key, learn_key = jax.random.split(state.key, 4)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart)
 

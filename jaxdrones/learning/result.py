@@ -24,6 +24,9 @@ class Result(flax.struct.PyTreeNode):
     history: dict[str, Array]
     """(updates,) of every metric of `update`."""
 
+    def __repr__(self) -> str:
+        return f"<Result: {self.policy!r}, history of {', '.join(self.history)}>"
+
 
 def scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result:
     """Make all updates of a learner, in one program."""

@@ -13,7 +13,7 @@ from jaxdrones.adapters.sb3 import VecEnv
 from jaxdrones.learning.evaluation import Report, check_episodes, evaluate
 from jaxdrones.learning.runs import Progress, as_dict
 from jaxdrones.learning.sb3 import Actor, Recipe, Run
-from jaxdrones.learning.training import Diverged, Tell
+from jaxdrones.learning.training import CHOICE, REPORT, Diverged, Tell
 
 # isort: split
 import torch
@@ -102,7 +102,7 @@ class _Course(BaseCallback):
         super().__init__()
         self.trainer, self.run, self.tell, self.progress, self.deadline = trainer, run, tell, progress, deadline
         self.about = {"recipe": trainer.recipe.as_dict(), "seed": trainer.seed, "episodes": trainer.episodes}
-        self.choice, self.report = jax.random.split(jax.random.key(trainer.seed))
+        self.choice, self.report = (jax.random.fold_in(jax.random.key(trainer.seed), x) for x in (CHOICE, REPORT))
         self.best: float | None = None  # score
         self.update = 0
         self.due = 0.0  # share of the budget, of the next evaluation

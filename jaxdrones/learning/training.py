@@ -27,7 +27,7 @@ _SAVE = 30.0  # s between training states, at most
 _PATIENCE = 10  # updates in a row that are not finite
 _PROBE = 4  # times the size of the training state that must fit on the disk
 _NEAR = 1.0  # standard errors within which two shares of successes are the same but for chance
-_CHOICE, _REPORT = 1, 2  # what a seed's key is folded with
+CHOICE, REPORT = 2**31, 2**31 + 1  # what a seed's key is folded with; splitting it gives what 0, 1, 2, ... give
 _EVALUATED = ("success", "evaluated_return", "evaluated_error")
 
 Tell = Callable[[int, dict[str, float]], None]
@@ -241,7 +241,7 @@ class _Course:
     def judge(self, policy: Policy, update: int) -> dict[str, float]:
         """Evaluate a policy, always on the same episodes; keep it if it is the best."""
         policy = sharding.whole(self.trainer.mesh, policy)
-        report = self._evaluate(policy, _CHOICE)
+        report = self._evaluate(policy, CHOICE)
         score = score_of(report.success, report.returned)
         self.highest = max(self.highest, report.success)
         if self.best is None or best_of([self.best, score], self.trainer.episodes, self.highest) == 1:
@@ -257,7 +257,7 @@ class _Course:
 
     def finish(self) -> None:
         """Evaluate the best policy on other episodes than it was chosen by, and write the report."""
-        report = self._evaluate(self.run.policy(), _REPORT)
+        report = self._evaluate(self.run.policy(), REPORT)
         seconds = {
             "training": self.seconds,
             "compiling": self.trainer.compile_seconds,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxdrones.checks import check_finite, check_positive
+from jaxdrones.checks import check_finite, check_positive, check_quaternion
 
 Vector = tuple[float, float, float]
 Color = tuple[float, float, float, float]
@@ -33,6 +33,7 @@ class Obstacle:
             if np.shape(value) != (length,):
                 raise ValueError(f"{name} of {type(self).__name__} is {value!r}; give {length} numbers")
             check_finite(f"{name} of {type(self).__name__}", value)
+        check_quaternion(f"quat of {type(self).__name__}", self.quat)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdrones.checks import check_positive, check_whole
+from jaxdrones.checks import check_finite, check_positive, check_whole
 from jaxdrones.control.setpoint import Setpoint
 
 Point = Callable[[Int[Array, ""], Float[Array, ""]], Float[Array, "3"]]
@@ -44,6 +44,7 @@ class Curve(flax.struct.PyTreeNode):
 def circle(radius: float = 0.3, period: float = 10.0, height: float = 0.1, spacing: float = 0.05) -> Curve:
     """The paper's circle about (0, -radius): drones 60 degrees apart, each `spacing` above the one before, m and s."""
     check_positive("period", period, "s")
+    check_finite("circle", dict(radius=radius, height=height, spacing=spacing))
 
     def point(i, t):
         angle = 2 * jnp.pi * (t / period + i / 6) + jnp.pi / 2
@@ -55,6 +56,7 @@ def circle(radius: float = 0.3, period: float = 10.0, height: float = 0.1, spaci
 def crossing(n: int, reach: float = 0.5, period: float = 5.0, spacing: float = 0.5) -> Curve:
     """The paper's downwash flight: drones swing in x, neighbours in height against each other, the last one lowest."""
     check_positive("period", period, "s")
+    check_finite("crossing", dict(reach=reach, spacing=spacing))
 
     def point(i, t):
         x = reach * jnp.cos(2 * jnp.pi * t / period + i * jnp.pi)
@@ -66,6 +68,7 @@ def crossing(n: int, reach: float = 0.5, period: float = 5.0, spacing: float = 0
 def hop(height: float = 0.014, amplitude: float = 0.15, period: float = 4.0, spacing: float = 1.0) -> Curve:
     """The paper's take-off: a step to `height + amplitude`, from where z swings; drones `spacing` (m) apart in x."""
     check_positive("period", period, "s")
+    check_finite("hop", dict(height=height, amplitude=amplitude, spacing=spacing))
 
     def point(i, t):
         z = height + amplitude * (jnp.sin(2 * jnp.pi * t / period) + 1)

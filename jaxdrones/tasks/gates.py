@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones.checks import check_keywords, check_number, check_switch, check_whole, shown
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.sensing.scene import Cylinder, Scene, gate
@@ -22,6 +23,9 @@ START = np.array([-1.5, 0.75])
 OPENING, OUTER = 0.40, 0.72  # m, edges of the square hole and of the frame
 POLE_RADIUS, POLE_HEIGHT = 0.015, 1.52  # m
 LEVELS = (0, 1, 2, 3)
+_APART = 0.5  # m in y between drones at the start
+_ROOM = 3.0  # m from the middle of the track, beyond which a drone is lost
+_MOST_DRONES = 5  # as many as start within that room
 
 _GATE_RANGE = np.array([0.15, 0.15, 0.1, 0.2])  # m, m, m, rad: level 2 moves gates by U(-range, range)
 _POLE_RANGE = 0.15  # m
@@ -29,27 +33,34 @@ _IN_SIGHT = 3.0  # m, up to which poles are seen
 _INERTIA_RANGE = 0.2  # share: level 1 on
 
 
+@check_keywords
 def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: bool = False) -> Task:
     """One lap through four gates.
 
     In Bullet gates and poles stand where levels 0 and 1 have them; where they are moved, hits are seen by geometry.
 
     Args:
-        drones: number of drones; they start 0.5 m apart in y, and do not see each other.
+        drones: number of drones, up to 5; they start 0.5 m apart in y, and do not see each other.
         level: 0 nominal; 1 inertia randomised; 2 also gates and poles; 3 random tracks without poles.
         duration: of an episode, s.
         anywhere: start in the air before any of the gates, or one time in five at the start, for training; else on the
             ground at the start.
     """
+    check_whole("number of drones of gates", drones)
+    check_number("number of drones of gates", drones, at_most=_MOST_DRONES)
+    check_whole("level", level, minimum=0)
+    check_switch("anywhere", anywhere)
     if level not in LEVELS:
-        raise ValueError(f"level is {level!r}; give one of {', '.join(map(str, LEVELS))}")
+        raise ValueError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         track_key, pole_key, gate_key, place_key = jax.random.split(key, 4)
         n, dtype = len(params.mass), params.mass.dtype
         variables = {"gates": _track(track_key, level, dtype), "poles": _poles(pole_key, level, dtype)}
         x, y = START
-        pos = jnp.stack([jnp.full(n, x, dtype), y + 0.5 * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1)
+        pos = jnp.stack(
+            [jnp.full(n, x, dtype), y + _APART * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1
+        )
         index = jnp.zeros(n, jnp.int32)
         if anywhere:
             place = jax.random.randint(gate_key, (n,), -1, len(GATES))
@@ -96,7 +107,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
             "omega": (-0.002, shaping.turning),
             "action_change": (-0.02, shaping.action_change),
         },
-        ends={"finished": finished, "crashed": crashed} | out_of_control((0, 0, 1), 3.0),
+        ends={"finished": finished, "crashed": crashed} | out_of_control((0, 0, 1), _ROOM),
         advance=_advance,
         metrics={
             "gates": as_number(lambda world: world.variables["index"]),

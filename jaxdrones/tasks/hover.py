@@ -7,16 +7,21 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
+from jaxdrones.checks import check_keywords, check_number, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import standing_height, thrown
-from jaxdrones.tasks.task import Task, World, out_of_control, upright
+from jaxdrones.tasks.task import SPINNING, Task, World, out_of_control, upright
 
 SPACING = 3.0  # m between the goals of neighbours, further than they are thrown apart
+_ROOM = 5.0  # m from the outermost goal to where a drone is lost, at least
+_HIGHEST = 1000.0  # m; float32 resolves 0.1 mm there
+_FASTEST = 100.0  # m/s
 
 
+@check_keywords
 def hover(
     drones: int = 1,
     reach: float = 1.0,
@@ -30,13 +35,22 @@ def hover(
 
     Args:
         drones: number of drones; their goals are 3 m apart in x.
-        reach: start within +-reach of the goal along each axis, m.
-        speed: +-, m/s.
-        omega: +-, rad/s.
+        reach: start within +-reach of the goal along each axis, m; up to 5, beyond which a drone may be lost.
+        speed: +-, m/s; up to 100.
+        omega: +-, rad/s; below 100, at which a drone is lost.
         tilt: up to, degrees.
-        height: of the goal, m.
+        height: of the goal, m; up to 1,000.
         duration: of an episode, s.
+
+    Raises:
+        ValueError: a number out of range.
     """
+    check_whole("number of drones of hover", drones)
+    check_number("reach", reach, "m", at_least=0, at_most=_ROOM)
+    check_number("speed", speed, "m/s", at_least=0, at_most=_FASTEST)
+    check_number("omega", omega, "rad/s", at_least=0, below=SPINNING)
+    check_number("tilt", tilt, "degrees", at_least=0, at_most=180)
+    check_number("height", height, "m", above=0, at_most=_HIGHEST)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:
         goal = _goals(params, height)
@@ -50,13 +64,16 @@ def hover(
         start=start,
         target=_stay,
         rewards=shaping.reach_and_stay(_stay),
-        ends=out_of_control((0, 0, height), 5.0 + SPACING * drones),
+        ends=out_of_control((0, 0, height), _ROOM + SPACING * drones),
         success=settled,
     )
 
 
+@check_keywords
 def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Task:
     """Upside down, thrown and tumbling: level out at once, then fly back. Reports the altitude lost."""
+    check_whole("number of drones of recovery", drones)
+    check_number("height", height, "m", above=0, at_most=_HIGHEST)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         goal = _goals(params, height)
@@ -80,7 +97,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
         start=start,
         target=target,
         rewards=shaping.reach_and_stay(target) | {"upright": (0.1, upright)},
-        ends=out_of_control((0, 0, height), 5.0 + SPACING * drones),
+        ends=out_of_control((0, 0, height), _ROOM + SPACING * drones),
         advance=advance,
         metrics={
             "altitude_lost": lambda world: world.variables["start"] - world.variables["lowest"],
@@ -90,8 +107,11 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
     )
 
 
+@check_keywords
 def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task:
     """Land on the pad at the origin: softly, level, at rest."""
+    check_whole("number of drones of landing", drones)
+    check_number("height", height, "m", above=0, at_most=_ROOM)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:
         pad = _goals(params, 0.0).at[:, 2].set(standing_height(params))
@@ -112,7 +132,7 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         start=start,
         target=_stay,
         rewards=shaping.reach_and_stay(_stay) | {"descent": (-1.0, descent)},
-        ends=out_of_control((0, 0, height), 5.0 + SPACING * drones) | {"crashed": _upside_down},
+        ends=out_of_control((0, 0, height), _ROOM + SPACING * drones) | {"crashed": _upside_down},
         metrics={"upright": upright},
         success=_landed,
         contact=("ground",),

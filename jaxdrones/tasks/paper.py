@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_whole
+from jaxdrones.checks import check_keywords, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -29,11 +29,13 @@ Target = Callable[[Starts, Array], Setpoint]
 Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]  # of targets and the world after a step
 
 
+@check_keywords
 def hover(drones: int = 1) -> Task:
     """Equation 12: the negative squared distance from (0, 0, 1)."""
     return _task("paper-hover", "hover at z = 1 m (equation 12)", drones, _at(0.0, 0.0, 1.0), _squared_distance)
 
 
+@check_keywords
 def takeoff(drones: int = 1) -> Task:
     """Get off the ground: -5 below 2 cm, else -1 / (10 z)."""
 
@@ -45,6 +47,7 @@ def takeoff(drones: int = 1) -> Task:
     return _task("takeoff", "climb from the ground", drones, _at(0.0, 0.0, 1.0), cost)
 
 
+@check_keywords
 def fly_through_gate(drones: int = 1) -> Task:
     """Follow a point that moves through the gate at (0, -1, 0.75) in the five seconds of an episode."""
 
@@ -58,6 +61,7 @@ def fly_through_gate(drones: int = 1) -> Task:
     return _task("fly-through-gate", "fly through the gate at y = -1 m", drones, target, cost)
 
 
+@check_keywords
 def tune(drones: int = 1) -> Task:
     """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m.
 
@@ -75,6 +79,7 @@ def tune(drones: int = 1) -> Task:
     return _task("tune", summary, drones, target, _squared_distance, action="pid_gains")
 
 
+@check_keywords
 def leader_follower(drones: int = 2) -> Task:
     """Equation 13: the leader, drone 0, hovers at (0, 0, 0.5); the others are to be as high as the leader."""
 
@@ -87,6 +92,7 @@ def leader_follower(drones: int = 2) -> Task:
     return _task("leader-follower", summary, drones, _at_height(0.5), cost, minimum=2)
 
 
+@check_keywords
 def flock(drones: int = 2) -> Task:
     """The first drone hovers at (0, 0, 1); every other one is to be as high as the one before it."""
 
@@ -97,6 +103,7 @@ def flock(drones: int = 2) -> Task:
     return _task("flock", "fly at the height of the drone before", drones, _at_height(1.0), cost, minimum=2)
 
 
+@check_keywords
 def meetup(drones: int = 2) -> Task:
     """Drone i and drone n - 1 - i are to meet."""
 
@@ -110,11 +117,13 @@ def meetup(drones: int = 2) -> Task:
     return dataclasses.replace(task, contact=("ground", "drones"))
 
 
+@check_keywords
 def hover_v2(drones: int = 1) -> Task:
     """Hover at (0, 0, 1), rewarded by max(0, 2 - d^4)."""
     return _task_v2("hover-v2", "hover at z = 1 m, bounded reward", drones, _at(0.0, 0.0, 1.0), box=1.5)
 
 
+@check_keywords
 def multi_hover(drones: int = 2) -> Task:
     """Drone i hovers 1 / (i + 1) m above its start; the reference's reward is the sum over the team."""
 

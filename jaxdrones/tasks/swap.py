@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_whole
+from jaxdrones.checks import check_keywords, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -21,6 +21,7 @@ _APART = 0.6  # m between neighbours on the ring, at least
 _CLOSE = 0.4  # m: nearer costs
 
 
+@check_keywords
 def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
     """Drones on a ring are sent to each other's places, all as many places on; crowding costs.
 

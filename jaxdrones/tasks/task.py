@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
+from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
@@ -49,7 +50,8 @@ class World(flax.struct.PyTreeNode):
         return self.actions[:, -1]
 
 
-_SPINNING = 100.0  # rad/s
+SPINNING = 100.0  # rad/s; a drone that turns faster is lost
+CONTACTS = ("ground", "drones")
 
 Term = Callable[[World], Float[Array, " n"]]
 Condition = Callable[[World], Bool[Array, " n"]]
@@ -65,6 +67,11 @@ class Part:
     """Largest magnitude, of all entries or of each; what is beyond is cut off."""
     history: int = 2
     """Past actions that must be kept for it."""
+
+    def __post_init__(self):
+        for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
+            check_number("bound of an observation", bound, above=0)
+        check_whole("history of an observation", self.history)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,6 +118,17 @@ class Task:
     overtime: int = 0
     """Control steps an episode goes on after `duration`; 2 in the reference, which looks at the clock late."""
 
+    def __post_init__(self):
+        check_whole(f"number of drones of {self.name}", self.drones)
+        check_positive("duration", self.duration, "s")
+        check_positive("control_hz", self.control_hz, "1/s")
+        check_whole("substeps", self.substeps)
+        check_whole("overtime", self.overtime, minimum=0)
+        for name, (scale, _) in self.rewards.items():
+            check_number(f"scale of the reward {name!r}", scale)
+        for contact in check_sequence("contact", self.contact, "'ground'"):
+            check_choice("contact", contact, CONTACTS)
+
     def measure(self, world: World) -> dict[str, Float[Array, " n"]]:
         """All metrics by name; one's own go before the standard ones."""
         standard = {"error": distance(self, world), "speed": norm(world.drones.vel)}
@@ -151,7 +169,7 @@ def out_of_control(center: tuple[float, float, float], reach: float) -> dict[str
         return _beyond(world.drones.pos - jnp.asarray(center, world.drones.pos.dtype)[None], reach)
 
     def spinning(world: World) -> Bool[Array, " n"]:
-        return _beyond(world.drones.omega, _SPINNING)
+        return _beyond(world.drones.omega, SPINNING)
 
     return {"lost": lost, "spinning": spinning}
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice, check_positive
+from jaxdrones.checks import check_choice, check_keywords, check_number, check_switch, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -19,6 +19,7 @@ from jaxdrones.tasks.task import Task, out_of_control
 HEIGHT = 2.0  # m
 SPACING = 4.0  # m between the centres of neighbours' curves
 WAYPOINTS = 8
+_SHORTEST = 0.1  # s; a period in which a circle of 1 m radius is flown at 63 m/s
 Shape = Callable[[Array, Float[Array, ""]], Float[Array, "3"]]
 """(random numbers (27,) in [-1, 1], turns) -> place about the centre, m; periodic in whole turns."""
 
@@ -56,6 +57,7 @@ CURVES: dict[str, Shape] = {
 }
 
 
+@check_keywords
 def tracking(
     drones: int = 1, curve: str = "figure-eight", period: float = 10.0, duration: float = 10.0, anywhere: bool = True
 ) -> Task:
@@ -64,12 +66,14 @@ def tracking(
     Args:
         drones: number of drones; the centres of their curves are 4 m apart in y.
         curve: a name of `CURVES`.
-        period: s.
+        period: s, at least 0.1.
         duration: of an episode, s.
         anywhere: start at any point of the curve, 0.1 m and 0.1 m/s off; else at its start, at rest.
     """
+    check_whole("number of drones of tracking", drones)
     check_choice("curve", curve, CURVES)
-    check_positive("period", period, "s")
+    check_number("period", period, "s", at_least=_SHORTEST)
+    check_switch("anywhere", anywhere)
     shape = CURVES[curve]
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:

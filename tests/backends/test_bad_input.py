@@ -1,11 +1,16 @@
 """Every wrong shape and every wrong choice is a ValueError that says what, what was given and what to do."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxdrones
-from jaxdrones import State, downwash, drag
+from jaxdrones import State, Wrench, downwash, drag
+from jaxdrones.checks import POSITIVE
+from jaxdrones.control import Setpoint, geometric
 
 team = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 2)
 start = State.at_rest([[0.0, 0, 1], [1, 0, 1]])
@@ -91,3 +96,148 @@ def test_substeps_are_counted(substeps):
 def test_choices_are_functions(arguments, message):
     with pytest.raises(ValueError, match=message):
         jaxdrones.make_step(**arguments)
+
+
+def array_effect(params, state):
+    return jnp.zeros(3)
+
+
+def flat_effect(params, state):
+    return Wrench(jnp.zeros(2), jnp.zeros(3))
+
+
+def nothing(params, state):
+    return None
+
+
+def array_pair(params, state, other, other_state):
+    return jnp.zeros(6)
+
+
+@pytest.mark.parametrize(
+    ("effects", "pairs", "message"),
+    [
+        ((array_effect,), (), r"effects: array_effect returned an array of shape \(3,\); return jaxdrones\.Wrench\("),
+        ((flat_effect,), (), r"effects: flat_effect: force has shape \(2,\); expected \(3,\)"),
+        ((nothing,), (), r"effects: nothing returned None; return jaxdrones\.Wrench\("),
+        ((), (array_pair,), r"pairs: array_pair returned an array of shape \(6,\); return jaxdrones\.Wrench\("),
+    ],
+)
+def test_an_effect_that_returns_no_wrench_is_named(effects, pairs, message):
+    with pytest.raises(ValueError, match=message):
+        jaxdrones.make_step(effects, pairs)(team, start, rpm)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"effects": (downwash,)},
+            r"effects: downwash takes .*give a function of \(params, state\); .*belongs to pairs",
+        ),
+        ({"pairs": (drag,)}, r"pairs: drag takes .*\(params, state, other, other_state\); .*belongs to effects"),
+        ({"rotors": drag}, r"rotors: drag takes .*give a function of \(params, rpm, command\)"),
+        ({"integrator": drag}, r"integrator: drag takes .*give a function of \(derivative, state, dt\)"),
+    ],
+)
+def test_a_function_of_other_arguments_is_named_when_the_step_is_built(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        jaxdrones.make_step(**arguments)
+
+
+def test_functions_without_a_signature_and_with_defaults_are_taken():
+    def gust(params, state, force=0.0):
+        return Wrench.of_force(jnp.full(3, force))
+
+    effects = (functools.partial(gust, force=1.0), gust, jax.jit(gust), lambda *arguments: gust(*arguments))
+    assert np.isfinite(jaxdrones.make_step(effects)(team, start, rpm).vel).all()
+
+
+OFF = {
+    "zero": np.zeros(4),
+    "not a number": np.full(4, np.nan),
+    "two": np.array([0, 0, 0, 2.0]),
+    "almost": [0, 0, 0.1, 1],
+}
+
+
+def flown_once(params, state):
+    return jaxdrones.rollout(step, lambda params, memory, state, k: (memory, rpm), params, state, None, 1)
+
+
+@pytest.mark.parametrize("off", OFF)
+@pytest.mark.parametrize("look", [lambda state: step(team, state, rpm), lambda state: flown_once(team, state)])
+def test_a_quaternion_that_is_no_attitude_is_an_error_where_it_can_be_looked_at(look, off):
+    broken = start.replace(quat=start.quat.at[1].set(jnp.asarray(OFF[off])))
+    with pytest.raises(
+        ValueError, match=r"state\.quat (has length .*give a unit quaternion \(x, y, z, w\)|is not finite)"
+    ):
+        look(broken)
+    jax.eval_shape(look, broken)
+
+
+def test_quaternions_that_are_off_by_rounding_are_taken_with_either_sign():
+    for factor in (-1, 1 + 1e-4, 1 - 1e-4):
+        assert np.isfinite(step(team, start.replace(quat=factor * start.quat), rpm).pos).all()
+
+
+def test_a_controller_of_one_drone_refuses_a_quaternion_that_is_no_attitude():
+    one = jax.tree.map(lambda x: x[0], start)
+    single, gains = jaxdrones.load_params("cf2x"), geometric.gains()
+    with pytest.raises(ValueError, match=r"state\.quat has length 0: .*unit quaternion"):
+        setpoint = Setpoint.at(one.pos)
+        geometric.control(gains, single, geometric.init(1), one.replace(quat=jnp.zeros(4)), setpoint, dt=0.01)
+
+
+CONSTANTS = [(name, value) for name in POSITIVE for value in (0, -1)] + [("km", -1), ("gravity", -9.8)]
+
+
+@pytest.mark.parametrize(("name", "value"), CONSTANTS)
+def test_constants_with_which_nothing_flies_are_named_where_they_can_be_looked_at(name, value):
+    broken = team.replace(**{name: jnp.full_like(getattr(team, name), value)})
+    for look in (lambda: step(broken, start, rpm), lambda: flown_once(broken, start)):
+        with pytest.raises(ValueError, match=rf"params\.{name} is \[.*; give (positive )?numbers"):
+            look()
+    with pytest.raises(ValueError, match=rf"params\.{name} is"):  # closed over, they have values in `jit`, too
+        jax.jit(lambda state: step(broken, state, rpm))(start)
+    jax.eval_shape(lambda params: flown_once(params, start), broken)
+
+
+def test_rotors_without_a_limit_are_no_mistake():
+    unlimited = team.replace(max_rpm=jnp.full(2, jnp.inf))
+    assert np.isfinite(step(unlimited, start, rpm).pos).all()
+    flown_once(unlimited, start)
+
+
+@pytest.mark.parametrize("name", ["inertia", "rotor_pos", "mass"])
+def test_a_list_in_place_of_an_array_is_named(name):
+    broken = team.replace(**{name: np.asarray(getattr(team, name)).tolist()})
+    for look in (
+        lambda: step(broken, start, rpm),
+        lambda: flown_once(broken, start),
+        lambda: jaxdrones.repeat(broken, 2),
+    ):
+        with pytest.raises(ValueError, match=rf"params\.{name} is \[.*; give an array"):
+            look()
+    with pytest.raises(ValueError, match=r"state\.vel is \[\[.*; give an array"):
+        step(team, start.replace(vel=np.asarray(start.vel).tolist()), rpm)
+    with pytest.raises(ValueError, match=rf"params\.{name} is .*; give an array"):
+        jax.jit(lambda state: step(broken, state, rpm))(start)
+
+
+def test_parameters_that_are_none_are_refused_in_a_team():
+    for wrong in ("cf2x", 0.03, None):
+        with pytest.raises(ValueError, match=r"is given; repeat takes the parameters of a single drone"):
+            jaxdrones.repeat(wrong, 2)
+        with pytest.raises(ValueError, match=r"is given; stack takes the parameters of single drones"):
+            jaxdrones.stack([wrong])
+
+
+@pytest.mark.parametrize("dt", ["a", None, True, [0.1], 1e-50])
+def test_time_is_a_number(dt):
+    for control_step in (
+        lambda: jaxdrones.make_step(dt=dt),
+        lambda: jaxdrones.envs.make("hover", control_hz=dt or "a"),
+    ):
+        with pytest.raises(ValueError, match=r"is .*; give a positive number"):
+            control_step()

@@ -68,6 +68,7 @@ def test_memory_may_be_any_pytree():
 
 def test_rollouts_of_many_worlds_come_from_vmap():
     worlds = jax.tree.map(lambda x: jnp.stack([x, 0.9 * x]), start)
+    worlds = worlds.replace(quat=jnp.stack([start.quat, start.quat[::-1]]))
     final, _ = jax.vmap(lambda s: jaxdrones.rollout(step, replay, team, s, None, 5))(worlds)
     for i in range(2):
         world = jax.tree.map(lambda x, i=i: x[i], worlds)
@@ -132,3 +133,21 @@ def test_checkpoints_change_memory_and_neither_the_flight_nor_its_gradient():
 def test_a_checkpoint_divides_the_flight(every):
     with pytest.raises(ValueError, match="checkpoint"):
         jaxdrones.rollout(step, replay, team, start, None, 20, every)
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        (lambda *_: commands[0], r"control returned an array of shape \(2, 4\); return \(memory, rpm\)"),
+        (lambda *_: None, r"control returned None; return \(memory, rpm\)"),
+        (lambda *_: (None, commands[0], 1), r"control returned \(None, .*; return \(memory, rpm\)"),
+        (
+            lambda *_: ({"a": 1}, commands[0]),
+            r"control was given the memory .* and returned .*'a'.* of the same structure",
+        ),
+        ("replay", r"control: 'replay' is not a function; give for example lambda params, memory, state, k"),
+    ],
+)
+def test_a_controller_that_answers_something_else_is_told_what_to_return(control, message):
+    with pytest.raises(ValueError, match=message):
+        jaxdrones.rollout(step, control, team, start, None, 2)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, flying
+from helpers import assert_close, assert_finite, flying
 
 import jaxdrones
 from jaxdrones import State, drag, drag_world_axes, ground_effect, ground_effect_paper, rotation
@@ -160,3 +160,15 @@ def test_a_vehicle_without_a_coefficient_has_no_ground_effect_and_no_drag():
         wrench = on_each(effect, states, hummingbird)
         np.testing.assert_array_equal(wrench.force, 0)
         np.testing.assert_array_equal(wrench.torque, 0)
+
+
+@pytest.mark.parametrize("effect", [ground_effect, ground_effect_paper])
+@pytest.mark.parametrize("height", [-0.1, 0.0, 0.1])
+def test_without_a_coefficient_values_and_gradients_stay_finite_at_any_height(effect, height):
+    hummingbird = jaxdrones.load_params("hb")
+    state = jax.tree.map(lambda x: x[0], State.at_rest([[0.0, 0, height]])).replace(rpm=jnp.full(4, 4000.0))
+    force, gradient = jax.jit(jax.value_and_grad(lambda p, s: effect(p, s).force[2], argnums=(0, 1)))(
+        hummingbird, state
+    )
+    assert force == 0
+    assert_finite(gradient)

@@ -18,7 +18,7 @@ from jaxdrones.backends.bullet.contacts import Contact, of_last_step
 from jaxdrones.backends.host import HostStep, is_traced
 from jaxdrones.backends.team import check_team, flatten, unflatten
 from jaxdrones.backends.wrenches import Effect, Pair, check_functions, make_total_wrench
-from jaxdrones.checks import check_finite, check_positive, check_whole
+from jaxdrones.checks import check_finite, check_number, check_params, check_positive, check_quaternion, check_whole
 from jaxdrones.dynamics import instant_rotors
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.params import Params
@@ -72,8 +72,7 @@ def make_step(
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)
-    if not (np.isfinite(damping) and damping >= 0):
-        raise ValueError(f"damping is {damping}; give a number of at least 0 (1/s)")
+    check_number("damping", damping, "1/s", at_least=0)
     check_functions("rotors", [rotors])
     total_wrench = make_total_wrench(effects, pairs)
 
@@ -103,6 +102,9 @@ class BulletStep(HostStep):
         self._shapes: list[tuple[int, ...]] = []
         self._flat_params: jax.Array  # one array is handed over faster than twenty
         self._arms: np.ndarray
+
+    def __repr__(self) -> str:
+        return f"<step: Bullet at {1 / (self._dt * self._substeps):.4g} Hz x {self._substeps}>"
 
     def __enter__(self) -> BulletStep:
         return self
@@ -185,6 +187,7 @@ class BulletStep(HostStep):
         shapes = [np.shape(x) for x in (state.pos, state.quat, state.vel, state.omega, state.rpm, rpm)]
         if params is not self._params or shapes != self._shapes:
             check_team(params, state, rpm)
+            check_params(params)
             self._flat_params = flatten(params)
             self.client.set_team(np.asarray(_bodies(params), float))
             self._arms = np.asarray(params.arm, float)
@@ -196,6 +199,7 @@ class BulletStep(HostStep):
         if not np.isfinite(team).all():
             check_finite("state", state)
             check_finite("rpm", rpm)
+        check_quaternion("state.quat", team[:, _QUAT])
         team[:, _OMEGA] = (self.client.matrices(team[:, _QUAT]) @ team[:, _OMEGA, None])[..., 0]
         return team
 

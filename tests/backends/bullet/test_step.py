@@ -210,6 +210,17 @@ def test_a_state_that_is_not_finite_is_refused(team, step):
         step(team, start, command * np.inf)
 
 
+def test_a_quaternion_that_is_no_attitude_and_constants_that_do_not_fly_are_refused(team, step):
+    start, (command,) = apart(flying(team)), np.asarray(tape(team, 1))
+    for quat in (jnp.zeros(4), jnp.array([0, 0, 0, 2.0])):
+        broken = start.replace(quat=start.quat.at[1].set(quat))
+        for call in (lambda b=broken: step(team, b, command), lambda b=broken: step.camera(team, b)):
+            with pytest.raises(ValueError, match=r"state\.quat has length .*give a unit quaternion"):
+                call()
+    with pytest.raises(ValueError, match=r"params\.mass is \[.*give positive numbers"):
+        step(team.replace(mass=-team.mass), start, command)
+
+
 def test_a_wrong_shape_is_refused(team, step):
     start, (command,) = apart(flying(team)), np.asarray(tape(team, 1))
     with pytest.raises(ValueError, match=r"rpm has shape \(3, 4\).*4 drones"):

@@ -1,0 +1,168 @@
+"""Options of `make` and of tasks: nonsense is refused with what was given and what to give."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdrones as jd
+from jaxdrones.envs import ACTIONS, TASKS, Action, Env, autoreset, make
+from jaxdrones.envs.actions import one_d_thrust, position, rpm, thrust_and_rates
+from jaxdrones.envs.randomize import constant_wind, pushes, scaled, sensor_noise, shifted
+from jaxdrones.learning import evaluate
+from jaxdrones.tasks.curves import circle
+from jaxdrones.tasks.hover import hover
+from jaxdrones.tasks.task import Part
+
+CF2X = jd.load_params("cf2x")
+KEY = jax.random.key(0)
+NO_NUMBER = (np.nan, np.inf, -np.inf, "a", None, [1.0], True)
+
+
+def refused(name, option, values):
+    for value in values:
+        with pytest.raises(ValueError, match=rf"{option}.* is .*; give"):
+            make(name, **{option: value})
+
+
+@pytest.mark.parametrize("option", ["reach", "speed", "omega", "tilt", "height", "duration"])
+def test_numbers_of_a_hover_are_refused_where_they_make_no_sense(option):
+    refused("hover", option, (-1, 1e9, *NO_NUMBER) if option != "duration" else (-1, 0, 1e12, 1e-9, *NO_NUMBER))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_option_of_every_task_is_refused_where_it_makes_no_sense(name):
+    options = TASKS[name].__annotations__.keys() - {"return"}
+    assert "drones" in options
+    for option in options - {"reach", "speed", "omega", "tilt"}:
+        values = ("no", None, -1, np.nan) if option != "anywhere" else ("no", None, 2)
+        with_unit = "number of drones" if option == "drones" else option
+        for value in values:
+            with pytest.raises(ValueError, match=rf"{with_unit}.*{'unknown' if option == 'curve' else 'give'}|unknown"):
+                make(name, **{option: value})
+    for drones in (0, 2.5, True):
+        with pytest.raises(ValueError, match=r"number of drones .*is .*; give a whole number of at least [12]"):
+            make(name, drones=drones)
+
+
+def test_starts_from_which_a_drone_is_lost_at_once_are_refused():
+    with pytest.raises(ValueError, match="number of drones of gates is 6; give a number of at most 5"):
+        make("gates", drones=6)
+    with pytest.raises(ValueError, match=r"reach is 6.0; give a number of at least 0 and at most 5 \(m\)"):
+        make("hover", reach=6.0)
+    with pytest.raises(ValueError, match="period is 1e-05"):
+        make("tracking", period=1e-5)
+
+
+@pytest.mark.parametrize("option", ["control_hz", "substeps", "delay", "realistic", "vision_hz"])
+def test_numbers_of_make_are_refused_where_they_make_no_sense(option):
+    optional = ("control_hz", "substeps", "delay", "vision_hz")
+    for value in (-1, 0, *NO_NUMBER, 1e12):
+        fine = (value is None and option in optional) or (value == 0 and option == "delay")
+        fine = fine or (option == "realistic" and isinstance(value, bool))
+        if not fine:
+            with pytest.raises(ValueError, match=r"is .*; give|vision is asked for"):
+                make("hover", **{option: value}, **(dict(vision=("rgb",)) if option == "vision_hz" else {}))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            dict(observation="position"),
+            r"observation is 'position'; give a sequence, for example \('position_error',\)",
+        ),
+        (dict(effects="drag"), r"effects is 'drag'; give a sequence, for example \('drag',\)"),
+        (dict(pairs="downwash"), r"pairs is 'downwash'; give a sequence"),
+        (dict(vision="rgb"), r"vision is 'rgb'; give a sequence, for example \('rgb',\)"),
+        (dict(laws=scaled("mass", 0.9, 1.1)), r"laws is .*; give a sequence"),
+        (dict(laws=("mass",)), r"laws: 'mass' is not a function"),
+        (dict(noise=0.1), r"noise: 0.1 is not a function; give for example sensor_noise\(\)"),
+        (dict(disturb=0.1), r"disturb: 0.1 is not a function; give for example pushes\(0.3\)"),
+        (dict(observation=(3,)), r"observation: 3 is not a part"),
+        (dict(action=3), r"action is 3; give an object of Action"),
+        (dict(effects=("downwash",)), r"'downwash' is given as one of effects; .* give pairs=\('downwash',\)"),
+        (dict(pairs=("drag",)), r"'drag' is given as one of pairs; .* give effects=\('drag',\)"),
+        (dict(effects=(jd.downwash,)), r"effects: downwash takes .*; give a function of \(params, state\)"),
+        (dict(vehicle=5), r"vehicle is 5; give"),
+        (dict(vehicle=jd.repeat(CF2X, 2)), r"mass has shape \(2,\).*single drone"),
+        (dict(vehicle=CF2X.replace(mass=-1)), r"params\.mass is -1; give positive numbers"),
+        (dict(vehicle=CF2X.replace(mass=jnp.array(0.0))), r"params\.mass is 0.0; give positive numbers"),
+        (dict(vehicle=CF2X.replace(inertia=[1e-5, 1e-5, 2e-5])), r"params\.inertia is \[1e-05.*; give an array"),
+        (dict(vehicle=CF2X.replace(kf=jnp.nan)), r"params\.kf is not finite"),
+        (dict(vehicel="hb"), r"unknown option of hover 'vehicel'; did you mean 'vehicle'\?"),
+        (dict(drone=2), r"unknown option of hover 'drone'; did you mean 'drones'\?"),
+    ],
+    ids=range(21),
+)
+def test_a_mistake_in_an_option_is_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        make("hover", **options)
+
+
+def test_an_unknown_option_beside_a_task_names_the_closest_of_make():
+    with pytest.raises(ValueError, match=r"options vehicel are given beside a task.*; did you mean 'vehicle'\?"):
+        make(hover(), vehicel="hb")
+    with pytest.raises(ValueError, match=r"unknown argument of hover 'hight'; did you mean 'height'\?"):
+        hover(hight=3)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        (lambda: sensor_noise(pos=-1), "pos of the noise is -1"),
+        (lambda: sensor_noise(omega=np.nan), "omega of the noise is nan"),
+        (lambda: pushes(-0.1), "force of a push is -0.1"),
+        (lambda: pushes(0.1, every=0), "every is 0"),
+        (lambda: pushes(0.1, lasting=np.nan), "lasting is nan"),
+        (lambda: constant_wind(-1), "speed of the wind is -1"),
+        (lambda: scaled("mass", -1, 1), "lower bound of mass is -1"),
+        (lambda: shifted("mass", 0, np.inf), "upper bound of mass is inf"),
+        (lambda: rpm(near_hover=-1), "near_hover is -1"),
+        (lambda: one_d_thrust(share=2), "share is 2; give a number above 0 and at most 1"),
+        (lambda: position(step=-0.1), "step is -0.1"),
+        (lambda: thrust_and_rates((1, 2)), r"max_rate has shape \(2,\)"),
+        (lambda: thrust_and_rates((1, 2, -3)), "an entry of max_rate is -3"),
+        (lambda: Action(0, ACTIONS["rpm"]().rpm), "size of an action type is 0"),
+        (lambda: Action(4, "rpm"), "rpm of an action type: 'rpm' is not a function"),
+        (lambda: Part(lambda task, world: world.drones.pos, np.nan), "bound of an observation is nan"),
+        (lambda: circle(radius=np.nan), r"circle\['radius'\] is not finite"),
+        (
+            lambda: Env("hover", CF2X, None, dt=0.01, action=None, observation=()),
+            "task is 'hover'; give an object of Task",
+        ),
+    ],
+)
+def test_a_mistake_in_a_part_is_named(mistake, message):
+    with pytest.raises(ValueError, match=message):
+        mistake()
+
+
+def test_a_key_is_one_random_key_typed_or_raw():
+    env = make("hover")
+    obs, world = env.reset(KEY)
+    raw = jax.random.key_data(KEY)
+    np.testing.assert_array_equal(env.reset(raw)[0], obs)
+    action = jnp.zeros((1, 4))
+    takers = (
+        env.reset,
+        autoreset(env).reset,
+        lambda key: env.step(key, world, action),
+        lambda key: evaluate(env, lambda obs: action, key, 2),
+    )
+    for take in takers:
+        for wrong in (0, None, 1.5, "key", np.uint32(3), jnp.zeros(2), jnp.zeros(4, jnp.uint32)):
+            with pytest.raises(ValueError, match=r"key is .*; give a random key, for example jax\.random\.key\(0\)"):
+                take(wrong)
+        for many in (jax.random.split(KEY, 3), jax.random.split(raw, 3)):
+            with pytest.raises(ValueError, match=r"key has shape \(3.*; give one key, and use jax\.vmap for many"):
+                take(many)
+    assert jax.eval_shape(jax.vmap(env.reset), jax.random.split(raw, 3))[0].shape[0] == 3
+
+
+def test_a_world_with_a_quaternion_that_is_no_attitude_is_refused():
+    env = make("hover")
+    _, world = env.reset(KEY)
+    broken = world.replace(drones=world.drones.replace(quat=jnp.zeros((1, 4))))
+    with pytest.raises(ValueError, match=r"state\.quat has length 0: .*give a unit quaternion"):
+        env.step(KEY, broken, jnp.zeros((1, 4)))

@@ -1,0 +1,192 @@
+"""No two draws share a random key: every key is either drawn from, once, or made others of, which all differ."""
+
+import dataclasses
+from collections import Counter
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import mostly_slow
+
+from jaxdrones.envs import autoreset, make
+from jaxdrones.envs.randomize import pushes, scaled, sensor_noise, shifted
+from jaxdrones.learning import bptt, ppo, shac, training
+from jaxdrones.learning.networks import Policy
+
+DRAWS = ("uniform", "normal", "bernoulli", "randint")
+KEY = jax.random.key(3)
+EVERYTHING = dict(
+    laws=(scaled("mass", 0.9, 1.1), scaled("kf", 0.9, 1.1), shifted("wind", -1, 1)),
+    noise=sensor_noise(),
+    disturb=pushes(0.3),
+)
+SMALL = dict(updates=2, worlds=3, horizon=2, sizes=(2,))
+CRITIC = dict(critic_sizes=(2,))
+LEARNERS = {
+    "bptt": (bptt, bptt.Config(**SMALL)),
+    "shac": (shac, shac.Config(**SMALL, **CRITIC, critic_steps=2)),
+    "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, batches=3)),
+}
+
+
+class Keys:
+    """What the functions of `jax.random` were given and gave, also in compiled programs."""
+
+    def __init__(self):
+        self.drawn, self.parents, self.derived = Counter(), set(), Counter()
+
+    def check(self, least):
+        jax.effects_barrier()
+        assert sum(self.drawn.values()) >= least
+        assert max(self.drawn.values()) == 1, "a key is drawn from twice"
+        assert max(self.derived.values()) == 1, "two keys that were made of others are the same"
+        both = self.drawn.keys() & self.parents
+        assert not both, "a key is drawn from, and others are made of it"
+
+
+@pytest.fixture
+def keys(monkeypatch):
+    keys = Keys()
+
+    def seen(key):
+        return jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
+
+    def note_draw(key):
+        keys.drawn[np.asarray(key).tobytes()] += 1
+
+    def note_family(parent, children):
+        keys.parents.add(np.asarray(parent).tobytes())
+        for child in np.asarray(children).reshape(-1, 2):
+            keys.derived[child.tobytes()] += 1
+
+    def drawing(function):
+        def draw(key, *args, **kwargs):
+            jax.debug.callback(note_draw, seen(key))
+            return function(key, *args, **kwargs)
+
+        return draw
+
+    def making(function):
+        def make(key, *args, **kwargs):
+            children = function(key, *args, **kwargs)
+            jax.debug.callback(note_family, seen(key), seen(children))
+            return children
+
+        return make
+
+    for name in DRAWS:
+        monkeypatch.setattr(jax.random, name, drawing(getattr(jax.random, name)))
+    for name in ("split", "fold_in"):
+        monkeypatch.setattr(jax.random, name, making(getattr(jax.random, name)))
+    return keys
+
+
+@pytest.mark.parametrize("task", mostly_slow(["hover", "tracking", "swap-goals"], ["hover"]))
+def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
+    """Start, parameters, noise, pushes, and those of the next episode: in one step that ends one."""
+    env = make(task, **EVERYTHING)
+    _, episode = autoreset(env).reset(jax.random.key(2))
+    episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
+    autoreset(env).step(KEY, episode, jnp.zeros((env.drones, 4)))
+    keys.check(least=2 * 5 + 2)
+
+
+def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatch):
+    """Fake noise, pushes, laws, starts and resets tell which key they saw, also where all are given the same one."""
+    seen = {}
+
+    def tell(stream, key):
+        def note(data):
+            seen.setdefault(stream, set()).add(np.asarray(data).tobytes())
+
+        jax.debug.callback(note, jax.random.key_data(key))
+
+    def noise(key, state):
+        tell("noise", key)
+        return state
+
+    def disturb(key, params, dt):
+        tell("disturbance", key)
+        return params
+
+    def law_keys(laws, key, params):
+        tell("laws", key)
+        return params
+
+    plain = make("hover").task
+
+    def start(key, params):
+        tell("start", key)
+        return plain.start(key, params)
+
+    monkeypatch.setattr("jaxdrones.envs.env.draw", law_keys)
+    env = make(dataclasses.replace(plain, start=start), noise=noise, disturb=disturb)
+    reset, env.reset = env.reset, lambda key: (tell("reset", key), reset(key))[1]
+    _, episode = autoreset(env).reset(KEY)
+    episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
+    autoreset(env).step(KEY, episode, jnp.zeros((1, 4)))
+    jax.effects_barrier()
+    counts = {stream: len(found) for stream, found in seen.items()}
+    assert counts == dict(reset=2, laws=2, start=2, noise=2, disturbance=1)
+    assert len(set().union(*seen.values())) == sum(counts.values())
+
+
+def test_noise_and_pushes_of_a_step_are_independent():
+    """Both drawn in the same way; of one key they would be the same numbers."""
+
+    def noise(key, state):
+        return state.replace(vel=jax.random.normal(key, state.vel.shape))
+
+    def disturb(key, params, dt):
+        return params.replace(push=jax.random.normal(key, params.push.shape))
+
+    env = make("hover", observation=("velocity",), noise=noise, disturb=disturb, drones=200)
+    _, world = env.reset(KEY)
+    obs, world, *_ = env.step(jax.random.key(1), world, jnp.zeros((200, 4)))
+    assert abs(np.corrcoef(obs.ravel(), world.params.push.ravel())[0, 1]) < 0.15
+
+
+class Toss:
+    """A world that draws in every step; all that a learner needs."""
+
+    drones, action_size, observation_size, dt, steps, kept = 1, 1, 2, 0.1, 2, ()
+
+    def reset(self, key):
+        x = jax.random.uniform(jax.random.fold_in(key, 0), (1, 2))
+        return x, TossWorld(Place(x), jnp.zeros((), jnp.int32))
+
+    def step(self, key, world, action):
+        x = world.drones.pos + jax.random.normal(jax.random.fold_in(key, 0), (1, 2)) + action
+        world = TossWorld(Place(x), world.step + 1)
+        no = jnp.zeros((), bool)
+        return x, world, -(x[:, 0] ** 2), no, world.step >= self.steps, {"metrics": {"error": jnp.abs(x[:, 0])}}
+
+
+class Place(flax.struct.PyTreeNode):
+    pos: jax.Array
+
+
+class TossWorld(flax.struct.PyTreeNode):
+    drones: Place
+    step: jax.Array
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("name", LEARNERS)
+def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(keys, name, monkeypatch):
+    learner, config = LEARNERS[name]
+    env = Toss()
+
+    def init(key, *_):  # of the networks, which flax draws with functions of its own
+        jax.random.normal(key)
+        return Policy.init(jax.random.key(0), env, (2,))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(learner, "Policy", type("Policy", (), {"init": staticmethod(init)}))
+        state = learner.init(KEY, env, config)
+    jax.jit(lambda state: learner.update(env, config, state))(state)
+    for purpose in (training.CHOICE, training.REPORT):
+        jax.random.split(jax.random.fold_in(KEY, purpose))
+    keys.check(least=10)

@@ -1,0 +1,59 @@
+"""What is printed of the large objects is one line that says what they are."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxdrones as jd
+from jaxdrones.envs import autoreset, make
+from jaxdrones.learning import Result
+from jaxdrones.learning.networks import Policy
+
+HOVER = make("hover", drones=2, vehicle="hb")
+POLICY = Policy.init(jax.random.key(0), HOVER, (32, 16))
+
+
+def two_gusts(params, state):
+    return jd.Wrench.of_force(2 * params.push)
+
+
+LINES = {
+    "environment": (HOVER, "<Env hover: 2 x hb, dt 0.01 s, 500 steps, 4 actions and 22 observations a drone, explicit"),
+    "own vehicle": (make("hover", vehicle=jd.load_params("hb")), "<Env hover: 1 x drones of own parameters, dt 0.01"),
+    "autoreset": (autoreset(HOVER), "<AutoReset of <Env hover: 2 x hb, "),
+    "policy": (POLICY, "<Policy 22 -> 32 -> 16 -> 4, tanh, 1,332 parameters, statistics of 0 observations>"),
+    "policies": (
+        Policy.init(jax.random.key(0), HOVER, (8,), True),
+        "440 parameters, one network per drone, statistics",
+    ),
+    "result": (Result(POLICY, None, {"reward": jnp.zeros(3)}), "<Result: <Policy 22 -> 32 -> 16 -> 4, "),
+    "step": (
+        jd.make_step((jd.drag, two_gusts), (jd.downwash,), jd.lagging_rotors, jd.rk4, dt=0.002, substeps=5),
+        "<step: rk4 at 100 Hz x 5, lagging_rotors, effects: drag, two_gusts, pairs: downwash>",
+    ),
+    "plain step": (
+        jd.make_step(),
+        "<step: semi_implicit_euler at 240 Hz x 1, instant_rotors, effects: none, pairs: none>",
+    ),
+}
+
+
+@pytest.mark.parametrize(("thing", "line"), LINES.values(), ids=LINES)
+def test_one_line_says_what_it_is(thing, line):
+    assert line in repr(thing) == str(thing)
+    assert "\n" not in repr(thing) and len(repr(thing)) < 200
+
+
+def test_a_policy_can_be_printed_while_it_is_traced_mapped_and_rebuilt():
+    lines = []
+    jax.jit(jax.vmap(lambda policy: lines.append(repr(policy))))(jax.tree.map(lambda x: jnp.stack([x, x]), POLICY))
+    lines.append(repr(jax.tree.map(lambda x: None, POLICY)))
+    lines.append(repr(jax.eval_shape(lambda: POLICY)))
+    assert all("32 -> 16 -> 4, tanh" in line and "statistics" not in line for line in lines)
+
+
+def test_a_step_and_an_environment_of_bullet_say_so():
+    pytest.importorskip("pybullet")
+    with make("hover", backend="bullet", vision=("rgb",)) as env:
+        assert repr(env.physics) == "<step: Bullet at 100 Hz x 5>"
+        assert "22 observations and rgb a drone, bullet backend>" in repr(env)

@@ -55,7 +55,7 @@ class Record:
 
         A drone diverged if its state is not finite at some time, or if at some time in the last quarter of the flight
         it is upside down, or its error (the distance to the target position or the difference to the target velocity)
-        is 1 m or 1 m/s above its error at the start. The paper's four flights, flown well, stay below 0.4 m or m/s and
+        is 1 m or 1 m/s above its error at the start. The paper's four flights, flown well, stay below 0.6 m or m/s and
         within 30 degrees of level; a drone that is lost is hundreds of metres off.
         """
         miss, unit = self._miss()

@@ -11,7 +11,7 @@ import jaxdrones
 
 PACKAGE = Path(jaxdrones.__file__).parent
 
-NOUNS = ("assets", "checks", "compiler", "numerics", "params", "rotation", "state", "urdf", "wrench")
+NOUNS = ("assets", "checks", "compiler", "limits", "numerics", "params", "rotation", "state", "urdf", "wrench")
 LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports another
     (NOUNS,),
     (("dynamics",), ("control",), ("sensing",)),

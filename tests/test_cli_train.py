@@ -196,7 +196,7 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
     assert main([*resume, "--budget", "5"]) == 2
     assert "began with updates 12, not 5" in capsys.readouterr().err
     assert main([*resume, "--budget", "0.001s"]) == 0
-    assert Run(folder).report()["updates"] == made + 1 == len(rewards(folder))
+    assert made < Run(folder).report()["updates"] == len(rewards(folder))
     assert at_least(Run(folder).told("best", "score"), best)
 
 

@@ -45,8 +45,9 @@ def make_step(
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
         rpm (n, 4) the commanded rotor speeds. The rotors limit them to [0, `params.max_rpm`], and so the speeds that
         a state starts with. There is no floor: drones fall through z = 0 unless `ground_contact` is among the
-        effects. It raises `ValueError` on a wrong shape, and where it is called with values, on constants that do not
-        fly and on quaternions that are no attitude.
+        effects, and pass through each other unless `drone_contact` is among the pairs. It raises `ValueError` on a
+        wrong shape, and where it is called with values, on constants that do not fly and on quaternions that are no
+        attitude.
 
     Raises:
         ValueError: `dt` or `substeps` not positive, or an argument that should be a function and is not.

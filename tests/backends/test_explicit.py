@@ -26,6 +26,7 @@ from jaxdrones import (
     downwash,
     downwash_paper,
     drag,
+    ground_contact,
     ground_effect,
     instant_rotors,
     lagging_rotors,
@@ -95,6 +96,14 @@ def test_without_a_limit_motors_follow_and_the_gradient_of_a_flight_is_finite(st
         return jnp.sum(fly(step, team, start, jnp.stack([rpm] * 3)).pos)
 
     assert_finite(slopes(team, start, rpm))
+
+
+def test_only_with_contact_is_there_a_floor():
+    """A drone that falls from 0.1 m with its rotors at rest, after a quarter of a second and more."""
+    team, start = jaxdrones.repeat(cf2x, 1), State.at_rest([[0.0, 0, 0.1]])
+    for effects, floor in ((), False), ((ground_contact,), True):
+        end = make_step(effects, substeps=72)(team, start, jnp.zeros((1, 4)))
+        assert (end.pos[0, 2] > 0) == floor
 
 
 def test_whole_numbers_and_lists_are_rotor_speeds_too():

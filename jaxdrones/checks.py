@@ -8,7 +8,7 @@ import functools
 import inspect
 import operator
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -84,8 +84,8 @@ def check_number(
     """
     if not is_known(value):
         return
-    bounds = {"at least": at_least, "above": above, "at most": at_most, "below": below}
-    bounds = {word: bound for word, bound in bounds.items() if bound is not None}
+    given = {"at least": at_least, "above": above, "at most": at_most, "below": below}
+    bounds = {word: bound for word, bound in given.items() if bound is not None}
     if not (_is_number(value) and _within(float(value), bounds, infinite)):
         words = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items())
         wanted = {"": "a finite number", "above 0": "a positive number"}.get(words, f"a number of {words}")
@@ -173,20 +173,20 @@ def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], h
 
 def check_keywords(function: Function) -> Function:
     """The same function or class; a keyword that it does not have is an error that names the closest one."""
-    called = function.__init__ if isinstance(function, type) else function
+    called: Any = function.__dict__["__init__"] if isinstance(function, type) else function
     name = function.__qualname__
     known = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
 
     @functools.wraps(called)
-    def checked(*args, **kwargs):
+    def checked(*args: Any, **kwargs: Any) -> Any:
         for keyword in kwargs:
             check_choice(f"argument of {name}", keyword, known)
         return called(*args, **kwargs)
 
     if isinstance(function, type):
-        function.__init__ = checked
+        setattr(function, "__init__", checked)  # noqa: B010, a type checker does not let it be assigned
         return function
-    return checked
+    return cast(Function, checked)
 
 
 def check_arrays(name: str, tree: dict[str, Any]) -> None:

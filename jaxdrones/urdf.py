@@ -106,7 +106,7 @@ def _params(urdf: "_Urdf") -> Params:
         )[2],
     )
     urdf.check_what_params_cannot_hold()
-    _check_flies(urdf.name, {name: np.asarray(value, float) for name, value in values.items()}, thrust2weight)
+    _check_flies(urdf.name, {name: np.asarray(value, float) for name, value in values.items()}, float(thrust2weight))
     return Params(**{name: jnp.asarray(value, float) for name, value in values.items()})
 
 

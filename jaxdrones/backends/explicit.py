@@ -88,12 +88,12 @@ def make_step(
 class _ExplicitStep:
     """A compiled step that looks at what it is given, where that has values: once at constants and at a start."""
 
-    def __init__(self, compiled: Step, text: str):
+    def __init__(self, compiled: Callable[..., State], text: str):
         self._compiled, self._text = compiled, text
         self._params: Params | None = None  # what was looked at last, and the attitude that was flown to
         self._quat: jax.Array | None = None
 
-    def __call__(self, params: Params, state: State, rpm: jax.Array) -> State:
+    def __call__(self, params: Params, state: State, rpm: ArrayLike) -> State:
         if params is not self._params or state.quat is not self._quat:
             check_values(params, state)
         state = self._compiled(params, state, rpm)

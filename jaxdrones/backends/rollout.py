@@ -83,7 +83,7 @@ def rollout(
     return final, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), legs)
 
 
-def _commanded(control: Control, params: Params, memory: Any, state: State, k: jax.Array) -> tuple[Any, jax.Array]:
+def _commanded(control: Control, params: Params, memory: Any, state: State, k: Any) -> tuple[Any, jax.Array]:
     """What a controller answers, or an error if that is something else than memory and rotor speeds."""
     answer = control(params, memory, state, k)
     if not (isinstance(answer, tuple | list) and len(answer) == 2):
@@ -91,12 +91,13 @@ def _commanded(control: Control, params: Params, memory: Any, state: State, k: j
         raise ValueError(
             f"control returned {given}; return (memory, rpm), with memory as it was given if there is none"
         )
-    if jax.tree.structure(answer[0]) != jax.tree.structure(memory):
+    given, returned = (str(jax.tree.structure(x)) for x in (memory, answer[0]))
+    if given != returned:
         raise ValueError(
-            f"control was given the memory {jax.tree.structure(memory)} and returned {jax.tree.structure(answer[0])}; "
+            f"control was given the memory {given} and returned {returned}; "
             "return (memory, rpm) with memory of the same structure"
         )
-    return answer
+    return answer[0], answer[1]
 
 
 def _loop(

@@ -58,7 +58,9 @@ def load(path: str | os.PathLike) -> Policy:
         raise ValueError(f"{path} holds no policy; found {', '.join(kept)}")
     numbers = _restored(path, kept)
     try:
-        settings = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()}
+        settings: dict[str, Any] = {
+            name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()
+        }
         network = VisionMLP(**settings) if "channels" in settings else MLP(**settings)
         statistics = Statistics(**{name: jnp.asarray(x) for name, x in numbers["statistics"].items()})
         params = jax.tree.map(jnp.asarray, numbers["params"])

@@ -1,5 +1,7 @@
 """A vectorised, differentiable simulator of quadrotor teams."""
 
+from typing import TYPE_CHECKING, Any
+
 from jaxdrones import rotation
 from jaxdrones.backends.cells import Cells
 from jaxdrones.backends.explicit import Step, make_step
@@ -65,7 +67,11 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str):
-    if name == "KERNEL_OPTIONS":  # the compiler of the device is asked, which importing should not start
-        return kernel_options()
-    raise AttributeError(f"module 'jaxdrones' has no attribute {name!r}")
+if TYPE_CHECKING:
+    KERNEL_OPTIONS: dict[str, Any]
+else:
+
+    def __getattr__(name: str):
+        if name == "KERNEL_OPTIONS":  # the compiler of the device is asked, which importing should not start
+            return kernel_options()
+        raise AttributeError(f"module 'jaxdrones' has no attribute {name!r}")

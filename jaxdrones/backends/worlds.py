@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ParamSpec, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +26,17 @@ _KERNEL_CHUNK, _CHUNK = 128, 512
 """Worlds whose states a cache holds in a flight as one kernel, and in one by many kernels."""
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
 def over_worlds(
-    function: Callable,
+    function: Callable[P, R],
     chunk: int | None = None,
     in_axes: int | Sequence[int] = 0,
     one_kernel: bool = True,
     devices: Sequence[jax.Device] = (),
-) -> Callable[..., Any]:
+) -> Callable[P, R]:
     """A function of one world, for many: of arrays with an axis over worlds in place of its arguments.
 
     It gives what `jax.vmap` gives, of every function. On a CPU the function is applied to one chunk of the worlds after
@@ -59,10 +63,10 @@ def over_worlds(
     if chunk is not None:
         check_whole("chunk", chunk)
 
-    def many(*arguments):
+    def many(*arguments: Any) -> Any:
         axes = tuple(in_axes) if isinstance(in_axes, Sequence) else (in_axes,) * len(arguments)
         worlds = _worlds(arguments, axes)
-        share = jax.vmap(function, axes)
+        share: Callable[..., Any] = jax.vmap(function, axes)
         if worlds and jax.default_backend() == "cpu" and _is_able():
             share = _on_a_cpu(function, chunk, axes, one_kernel)
         if not worlds or len(devices) < 2:
@@ -74,7 +78,7 @@ def over_worlds(
         first = PartitionSpec("worlds")
         return jax.shard_map(share, mesh=mesh, in_specs=shares, out_specs=first, check_vma=False)(*arguments)
 
-    return many
+    return cast(Callable[P, R], many)
 
 
 def _worlds(arguments: tuple, axes: tuple[int, ...]) -> int:

@@ -37,11 +37,13 @@ def test_swarm_and_scaling_report_every_way_to_fly():
         assert set(row["memory"]) == set(row["compile"]) == set(row["rates"])
 
 
+@pytest.mark.slow
 def test_startup_loads_nothing_optional():
     result = quick("startup.py")
     assert result["loaded"] == [] and len(result["seconds"]) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_bullet_reports_four_rates():
     rates = quick("bullet.py")
@@ -100,6 +102,7 @@ def test_rivals_races_our_side_where_there_are_no_rivals():
     assert all(row["agree"] is None and min(row["rates"].values()) > 0 for row in rows)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="the limit is compiled by a C compiler")
 def test_limit_in_c_flies_our_trajectory():
     result = quick("limit")

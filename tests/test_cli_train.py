@@ -156,6 +156,7 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
     assert [row["update"] for row in Run(folder).history()] == [1, 2, 3, 4]
 
 
+@pytest.mark.slow
 def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, tmp_path, capsys, monkeypatch):
     folder = shutil.copytree(trained[0], tmp_path / "hover")
     resume = ["train", "hover", "--output", str(folder), "--resume", "--no-figure"]
@@ -213,6 +214,7 @@ def without_seconds(folder):
         return [{name: x for name, x in row.items() if name != "seconds"} for row in csv.DictReader(file)]
 
 
+@pytest.mark.slow
 def test_numbers_that_are_not_finite_stop_training_and_the_best_policy_stays(tmp_path, capsys):
     wild = [*TRAIN, "--set", "learning_rate=1e38", "--no-figure", "--output", str(tmp_path)]
     assert main(wild) == 1
@@ -222,6 +224,7 @@ def test_numbers_that_are_not_finite_stop_training_and_the_best_policy_stays(tmp
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.slow
 def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     arguments = ["train", "hover", *SMALL, "--algo", "shac", "--budget", "0.001s", "--episodes", "8", "--seeds", "2"]
     assert main([*arguments, "--seed", "3", "--json", "--output", str(tmp_path)]) == 0
@@ -336,6 +339,7 @@ def test_eval_prints_one_object(trained, capsys):
     assert set(printed["evaluation"]["error_percentiles"]) == {"50", "95", "99"}
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_a_policy_is_flown_on_either_backend(trained, tmp_path, capsys):
     folder, _ = trained
@@ -353,6 +357,7 @@ def test_a_policy_is_flown_on_either_backend(trained, tmp_path, capsys):
     assert json.loads(str(logs[0]["conditions"]))["run"] == str(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet", "imageio_ffmpeg")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

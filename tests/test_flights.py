@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import mostly_slow
 
 from jaxdrones import flights
 from jaxdrones.tasks.examples import FLIGHTS
@@ -37,6 +38,7 @@ def test_every_drone_of_the_circle_flies_alike(circle):
     np.testing.assert_allclose(circle.pos[-1, :, 2], 0.1 + 0.05 * np.arange(4), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_velocity_flight_reaches_its_steps_and_reverses_them():
     record = flights.fly("velocity")
     assert record.diverged() == {}
@@ -66,24 +68,27 @@ def test_in_downwash_the_lower_drone_dips_and_the_upper_does_not():
     assert free["lowest_z_m"] > 0.499
 
 
+@pytest.mark.slow
 def test_the_jet_model_pushes_less_than_equation_6_but_visibly():
     lower = results(flights.fly("downwash", effects=["downwash"], duration=6.0))[1]
     assert 0.48 < lower["lowest_z_m"] < 0.495
 
 
-@pytest.mark.parametrize("vehicle", ["cf2p", "hb", "racer"])
+@pytest.mark.parametrize("vehicle", mostly_slow(["cf2p", "hb", "racer"], ["hb"]))
 def test_every_vehicle_flies_the_circle(vehicle):
     record = flights.fly("circle", vehicle=vehicle, drones=2, duration=6.0)
     assert all(row["steady_error_m"] < 0.125 for row in results(record))
     assert record.diverged() == {}
 
 
+@pytest.mark.slow
 def test_the_same_seed_is_the_same_flight_and_another_seed_another():
     first, again, other = (flights.fly("circle", drones=1, duration=0.5, seed=seed).pos for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_progress_goes_from_nothing_to_all():
     told = []
     flights.fly("circle", drones=1, duration=1.0, progress=told.append)

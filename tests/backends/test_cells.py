@@ -44,6 +44,7 @@ def test_nobody_within_reach_is_left_out_and_nobody_else_counts(spread):
     assert (np.max(np.abs(by_cells.force - alone.force)) > 1e-6) == (spread < 100)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_all_pairs():
     params, state = team(8.0)
 

@@ -64,6 +64,7 @@ def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all
     assert_close(around, at_once, 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [300, 1000], ids=["with a rest", "all"])
 def test_a_large_gradient_alone_is_one_kernel_too(chunk):
     many = jax.tree.map(lambda x: jnp.repeat(x, 200, axis=0), (starts, jnp.tile(commands, (1, 10, 1, 1))))
@@ -169,6 +170,7 @@ def test_a_line_does_not_double_the_program(looped, size, options):
     np.testing.assert_allclose(program(x)[0], flown(x[:1])[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_of_teams_are_one_kernel_without_options_too():
     meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
 

@@ -195,6 +195,7 @@ def test_the_logarithm_of_a_probability_is_that_of_a_normal_distribution():
     np.testing.assert_allclose(ppo.log_prob(action, mean, jnp.asarray(log_std)), np.log(density).sum(-1), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_ppo_at_the_policy_that_flew_has_the_plain_policy_gradient():
     config = ppo.Config(value_weight=0.0, discount=0.9)
     rng = np.random.default_rng(0)

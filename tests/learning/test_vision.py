@@ -141,6 +141,7 @@ def test_images_without_a_scale_such_as_labels_are_refused():
             Policy.init(KEY, env, (8,))
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("per_role", [False, True])
 def test_drones_that_see_the_same_do_the_same_unless_each_has_its_own_eyes(team, per_role):
@@ -189,6 +190,7 @@ def test_a_compiled_program_sees_what_is_seen_without_one(team):
             np.testing.assert_array_equal(a[i], b)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_worlds_of_different_ages_take_pictures_only_when_due(monkeypatch):
     with jd.make("hover", tilt=0.0, omega=0.0, backend="bullet", vision=("depth",), vision_hz=25) as env:

@@ -14,10 +14,10 @@ train: .venv/installed  ## full four-motor hover, by the gradient of the simulat
 	$(BIN)/jaxdrones fly --policy runs/hover
 
 test: .venv/installed
-	$(BIN)/pytest -n 2 -m "not slow"
+	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
 
 test-slow: .venv/installed
-	$(BIN)/pytest -n 2 -m slow
+	$(BIN)/pytest -n 2 --dist worksteal -m slow
 
 lint: .venv/installed
 	$(BIN)/ruff format --check .

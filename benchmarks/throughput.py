@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("--rotors", default="instant")
     parser.add_argument("--integrator", default="semi_implicit_euler")
     parser.add_argument("--substeps", type=int, default=1)
+    parser.add_argument("--gradient-worlds", type=int, default=8192, help="at most, of a gradient, whose memory grows")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--float64", action="store_true")
     parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
@@ -107,7 +108,7 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     time = seconds(forward, starts, rpm, repeats=options.repeats)
     steps = worlds * n * options.substeps / 1e6
 
-    few = min(worlds, 8192)  # of many worlds a part shows the same: memory grows with them, speed does not
+    few = min(worlds, options.gradient_worlds)  # on a CPU a part of many shows the same: memory grows, speed does not
     starts, rpms = jax.tree.map(lambda x: x[:few], (starts, jnp.repeat(rpm[:, None], grad_length, axis=1)))
     value, _ = compiled(in_chunks(loss), starts, rpms, options=ours)
     gradient, backward_compile = compiled(in_chunks(jax.value_and_grad(loss, 1)), starts, rpms, options=ours)

@@ -2,12 +2,13 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 import jax
 import numpy as np
 
 
-def check_shape(name: str, array, shape: tuple[int | str, ...], meaning: str) -> None:
+def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: str) -> None:
     """Raise unless `array` has `shape`; a string entry stands for any length of at least one."""
     given = np.shape(array)
     fits = len(given) == len(shape) and all(
@@ -18,7 +19,7 @@ def check_shape(name: str, array, shape: tuple[int | str, ...], meaning: str) ->
         raise ValueError(f"{name} has shape {given}; expected {wanted}: {meaning}")
 
 
-def check_finite(name: str, tree) -> None:
+def check_finite(name: str, tree: Any) -> None:
     """Raise if a concrete array of `tree` holds NaN or infinity; traced values cannot be looked at."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if not isinstance(leaf, jax.core.Tracer) and not np.all(np.isfinite(leaf)):

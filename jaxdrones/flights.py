@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from jaxdrones.urdf import load_params
 _START_SPREAD = 0.01  # m; standard deviation of the start when a seed is given
 
 
-def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None = None, **options) -> Record:
+def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None = None, **options: Any) -> Record:
     """Fly one of the examples.
 
     Args:
@@ -69,7 +70,7 @@ def scene_of(conditions: Conditions) -> Scene:
 
 def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: State, memory) -> State:
     """The trajectory, on the backend that was chosen."""
-    common = dict(
+    common: dict[str, Any] = dict(
         effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
         pairs=[PAIRS[effect] for effect in conditions.effects if effect in PAIRS],
         rotors=ROTORS[conditions.rotors],
@@ -80,7 +81,7 @@ def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: 
         if gui:
             raise ValueError("a window is asked for; only the bullet backend has one")
         step = make_step(**common, integrator=INTEGRATORS[conditions.integrator])
-        fly = jax.jit(lambda *start: rollout(step, control, *start, conditions.steps)[1])
+        fly = jax.jit(lambda params, start, memory: rollout(step, control, params, start, memory, conditions.steps)[1])
         return fly(params, start, memory)
 
     from jaxdrones.backends import bullet  # optional

@@ -2,7 +2,8 @@
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -128,4 +129,5 @@ def _fraction(s: Array, numerator: Callable[[int], int], terms: int) -> tuple[Ar
 
 
 def _horner(polynomial: np.poly1d, s: Array) -> Array:
-    return functools.reduce(lambda value, coefficient: value * s + coefficient, map(float, polynomial.coeffs))
+    coefficients: Iterable[Any] = map(float, polynomial.coeffs)  # arrays from the second value on
+    return functools.reduce(lambda value, coefficient: value * s + coefficient, coefficients)

@@ -4,10 +4,10 @@ import csv
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jaxdrones.conditions import Conditions
 from jaxdrones.control.pid import VEHICLES, rpm_to_pwm
 
 _BAND = 0.1  # share of the steady error within which a response counts as settled
@@ -29,7 +29,7 @@ class Record:
     target_pos: np.ndarray  # (K, n, 3) m; NaN where a velocity is commanded
     target_vel: np.ndarray  # (K, n, 3) m/s; NaN where a position is commanded
     labels: tuple[str, ...]  # n names
-    conditions: Conditions
+    conditions: Any  # what was flown, and how: `as_dict()`, for JSON
 
     @property
     def late(self) -> np.ndarray:
@@ -121,7 +121,8 @@ class Record:
 
     def save_npz(self, path: Path, pwm: bool = False) -> None:
         """Write the named arrays."""
-        np.savez_compressed(path, **self.arrays(pwm))
+        arrays: dict[str, Any] = self.arrays(pwm)
+        np.savez_compressed(path, **arrays)
 
     def save_csv(self, path: Path, pwm: bool = False) -> None:
         """Write one line per time and drone."""

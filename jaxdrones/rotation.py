@@ -4,6 +4,8 @@ Every function is about one rotation, never a batch: use `jax.vmap` for more. Al
 everywhere they are defined, also at zero rotation.
 """
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -25,7 +27,7 @@ def dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
 
     Written out: XLA's CPU compiler makes a library call of a reduction over many short vectors, 10 to 100 times slower.
     """
-    return sum(x * y for x, y in zip(unstack(a), unstack(b), strict=True))
+    return cast(Array, sum(x * y for x, y in zip(unstack(a), unstack(b), strict=True)))
 
 
 def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -63,7 +65,8 @@ def conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
 
 def rotate(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
     """R v: a vector from the body frame to the world frame, v + w t + u x t with t = 2 u x v and q = (u, w)."""
-    return _rotate(*unstack(q), v)
+    x, y, z, w = unstack(q)
+    return _rotate(x, y, z, w, v)
 
 
 def rotate_inverse(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -72,7 +75,7 @@ def rotate_inverse(q: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "
     return _rotate(x, y, z, -w, v)
 
 
-def _rotate(x, y, z, w, v):
+def _rotate(x: Array, y: Array, z: Array, w: Array, v: Array) -> Array:
     vx, vy, vz = unstack(v)
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
     return jnp.stack([vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import flax.struct
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
+from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_finite, check_shape
 
@@ -24,7 +25,7 @@ class State(flax.struct.PyTreeNode):
     """(4,) rotor speeds, revolutions per minute."""
 
     @classmethod
-    def at_rest(cls, pos: Float[Array, "n 3"], yaw: Float[Array, " n"] | None = None) -> State:
+    def at_rest(cls, pos: ArrayLike, yaw: ArrayLike | None = None) -> State:
         """A level team at rest with its rotors standing still.
 
         Args:

@@ -1,5 +1,6 @@
 """Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
 
+import importlib.util
 from pathlib import Path
 
 import jax
@@ -10,6 +11,14 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def pytest_runtest_setup(item):
+    """Skip a test marked with `needs` where one of the optional libraries it names is not installed."""
+    for mark in item.iter_markers("needs"):
+        for library in mark.args:
+            if importlib.util.find_spec(library) is None:
+                pytest.skip(f"{library} is not installed")
 
 
 @pytest.fixture(autouse=True)

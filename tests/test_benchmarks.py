@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-HELPERS = {"common.py", "figure.py", *(path.name for path in BENCHMARKS.glob("rivals_*.py"))}
+SECTIONS = {"tests", "plant", "envs", "swarm", "learning"}
+HELPERS = {"common.py", "figure.py", "published.py", *(path.name for path in BENCHMARKS.glob("rivals_*.py"))}
 
 
-def quick(name: str) -> dict:
-    command = [sys.executable, str(BENCHMARKS / name), "--quick", "--json"]
+def quick(name: str, *options: str) -> dict:
+    command = [sys.executable, str(BENCHMARKS / name), "--quick", "--json", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 
@@ -41,6 +42,7 @@ def test_startup_loads_nothing_optional():
     assert result["loaded"] == [] and len(result["seconds"]) == 3
 
 
+@pytest.mark.needs("pybullet")
 def test_bullet_reports_four_rates():
     rates = quick("bullet.py")
     assert len(rates) == 4 and min(rates.values()) > 0
@@ -64,7 +66,27 @@ def test_learning_reports_every_seed():
     assert rows and all(0 <= row["success"] <= 1 for row in rows)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.slow
+def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_path):
+    result = quick("accelerator.py", "--output", str(tmp_path / "result.json"))
+    assert not result["stopped"] and {row["section"] for row in result["rows"]} == SECTIONS
+    assert json.loads((tmp_path / "result.json").read_text()) == result
+    for row in result["rows"]:
+        assert row["value"] > 0 and ("ratio" in row) == ("source" in row.get("published", {}))
+    assert result["rows"][0]["failed"] == []
+
+
+def test_accelerator_stops_what_takes_longer_than_its_share(tmp_path):
+    file = tmp_path / "result.json"
+    command = [sys.executable, str(BENCHMARKS / "accelerator.py"), "--budget", "1", "--sections", "plant", "learning"]
+    subprocess.run([*command, "--output", str(file)], capture_output=True, check=True)
+    result = json.loads(file.read_text())
+    assert result["rows"] == [] and set(result["stopped"]) == {"plant", "learning"}
+
+
+@pytest.mark.slow
+@pytest.mark.needs("pybullet")
 def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():
     result = quick("transfer.py")
     assert [row["plant"] for row in result["rows"]] == ["own", "bullet, damping 0.04"]

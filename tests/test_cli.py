@@ -173,6 +173,7 @@ def test_list_names_what_can_be_chosen(capsys):
     assert "integrators" in capsys.readouterr().out
 
 
+@pytest.mark.needs("pybullet")
 def test_compare_prints_how_the_backends_part(capsys):
     assert main(["compare", "ground-effect", "--duration", "0.1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -183,6 +184,7 @@ def test_compare_prints_how_the_backends_part(capsys):
     assert "attitude (rad)" in capsys.readouterr().out
 
 
+@pytest.mark.needs("pybullet", "imageio_ffmpeg")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_flight_in_bullet_is_filmed(tmp_path, capsys):

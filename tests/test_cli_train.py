@@ -336,6 +336,7 @@ def test_eval_prints_one_object(trained, capsys):
     assert set(printed["evaluation"]["error_percentiles"]) == {"50", "95", "99"}
 
 
+@pytest.mark.needs("pybullet")
 def test_a_policy_is_flown_on_either_backend(trained, tmp_path, capsys):
     folder, _ = trained
     logs = []
@@ -352,6 +353,7 @@ def test_a_policy_is_flown_on_either_backend(trained, tmp_path, capsys):
     assert json.loads(str(logs[0]["conditions"]))["run"] == str(folder)
 
 
+@pytest.mark.needs("pybullet", "imageio_ffmpeg")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_policy_is_filmed(trained, tmp_path, capsys):

@@ -79,6 +79,7 @@ def test_a_setting_that_sb3_or_the_environment_lacks_is_one_line(arguments, mess
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.needs("pybullet", "stable_baselines3")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "settings"),
@@ -89,7 +90,6 @@ def test_a_setting_that_sb3_or_the_environment_lacks_is_one_line(arguments, mess
     ],
 )
 def test_the_papers_learners_climb_to_the_goal_and_fly_there_on_both_backends(algorithm, settings, tmp_path, capsys):
-    pytest.importorskip("stable_baselines3")
     small = ["--set", "net_arch=64,64", "--episodes", "2", "--json", "--output", str(tmp_path)]
     assert main([*SB3, "--algo", algorithm, *settings, *small]) == 0
     printed = json.loads(capsys.readouterr().out)

@@ -1,14 +1,44 @@
-"""The page about environments names what there is."""
+"""The pages name what there is, and what is written on them runs."""
 
-from pathlib import Path
+import ast
+import re
 
 import pytest
+from documents import LANGUAGES, PAGES, ROOT, blocks, run_python
 
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 
-PAGE = (Path(__file__).parent.parent / "docs" / "environments.md").read_text()
+PAGE = (ROOT / "docs" / "environments.md").read_text()
 
 
 @pytest.mark.parametrize("name", [*TASKS, *ACTIONS, *OBSERVATIONS])
 def test_everything_with_a_name_is_on_the_page(name):
     assert f"`{name}`" in PAGE
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_block_says_what_it_is_and_all_python_is_python(page):
+    found = blocks(page)
+    assert page.read_text().count("```") == 2 * len(found)  # none is indented, or not closed
+    for block in found:
+        assert block.language in LANGUAGES, f"{block.name}: give the language, one of {', '.join(LANGUAGES)}"
+        if block.language == "python":
+            ast.parse(block.code)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_file_that_a_page_names_is_there(page):
+    named = re.findall(r"(?<![\w/])(?:assets|benchmarks|docs|notebooks|tests|\.ci)/[\w./-]*\w", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if blocks(page, "python") and page != ROOT / "README.md"],  # which has tests of its own
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
+def test_the_python_of_a_page_runs_from_top_to_bottom(page):
+    skipped = []
+    run_python(page, skipped)
+    if skipped:
+        pytest.skip("; ".join(skipped))

@@ -1,27 +1,166 @@
-"""What the README says runs."""
+"""What the README says runs: its Python from top to bottom, and its commands, in short form."""
 
 import re
-from pathlib import Path
+import tomllib
+from typing import NamedTuple
 
-import jax
 import numpy as np
+import pytest
+from documents import ROOT, blocks, run_python
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+from jaxdrones.cli import main
+from jaxdrones.learning.training import Trainer
+
+README = ROOT / "README.md"
+BLOCKS = blocks(README, "sh")
 
 
 def test_the_python_of_the_readme_runs_from_top_to_bottom():
-    names = {}
-    with jax.numpy_rank_promotion("allow"):  # as users have it
-        for block in re.findall(r"```python\n(.*?)```", README, re.DOTALL):
-            exec(compile(block, "README.md", "exec"), names)
+    skipped = []
+    names = run_python(README, skipped)
     assert names["trajectory"].pos.shape == (1440, 4, 3)
     assert names["many"][1].pos.shape == (100, 1440, 4, 3)
     assert np.isfinite(names["d_mass"])
     assert np.isfinite(names["hovering"].pos).all()
+    if skipped:
+        pytest.skip("; ".join(skipped))
 
 
-def test_the_commands_of_the_readme_are_known_to_the_command_line():
-    from jaxdrones.tasks.examples import FLIGHTS
+class Short(NamedTuple):
+    """How a command is tried, and what it prints."""
 
-    named = set(re.findall(r"jaxdrones fly ([a-z][a-z-]*)", README))
-    assert named == set(FLIGHTS)
+    prints: str
+    """Patterns, which `...` joins: one after the other, with anything between."""
+    more: str = ""
+    """Arguments that make it short."""
+    needs: tuple[str, ...] = ()
+    """Optional libraries."""
+
+
+FLIGHT, TRAINING = "--duration 0.2", "--set worlds=8 --set horizon=4 --budget 2 --episodes 8"
+BULLET, FILM, SB3 = ("pybullet",), ("pybullet", "imageio_ffmpeg"), ("stable_baselines3",)
+LOGGED = r"wrote \S+/log\.npz, \S+/flight\.png"
+TRAINED = "compiled in ... trained in ... success ... wrote runs/ ... /best.msgpack, ... /report.json ... fly it: "
+FLIGHTS = {
+    "fly circle": Short(f"circle: 4 x cf2x, pid at 120 Hz ... drone 3 ... {LOGGED}", FLIGHT),
+    "fly circle --drones 4 --output runs/circle": Short(
+        "circle: 4 x cf2x ... wrote runs/circle/log.npz, runs/circle/flight.png", FLIGHT
+    ),
+    "fly velocity": Short(f"velocity: 4 x cf2x ... {LOGGED}", FLIGHT),
+    "fly ground-effect": Short(f"ground-effect: 2 x cf2x ... {LOGGED}", FLIGHT),
+    "fly downwash": Short(f"downwash: 2 x cf2x ... {LOGGED}", FLIGHT),
+    "fly circle --drones 8 --vehicle racer --effects drag,downwash --duration 20 --json": Short(
+        r'"vehicle": "racer", "drones": 8, "effects": \["drag", "downwash"\]', FLIGHT
+    ),
+    "fly circle --backend bullet --obstacles --video circle.mp4": Short(
+        "circle: 4 x cf2x ... Bullet at 240 Hz ... wrote .*circle.mp4", FLIGHT, FILM
+    ),
+    "compare circle": Short(r"circle: explicit against bullet ... t \(s\)  position ... 0\.20 ", FLIGHT, BULLET),
+    "list": Short("flights +circle, velocity ... vehicles +cf2p, cf2x, hb, racer"),
+}
+TRAININGS = {
+    "train hover": Short(TRAINED, TRAINING),
+    "train leader-follower --algo ppo --seeds 3 --budget 60s": Short(
+        TRAINED.replace("trained", "seed 2:\ntrained"), TRAINING
+    ),
+    "train gates --set level=2": Short(f"gates by ppo, level 2: ... {TRAINED}", TRAINING),
+    "train tracking --realistic --set period=5 --set worlds=512": Short(TRAINED, TRAINING),
+    "train hover --resume": Short(TRAINED),
+    "eval runs/hover --episodes 10000 --json": Short('"run": "runs/hover" ... "episodes": 8', "--episodes 8"),
+    "fly --policy runs/hover": Short(f"hover by bptt, policy of runs/hover ... {LOGGED}"),
+    "fly --policy runs/hover --backend bullet --video hover.mp4": Short(
+        "hover by bptt, policy of runs/hover, on Bullet ... wrote .*hover.mp4", needs=FILM
+    ),
+    "train hover --library sb3 --algo ppo": Short(
+        "trained in ", "--budget 64 --set n_steps=8 --set batch_size=32 --episodes 2", SB3
+    ),
+    "fly --policy runs/hover-sb3-ppo": Short(LOGGED, needs=SB3),
+}
+
+
+def commands(block) -> list[str]:
+    """The commands of a block, without comments; `jaxdrones` first where it is ours."""
+    lines = [re.sub(r"\s+#.*", "", line) for line in block.code.splitlines()]
+    return [part.strip().removeprefix(".venv/bin/") for line in lines for part in line.split("&&") if part.strip()]
+
+
+def ours(block) -> list[str]:
+    return [command.removeprefix("jaxdrones ") for command in commands(block) if command.startswith("jaxdrones ")]
+
+
+def tried(command: str, short: Short, capsys) -> None:
+    """Run a command, and compare what it prints."""
+    code = main([*command.split(), *short.more.split()])
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    assert re.search(short.prints.replace(" ... ", "(?s:.*)"), printed.out), printed.out
+
+
+def test_every_command_of_the_readme_is_tried():
+    assert {command for block in BLOCKS for command in ours(block)} == FLIGHTS.keys() | TRAININGS.keys()
+
+
+def test_what_sets_the_project_up_is_there():
+    others = [c for block in BLOCKS for c in commands(block) if not c.startswith("jaxdrones ")]
+    targets = re.findall(r"(?m)^([\w-]+):", (ROOT / "Makefile").read_text())
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    recipe = (ROOT / "Makefile").read_text()
+    for command in others:
+        program, *arguments = command.split()
+        if program == "make":
+            assert set(arguments) <= set(targets)
+        elif program == "pip":
+            assert (ROOT / arguments[arguments.index("-c") + 1]).is_file()
+            assert set(re.search(r"\[(.*)\]", command)[1].split(",")) <= set(extras)
+        else:
+            assert program in ("python3", "pytest")
+            assert program == "python3" or f"$(BIN)/{command}" in recipe  # as `make test` has it
+
+
+@pytest.mark.float32
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(
+    "command", [pytest.param(c, marks=pytest.mark.needs(*short.needs)) for c, short in FLIGHTS.items()]
+)
+def test_a_flight_of_the_readme_prints_what_it_is_for(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tried(command, FLIGHTS[command], capsys)
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize(
+    "block", [b for b in BLOCKS if set(ours(b)) & TRAININGS.keys()], ids=lambda b: f"line {b.line}"
+)
+def test_the_trainings_of_the_readme_can_be_interrupted_resumed_evaluated_and_flown(
+    block, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    here = ours(block)
+    shorts = {command: (TRAININGS | FLIGHTS)[command] for command in here}
+    for library in sorted({library for short in shorts.values() for library in short.needs}):
+        pytest.importorskip(library)
+    for command, short in shorts.items():
+        if command == "train hover" and "train hover --resume" in here:
+            with monkeypatch.context() as patch:
+                interrupt(patch)
+                assert main([*command.split(), *short.more.split()]) == 130
+            assert "--resume" in capsys.readouterr().err
+        else:
+            tried(command, short, capsys)
+
+
+def interrupt(patch) -> None:
+    """Ctrl-C, when the trainer goes on for the second time."""
+    advance, calls = Trainer.advance, []
+
+    def interrupted(self, state, updates):
+        calls.append(updates)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return advance(self, state, updates)
+
+    patch.setattr(Trainer, "advance", interrupted)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -151,7 +151,9 @@ class _Training(base.Wrapper):
         return after.replace(pipeline_state=place, obs=obs, done=_float(done), info=info)
 
 
-def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> base.Wrapper:
+def wrap_for_training(
+    env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
+) -> base.Wrapper:
     """The trainers' `wrap_env_fn`: many worlds, each episode from a fresh start, time limits told from ends.
 
     Brax's own starts every episode of a world from the same cached state. `info["truncation"]` and
@@ -193,15 +195,15 @@ def trainers() -> Iterator[None]:
             del jax.device_put_replicated
 
 
-def _device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
+def _device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
     """A copy of every array on every device, along a new leading axis; laid out as what a `pmap` over "i" returns."""
     sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
 
-    def put(x):
-        copies = jnp.broadcast_to(jnp.asarray(x)[None], (len(devices), *jnp.shape(x)))
+    def put(leaf):
+        copies = jnp.broadcast_to(jnp.asarray(leaf)[None], (len(devices), *jnp.shape(leaf)))
         return jax.device_put(copies, sharding)
 
-    return jax.tree.map(put, tree)
+    return jax.tree.map(put, x)
 
 
 def _mean(x: jax.Array) -> jax.Array:

@@ -30,7 +30,7 @@ class Env(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
 
     def __init__(
-        self, task: str | Task | envs.Env, *, dict_spaces: bool = False, render_mode: str | None = None, **options
+        self, task: str | Task | envs.Env, *, dict_spaces: bool = False, render_mode: str | None = None, **options: Any
     ):
         """Wrap an environment.
 
@@ -52,14 +52,14 @@ class Env(gymnasium.Env):
         self.observation_space, self.action_space = self._layout.observation, self._layout.action
         self._session = Session(self.env)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; the same seed starts the same one."""
         super().reset(seed=seed)
         _refuse(options)
         obs = self._session.reset(int(self.np_random.integers(SEEDS)) if seed is None else seed)
         return self._layout.arrange(obs), {}
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One control step.
 
         Raises:
@@ -112,7 +112,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         dict_spaces: bool = False,
         numpy: bool = True,
         max_episode_steps: int | None = None,
-        **options,
+        **options: Any,
     ):
         """Wrap an environment.
 
@@ -142,20 +142,20 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._auto = envs.autoreset(self.env)
-        self._reset = jax.jit(self._reset)
-        self._step = jax.jit(self._step, donate_argnums=1)
+        self._compiled_reset = jax.jit(self._reset)
+        self._compiled_step = jax.jit(self._step, donate_argnums=1)
         self._worlds = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every world; the same seed starts the same ones."""
         super().reset(seed=seed)
         _refuse(options)
         first = int(self.np_random.integers(SEEDS)) if seed is None else seed
         seeds = ((first + np.arange(self.num_envs)) % SEEDS).astype(np.uint32)
-        self._keys, self._worlds, obs = self._reset(seeds)
+        self._keys, self._worlds, obs = self._compiled_reset(seeds)
         return self._out(obs), {}
 
-    def step(self, actions):
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """One control step in every world.
 
         Raises:
@@ -165,11 +165,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         if self._worlds is None:
             raise gymnasium.error.ResetNeeded("step is called before reset; call reset")
         actions = self._layout.gather(actions, (self.num_envs,))
-        self._worlds, outcome = self._step(self._keys, self._worlds, actions)
+        self._worlds, outcome = self._compiled_step(self._keys, self._worlds, actions)
         obs, reward, terminated, truncated, info = self._out(outcome)
         return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
 
-    def close_extras(self, **kwargs) -> None:
+    def close_extras(self, **kwargs: Any) -> None:
         """End what is connected to Bullet."""
         self.env.close()
 

@@ -18,7 +18,7 @@ except ImportError as error:
     raise ImportError('pettingzoo is not installed; pip install "jaxdrones[pettingzoo]"') from error
 
 
-def parallel_env(task: str | Task | Env, **options) -> ParallelEnv:
+def parallel_env(task: str | Task | Env, **options: Any) -> ParallelEnv:
     """A team whose agents are `drone_0`, `drone_1`, ...; the options are those of `jaxdrones.make`."""
     return ParallelEnv(task, **options)
 
@@ -26,7 +26,7 @@ def parallel_env(task: str | Task | Env, **options) -> ParallelEnv:
 class ParallelEnv(pettingzoo.ParallelEnv):
     """One world; an episode begins and ends for all agents at once."""
 
-    def __init__(self, task: str | Task | Env, *, render_mode: str | None = None, **options):
+    def __init__(self, task: str | Task | Env, *, render_mode: str | None = None, **options: Any):
         """Wrap an environment.
 
         Args:
@@ -65,7 +65,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         """What an agent does."""
         return self.action_spaces[agent]
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Start an episode; the same seed starts the same one, and the same ones after it. There are no options."""
         if seed is not None:
             self._seeds = np.random.default_rng(seed)
@@ -73,7 +73,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         obs = self._session.reset(int(self._seeds.integers(SEEDS)) if seed is None else seed)
         return self._observed(obs), {agent: {} for agent in self.agents}
 
-    def step(self, actions: dict[str, np.ndarray]):
+    def step(self, actions: dict[str, np.ndarray]) -> tuple[Any, Any, Any, Any, Any]:
         """One control step.
 
         Raises:

@@ -23,7 +23,7 @@ class VecEnv(vec_env.VecEnv):
     That is `terminal_observation`, `TimeLimit.truncated`, and `episode` (return `r`, length `l`) for its log.
     """
 
-    def __init__(self, task: str | Task | Env, num_envs: int, *, seed: int | None = None, **options):
+    def __init__(self, task: str | Task | Env, num_envs: int, *, seed: int | None = None, **options: Any):
         """Make the worlds.
 
         Args:
@@ -38,25 +38,26 @@ class VecEnv(vec_env.VecEnv):
         self.envs = gymnasium.VectorEnv(task, num_envs, **options)
         self.render_mode = None
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
-        self._seed, self._actions = seed, None
+        self._seed = seed
+        self._actions: np.ndarray
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the next reset."""
         self._seed = seed
         return [None if seed is None else seed + i for i in range(self.num_envs)]
 
-    def reset(self):
+    def reset(self) -> Any:
         """Start an episode in every world."""
         obs, _ = self.envs.reset(seed=self._seed)
         self._seed = None
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return obs
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take actions for `step_wait`."""
         self._actions = actions
 
-    def step_wait(self):
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """One control step in every world."""
         obs, reward, terminated, truncated, info = self.envs.step(self._actions)
         done = terminated | truncated
@@ -74,11 +75,11 @@ class VecEnv(vec_env.VecEnv):
         """End what is connected to Bullet."""
         self.envs.close()
 
-    def get_attr(self, attr_name: str, indices=None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The same attribute for every world asked for."""
         return [getattr(self.envs, attr_name) for _ in self._chosen(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """The worlds are one; they cannot be set apart.
 
         Raises:
@@ -86,7 +87,7 @@ class VecEnv(vec_env.VecEnv):
         """
         raise ValueError(f"attribute {attr_name} cannot be set in a compiled environment; give it as an option")
 
-    def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list[Any]:
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """The worlds are one; they have no methods of their own.
 
         Raises:
@@ -94,7 +95,7 @@ class VecEnv(vec_env.VecEnv):
         """
         raise ValueError(f"method {method_name} cannot be called: the environments are one compiled step")
 
-    def env_is_wrapped(self, wrapper_class: type, indices=None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """No world is wrapped."""
         return [False for _ in self._chosen(indices)]
 

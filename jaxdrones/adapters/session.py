@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxdrones.backends.host import HostStep
 from jaxdrones.envs import AutoReset, Env, make
@@ -24,6 +26,8 @@ class Session:
         self.running = False
         """Whether an episode has begun and not ended."""
         on_host = isinstance(env.physics, HostStep)  # is called as it is, and compiles what is around it by itself
+        self._begin: Callable[..., Any]
+        self._advance: Callable[..., Any]
         self._begin, self._advance = (begin, _advance) if on_host else (_begin_compiled, _advance_compiled)
 
     def reset(self, seed: int) -> Any:
@@ -54,6 +58,7 @@ class Session:
         Raises:
             ImportError: pybullet is not installed; says which extra to install.
         """
+        assert self.world is not None
         pos = np.asarray(self.world.drones.pos, float)
         center = pos.mean(axis=0)
         reach = 1.0 + np.abs(pos - center).max()  # m
@@ -89,7 +94,7 @@ def made(task: str | Task | Env, options: dict[str, Any]) -> Env:
     return task
 
 
-def begin(env: Env | AutoReset, seed: jax.Array) -> tuple[jax.Array, World, Any]:
+def begin(env: Env | AutoReset, seed: ArrayLike) -> tuple[jax.Array, Any, Any]:
     """The key of an episode's steps, the world at its start, and what is seen of it."""
     key, start = jax.random.split(jax.random.PRNGKey(seed))
     obs, world = env.reset(start)

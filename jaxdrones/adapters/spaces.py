@@ -33,8 +33,9 @@ def stacked(space: spaces.Space, n: int) -> spaces.Space:
     """The space of n side by side, with a leading axis."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({name: stacked(part, n) for name, part in space.items()})
+    assert isinstance(space, spaces.Box)
     low, high = (np.broadcast_to(x, (n, *space.shape)) for x in (space.low, space.high))
-    return spaces.Box(low, high, dtype=space.dtype)
+    return spaces.Box(low, high, dtype=space.low.dtype.type)
 
 
 class Layout:
@@ -42,7 +43,9 @@ class Layout:
 
     def __init__(self, env: Env, names: Sequence[str] | None):
         n = env.drones
-        self.drones, self.size, self.names = n, env.action_size, names
+        self.drones, self.size, self.names = n, env.action_size, tuple(names or ())
+        self.observation: Any
+        self.action: Any
         if names:
             self.observation = spaces.Dict({name: observation_of_drone(env) for name in names})
             self.action = spaces.Dict({name: action_of_drone(env) for name in names})

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from jaxdrones.backends.cells import Cells
 from jaxdrones.backends.team import check_team
@@ -26,7 +27,7 @@ def make_step(
     dt: float = 1 / 240,
     substeps: int = 1,
     cells: Cells | None = None,
-) -> Step:
+) -> Callable[[Params, State, ArrayLike], State]:
     """Build the step of a world.
 
     Args:
@@ -58,7 +59,7 @@ def make_step(
         rate = State(pos=state.vel, quat=jax.vmap(quat_rate)(state), vel=acc, omega=omega_rate, rpm=rpm_rate)
         return stored(rate)  # rk4 takes 39 instead of 72 ns, its gradient 240 instead of 570
 
-    def step(params: Params, state: State, rpm: jax.Array) -> State:
+    def step(params: Params, state: State, rpm: ArrayLike) -> State:
         rpm = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
         check_team(params, state, rpm)
         speed, _ = jax.vmap(rotors)(params, state.rpm, rpm)

@@ -74,4 +74,6 @@ def _needed(jaxpr: Jaxpr, same: dict[Var, Var], equations: list[JaxprEqn]) -> tu
 
 def alone(eqn: JaxprEqn, variables: Iterable[Var], results: Sequence[Var]) -> Callable:
     """An equation as a function."""
-    return jaxpr_as_fun(ClosedJaxpr(Jaxpr((), [*variables], [*results], [eqn], eqn.effects), ()))
+    empty = jax.make_jaxpr(lambda: ())().jaxpr  # has what a program must tell about its source
+    program = empty.replace(invars=[*variables], outvars=[*results], eqns=[eqn], effects=eqn.effects)
+    return jaxpr_as_fun(ClosedJaxpr(program, ()))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +24,7 @@ _SHAPES = {
 _STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
 
 
-def check_team(params: Params, state: State, rpm) -> None:
+def check_team(params: Params, state: State, rpm: Any) -> None:
     """Raise `ValueError` unless the arrays are those of one team of n drones."""
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap")
     n = len(state.pos)

@@ -1,6 +1,7 @@
 """The sum of wrenches on a team, the same for every backend."""
 
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +100,7 @@ def _from_others(pair: Pair, params: Params, state: State, cells: Cells | None) 
 
 def _sum(x: jax.Array) -> jax.Array:
     """The sum over the first axis; written out where it is short, like `rotation.dot`."""
-    return sum(rotation.unstack(x)) if len(x) <= _SHORT else jnp.sum(x, axis=0)
+    return cast(jax.Array, sum(rotation.unstack(x))) if len(x) <= _SHORT else jnp.sum(x, axis=0)
 
 
 def _stored(x: jax.Array) -> jax.Array:

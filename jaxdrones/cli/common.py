@@ -98,7 +98,7 @@ def check_writable(file: Path) -> None:
     probe.unlink()
 
 
-def bar(total: int, what: str, unit: str, initial: int = 0):
+def bar(total: int | None, what: str, unit: str, initial: int = 0):
     """A progress bar on stderr; nothing without a terminal, `None` without tqdm."""
     try:
         from tqdm import tqdm

@@ -31,9 +31,9 @@ def _compare(options: argparse.Namespace) -> int:
         raise ValueError(f"--backends is {options.backends!r}; give two different ones, for example explicit,bullet")
     for name in names:
         check_choice("backend", name, BACKENDS)
-    records = [flown(options, backend=name) for name in names]
-    rows = divergence(*records)
-    diverged = {name: record.diverged() for name, record in zip(names, records, strict=True)}
+    first, second = (flown(options, backend=name) for name in names)
+    rows = divergence(first, second)
+    diverged = {names[0]: first.diverged(), names[1]: second.diverged()}
     if options.json:
         print(as_json({"flight": options.flight, "backends": names, "divergence": rows, "diverged": diverged}))
     else:

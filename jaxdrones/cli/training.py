@@ -113,7 +113,8 @@ class Shown(contextlib.ExitStack):
         """
         super().__init__()
         self._total, self._what, self._episodes, self._say, self._unit = total, what, episodes, say, unit
-        self._bar, self._evaluated, self._begun = None, "", False
+        self._bar: Any = None
+        self._evaluated, self._begun = "", False
 
     def tell(self, count: int, now: dict[str, float]) -> None:
         """Move the bar; say what an evaluation came to."""

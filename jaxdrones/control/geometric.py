@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import flax.struct
 import jax.numpy as jnp
@@ -73,7 +73,8 @@ def control(
     target = attitude.from_thrust(acc, setpoint.yaw)
 
     thrust = params.mass * rotation.dot(acc, axes[2])
-    asked = sum(rate * axis for rate, axis in zip(rotation.unstack(setpoint.omega), target, strict=True))  # world
+    rates = zip(rotation.unstack(setpoint.omega), target, strict=True)
+    asked = cast(Array, sum(rate * axis for rate, axis in rates))  # world
     omega_target = jnp.stack([rotation.dot(axis, asked) for axis in axes])
     omega_rate = (
         -gains.attitude * attitude.error(axes, target)

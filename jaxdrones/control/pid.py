@@ -6,6 +6,8 @@ Crazyflie's 16-bit PWM, whatever the vehicle.
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -59,7 +61,7 @@ class Memory(flax.struct.PyTreeNode):
     """(3,) roll, pitch, yaw at the last call, rad."""
 
 
-def rpm_to_pwm(rpm):
+def rpm_to_pwm(rpm: Any) -> Any:
     """The Crazyflie's 16-bit PWM of a rotor speed (RPM), any shape."""
     return (rpm - _PWM_OFFSET) / _PWM_TO_RPM
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import flax.struct
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
+from numpy.typing import ArrayLike
 
 
 class Setpoint(flax.struct.PyTreeNode):
@@ -24,13 +25,13 @@ class Setpoint(flax.struct.PyTreeNode):
     @classmethod
     def at(
         cls,
-        pos: Float[Array, "*n 3"],
-        vel: Float[Array, "*n 3"] | None = None,
-        acc: Float[Array, "*n 3"] | None = None,
-        yaw: Float[Array, " *n"] | None = None,
-        omega: Float[Array, "*n 3"] | None = None,
+        pos: ArrayLike,
+        vel: ArrayLike | None = None,
+        acc: ArrayLike | None = None,
+        yaw: ArrayLike | None = None,
+        omega: ArrayLike | None = None,
     ) -> Setpoint:
-        """A position to be at; what is left out is zero."""
+        """A position to be at, (*n, 3), and the other targets; what is left out is zero."""
         pos = jnp.asarray(pos)
         zero = jnp.zeros_like(pos)
         return cls(

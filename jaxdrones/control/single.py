@@ -8,8 +8,8 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 
 _HINT = "a controller is about one drone; use jax.vmap for a team"
-_STATE = {"pos": (3,), "quat": (4,), "vel": (3,), "omega": (3,)}
-_SETPOINT = {"pos": (3,), "vel": (3,), "acc": (3,), "yaw": (), "omega": (3,)}
+_STATE: dict[str, tuple[int, ...]] = {"pos": (3,), "quat": (4,), "vel": (3,), "omega": (3,)}
+_SETPOINT: dict[str, tuple[int, ...]] = {"pos": (3,), "vel": (3,), "acc": (3,), "yaw": (), "omega": (3,)}
 
 
 def check_single(params: Params, state: State, setpoint: Setpoint | None = None, memory: Any = None) -> None:

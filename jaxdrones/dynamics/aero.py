@@ -4,6 +4,8 @@
 compute what the paper's simulator does, for its figures and its recorded data.
 """
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -60,7 +62,7 @@ def external_push(params: Params, state: State) -> Wrench:
 
 def _summed_rotor_speed(state: State) -> Float[Array, ""]:
     """rad/s."""
-    return _RADIANS_PER_SECOND * sum(rotation.unstack(state.rpm))
+    return _RADIANS_PER_SECOND * cast(Array, sum(rotation.unstack(state.rpm)))
 
 
 def _rotor_heights(params: Params, state: State) -> Float[Array, "4"]:

@@ -11,7 +11,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.backends.explicit import Step
 from jaxdrones.backends.host import HostStep
@@ -89,7 +89,7 @@ class Env:
         self._delay = _nearly_whole(delay / dt)
         self._history = max(math.ceil(self._delay) + 1, *(part.history for part in observation))
         self.physics, self.vision = step, vision
-        self._before, self._after, self._start = jax.jit(self._before), jax.jit(self._after), jax.jit(self._start)
+        self._start, self._before, self._after = jax.jit(self._draw), jax.jit(self._commanded), jax.jit(self._outcome)
         widths = self._widths()
         bound = [np.broadcast_to(part.bound, (width,)) for part, width in zip(self._parts, widths, strict=True)]
         self.observation_bound = np.concatenate(bound).astype(np.float32)
@@ -104,7 +104,7 @@ class Env:
         return self._seen(obs, world), world
 
     def step(
-        self, key: jax.Array, world: World, action: Float[Array, "n a"]
+        self, key: jax.Array, world: World, action: Float[ArrayLike, "n a"]
     ) -> tuple[Obs, World, Float[Array, " n"], Array, Array, dict[str, Any]]:
         """One control step.
 
@@ -158,7 +158,8 @@ class Env:
     def __exit__(self, *_) -> None:
         self.close()
 
-    def _start(self, key: jax.Array) -> tuple[World, Array]:
+    def _draw(self, key: jax.Array) -> tuple[World, Array]:
+        """The world at the start of an episode, and what is observed of it."""
         params = draw(self._laws, jax.random.fold_in(key, LAWS), self.params)
         drones, variables = self.task.start(jax.random.fold_in(key, START), self.params)
         world = World(
@@ -172,7 +173,7 @@ class Env:
         )
         return world, self._observe(jax.random.fold_in(key, NOISE), world)
 
-    def _before(self, key: jax.Array, world: World, action: Array) -> tuple[World, Array]:
+    def _commanded(self, key: jax.Array, world: World, action: Array) -> tuple[World, Array]:
         """What the rotors are commanded, and the surroundings they meet."""
         action = jnp.clip(jnp.asarray(action, world.actions.dtype), -1, 1)
         actions = jnp.concatenate([world.actions[:, 1:], action[:, None]], axis=1)
@@ -182,14 +183,14 @@ class Env:
         world = world.replace(actions=actions, params=params)
         target = self.task.target_now(world)
 
-        def rpm(params, memory, state, action, setpoint):
+        def fly(params, memory, state, action, setpoint):
             return self.action.rpm(params, memory, state, action, setpoint, self.dt)
 
         command = delayed(actions, self._delay)
-        memory, rpm = jax.vmap(rpm)(self.params, world.memory, world.drones, command, target)
+        memory, rpm = jax.vmap(fly)(self.params, world.memory, world.drones, command, target)
         return world.replace(memory=memory), rpm
 
-    def _after(self, key: jax.Array, world: World, drones: State):
+    def _outcome(self, key: jax.Array, world: World, drones: State):
         """What came of it."""
         task = self.task
         world = world.replace(drones=drones, step=world.step + 1)
@@ -215,7 +216,7 @@ class Env:
 
     def _widths(self) -> list[int]:
         def parts(key):
-            world, _ = self._start(key)
+            world, _ = self._draw(key)
             return [part.observe(self.task, world) for part in self._parts]
 
         return [x.shape[-1] for x in jax.eval_shape(parts, jax.random.key(0))]

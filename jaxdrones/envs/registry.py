@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from typing import Any
 
-from jaxdrones.backends.explicit import make_step
+from jaxdrones.backends.explicit import Step, make_step
 from jaxdrones.checks import check_choice, check_positive, check_whole
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS, drone_contact, external_push, ground_contact
 from jaxdrones.envs.actions import ACTIONS, Action
@@ -58,7 +59,7 @@ def make(
     noise: Noise | None = None,
     disturb: Disturbance | None = None,
     delay: float | None = None,
-    **options,
+    **options: Any,
 ) -> Env:
     """Make an environment.
 
@@ -102,7 +103,8 @@ def make(
     if disturb is not None:
         effects = [*effects, external_push]
     pairs = [_named("pair effect", pair, PAIRS) for pair in pairs]
-    physics = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
+    physics: dict[str, Any] = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
+    step: Step
     if backend == "bullet":
         from jaxdrones.backends import bullet  # an optional library behind it
 
@@ -116,14 +118,14 @@ def make(
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
-    action = _named("action", task.action if action is None else action, ACTIONS)
+    chosen = _named("action", task.action if action is None else action, ACTIONS)
     parts = [_part(name, task) for name in (task.observation if observation is None else observation)]
     return Env(
         task,
         nominal,
         step,
         dt=dt,
-        action=action if isinstance(action, Action) else action(),
+        action=chosen if isinstance(chosen, Action) else chosen(),
         observation=parts,
         laws=(*task.laws, *(preset["laws"] if laws is None else laws)),
         noise=preset["noise"] if noise is None else noise,
@@ -133,8 +135,10 @@ def make(
     )
 
 
-_PLAIN = dict(rotors="instant", effects=(), laws=(), noise=None, delay=0.0)
-_REALISTIC = dict(rotors="lagging", effects=("drag",), laws=REALISTIC_LAWS, noise=sensor_noise(), delay=REALISTIC_DELAY)
+_PLAIN: dict[str, Any] = dict(rotors="instant", effects=(), laws=(), noise=None, delay=0.0)
+_REALISTIC: dict[str, Any] = dict(
+    rotors="lagging", effects=("drag",), laws=REALISTIC_LAWS, noise=sensor_noise(), delay=REALISTIC_DELAY
+)
 
 
 def _task(task: str | Task, options: dict) -> Task:
@@ -149,7 +153,7 @@ def _task(task: str | Task, options: dict) -> Task:
     return TASKS[task](**options)
 
 
-def _named(kind: str, value, table: dict):
+def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
     if not isinstance(value, str):
         return value
     check_choice(kind, value, table)

@@ -93,7 +93,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         params=optax.apply_updates(state.policy.params, step),
         statistics=collect.remember(state.policy.statistics, vector(flight.obs), config, state.step),
     )
-    metrics = collect.progress(flight) | {"gradient_norm": optax.global_norm(gradient)}
+    metrics = collect.progress(flight) | {"gradient_norm": optax.tree.norm(gradient)}
     return TrainState(state.step + 1, key, policy, optimiser, worlds), metrics
 
 

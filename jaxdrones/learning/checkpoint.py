@@ -28,7 +28,7 @@ FORMAT = 2
 ANOTHER = "take another checkpoint, or train anew"
 
 
-def save(path: str | os.PathLike, policy: Policy, **about) -> None:
+def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
     """Write `path`.msgpack and `path`.json, both or none.
 
     Args:
@@ -58,7 +58,9 @@ def load(path: str | os.PathLike) -> Policy:
         raise ValueError(f"{path} holds no policy; found {', '.join(kept)}")
     numbers = _restored(path, kept)
     try:
-        settings = {name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()}
+        settings: dict[str, Any] = {
+            name: tuple(x) if isinstance(x, list) else x for name, x in kept["policy"]["network"].items()
+        }
         network = VisionMLP(**settings) if "channels" in settings else MLP(**settings)
         statistics = Statistics(**{name: jnp.asarray(x) for name, x in numbers["statistics"].items()})
         params = jax.tree.map(jnp.asarray, numbers["params"])
@@ -70,7 +72,7 @@ def load(path: str | os.PathLike) -> Policy:
     return policy
 
 
-def save_tree(path: str | os.PathLike, tree: Any, **about) -> None:
+def save_tree(path: str | os.PathLike, tree: Any, **about: Any) -> None:
     """Write any pytree, such as a training state, with what it means; keys are kept too."""
     path = Path(path)
     tree = _without_keys(tree)
@@ -79,7 +81,7 @@ def save_tree(path: str | os.PathLike, tree: Any, **about) -> None:
     save_bytes(_numbers(path), content, **about, versions=versions, shapes=_shapes(tree))
 
 
-def save_bytes(file: Path, content: bytes, **about) -> None:
+def save_bytes(file: Path, content: bytes, **about: Any) -> None:
     """Write a file, and beside it, as .json, what it means; a crash leaves both, or both of before."""
     kept = {name: _plain(x) for name, x in about.items()} | {"format": FORMAT, "sha256": _digest(content)}
     kept = json.loads(json.dumps(kept, default=str))

@@ -69,8 +69,8 @@ class Flight(flax.struct.PyTreeNode):
 def idle(env: Env, worlds: int) -> Worlds:
     """Worlds in which nothing has begun yet."""
     obs, episodes = jax.eval_shape(jax.vmap(autoreset(env).reset), jax.random.split(jax.random.key(0), worlds))
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
-    return Worlds(*nothing, ended=jnp.ones(worlds, bool))
+    episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
+    return Worlds(episodes, obs, ended=jnp.ones(worlds, bool))
 
 
 def restart(key: jax.Array, env: Env, worlds: Worlds, share: float = 0.0) -> Worlds:
@@ -177,7 +177,7 @@ def progress(flight: Flight) -> dict[str, Array]:
     }
 
 
-def remember(statistics: Statistics, seen: Float[Array, "t w n d"], config, step: Array) -> Statistics:
+def remember(statistics: Statistics, seen: Float[Array, "t w n d"], config: Any, step: Array) -> Statistics:
     """The statistics of what was seen so far with those of a flight, until they are settled.
 
     Args:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from jaxdrones.envs import Env
 GRADIENTS = ("exact", "decay", "surrogate")
 
 
-def with_gradient(env: Env, config) -> Env:
+def with_gradient(env: Env, config: Any) -> Env:
     """The environment, differentiated as the settings say."""
     if config.gradient != "surrogate":
         return env
@@ -31,14 +32,14 @@ def with_gradient(env: Env, config) -> Env:
     return changed
 
 
-def linked(config) -> Callable:
+def linked(config: Any) -> Callable:
     """What happens to the gradient of worlds between two control steps."""
     if config.gradient == "decay":
         return lambda worlds: scale_gradient(worlds, config.decay)
     return lambda worlds: worlds
 
 
-def scale_gradient(tree, factor: float):
+def scale_gradient(tree: Any, factor: float) -> Any:
     """The same numbers, with a gradient multiplied by `factor`."""
 
     def scale(x):

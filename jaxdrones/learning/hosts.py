@@ -109,7 +109,7 @@ def _await_calls(address: tuple[str, int], hosts: int, deadline: float) -> None:
     """Host 0 listens until all others have called, then answers them."""
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(socket.create_server(address))
-        calls = {}
+        calls: dict[str, socket.socket] = {}
         while len(calls) < hosts - 1:
             server.settimeout(max(deadline - time.monotonic(), _PAUSE))
             call = stack.enter_context(server.accept()[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import flax.struct
@@ -160,9 +160,9 @@ def init_params(key: jax.Array, network: MLP | VisionMLP, example: Obs, roles: i
 def apply(network: MLP | VisionMLP, params: Any, x: Obs, per_role: bool) -> Array:
     """The network of every drone, or the one for all."""
     if not per_role:
-        return network.apply(params, x)
+        return cast(Array, network.apply(params, x))
     drones = vector(x).ndim - 2
-    return jax.vmap(network.apply, in_axes=(0, drones), out_axes=drones)(params, x)
+    return cast(Array, jax.vmap(network.apply, in_axes=(0, drones), out_axes=drones)(params, x))
 
 
 def central(obs: Float[Array, "*batch n d"], action: Float[Array, "*batch n a"]) -> Float[Array, "*batch n e"]:

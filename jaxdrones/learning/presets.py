@@ -61,7 +61,9 @@ def algorithm_for(task: str) -> str:
     return _ALGORITHM.get(task, "bptt")
 
 
-def preset(task: str, algorithm: str, realistic: bool = False, practice: bool = False, **options) -> tuple[Env, Any]:
+def preset(
+    task: str, algorithm: str, realistic: bool = False, practice: bool = False, **options: Any
+) -> tuple[Env, Any]:
     """An environment and the settings to learn it with.
 
     Args:

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from jaxdrones.envs import Env
 from jaxdrones.learning.networks import Policy
 
-COMPILER_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+COMPILER_OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 """For `jax.jit(train).lower(key).compile(...)`: a third less time to compile on a CPU, and the same speed after."""
 
 
@@ -28,7 +28,7 @@ class Result(flax.struct.PyTreeNode):
     """(updates,) of every metric of `update`."""
 
 
-def scan_updates(update: Callable, env: Env, config, state) -> Result:
+def scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result:
     """Make all updates of a learner, in one program."""
     state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=config.updates)
     return Result(state.policy, state, history)
@@ -57,7 +57,7 @@ def bounded(clip: float) -> optax.GradientTransformation:
     """Norm at most `clip`; a gradient that is not finite counts as zero, so that one wild flight ruins nothing."""
 
     def update(gradient, state, params=None):
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         finite = jnp.isfinite(norm)
         scale = jnp.where(finite, jnp.minimum(1, clip / jnp.where(norm > 0, norm, 1)), 0)
         return jax.tree.map(lambda g: jnp.where(finite, g, 0) * scale.astype(g.dtype), gradient), state

@@ -182,11 +182,11 @@ class Run(runs.Run):
 
     policy_suffix = "zip"
 
-    def recipe(self, name: str = "best") -> Recipe:
+    def recipe(self, name: str = "best") -> Any:
         """What was trained here."""
         return Recipe.from_dict(self.told(name, "recipe"))
 
-    def policy(self, name: str = "best", env: Env | None = None) -> Actor:
+    def policy(self, name: str = "best", env: Env | None = None) -> Any:
         """The policy `best` or `last`; raises as `load` does, and if it does not fit `env`."""
         actor = Actor.of(self.load(name))
         if env is not None:

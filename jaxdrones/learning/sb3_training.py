@@ -103,7 +103,7 @@ class _Course(BaseCallback):
         self.trainer, self.run, self.tell, self.progress, self.deadline = trainer, run, tell, progress, deadline
         self.about = {"recipe": trainer.recipe.as_dict(), "seed": trainer.seed, "episodes": trainer.episodes}
         self.choice, self.report = jax.random.split(jax.random.key(trainer.seed))
-        self.best = None  # score
+        self.best: float | None = None  # score
         self.update = 0
         self.due = 0.0  # share of the budget, of the next evaluation
         self.evaluating = 0.0  # s

@@ -42,7 +42,7 @@ def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS)
     pos = record.pos[_finite(record)]
     low, high = pos.min(axis=(0, 1)), pos.max(axis=(0, 1))
     middle = (low + high) / 2
-    eye = middle + _DIRECTION * _DISTANCE * max(_LEAST_EXTENT, np.linalg.norm(high - low))
+    eye = middle + _DIRECTION * _DISTANCE * max(_LEAST_EXTENT, float(np.linalg.norm(high - low)))
     with bullet.make_step(scene=scene) as step:
         params = _params(record)
         frames = (step.photo(params, state, eye, middle) for state in _states(record, fps))

@@ -131,20 +131,19 @@ def _touch_each_other(bodies: _Cylinder, margin: float) -> Array:
 
 def _touches_any(body: _Cylinder, obstacles: Sequence[Obstacle], margin: float) -> Array:
     dtype, touches = body.pos.dtype, jnp.zeros((), bool)
-    of_kind = {kind: [o for o in obstacles if isinstance(o, kind)] for kind in (Box, Sphere, Cylinder)}
 
     def column(values) -> Array:
         return jnp.asarray(np.array(values), dtype)
 
-    if boxes := of_kind[Box]:
-        rows = ((o.pos, _unit(o.quat), np.array(o.size) / 2) for o in boxes)
-        shapes = _Box(*(column(x) for x in zip(*rows, strict=True)))
-        touches |= jnp.any(jax.vmap(lambda box: _gap(body, box, []))(shapes) <= margin)
-    if cylinders := of_kind[Cylinder]:
-        rows = ((o.pos, _z_axis(o.quat), o.radius, o.height / 2) for o in cylinders)
-        shapes = _Cylinder(*(column(x) for x in zip(*rows, strict=True)))
-        touches |= jnp.any(jax.vmap(lambda c: _gap(body, c, [cross(body.axis, c.axis)]))(shapes) <= margin)
-    if spheres := of_kind[Sphere]:
+    if boxes := [o for o in obstacles if isinstance(o, Box)]:
+        sides = [(o.pos, _unit(o.quat), np.array(o.size) / 2) for o in boxes]
+        blocks = _Box(*(column(x) for x in zip(*sides, strict=True)))
+        touches |= jnp.any(jax.vmap(lambda box: _gap(body, box, []))(blocks) <= margin)
+    if cylinders := [o for o in obstacles if isinstance(o, Cylinder)]:
+        sizes = [(o.pos, _z_axis(o.quat), o.radius, o.height / 2) for o in cylinders]
+        pillars = _Cylinder(*(column(x) for x in zip(*sizes, strict=True)))
+        touches |= jnp.any(jax.vmap(lambda c: _gap(body, c, [cross(body.axis, c.axis)]))(pillars) <= margin)
+    if spheres := [o for o in obstacles if isinstance(o, Sphere)]:
         centers, radii = column([o.pos for o in spheres]), column([o.radius for o in spheres])
         apart = jax.vmap(lambda center: center - body.nearest(center))(centers)
         touches |= jnp.any(jax.vmap(dot)(apart, apart) <= (radii + margin) ** 2)

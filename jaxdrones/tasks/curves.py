@@ -21,12 +21,12 @@ class Curve(flax.struct.PyTreeNode):
     point: Point = flax.struct.field(pytree_node=False)
     """(drone, time in s) -> (3,) m, world."""
 
-    def positions(self, n: int, t: float = 0.0) -> Float[Array, "n 3"]:
+    def positions(self, n: int, t: float | Array = 0.0) -> Float[Array, "n 3"]:
         """Where the n drones of a team should be at time t (s)."""
         check_whole("number of drones", n)
         return jax.vmap(self.point, (0, None))(jnp.arange(n), jnp.asarray(t, float))
 
-    def setpoints(self, n: int, t: float = 0.0) -> Setpoint:
+    def setpoints(self, n: int, t: float | Array = 0.0) -> Setpoint:
         """Position, velocity and acceleration of the n drones at time t (s), by differentiating the curve."""
         check_whole("number of drones", n)
         t = jnp.asarray(t, float)

@@ -119,7 +119,9 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
     )
 
 
-def settled(metrics: Mapping[str, Array], dt: float, within: float = 0.05, speed: float = 0.1, last: float = 2.0):
+def settled(
+    metrics: Mapping[str, Array], dt: float, within: float = 0.05, speed: float = 0.1, last: float = 2.0
+) -> Array:
     """Within 5 cm of the target and slower than 0.1 m/s for the last two seconds."""
     steps = round(last / dt)
     return jnp.all((metrics["error"][-steps:] < within) & (metrics["speed"][-steps:] < speed), axis=0)

@@ -206,8 +206,8 @@ def _at_height(z: float) -> Target:
 
 def _everywhere(starts: Starts, pos: list[Array], vel: list[Array]) -> Setpoint:
     """The same target for every drone."""
-    pos, vel = (jnp.broadcast_to(jnp.stack(v).astype(starts.dtype), starts.shape) for v in (pos, vel))
-    return Setpoint.at(pos, vel=vel)
+    at, moving = (jnp.broadcast_to(jnp.stack(v).astype(starts.dtype), starts.shape) for v in (pos, vel))
+    return Setpoint.at(at, vel=moving)
 
 
 def _squared_distance(target: Float[Array, "n 3"], world: World) -> Float[Array, " n"]:

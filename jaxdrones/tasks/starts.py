@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
 from jaxdrones.params import Params
@@ -32,7 +33,14 @@ def standing_height(params: Params) -> Float[Array, " n"]:
 
 
 def thrown(
-    key: jax.Array, params: Params, pos: Float[Array, "n 3"], *, reach, speed: float, omega: float, tilt: float
+    key: jax.Array,
+    params: Params,
+    pos: Float[Array, "n 3"],
+    *,
+    reach: ArrayLike,
+    speed: float,
+    omega: float,
+    tilt: float | Array,
 ) -> State:
     """Anywhere near `pos`, in any motion, with the rotors at hover speed.
 

@@ -126,6 +126,7 @@ def test_no_landing_gains_energy_or_tunnels_and_every_one_comes_to_rest(vehicle,
     assert np.all(end.pos[:, 2] > low - 0.01)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("vehicle", VEHICLES)
 def test_a_landing_ends_as_high_as_in_bullet_and_does_not_bounce(vehicle):
     """Rest is 1.5 mm deep, Bullet's 0.01 mm. A rebound rises by 0.3 mm at 1 m/s, 3 mm at 5 m/s; Bullet's not."""
@@ -156,6 +157,7 @@ def test_a_drone_at_rest_stays_at_rest(vehicle):
     np.testing.assert_allclose(end.pos[:2], 0, atol=1e-9)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("vehicle", VEHICLES)
 def test_friction_slows_a_sliding_drone_by_mu_g_and_stops_it_where_bullet_does(vehicle):
     """From 2 m/s: v^2 / (2 mu g) = 0.408 m; Bullet's 0.404 m has a step less. Within 3 %.

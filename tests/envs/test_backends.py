@@ -13,12 +13,14 @@ from jaxdrones.envs import TASKS, check_env, make
 KEY = jax.random.key(3)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("task", mostly_slow(TASKS, ("hover", "gates", "swap-goals", "multi-hover")))
 def test_every_task_keeps_the_contract_on_bullet(task):
     with make(task, backend="bullet") as env:
         check_env(env, steps=2)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("task", ["hover", "tracking", "swap-goals", "hover-v2"])
 def test_in_free_flight_both_backends_see_and_reward_the_same(task):
     options = dict(effects=("drag",), pairs=("downwash",))
@@ -38,6 +40,7 @@ def fly(env):
     return seen
 
 
+@pytest.mark.needs("pybullet")
 def test_pictures_come_beside_the_state_at_their_own_rate():
     with make("hover", backend="bullet", vision=("rgb", "depth"), vision_hz=25) as env:
         obs, world = env.reset(KEY)
@@ -51,6 +54,7 @@ def test_pictures_come_beside_the_state_at_their_own_rate():
         assert changes == [False, False, True, False, False, False, True]
 
 
+@pytest.mark.needs("pybullet")
 def test_pictures_are_the_same_in_a_compiled_program():
     with make("hover", backend="bullet", vision=("segmentation",), vision_hz=50) as env:
         _, world = env.reset(KEY)
@@ -62,11 +66,13 @@ def test_pictures_are_the_same_in_a_compiled_program():
             world = plain[1]
 
 
+@pytest.mark.needs("pybullet")
 def test_a_rate_of_pictures_that_does_not_divide_the_control_rate_is_refused():
     with pytest.raises(ValueError, match="vision_hz is 30; give a divisor of the control rate, 100"):
         make("hover", backend="bullet", vision=("rgb",), vision_hz=30)
 
 
+@pytest.mark.needs("pybullet")
 def test_a_gradient_through_bullet_is_refused():
     with make("hover", backend="bullet") as env:
         _, world = env.reset(KEY)
@@ -79,6 +85,7 @@ def test_an_integrator_is_refused_on_bullet():
         make("hover", backend="bullet", integrator="rk4")
 
 
+@pytest.mark.needs("pybullet")
 def test_a_closed_environment_says_so():
     env = make("hover", backend="bullet")
     _, world = env.reset(KEY)

@@ -107,6 +107,7 @@ def seen(env, *batch: int):
     }
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("image", ["rgb", "depth"])
 def test_what_a_policy_does_depends_on_what_it_sees(team, image):
     policy, obs = Policy.init(KEY, team, (8,)), seen(team)
@@ -125,6 +126,7 @@ def test_what_is_nearer_is_brighter_from_0_far_away_to_1_at_the_eye():
     assert jnp.all(jnp.diff(nearness[:-1]) < 0)
 
 
+@pytest.mark.needs("pybullet")
 def test_normalising_leaves_pictures_as_they_are(team):
     obs = seen(team)
     twice = on_vector(lambda x: 2 * x, obs)
@@ -132,12 +134,14 @@ def test_normalising_leaves_pictures_as_they_are(team):
     assert twice["rgb"] is obs["rgb"] and twice["depth"] is obs["depth"]
 
 
+@pytest.mark.needs("pybullet")
 def test_images_without_a_scale_such_as_labels_are_refused():
     with jd.make("hover", backend="bullet", vision=("depth", "segmentation")) as env:
         with pytest.raises(ValueError, match=r"unknown image for a policy 'segmentation' \(known: depth, rgb\)"):
             Policy.init(KEY, env, (8,))
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("per_role", [False, True])
 def test_drones_that_see_the_same_do_the_same_unless_each_has_its_own_eyes(team, per_role):
     policy = Policy.init(KEY, team, (8,), per_role)
@@ -146,6 +150,7 @@ def test_drones_that_see_the_same_do_the_same_unless_each_has_its_own_eyes(team,
     assert jnp.all(action[0] == action[1]) == (not per_role)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("per_role", [False, True])
 def test_a_policy_of_many_worlds_is_that_of_each(team, per_role):
     policy, obs = Policy.init(KEY, team, (8,), per_role), seen(team, 3, 2)
@@ -155,6 +160,7 @@ def test_a_policy_of_many_worlds_is_that_of_each(team, per_role):
     np.testing.assert_allclose(action[1, 1], alone, rtol=1e-5, atol=1e-9)  # pictures are in single precision
 
 
+@pytest.mark.needs("pybullet")
 def test_a_policy_that_sees_flies_on_as_it_was_saved(team, tmp_path):
     policy, obs = Policy.init(KEY, team, (8,), per_role=True), seen(team)
     checkpoint.save(tmp_path / "policy", policy)
@@ -163,6 +169,7 @@ def test_a_policy_that_sees_flies_on_as_it_was_saved(team, tmp_path):
     assert jax.tree.structure(loaded) == jax.tree.structure(policy)
 
 
+@pytest.mark.needs("pybullet")
 def test_a_central_critic_sees_every_vector_and_its_own_pictures(team):
     config = ppo.Config(updates=1, worlds=8, horizon=2, per_role=True, central_critic=True, critic_sizes=(8,))
     state = jax.eval_shape(lambda key: ppo.init(key, team, config), KEY)
@@ -172,6 +179,7 @@ def test_a_central_critic_sees_every_vector_and_its_own_pictures(team):
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
 
 
+@pytest.mark.needs("pybullet")
 def test_a_compiled_program_sees_what_is_seen_without_one(team):
     drones = jax.vmap(team.reset)(jax.random.split(KEY, 3))[1].drones
     together = jax.jit(jax.vmap(lambda drones: team.physics.camera(team.params, drones)))(drones)
@@ -181,6 +189,7 @@ def test_a_compiled_program_sees_what_is_seen_without_one(team):
             np.testing.assert_array_equal(a[i], b)
 
 
+@pytest.mark.needs("pybullet")
 def test_worlds_of_different_ages_take_pictures_only_when_due(monkeypatch):
     with jd.make("hover", tilt=0.0, omega=0.0, backend="bullet", vision=("depth",), vision_hz=25) as env:
         _, worlds = jax.vmap(env.reset)(jax.random.split(KEY, 4))
@@ -196,6 +205,7 @@ def test_worlds_of_different_ages_take_pictures_only_when_due(monkeypatch):
         assert len(taken) == 4
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.slow
 @pytest.mark.float32
 def test_ppo_learns_where_to_look_and_that_is_due_to_the_picture():

@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -12,6 +11,7 @@ from PIL import Image
 from jaxdrones import flights
 from jaxdrones.render import replay, video
 
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 pytestmark = [  # imageio-ffmpeg leaves its pipes to the garbage collector
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
@@ -30,6 +30,7 @@ def read(path) -> tuple[dict, list[np.ndarray]]:
     return about, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames]
 
 
+@pytest.mark.needs("pybullet")
 def test_a_film_has_a_frame_for_every_24th_of_a_simulated_second_and_moves(record, tmp_path):
     assert replay.film(record, tmp_path / "flight.mp4") == 36
     about, frames = read(tmp_path / "flight.mp4")
@@ -39,6 +40,7 @@ def test_a_film_has_a_frame_for_every_24th_of_a_simulated_second_and_moves(recor
     assert 20 < moved.sum() < 0.05 * moved.size  # the drones, not the camera
 
 
+@pytest.mark.needs("pybullet")
 def test_a_film_may_be_a_gif(record, tmp_path):
     replay.film(record, tmp_path / "flight.gif", fps=8)
     with Image.open(tmp_path / "flight.gif") as picture:
@@ -96,6 +98,7 @@ def test_frames_are_in_step_with_simulated_time(record):
         np.testing.assert_array_equal(state.pos, record.pos[k])
 
 
+@pytest.mark.needs("pybullet")
 def test_every_drone_leaves_its_pictures(record, tmp_path):
     assert replay.save_cameras(record, tmp_path, fps=4) == 12
     pictures = sorted((tmp_path / "drone 1").glob("*.png"))

@@ -137,6 +137,7 @@ def bullets_distances(client) -> dict[str, list[float]]:
     )
 
 
+@pytest.mark.needs("pybullet")
 def test_flags_agree_with_bullets_distances_whatever_the_margin():
     """To 1 mm, Bullet's own margin; projections that have not converged make it 6 mm for 1 in 200."""
     params = jaxdrones.repeat(CRAZYFLIE, 2)
@@ -157,6 +158,7 @@ def test_flags_agree_with_bullets_distances_whatever_the_margin():
     assert max(wrong) < 6e-3 and np.sum(np.array(wrong) > 1e-3) < compared / 200
 
 
+@pytest.mark.needs("pybullet")
 def test_what_bullet_lets_touch_is_flagged():
     """Its balls lie inside the cylinder."""
     params = jaxdrones.repeat(CRAZYFLIE, 2)
@@ -173,6 +175,7 @@ def test_what_bullet_lets_touch_is_flagged():
     assert min(found.values()) > 20
 
 
+@pytest.mark.needs("pybullet")
 def test_a_drone_at_rest_on_either_ground_touches_it():
     params, state = team((0, 0, 0.03))
     explicit = jaxdrones.make_step(effects=(jaxdrones.ground_contact,))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxdrones.backends.bullet.client import Client
 from jaxdrones.checks import check_positive, check_whole
@@ -67,11 +68,11 @@ def of_drones(
 
 
 def look(
-    client: Client, eye, target, camera: Camera, near: float, raw_depth: bool = False
+    client: Client, eye: ArrayLike, target: ArrayLike, camera: Camera, near: float, raw_depth: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One picture from `eye` towards `target` (m, world): RGBA uint8, depth float32 (m or raw), segmentation int32."""
     p = client.p
-    view = p.computeViewMatrix(list(eye), list(target), [0, 0, 1])
+    view = p.computeViewMatrix(np.asarray(eye).tolist(), np.asarray(target).tolist(), [0, 0, 1])
     aspect = camera.width / camera.height if camera.aspect is None else camera.aspect
     projection = p.computeProjectionMatrixFOV(camera.fov, aspect, near, camera.far)
     _, _, rgb, depth, bodies = p.getCameraImage(

@@ -49,7 +49,8 @@ class Client:
         check_choice("collision shape", collision, (BALLS, CYLINDER))
         check_choice("renderer", renderer, (TINY, EGL))
         self.p = import_pybullet()
-        self.scene, self.drones = scene, []
+        self.scene = scene
+        self.drones: list[int] = []
         self._damping = float(np.float32(damping))  # the reference's, Bullet's default, is in single precision
         self._collision = collision
         self._team = np.empty((0, 20))

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
+from jax.typing import ArrayLike
 
 from jaxdrones import rotation
 from jaxdrones.backends.bullet.camera import Camera, look, of_drones
@@ -91,13 +94,13 @@ def make_step(
 class BulletStep(HostStep):
     """`step(params, state, rpm) -> state`. The same input gives the same output whatever was called between."""
 
-    def __init__(self, client: Client, loads: Callable[[jax.Array, jax.Array], jax.Array], substeps: int, dt: float):
+    def __init__(self, client: Client, loads: Callable[[jax.Array, ArrayLike], jax.Array], substeps: int, dt: float):
         self.client, self._loads, self._substeps, self._dt = client, loads, substeps, dt
         # What the last call with values was checked for and what was made of it, kept as long as it stays the same:
         self._params: Params | None = None
         self._shapes: list[tuple[int, ...]] = []
-        self._flat_params: jax.Array | None = None  # one array is handed over faster than twenty
-        self._arms: np.ndarray | None = None
+        self._flat_params: jax.Array  # one array is handed over faster than twenty
+        self._arms: np.ndarray
 
     def __enter__(self) -> BulletStep:
         return self
@@ -109,7 +112,7 @@ class BulletStep(HostStep):
         """End the connection to Bullet."""
         self.client.close()
 
-    def __call__(self, params: Params, state: State, rpm: jax.Array) -> State:
+    def __call__(self, params: Params, state: State, rpm: ArrayLike) -> State:
         """Advance a team by one control step; arrays as for the explicit backend.
 
         Given values it returns NumPy arrays; under `jit` and `vmap` it goes through a callback.
@@ -159,7 +162,9 @@ class BulletStep(HostStep):
         team = self._place(params, state)
         return of_drones(self.client, team, self._arms, camera, raw_depth)
 
-    def photo(self, params: Params, state: State, eye, target, camera: Camera = _FILM_CAMERA) -> np.ndarray:
+    def photo(
+        self, params: Params, state: State, eye: npt.ArrayLike, target: npt.ArrayLike, camera: Camera = _FILM_CAMERA
+    ) -> np.ndarray:
         """A picture of the team from `eye` towards `target` (3,) (m, world): RGB (height, width, 3) uint8."""
         self._place(params, state)
         return look(self.client, eye, target, camera, _FILM_NEAR)[0][..., :3]
@@ -172,7 +177,7 @@ class BulletStep(HostStep):
     def _loads_on(self, team: np.ndarray) -> np.ndarray:
         return np.asarray(self._loads(self._flat_params, team.astype(self._flat_params.dtype)))
 
-    def _pack(self, params: Params, state: State, rpm: jax.Array) -> np.ndarray:
+    def _pack(self, params: Params, state: State, rpm: ArrayLike) -> np.ndarray:
         """Check a call with values and make one array of it; the bodies are those of the team from here on."""
         self.client.check_open()
         shapes = [np.shape(x) for x in (state.pos, state.quat, state.vel, state.omega, state.rpm, rpm)]
@@ -195,7 +200,8 @@ class BulletStep(HostStep):
     def _unpack(self, team: np.ndarray) -> State:
         team[:, _OMEGA] = (team[:, None, _OMEGA] @ self.client.matrices(team[:, _QUAT]))[:, 0]
         team = team.astype(self._flat_params.dtype)
-        return State(**{name: team[:, columns] for name, columns in _COLUMNS.items()})
+        arrays: dict[str, Any] = {name: team[:, columns] for name, columns in _COLUMNS.items()}  # of NumPy
+        return State(**arrays)
 
     def _traced(self, params: Params, state: State, rpm: jax.Array) -> State:
         """The same in a compiled program, which computes the wrenches itself and calls back for every physics step."""
@@ -216,7 +222,7 @@ class BulletStep(HostStep):
         state = State(**{name: team[:, columns] for name, columns in _COLUMNS.items()})
         return state.replace(omega=jax.vmap(rotation.rotate_inverse)(state.quat, state.omega))
 
-    def _traced_camera(self, params: Params, state: State, camera: Camera, raw_depth: bool) -> tuple[jax.Array, ...]:
+    def _traced_camera(self, params: Params, state: State, camera: Camera, raw_depth: bool) -> Any:
         """The same in a compiled program; the callback itself computes nothing with JAX, which would be slow."""
         n, size = len(state.pos), (camera.height, camera.width)
         kinds = (((*size, 4), np.uint8), (size, np.float32), (size, np.int32))

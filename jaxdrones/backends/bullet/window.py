@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
-import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxdrones.backends.bullet.step import BulletStep
 from jaxdrones.backends.host import HostStep
@@ -31,7 +31,7 @@ class Window(HostStep):
         p.resetDebugVisualizerCamera(1.5, -30, -30, [0, 0, 0.3], physicsClientId=client)
         self._start = time.monotonic()
 
-    def __call__(self, params: Params, state: State, rpm: jax.Array) -> State:
+    def __call__(self, params: Params, state: State, rpm: ArrayLike) -> State:
         """Advance a team, then wait until as much real time has passed as simulated time."""
         p, client = self._step.client.p, self._step.client.id
         if p.readUserDebugParameter(self._button, physicsClientId=client) % 2:

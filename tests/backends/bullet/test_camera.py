@@ -3,7 +3,6 @@
 import golden_data
 import jax.numpy as jnp
 import numpy as np
-import pybullet_data
 import pytest
 
 import jaxdrones
@@ -11,8 +10,10 @@ from jaxdrones import State, rotation
 from jaxdrones.backends import bullet
 from jaxdrones.sensing.scene import Box, Scene, Sphere, Urdf
 
+pytestmark = pytest.mark.needs("pybullet")
+
 CRAZYFLIE = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1)
-STOCK = pybullet_data.getDataPath() + "/"
+STOCK = pytest.importorskip("pybullet_data").getDataPath() + "/"
 
 
 def at(pos, quat=(0.0, 0.0, 0.0, 1.0)) -> State:

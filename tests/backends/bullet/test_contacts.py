@@ -9,6 +9,8 @@ from jaxdrones import State
 from jaxdrones.backends import bullet
 from jaxdrones.sensing.scene import Box, Cylinder, Scene, gate
 
+pytestmark = pytest.mark.needs("pybullet")
+
 CRAZYFLIE = jaxdrones.load_params("cf2x")
 WEIGHT = float(CRAZYFLIE.weight)
 

@@ -12,6 +12,8 @@ import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.backends import bullet
 
+pytestmark = pytest.mark.needs("pybullet")
+
 DAMPING = 0.04  # the reference leaves Bullet's own on
 PYB_EFFECTS = {
     "gnd": jaxdrones.ground_effect_paper,

@@ -13,6 +13,8 @@ from jaxdrones import State
 from jaxdrones.backends import bullet
 from jaxdrones.sensing.scene import Box, Scene
 
+pytestmark = pytest.mark.needs("pybullet")
+
 EVERYTHING = dict(effects=(jaxdrones.drag, jaxdrones.ground_effect), pairs=(jaxdrones.downwash,))
 LEVEL = [0.0, 0.0, 0.0, 1.0]
 

@@ -9,6 +9,8 @@ import pytest
 
 from jaxdrones.backends import bullet
 
+pytestmark = pytest.mark.needs("pybullet")
+
 SCRIPT = """
 import time, numpy as np, jaxdrones
 from jaxdrones.backends import bullet

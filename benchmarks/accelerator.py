@@ -1,0 +1,241 @@
+"""What is right and what is fast on an accelerator, in one command of at most ten minutes?
+
+Some tests, the plant, environments, teams of eight drones and learners, each in a process of its own that has a share
+of the time; what it measured until then counts. The ratios are to figures that others publish (published.py), on the
+hardware that they name: they say how far apart the figures are, not how much of it is due to the code.
+"""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ElementTree
+from argparse import Namespace
+from collections.abc import Iterator
+from pathlib import Path
+
+import published
+from common import about
+
+HERE = Path(__file__).parent
+SHARES = {"tests": 0.25, "plant": 0.3, "envs": 0.1, "swarm": 0.15, "learning": 0.2}
+"""Of the time; what a section leaves, the next ones have."""
+
+TESTS = (
+    "tests/backends/test_devices.py",
+    "tests/backends/test_golden.py",
+    "tests/backends/test_explicit.py",
+    "tests/backends/test_gradients.py",
+    "tests/dynamics/test_integrators.py",
+    "tests/dynamics/test_aero.py",
+)
+FEW_TESTS = ("tests/test_wrench.py",)
+WORLDS = (262_144, 16_384, 65_536, 1_024, 1_048_576)  # the first ones are what the figures of others are for
+MOST_WITH_GRADIENT = 262_144  # a few GiB
+PLANTS = {
+    "semi-implicit Euler": dict(integrator="semi_implicit_euler"),
+    "rk4": dict(integrator="rk4"),
+    "rk4, 10 substeps a call": dict(integrator="rk4", substeps=10),
+}
+HOVERS = 0.99  # success from which a training counts as one
+Row = dict[str, object]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sections", nargs="+", default=list(SHARES), choices=list(SHARES))
+    parser.add_argument("--budget", type=float, default=570.0, metavar="S", help="seconds for all (570)")
+    parser.add_argument("--output", type=Path, default=Path("runs/accelerator.json"), help="JSON to write")
+    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    parser.add_argument("--rows", type=Path, help=argparse.SUPPRESS)  # of a section's own process: where rows go
+    options = parser.parse_args()
+    if options.rows:
+        measure(options)
+        return
+    result = measured(options)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(json.dumps(result, indent=2))
+    print(json.dumps(result) if options.json else "\n".join([*table(result), f"written: {options.output}"]))
+
+
+def measured(options: Namespace) -> dict[str, object]:
+    """What all sections found, each in the time that it has."""
+    end = time.monotonic() + options.budget
+    result: dict[str, object] = {"about": {}, "rows": [], "stopped": {}}
+    groups = [options.sections] if options.quick else [[section] for section in options.sections]
+    for i, group in enumerate(groups):
+        left = [section for sections in groups[i:] for section in sections]
+        share = sum(SHARES[section] for section in group) / sum(SHARES[section] for section in left)
+        part = run(group, share * (end - time.monotonic()), options.quick)
+        for name, found in part.items():
+            result[name] = result[name] + found if name == "rows" else result[name] | found
+    return result
+
+
+def run(sections: list[str], seconds: float, quick: bool) -> dict[str, object]:
+    """The rows of some sections, by a process that is ended when its time is up."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rows"
+        file.touch()
+        command = [sys.executable, __file__, "--sections", *sections, "--rows", str(file), *["--quick"] * quick]
+        stopped = ended(command, seconds)
+        rows = [json.loads(line) for line in file.read_text().splitlines()]
+    about = [row.pop("about") for row in rows if "about" in row]
+    return {
+        "about": about[0] if about else {},
+        "rows": [row for row in rows if row],
+        "stopped": {", ".join(sections): stopped} if stopped else {},
+    }
+
+
+def ended(command: list[str], seconds: float) -> str | None:
+    """Run a command, and end it with all that it started when the time is up; why it did not come to its end."""
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        _, said = process.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        return f"the time was up after {seconds:.0f} s"
+    return said.strip().splitlines()[-1] if process.returncode else None
+
+
+def measure(options: Namespace) -> None:
+    """Write a line for each measurement as soon as it is made."""
+    for section in options.sections:
+        if section != "tests":  # they need the accelerator for themselves
+            write(options.rows, {"about": about()})
+        for found in MEASURES[section](options.quick):
+            write(options.rows, {"section": section} | found)
+
+
+def write(file: Path, found: Row) -> None:
+    with file.open("a") as rows:
+        rows.write(json.dumps(found) + "\n")
+
+
+def tests(quick: bool) -> Iterator[Row]:
+    """How many of some tests pass, and which fail."""
+    for path in FEW_TESTS if quick else TESTS:
+        start = time.monotonic()
+        with tempfile.TemporaryDirectory() as folder:
+            report = Path(folder) / "report.xml"
+            command = [sys.executable, "-m", "pytest", "-q", path, "-m", "not slow", f"--junitxml={report}"]
+            subprocess.run(command, cwd=HERE.parent, capture_output=True, check=False)
+            cases = list(ElementTree.parse(report).iter("testcase"))
+        failed = [x.get("name") for x in cases if x.find("failure") is not None or x.find("error") is not None]
+        tried = len(cases) - sum(x.find("skipped") is not None for x in cases)
+        note = f"of {tried}, in {time.monotonic() - start:.0f} s{'; failed: ' * bool(failed)}{', '.join(failed)}"
+        yield {"what": path, "value": tried - len(failed), "unit": "passed", "note": note, "failed": failed}
+
+
+def plant(quick: bool) -> Iterator[Row]:
+    """Steps per second of one drone a world with drag and lagging rotors, and with the gradient."""
+    for worlds in (64,) if quick else WORLDS:
+        for name, changes in list(PLANTS.items())[:1] if quick else PLANTS.items():
+            yield from flown(name, worlds, 1, published.CRAZYFLOW.get(worlds), quick, **changes)
+
+
+def swarm(quick: bool) -> Iterator[Row]:
+    """Drone-steps per second of eight drones in each other's jets: the plant, and an environment of it."""
+    for worlds in () if quick else (16_384, 1_024):
+        yield from flown("eight drones, downwash", worlds, 8, None, quick, effects="drag,downwash")
+    yield from stepped("swap-goals, eight drones, downwash", "swap-goals", quick, drones=8, pairs=("downwash",))
+
+
+def envs(quick: bool) -> Iterator[Row]:
+    """Environment steps per second, with observation, reward and fresh episodes, ten substeps of rk4 in each."""
+    options = dict(rotors="lagging", integrator="rk4", substeps=10)
+    yield from stepped("hover, rk4 with lag, 10 substeps", "hover", quick, **options)
+
+
+def flown(
+    what: str, worlds: int, drones: int, figure: published.Figure | None, quick: bool, **changes
+) -> Iterator[Row]:
+    import throughput
+
+    options = dict(effects="drag", rotors="lagging", integrator="semi_implicit_euler", substeps=1)
+    options |= dict(
+        drones=drones,
+        chunk=None,
+        many_kernels=False,
+        float64=False,
+        gradient_worlds=MOST_WITH_GRADIENT,
+        quick=quick,
+        repeats=1 if quick else 3,
+    )
+    options = Namespace(**options | changes)
+    found = throughput.measure(throughput.make_step(options), worlds, options)
+    of = {"worlds": worlds, "unit": "drone-steps/s"}
+    compiling = f"compiled in {found['forward compile']:.1f} s"
+    yield row(what, 1e6 * found["forward"], figure, note=compiling, **of)
+    compiling = f"compiled in {found['backward compile']:.1f} s"
+    of["worlds"] = min(worlds, MOST_WITH_GRADIENT)
+    yield row(f"{what}, with gradient", 1e6 * found["with backward"], None, note=compiling, **of)
+
+
+def stepped(what: str, task: str, quick: bool, **options) -> Iterator[Row]:
+    import envs as benchmark
+
+    from jaxdrones.envs import make
+
+    env = make(task, **options)
+    for worlds in (4,) if quick else (65_536, 4_096):
+        rate = env.drones * benchmark.in_jit(env, Namespace(worlds=worlds, repeats=1 if quick else 3))
+        yield row(what, rate, published.QUADSWARM[env.drones], worlds=worlds, unit="drone-steps/s", note="environment")
+
+
+def learning(quick: bool) -> Iterator[Row]:
+    """Seconds of training to hover, full four motors from any motion, and what success that has."""
+    import learning as benchmark
+
+    from jaxdrones.learning.runs import Recipe
+
+    small = dict(updates=2, worlds=8, horizon=4) if quick else {}
+    for algorithm in ("bptt",) if quick else ("bptt", "ppo"):
+        options = Namespace(cache=None, first_seed=0, seeds=1, episodes=10 if quick else 10_000)
+        (found,), spent = benchmark.measure(Recipe.of("hover", algorithm, **small), options)
+        hovers = found["success"] >= HOVERS
+        figure = published.LEARNING_TO_FLY_IN_SECONDS if hovers else None
+        note = f"success {found['success']:.4f}, compiled in {spent['compile s']:.1f} s"
+        yield row(f"hover by {algorithm}", found["run"], figure, unit="s", note=note, success=found["success"])
+
+
+def row(what: str, value: float, figure: published.Figure | None, **more) -> Row:
+    """A measurement beside a published figure; the ratio is above one where ours is the better one."""
+    if figure is None:
+        return {"what": what, "value": value} | more
+    ratio = figure.value / value if figure.unit == "s" else value / figure.value
+    theirs = {"value": figure.value, "unit": figure.unit, "what": figure.what, "hardware": figure.hardware}
+    return {"what": what, "value": value, "ratio": ratio, "published": theirs | {"source": figure.source}} | more
+
+
+MEASURES = {"tests": tests, "plant": plant, "envs": envs, "swarm": swarm, "learning": learning}
+
+
+def table(result: dict) -> list[str]:
+    """Lines for people."""
+    lines = [f"{name}: {value}" for name, value in result["about"].items()]
+    sources: dict[str, int] = {}
+    for found in result["rows"]:
+        theirs = found.get("published")
+        worlds = f"{found['worlds']:>9,} worlds" if "worlds" in found else " " * 16
+        value = "-" if found["value"] is None else f"{found['value']:,.4g}"
+        line = f"{found['section']:8} | {found['what']:42} | {worlds} | {value:>10} {found['unit']:13}"
+        if theirs:
+            number = sources.setdefault(f"{theirs['what']}, {theirs['hardware']}: {theirs['source']}", len(sources) + 1)
+            line += f" | {found['ratio']:8.3g} times {theirs['value']:,.4g} {theirs['unit']} [{number}]"
+        lines.append(f"{line} | {found['note']}")
+    lines += [f"[{number}] {source}" for source, number in sources.items()]
+    return lines + [f"stopped: {section}: {why}" for section, why in result["stopped"].items()]
+
+
+if __name__ == "__main__":
+    main()

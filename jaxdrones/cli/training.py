@@ -37,7 +37,7 @@ def budget(text: str | None, unit: str, example: int) -> tuple[int | None, float
 
 def settings(texts: list[str]) -> dict[str, Any]:
     """Name -> value of every --set."""
-    changes = {}
+    changes: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,8 @@ def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
     import imageio_ffmpeg
 
     new = path.absolute().with_name(f".{path.stem.replace('%', '')}.new.mp4")  # absolute: not an option, no protocol
-    writer, count = None, 0
+    writer: Any = None
+    count = 0
     try:
         for frame in frames:
             if writer is None:

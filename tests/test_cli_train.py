@@ -268,7 +268,6 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
         (["train", "hover", "--set", "updates=3000000000"], "updates is 3000000000; give at most"),
         (["train", "hover", "--set", "surrogate=3"], "unknown setting 'surrogate'"),
         (["train", "hover", "--set", "task=x"], "--set task is no setting"),
-        (["train", "hover", "--set", "worlds=3", "--set", "worlds=4"], "--set worlds is given twice: 3 and 4"),
         (["train", "hover", "--set", "updates=3", "--budget", "4"], "--set updates=3 is given beside --budget"),
         (["train", "hover", "--set", "disturb=3"], "disturb"),
         (["train", "hover", "--set", "worlds=" + "9" * 5000], "worlds is"),

@@ -36,14 +36,12 @@ def budget(text: str | None, unit: str, example: int) -> tuple[int | None, float
 
 
 def settings(texts: list[str]) -> dict[str, Any]:
-    """Name -> value of every --set."""
+    """Name -> value of every --set; of a name that is given twice, the last."""
     changes: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
-        if name in changes:
-            raise ValueError(f"--set {name} is given twice: {changes[name]} and {value}; give it once")
         if name in _ARGUMENTS:
             raise ValueError(
                 f"--set {name} is no setting of a learner or of an environment; see jaxdrones train --help"

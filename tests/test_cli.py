@@ -12,6 +12,7 @@ from jaxdrones.cli import main
 from jaxdrones.conditions import Conditions
 from jaxdrones.learning import presets
 
+FILMS = pytest.mark.needs("pybullet", "imageio_ffmpeg")
 SHORT = ["--duration", "0.25", "--drones", "2"]
 
 
@@ -99,9 +100,17 @@ def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
         (["fly", "circle", "--effects", "downwash_paper,downwash"], "'downwash' is given beside 'downwash_paper'"),
         (["fly", "circle", "--effects", "drag,"], "unknown effect ''"),
         (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for of 'racer'"),
-        (["fly", "circle", "--video", "folder.mp4"], "--video folder.mp4 cannot be written: Is a directory"),
-        (["fly", "circle", "--video", "file/film.mp4"], "--video file/film.mp4 cannot be written"),
-        (["fly", "circle", "--video", "/proc/film.mp4"], "--video /proc/film.mp4 cannot be written"),
+        pytest.param(
+            ["fly", "circle", "--video", "folder.mp4"],
+            "--video folder.mp4 cannot be written: Is a directory",
+            marks=FILMS,
+        ),
+        pytest.param(
+            ["fly", "circle", "--video", "file/film.mp4"], "--video file/film.mp4 cannot be written", marks=FILMS
+        ),
+        pytest.param(
+            ["fly", "circle", "--video", "/proc/film.mp4"], "--video /proc/film.mp4 cannot be written", marks=FILMS
+        ),
         (["fly", "circle", "--video", ""], "the path is empty"),
         (["fly", "circle", "--output", ""], "the path is empty"),
         (["fly", "--policy", ""], "the path is empty"),
@@ -149,6 +158,7 @@ def flies_only_to_complain(flight, gui=False, progress=None, **options):
     return flights.fly(flight, gui, progress, **options)
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("name", ["", "log.npz", "log.csv", "flight.png", "cameras"])
 def test_an_output_that_cannot_be_written_is_refused_before_the_flight(name, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("jaxdrones.cli.conditions.fly", flies_only_to_complain)

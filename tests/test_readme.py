@@ -66,6 +66,8 @@ TRAININGS = {
     "train gates --set level=2": Short(f"gates by ppo, level 2: ... {TRAINED}", TRAINING),
     "train tracking --realistic --set period=5 --set worlds=512": Short(TRAINED, TRAINING),
     "train hover --resume": Short(TRAINED),
+    "train hover --resume --budget 100": Short("updates: 102, 2 of them made ... " + TRAINED.split(" ... ", 1)[1]),
+    "train hover --overwrite": Short(TRAINED, TRAINING),
     "eval runs/hover --episodes 10000 --json": Short('"run": "runs/hover" ... "episodes": 8', "--episodes 8"),
     "fly --policy runs/hover": Short(f"hover by bptt, policy of runs/hover ... {LOGGED}"),
     "fly --policy runs/hover --backend bullet --video hover.mp4": Short(

@@ -49,6 +49,7 @@ def test_a_film_may_be_a_gif(record, tmp_path):
     assert sum(durations) == 1500  # ms, in whole hundredths of a second
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("name", ["short.mp4", "short.gif", "-x:y %d.mp4"])
 def test_the_shortest_flight_is_one_frame_whatever_its_file_is_called(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -67,6 +68,7 @@ def test_a_flight_that_breaks_is_filmed_until_then(wrong, record):
         replay.film(dataclasses.replace(record, pos=np.full_like(pos, wrong)), Path("film.gif"))
 
 
+@pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("fault", ["no file", "no film", "a folder"])
 def test_a_film_that_ffmpeg_cannot_write_is_one_line_and_leaves_the_old_one(
     fault, record, tmp_path, monkeypatch, capfd

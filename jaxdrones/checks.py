@@ -28,12 +28,12 @@ _UNKNOWN = (jax.core.Tracer, jax.ShapeDtypeStruct)
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def is_known(value) -> bool:
+def is_known(value: Any) -> bool:
     """Whether something has a value that can be looked at."""
     return not isinstance(value, _UNKNOWN) and type(value) is not object
 
 
-def shown(value) -> str:
+def shown(value: Any) -> str:
     """A value in one short line: of an array its numbers, not its address or type."""
     text = repr(np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic | jax.Array) else value)
     text = " ".join(text.split())
@@ -61,7 +61,7 @@ def check_finite(name: str, tree: Any) -> None:
 
 def check_number(
     name: str,
-    value,
+    value: Any,
     unit: str = "",
     *,
     at_least: float | None = None,
@@ -93,7 +93,7 @@ def check_number(
         raise ValueError(f"{name} is {shown(value)}; give {wanted}" + (f" ({unit})" if unit else ""))
 
 
-def _is_number(value) -> bool:
+def _is_number(value: Any) -> bool:
     if isinstance(value, bool | str | bytes) or np.shape(value) != ():
         return False
     return np.asarray(value).dtype.kind in _NUMBERS
@@ -144,14 +144,14 @@ def hint(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def check_sequence(name: str, value, example: str) -> tuple:
+def check_sequence(name: str, value: Any, example: str) -> tuple:
     """The entries of a sequence, or an error if something single stands in its place."""
     if isinstance(value, str) or callable(value) or not isinstance(value, Iterable):
         raise ValueError(f"{name} is {shown(value)}; give a sequence, for example ({example},)")
     return tuple(value)
 
 
-def check_callable(name: str, value, example: str) -> None:
+def check_callable(name: str, value: Any, example: str) -> None:
     """Raise unless `value` is a function."""
     if not callable(value):
         raise ValueError(f"{name}: {shown(value)} is not a function; give for example {example}")
@@ -196,7 +196,7 @@ def check_arrays(name: str, tree: dict[str, Any]) -> None:
             raise ValueError(f"{name}.{field} is {shown(leaf)}; give an array, for example with jax.numpy.array(...)")
 
 
-def check_params(params, finite: bool = True) -> None:
+def check_params(params: Any, finite: bool = True) -> None:
     """Raise if constants of a drone or a team are not those of something that flies, where they can be looked at.
 
     Args:
@@ -216,11 +216,11 @@ def check_params(params, finite: bool = True) -> None:
                 raise ValueError(f"params.{name} is {shown(leaf)}; give {words}")
 
 
-def _without_infinity(leaf):
+def _without_infinity(leaf: Any) -> Any:
     return np.where(np.isposinf(leaf), 0, leaf) if is_known(leaf) else leaf
 
 
-def check_quaternion(name: str, quat) -> None:
+def check_quaternion(name: str, quat: Any) -> None:
     """Raise unless quaternions (..., 4) have unit length, where they can be looked at."""
     if not is_known(quat) or np.shape(quat)[-1:] != (4,):  # what else it is, is said where shapes are checked
         return
@@ -232,7 +232,7 @@ def check_quaternion(name: str, quat) -> None:
         raise ValueError(f"{name} has length {length:g}: {given}; give a unit quaternion (x, y, z, w)")
 
 
-def check_key(name: str, key) -> None:
+def check_key(name: str, key: Any) -> None:
     """Raise unless `key` is one random key, typed or raw; what is traced has a shape, too."""
     example = "give a random key, for example jax.random.key(0)"
     if not isinstance(key, jax.Array | np.ndarray):

@@ -134,6 +134,7 @@ def test_whatever_is_left_of_a_run_is_not_replaced_unasked(name, nothing_compile
     assert contents(tmp_path) == {name: b"mine"}
 
 
+@pytest.mark.slow
 def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, tmp_path, monkeypatch, capsys):
     folder = shutil.copytree(trained[0], tmp_path / "hover")
     (folder / "notes.txt").write_text("of other people")

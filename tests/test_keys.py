@@ -174,7 +174,7 @@ class TossWorld(flax.struct.PyTreeNode):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize("name", mostly_slow(LEARNERS, ["bptt"]))
 def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(keys, name, monkeypatch):
     learner, config = LEARNERS[name]
     env = Toss()

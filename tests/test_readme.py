@@ -58,6 +58,7 @@ FLIGHTS = {
     "compare circle": Short(r"circle: explicit against bullet ... t \(s\)  position ... 0\.20 ", FLIGHT, BULLET),
     "list": Short("flights +circle, velocity ... vehicles +cf2p, cf2x, hb, racer"),
 }
+QUICK = ("fly circle", "compare circle", "list")
 TRAININGS = {
     "train hover": Short(TRAINED, TRAINING),
     "train leader-follower --algo ppo --seeds 3 --budget 60s": Short(
@@ -123,7 +124,11 @@ def test_what_sets_the_project_up_is_there():
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
-    "command", [pytest.param(c, marks=pytest.mark.needs(*short.needs)) for c, short in FLIGHTS.items()]
+    "command",
+    [
+        pytest.param(c, marks=(pytest.mark.needs(*short.needs), *((pytest.mark.slow,) if c not in QUICK else ())))
+        for c, short in FLIGHTS.items()
+    ],
 )
 def test_a_flight_of_the_readme_prints_what_it_is_for(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

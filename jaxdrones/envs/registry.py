@@ -17,6 +17,7 @@ from jaxdrones.checks import (
     check_switch,
     check_whole,
     hint,
+    shown,
 )
 from jaxdrones.dynamics import (
     EFFECTS,
@@ -204,7 +205,11 @@ def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
 def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> Action:
     """The action type as the vehicle needs it, and an error if its controller cannot fly that."""
     kind = _named("action", action, ACTIONS)
-    kind = kind if isinstance(kind, Action) else kind()
+    kind = kind() if callable(kind) else kind
+    if not isinstance(kind, Action):
+        raise ValueError(
+            f"action is {shown(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
+        )
     check_loop(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
     return kind.fitted(nominal)
 

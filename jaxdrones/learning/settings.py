@@ -20,7 +20,7 @@ _positive_or_infinite = partial(check_number, above=0, infinite=True)
 _not_negative = partial(check_number, at_least=0)
 
 
-def _whole_or_traced(name: str, value) -> None:
+def _whole_or_traced(name: str, value: Any) -> None:
     if is_known(value):
         check_whole(name, value)
 
@@ -32,7 +32,7 @@ def _layers(name: str, sizes) -> None:
         check_whole(f"an entry of {name}", size)
 
 
-def _gradient(name: str, value) -> None:
+def _gradient(name: str, value: Any) -> None:
     check_choice(name, value, GRADIENTS)
 
 
@@ -80,7 +80,7 @@ _CHECKS: dict[str, Check] = {
 }
 
 
-def check_settings(config, valued: bool = False) -> None:
+def check_settings(config: Any, valued: bool = False) -> None:
     """Raise unless every setting makes sense.
 
     Args:
@@ -95,7 +95,7 @@ def check_settings(config, valued: bool = False) -> None:
         checks[field.name](field.name, getattr(config, field.name))
 
 
-def check_config(config, kind: type) -> None:
+def check_config(config: Any, kind: type) -> None:
     """Raise unless the settings are those of this learner."""
     if isinstance(config, kind):
         return

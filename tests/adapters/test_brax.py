@@ -59,6 +59,7 @@ def flown(env, wrapped, actions, steps):
     return [np.asarray(x) for x in jax.jit(lambda s: jax.lax.scan(step, s, length=steps))(state)[1]]
 
 
+@pytest.mark.slow
 def test_a_cut_is_told_from_an_end():
     env = brax.wrap(two_ends())
     wrapped = brax.wrap_for_training(env, episode_length=60)

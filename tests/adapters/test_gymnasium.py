@@ -202,6 +202,7 @@ def test_make_vec_takes_the_options_of_both(env_of):
     assert truncated.all() and reward.shape == (2,)
 
 
+@pytest.mark.slow
 def test_bullet_flies_alone_and_many_with_cameras(env_of):
     pytest.importorskip("pybullet")
     options = dict(backend="bullet", vision=("rgb", "depth", "segmentation"), drones=2, height=2.0)

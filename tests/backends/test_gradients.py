@@ -164,7 +164,7 @@ def test_gradients_are_finite_where_formulas_tend_to_break(effects):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("effects", [SMOOTH, PAPER], ids=["smooth", "paper"])
+@pytest.mark.parametrize("effects", [SMOOTH, pytest.param(PAPER, marks=pytest.mark.slow)], ids=["smooth", "paper"])
 def test_gradients_are_finite_in_float32_too(effects):
     assert_finite_everywhere(jaxdrones.make_step(*effects))
 

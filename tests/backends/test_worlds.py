@@ -74,6 +74,7 @@ def test_a_large_gradient_alone_is_one_kernel_too(chunk):
     assert_close(gradient[999], 2 * one, 1e-12)
 
 
+@pytest.mark.slow
 def test_an_argument_may_be_of_no_use():
     def reached(start, commands):
         return jnp.sum(fly(start, commands).pos)
@@ -83,6 +84,7 @@ def test_an_argument_may_be_of_no_use():
     assert_close(inside, jax.jit(jax.vmap(gradient))(starts, commands), 1e-12)
 
 
+@pytest.mark.slow
 def test_with_our_options_gradients_through_contacts_and_downwash_are_one_kernel():
     meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
 

@@ -58,6 +58,7 @@ def test_a_place_30_cm_off_is_reached_and_the_rest_leaves_with_the_integral(hz):
     np.testing.assert_allclose(error[-1] / error[-1 - 4 * hz], np.exp(-4 / 8), rtol=0.03)  # measured: 0.610 to 0.615
 
 
+@pytest.mark.slow
 def test_at_48_hz_it_is_in_a_limit_cycle_and_at_120_hz_it_is_not():
     """Hover after a push of 0.1 m/s. With its own small inertia the drone saturates the torque at 12 Hz."""
     ripple, lowest, highest = {}, {}, {}

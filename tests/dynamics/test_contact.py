@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_finite
+from helpers import assert_finite, mostly_slow
 
 import jaxdrones
 from jaxdrones import State, drone_contact, ground_contact, rotation
@@ -250,7 +250,7 @@ def crash(params, speed, towards, n=30):
 
 
 @pytest.mark.parametrize(("speed", "towards"), [(1.0, (1, 0, 0)), (3.0, (1, 0, 0)), (3.0, (0, 0, 1))])
-@pytest.mark.parametrize("vehicle", VEHICLES)
+@pytest.mark.parametrize("vehicle", mostly_slow(VEHICLES, ["cf2x"]))
 def test_drones_that_crash_stop_each_other_and_gain_nothing(vehicle, speed, towards):
     """They rebound by no more than 0.4 of their speed (0.2 typical; Bullet's below 0.05) and stay on their own sides.
 
@@ -289,11 +289,11 @@ def smallest_gap(state):
     return min(np.linalg.norm(a - b) for i, a in enumerate(pos) for b in pos[:i])
 
 
-@pytest.mark.parametrize("vehicle", VEHICLES)
+@pytest.mark.parametrize("vehicle", mostly_slow(VEHICLES, ["cf2x"]))
 @pytest.mark.parametrize(
     "quat", [(0.0, 0, 0, 1), (0.5, 0.5, 0.5, 0.5), (0.0, 0.6, 0, 0.8)], ids=["level", "edge", "tilt"]
 )
-@pytest.mark.parametrize("n", [2, 5])
+@pytest.mark.parametrize("n", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_drones_in_exactly_the_same_place_come_apart_and_keep_their_momentum(vehicle, n, quat):
     """By the height of the bodies at least, in the order of their indices, the same way every time."""
     params = VEHICLES[vehicle]
@@ -304,6 +304,7 @@ def test_drones_in_exactly_the_same_place_come_apart_and_keep_their_momentum(veh
     np.testing.assert_allclose(jnp.sum(end.vel, axis=0), 0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_drones_in_the_same_place_come_apart_in_single_precision_far_away_and_with_cells():
     params = jaxdrones.load_params("cf2x")
@@ -313,6 +314,7 @@ def test_drones_in_the_same_place_come_apart_in_single_precision_far_away_and_wi
             assert smallest_gap(end) > params.collision_height
 
 
+@pytest.mark.slow
 def test_gradients_of_drones_in_the_same_place_are_finite():
     wrench = make_total_wrench((), (drone_contact,))
 
@@ -323,6 +325,7 @@ def test_gradients_of_drones_in_the_same_place_are_finite():
     assert_finite(jax.jit(jax.grad(sums, (0, 1)))(start, team))
 
 
+@pytest.mark.slow
 def test_a_drone_lies_on_another():
     """Both a few millimetres deep, and still."""
     start = State.at_rest([[0, 0, 0.0125], [0, 0, 0.0376]])

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import VEHICLES, make_step
+from helpers import VEHICLES, make_step, mostly_slow
 
 import jaxdrones
 from jaxdrones import State, assets
@@ -49,7 +49,7 @@ def fly(team, name, act):
 
 
 @pytest.mark.parametrize("controller", TEAMS)
-@pytest.mark.parametrize("name", ON)
+@pytest.mark.parametrize("name", mostly_slow(ON, ["velocity"]))
 def test_every_vehicle_goes_where_an_action_asks_and_stays_where_none_does(name, controller):
     """A nominal 3 % of the top speed, 0.25 m/s of a Crazyflie, covers the 0.47 m in time."""
     axes, act = ON[name]
@@ -69,7 +69,7 @@ def test_the_pid_flies_crazyflies_by_their_numbers_whatever_their_name(tmp_path)
     assert not pid.fits(jaxdrones.stack([CRAZYFLIE, HEAVY]))
 
 
-@pytest.mark.parametrize("vehicle", ["hb", "racer"])
+@pytest.mark.parametrize("vehicle", mostly_slow(["hb", "racer"], ["hb"]))
 def test_hover_with_a_large_vehicle_stays_at_its_start_under_no_action(vehicle):
     """The environment by its name, from any of its starts: it slows down from up to 1 m/s and stays."""
     env = make("hover", vehicle=vehicle, action="position")

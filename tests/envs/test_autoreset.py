@@ -50,6 +50,7 @@ def test_statistics_are_those_of_the_episode():
         np.testing.assert_allclose(info["episode"]["return"], sum(row[3] for row in ROWS[first : last + 1]), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_of_many_worlds_those_that_end_start_as_each_would_alone():
     """A few at once, and all at once."""
     keys = jax.random.split(jax.random.key(1), 130)

@@ -123,6 +123,7 @@ def test_mistakes_are_named():
         scaled("mass", 1.1, 0.9)
 
 
+@pytest.mark.slow
 def test_the_truth_is_the_observation_without_noise_and_how_far_parameters_are_off():
     laws = (scaled("mass", 0.9, 1.1), constant_wind(2.0))
     env = make("hover", laws=laws, noise=sensor_noise())

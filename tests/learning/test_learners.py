@@ -83,7 +83,10 @@ TOY = {
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("learner, settings, within", TOY.values(), ids=TOY)
+@pytest.mark.parametrize(
+    "learner, settings, within",
+    [pytest.param(*case, marks=() if name == "bptt" else pytest.mark.slow, id=name) for name, case in TOY.items()],
+)
 def test_a_double_integrator_is_flown_nearly_as_cheaply_as_by_lqr(learner, settings, within):
     env, config = DoubleIntegrator(), learner.Config(sizes=(16,), **settings)
     policy = jax.jit(lambda key: learner.train(key, env, config).policy)(jax.random.key(0))
@@ -112,6 +115,7 @@ def test_the_same_key_gives_the_same_result_and_seeds_by_vmap_are_the_seeds_alon
         np.testing.assert_allclose(together[1][i], alone[1], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_learning_rates_can_be_mapped():
     env = envs.make("hover")

@@ -107,6 +107,7 @@ def seen(env, *batch: int):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("image", ["rgb", "depth"])
 def test_what_a_policy_does_depends_on_what_it_sees(team, image):
@@ -151,6 +152,7 @@ def test_drones_that_see_the_same_do_the_same_unless_each_has_its_own_eyes(team,
     assert jnp.all(action[0] == action[1]) == (not per_role)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("per_role", [False, True])
 def test_a_policy_of_many_worlds_is_that_of_each(team, per_role):

@@ -64,6 +64,7 @@ def test_progress_is_the_distance_gained_on_the_next_gate():
     np.testing.assert_allclose(moved(start, end)["came_nearer"], 0.7, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_who_starts_anywhere_starts_at_the_start_one_time_in_five_and_else_before_a_gate():
     env = make("gates", anywhere=True, level=2)
     worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2000))[1]
@@ -80,6 +81,7 @@ def test_poles_are_seen_from_the_drone_as_far_as_sight_goes():
     np.testing.assert_allclose(obs[0, 3:].reshape(4, 2), np.clip(POLES - obs[0, :2], -3, 3), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_levels_move_gates_and_poles_within_their_ranges_and_keep_random_gates_apart():
     def drawn(level):
         env = make("gates", level=level)

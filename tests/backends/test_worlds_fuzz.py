@@ -1,5 +1,10 @@
 """`over_worlds` gives what `jax.vmap` gives, of whatever JAX can trace."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,3 +63,20 @@ def test_derivatives_around_many_worlds_are_those_of_vmap(seed):
 
     found, expected = along(lambda f: jd.over_worlds(f, 2)), along(jax.vmap)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * max(1, np.max(np.abs(expected))))
+
+
+@pytest.mark.slow
+def test_two_devices_give_what_vmap_gives():
+    script = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+jax.config.update("jax_enable_x64", True)
+from test_worlds_fuzz import *
+for seed in range(2000, 2030):
+    arithmetic = seed % 2 == 0
+    arguments = worlds(seed, (2, 6, 20)[seed % 3], "float64", arithmetic)
+    assert_same(program(seed, arithmetic), arguments, "float64", chunk=4, devices=jax.devices())
+"""
+    folders = [Path(__file__).parent, Path(__file__).parent.parent]
+    path = os.pathsep.join([*map(str, folders), *sys.path])
+    subprocess.run([sys.executable, "-c", script], check=True, env=os.environ | {"PYTHONPATH": path})

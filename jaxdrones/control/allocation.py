@@ -54,6 +54,7 @@ def _square_of_limit(params: Params) -> Float[Array, ""]:
     return jnp.where(unlimited, jnp.inf, jnp.where(unlimited, 0, params.max_rpm) ** 2)
 
 
+@jax.checkpoint  # a gradient of a flight keeps less
 def _within_authority(
     inverse: Float[Array, "4 4"], target: Float[Array, "4"], limit: Float[Array, ""]
 ) -> Float[Array, "4"]:
@@ -102,7 +103,8 @@ def _non_negative_least_squares(
     matrix: Float[Array, "4 4"], inverses: Float[Array, "16 4 4"], target: Float[Array, "4"]
 ) -> Float[Array, "4"]:
     """The x >= 0 that minimises |A x - b| for a regular A: the best that is not negative of the sixteen candidates."""
-    candidates = inverses @ target
-    residuals = jnp.sum((candidates @ matrix.T - target[None]) ** 2, axis=-1)
-    feasible = jnp.all(candidates >= 0, axis=-1)
-    return candidates[jnp.argmin(jnp.where(feasible, residuals, jnp.inf))]
+    candidates = jnp.swapaxes(inverses, 0, 1) @ target  # (4, 16)
+    misses = (matrix[None] @ inverses - jnp.eye(4, dtype=matrix.dtype)[None]) @ jax.lax.stop_gradient(target)
+    residuals = jnp.sum(misses**2, axis=-1)
+    feasible = jnp.all(candidates >= 0, axis=0)
+    return candidates[:, jnp.argmin(jnp.where(feasible, residuals, jnp.inf))]

@@ -13,7 +13,8 @@ import time
 import jax
 from common import about, report
 
-from jaxdrones.learning import COMPILER_OPTIONS, bptt, ppo, presets, shac, sharding
+from jaxdrones import learning
+from jaxdrones.learning import bptt, ppo, presets, shac, sharding
 
 ALGORITHMS = {"bptt": bptt, "ppo": ppo, "shac": shac}
 
@@ -55,7 +56,7 @@ def measure(algorithm: str, changes: dict, repeats: int) -> dict[str, object]:
             init = jax.jit(lambda key: learner.init(key, env, config), out_shardings=placed)
             update = jax.jit(lambda state: learner.update(env, config, state)[0], out_shardings=placed)
             state = init(jax.random.key(0))
-            return update.lower(state).compile(COMPILER_OPTIONS), state
+            return update.lower(state).compile(learning.COMPILER_OPTIONS), state
 
     programs = {
         "one": flying(sharding.devices(config.worlds, jax.devices()[:1])),

@@ -19,6 +19,7 @@ def quick(name: str, *options: str) -> dict:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_throughput_reports_what_a_step_is_and_every_rate():
     result = quick("throughput.py")
     assert {"dt", "substeps", "integrator", "effects", "dtype", "chunk"} <= set(result["step"])

@@ -71,6 +71,7 @@ def test_a_cut_is_told_from_an_end():
     assert steps[first[0] + 1, 0] == 1  # of the next episode
 
 
+@pytest.mark.slow
 def test_every_episode_starts_anew(env_of):
     env = brax.wrap(env_of("hover"))
     done, truncation, _, _, obs = flown(env, brax.wrap_for_training(env, episode_length=4), [0.0, 0.0], 12)
@@ -116,6 +117,7 @@ def test_what_the_trainers_miss_is_there_for_a_while():
     assert not hasattr(jax, "device_put_replicated")
 
 
+@pytest.mark.slow
 def test_importing_it_prints_nothing_to_stdout():
     done = subprocess.run(
         [sys.executable, "-c", "import jaxdrones.adapters.brax"], capture_output=True, text=True, check=True

@@ -189,6 +189,7 @@ def test_arrays_are_ones_own_or_not_copied_at_all(env_of):
     assert all(isinstance(x, jax.Array) for x in (obs, reward, terminated, truncated, infos["_final_obs"]))
 
 
+@pytest.mark.slow
 def test_make_vec_takes_the_options_of_both(env_of):
     envs = gymnasium.make_vec(
         "jaxdrones/LeaderFollower-v0", num_envs=2, drones=3, dict_spaces=True, max_episode_steps=2

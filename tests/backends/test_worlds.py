@@ -56,6 +56,7 @@ def test_a_number_for_all_worlds_is_no_argument():
         jd.over_worlds(lambda start, gain: fly(start, commands[0] * gain))(starts, 1.01)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all():
     at_once = jax.jit(jax.vmap(jax.grad(miss, 1)))(starts, commands)
     inside = jax.jit(jd.over_worlds(jax.grad(miss, 1), 2))(starts, commands)

@@ -16,6 +16,7 @@ def env():
 CONFIG = bptt.Config(updates=4, worlds=3, horizon=2, sizes=(4,))
 
 
+@pytest.mark.slow
 def test_a_policy_flies_on_as_it_was_saved(env, tmp_path):
     policy = Policy.init(jax.random.key(0), env, (8, 8))
     checkpoint.save(tmp_path / "new" / "policy", policy, env="paper-hover", config=CONFIG)

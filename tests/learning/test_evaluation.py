@@ -45,6 +45,7 @@ def test_a_drone_that_falls_is_lost_and_its_metrics_stay_what_they_were_then(env
     np.testing.assert_allclose(report.error, 8.0, atol=0.2)
 
 
+@pytest.mark.slow
 def test_an_episode_of_a_team_succeeds_when_all_of_it_does():
     env = envs.make("hover", drones=2, reach=0.0, speed=0.0, omega=0.0, tilt=0.0)
 

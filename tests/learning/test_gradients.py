@@ -19,6 +19,7 @@ def test_scaling_a_gradient_keeps_the_value():
     assert value == 9 and gradient == 3
 
 
+@pytest.mark.slow
 def test_a_surrogate_has_the_values_of_one_step_and_the_derivative_of_the_other():
     fine, coarse = jd.make_step(dt=1 / 500, substeps=5), jd.make_step(dt=1 / 100)
     params = jd.repeat(jd.load_params("cf2x"), 1)

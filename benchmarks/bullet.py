@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
-from jaxdrones.backends import bullet
 from jaxdrones.control import Setpoint, pid
+from jaxdrones.engine import bullet
 from jaxdrones.sensing.scene import Box, Cylinder, Scene, Sphere
 
 EFFECTS = dict(effects=(jd.drag, jd.ground_effect), pairs=(jd.downwash,))

@@ -14,7 +14,8 @@ import jax
 from common import about, report
 
 from jaxdrones import learning
-from jaxdrones.learning import bptt, ppo, presets, shac, sharding
+from jaxdrones.learning import bptt, ppo, shac, sharding
+from jaxdrones.training import presets
 
 ALGORITHMS = {"bptt": bptt, "ppo": ppo, "shac": shac}
 

@@ -13,8 +13,9 @@ import jax.flatten_util
 import jax.numpy as jnp
 from common import about, report
 
-from jaxdrones.learning import bptt, collect, presets
+from jaxdrones.learning import bptt, collect
 from jaxdrones.learning.gradients import linked, with_gradient
+from jaxdrones.training import presets
 
 HORIZONS = (8, 16, 32, 64, 128, 256)
 OPTIONS = ("exact", "decay", "surrogate")

@@ -12,8 +12,8 @@ from common import about, report
 
 from jaxdrones.cli.training import settings
 from jaxdrones.learning import COMPILER_OPTIONS, evaluate
-from jaxdrones.learning.presets import ALGORITHMS
-from jaxdrones.learning.runs import Recipe
+from jaxdrones.training.presets import ALGORITHMS
+from jaxdrones.training.runs import Recipe
 
 
 def main() -> None:

@@ -62,7 +62,7 @@ def measure(n: int, repeats: int) -> dict[str, float]:
     params = jd.repeat(jd.load_params("cf2x"), n)
     state = jd.State.at_rest(jnp.asarray(pos, jnp.float32)).replace(rpm=params.hover_rpm[:, None] * jnp.ones((n, 4)))
     ways = {"all pairs": None} if n**2 <= MOST_PAIRS else {}
-    ways |= {"cells": jd.Cells(REACH)} if n > 1 else {}
+    ways |= {"cells": jd.NeighborGrid(REACH)} if n > 1 else {}
     row = {"drones": n}
     programs = {}
     for name, cells in ways.items():

@@ -29,10 +29,10 @@ import jaxdrones as jd
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
 from jaxdrones.learning import COMPILER_OPTIONS, evaluate
-from jaxdrones.learning.episode import fly_episode
 from jaxdrones.learning.evaluation import wilson
-from jaxdrones.learning.presets import ALGORITHMS
-from jaxdrones.learning.runs import Recipe, Run
+from jaxdrones.training.episode import fly_episode
+from jaxdrones.training.presets import ALGORITHMS
+from jaxdrones.training.runs import Recipe, Run
 
 PLANTS = ("own", "bullet", "crazyflow")
 DAMPING = 0.04  # 1/s, of the reference
@@ -108,7 +108,7 @@ def on_own(recipe: Recipe, runs: list[Run], options) -> list[dict]:
 
 
 def on_bullet(recipe: Recipe, runs: list[Run], options) -> list[dict]:
-    from jaxdrones.backends import bullet  # not in the environment of the rivals
+    from jaxdrones.engine import bullet  # not in the environment of the rivals
 
     env = recipe.env(drones=min(TEAM, options.bullet_episodes))
     substeps = env.task.substeps

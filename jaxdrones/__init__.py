@@ -2,30 +2,30 @@
 
 from typing import TYPE_CHECKING, Any
 
-from jaxdrones import rotation
-from jaxdrones.backends.cells import Cells
-from jaxdrones.backends.explicit import Step, make_step
-from jaxdrones.backends.rollout import rollout
-from jaxdrones.backends.worlds import over_worlds
-from jaxdrones.backends.wrenches import Effect, Pair
-from jaxdrones.compiler import kernel_options
+from jaxdrones import rotation, vector
+from jaxdrones.accelerate.compiler import kernel_options
+from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.dynamics import (
     downwash,
-    downwash_paper,
+    downwash_2021,
     drag,
     drag_world_axes,
     drone_contact,
     euler,
-    external_push,
+    external_force,
     ground_contact,
     ground_effect,
-    ground_effect_paper,
+    ground_effect_2021,
     implicit_midpoint,
     instant_rotors,
     lagging_rotors,
     rk4,
     semi_implicit_euler,
 )
+from jaxdrones.engine.explicit import Step, make_step
+from jaxdrones.engine.neighbors import NeighborGrid
+from jaxdrones.engine.rollout import rollout
+from jaxdrones.engine.wrenches import Effect, Pair
 from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
 from jaxdrones.state import State
@@ -34,23 +34,23 @@ from jaxdrones.wrench import Wrench
 
 __all__ = [
     "KERNEL_OPTIONS",
-    "Cells",
     "Effect",
+    "NeighborGrid",
     "Pair",
     "Params",
     "State",
     "Step",
     "Wrench",
     "downwash",
-    "downwash_paper",
+    "downwash_2021",
     "drag",
     "drag_world_axes",
     "drone_contact",
     "euler",
-    "external_push",
+    "external_force",
     "ground_contact",
     "ground_effect",
-    "ground_effect_paper",
+    "ground_effect_2021",
     "implicit_midpoint",
     "instant_rotors",
     "lagging_rotors",
@@ -64,6 +64,7 @@ __all__ = [
     "rotation",
     "semi_implicit_euler",
     "stack",
+    "vector",
 ]
 
 

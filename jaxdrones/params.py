@@ -42,8 +42,8 @@ class Params(flax.struct.PyTreeNode):
     """() kg/m^3."""
     wind: Array
     """(3,) velocity of the air, m/s, world."""
-    push: Array
-    """(3,) force of somebody else on the centre of mass, N, world; acts through the effect `external_push`."""
+    external_force: Array
+    """(3,) force of somebody else on the centre of mass, N, world; acts through the effect `external_force`."""
     drag_coeff: Array
     """(3,) rotor drag per axis, N per m/s of air speed and rad/s of summed rotor speed."""
     ground_effect_coeff: Array

@@ -92,7 +92,7 @@ def _params(urdf: "_Urdf") -> Params:
         gravity=GRAVITY,
         air_density=AIR_DENSITY,
         wind=[0, 0, 0],
-        push=[0, 0, 0],
+        external_force=[0, 0, 0],
         drag_coeff=properties["drag_coeff"],
         ground_effect_coeff=properties["ground_effect_coeff"],
         downwash_coeff=properties["downwash_coeff"],

@@ -6,7 +6,7 @@ import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.rotation import dot, unstack
+from jaxdrones.vector import components, dot
 
 
 class Wrench(flax.struct.PyTreeNode):
@@ -28,8 +28,8 @@ class Wrench(flax.struct.PyTreeNode):
     @classmethod
     def of_thrusts(cls, rotor_pos: Float[Array, "4 3"], thrust: Float[Array, "4"]) -> Wrench:
         """Forces along body z (N) at the rotors (m, body): sum of f and of r x f."""
-        x, y, _ = unstack(rotor_pos.T)
+        x, y, _ = components(rotor_pos.T)
         zero = jnp.zeros((), thrust.dtype)
-        force = jnp.stack([zero, zero, sum(unstack(thrust))])
+        force = jnp.stack([zero, zero, sum(components(thrust))])
         torque = jnp.stack([dot(y, thrust), -dot(x, thrust), zero])
         return cls(force, torque)

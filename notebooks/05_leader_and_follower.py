@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 
-from jaxdrones.learning import COMPILER_OPTIONS, evaluate, ppo, presets
-from jaxdrones.learning.episode import fly_episode
+from jaxdrones.learning import COMPILER_OPTIONS, evaluate, ppo
+from jaxdrones.training import presets
+from jaxdrones.training.episode import fly_episode
 
 # %%
 env, config = presets.preset("leader-follower", "ppo")
 print(
-    f"policy per role: {config.per_role}, central critic: {config.central_critic}, sees {env.observation_size} numbers"
+    f"policy per role: {config.per_agent}, central critic: {config.centralized_critic}, sees {env.observation_size} numbers"
 )
 
 train = jax.jit(lambda key: ppo.train(key, env, config), compiler_options=COMPILER_OPTIONS)

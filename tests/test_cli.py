@@ -10,8 +10,8 @@ from helpers import mostly_slow
 
 from jaxdrones import flights
 from jaxdrones.cli import main
-from jaxdrones.conditions import Conditions
-from jaxdrones.learning import presets
+from jaxdrones.flights.conditions import Conditions
+from jaxdrones.training import presets
 
 FILMS = pytest.mark.needs("pybullet", "imageio_ffmpeg")
 SHORT = ["--duration", "0.25", "--drones", "2"]
@@ -31,7 +31,7 @@ def test_fly_prints_a_table_and_writes_log_and_figure(tmp_path, capsys):
 def test_json_is_one_object_and_nothing_else_on_stdout(tmp_path, capsys):
     assert main(["fly", "downwash", "--duration", "0.2", "--json", "--output", str(tmp_path)]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["effects"] == ["downwash_paper"] and len(report["results"]) == 2
+    assert report["effects"] == ["downwash_2021"] and len(report["results"]) == 2
     assert report["files"] == [str(tmp_path / "log.npz"), str(tmp_path / "flight.png")]
 
 
@@ -98,7 +98,7 @@ def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
         (["fly", "circle", "--seed", str(2**70)], "give at most 2147483647"),
         (["fly", "circle", "--effects", "drag,drag"], "effect 'drag' is given twice"),
         (["fly", "circle", "--effects", "drag,drag_world_axes"], "'drag_world_axes' is given beside 'drag'"),
-        (["fly", "circle", "--effects", "downwash_paper,downwash"], "'downwash' is given beside 'downwash_paper'"),
+        (["fly", "circle", "--effects", "downwash_2021,downwash"], "'downwash' is given beside 'downwash_2021'"),
         (["fly", "circle", "--effects", "drag,"], "unknown effect ''"),
         (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for of 'racer'"),
         pytest.param(
@@ -178,7 +178,7 @@ def test_list_names_what_can_be_chosen(capsys):
     assert main(["list", "--json"]) == 0
     names = json.loads(capsys.readouterr().out)
     assert {"cf2x", "cf2p", "hb", "racer"} == set(names["vehicles"])
-    assert {"drag", "ground_effect", "downwash", "downwash_paper"} <= set(names["effects"])
+    assert {"drag", "ground_effect", "downwash", "downwash_2021"} <= set(names["effects"])
     assert names["algorithms"] == list(presets.ALGORITHMS)
     assert main(["list"]) == 0
     assert "integrators" in capsys.readouterr().out

@@ -12,9 +12,10 @@ import pytest
 
 from jaxdrones.cli import main
 from jaxdrones.cli.evaluate import percent, success
-from jaxdrones.learning import checkpoint, training
+from jaxdrones.learning import checkpoint
 from jaxdrones.learning.evaluation import wilson
-from jaxdrones.learning.runs import Run
+from jaxdrones.training import loop
+from jaxdrones.training.runs import Run
 
 pytestmark = pytest.mark.float32
 
@@ -50,7 +51,7 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
 
 
 def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained, tmp_path, capsys, monkeypatch):
-    advance, calls = training.Trainer.advance, []
+    advance, calls = loop.Trainer.advance, []
 
     def interrupted(self, state, updates):
         calls.append(updates)
@@ -58,7 +59,7 @@ def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained,
             raise KeyboardInterrupt
         return advance(self, state, updates)
 
-    monkeypatch.setattr(training.Trainer, "advance", interrupted)
+    monkeypatch.setattr(loop.Trainer, "advance", interrupted)
     folder = tmp_path / "hover"
     assert main([*TRAIN, "--output", str(folder)]) == 130
     said = capsys.readouterr().err
@@ -91,7 +92,7 @@ def nothing_compiles(monkeypatch):
     def compile(self):
         raise AssertionError("compiled")
 
-    monkeypatch.setattr(training.Trainer, "compile", compile)
+    monkeypatch.setattr(loop.Trainer, "compile", compile)
 
 
 @pytest.mark.parametrize("more", [[], ["--seed", "3"], ["--seeds", "2"], ["--algo", "shac"], ["--budget", "1s"]])
@@ -145,7 +146,7 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(training.Trainer, "compile", interrupted)
+        patch.setattr(loop.Trainer, "compile", interrupted)
         assert main(overwrite) == 130
     for wrong in (["--set", "horizon=0"], ["--set", "gradient=steep"], ["--resume"]):
         assert main([*overwrite, *wrong]) == 2
@@ -181,7 +182,7 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
     assert rewards(folder)[:4] == rewards(trained[0]) and len(rewards(folder)) == 6
     assert at_least(Run(folder).told("best", "score"), best)
 
-    advance, calls = training.Trainer.advance, []
+    advance, calls = loop.Trainer.advance, []
 
     def interrupted(self, state, updates):
         calls.append(updates)
@@ -190,7 +191,7 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
         return advance(self, state, updates)
 
     with monkeypatch.context() as patch:
-        patch.setattr(training.Trainer, "advance", interrupted)
+        patch.setattr(loop.Trainer, "advance", interrupted)
         assert main([*resume, "--set", "updates=12"]) == 130
     assert Run(folder).report() is None
     made = Run(folder).told("state", "update")

@@ -93,7 +93,7 @@ def test_the_papers_learners_climb_to_the_goal_and_fly_there_on_both_backends(al
     small = ["--set", "net_arch=64,64", "--episodes", "2", "--json", "--output", str(tmp_path)]
     assert main([*SB3, "--algo", algorithm, *settings, *small]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["task"] == "paper-hover"
+    assert printed["task"] == "hover-2021"
     for name in ("best.zip", "last.zip", "progress.csv", "curve.png", "report.json"):
         assert (tmp_path / name).stat().st_size > 0
     first = next(csv.DictReader((tmp_path / "progress.csv").read_text().splitlines()))
@@ -112,7 +112,7 @@ def test_the_papers_learners_climb_to_the_goal_and_fly_there_on_both_backends(al
 @pytest.mark.slow
 def test_an_interrupted_training_keeps_the_best_and_is_not_replaced_unasked(tmp_path, capsys, monkeypatch):
     pytest.importorskip("stable_baselines3")
-    from jaxdrones.learning import sb3_training
+    from jaxdrones.training import sb3_training
 
     def interrupted(self):
         raise KeyboardInterrupt

@@ -12,8 +12,9 @@ from helpers import mostly_slow
 
 from jaxdrones.envs import autoreset, make
 from jaxdrones.envs.randomize import pushes, scaled, sensor_noise, shifted
-from jaxdrones.learning import bptt, ppo, shac, training
+from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
+from jaxdrones.training import loop
 
 DRAWS = ("uniform", "normal", "bernoulli", "randint")
 KEY = jax.random.key(3)
@@ -23,7 +24,7 @@ EVERYTHING = dict(
     disturb=pushes(0.3),
 )
 SMALL = dict(updates=2, worlds=3, horizon=2, sizes=(2,))
-CRITIC = dict(critic_sizes=(2,))
+CRITIC = dict(critic_hidden_sizes=(2,))
 LEARNERS = {
     "bptt": (bptt, bptt.Config(**SMALL)),
     "shac": (shac, shac.Config(**SMALL, **CRITIC, critic_steps=2)),
@@ -140,12 +141,12 @@ def test_noise_and_pushes_of_a_step_are_independent():
         return state.replace(vel=jax.random.normal(key, state.vel.shape))
 
     def disturb(key, params, dt):
-        return params.replace(push=jax.random.normal(key, params.push.shape))
+        return params.replace(external_force=jax.random.normal(key, params.external_force.shape))
 
     env = make("hover", observation=("velocity",), noise=noise, disturb=disturb, drones=200)
     _, world = env.reset(KEY)
     obs, world, *_ = env.step(jax.random.key(1), world, jnp.zeros((200, 4)))
-    assert abs(np.corrcoef(obs.ravel(), world.params.push.ravel())[0, 1]) < 0.15
+    assert abs(np.corrcoef(obs.ravel(), world.params.external_force.ravel())[0, 1]) < 0.15
 
 
 class Toss:
@@ -187,6 +188,6 @@ def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(ke
         patched.setattr(learner, "Policy", type("Policy", (), {"init": staticmethod(init)}))
         state = learner.init(KEY, env, config)
     jax.jit(lambda state: learner.update(env, config, state))(state)
-    for purpose in (training.CHOICE, training.REPORT):
+    for purpose in (loop.CHOICE, loop.REPORT):
         jax.random.split(jax.random.fold_in(KEY, purpose))
     keys.check(least=10)

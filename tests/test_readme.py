@@ -9,7 +9,7 @@ import pytest
 from documents import ROOT, blocks, run_python
 
 from jaxdrones.cli import main
-from jaxdrones.learning.training import Trainer
+from jaxdrones.training.loop import Trainer
 
 README = ROOT / "README.md"
 BLOCKS = blocks(README, "sh")

@@ -14,7 +14,7 @@ POLICY = Policy.init(jax.random.key(0), HOVER, (32, 16))
 
 
 def two_gusts(params, state):
-    return jd.Wrench.of_force(2 * params.push)
+    return jd.Wrench.of_force(2 * params.external_force)
 
 
 LINES = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 
 ROUND_OFF = 1e-14  # a dozen float64 operations on numbers of order one
 
@@ -51,7 +51,7 @@ def test_the_z_axis_is_the_last_column_of_the_matrix():
 
 def test_cross_is_the_vector_product():
     a, b = vectors[:25], vectors[25:]
-    np.testing.assert_allclose(each(rotation.cross, a, b), np.cross(a, b), atol=ROUND_OFF)
+    np.testing.assert_allclose(each(vector.cross, a, b), np.cross(a, b), atol=ROUND_OFF)
 
 
 def test_normalize_gives_unit_length_and_keeps_the_direction():

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxdrones.backends.host import HostStep
+from jaxdrones.engine.host import HostStep
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.tasks.task import Task, World
 
@@ -76,7 +76,7 @@ class Session:
     def _photographer(self):
         if isinstance(self.env.physics, HostStep):
             return self.env.physics
-        from jaxdrones.backends import bullet  # an optional library behind it
+        from jaxdrones.engine import bullet  # an optional library behind it
 
         return bullet.make_step(scene=self.env.task.scene)
 

@@ -5,9 +5,9 @@ import argparse
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, table
 from jaxdrones.cli.conditions import add_conditions, flown, warn
-from jaxdrones.conditions import BACKENDS
-from jaxdrones.record import divergence
-from jaxdrones.tasks.examples import FLIGHTS
+from jaxdrones.flights.conditions import BACKENDS
+from jaxdrones.flights.examples import FLIGHTS
+from jaxdrones.flights.record import divergence
 
 
 def add(commands) -> None:

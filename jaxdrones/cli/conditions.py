@@ -6,11 +6,11 @@ from typing import Any
 
 from jaxdrones import assets
 from jaxdrones.cli.common import bar, complain
-from jaxdrones.conditions import Conditions
 from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
-from jaxdrones.flights import fly
-from jaxdrones.record import Record
+from jaxdrones.flights.conditions import Conditions
+from jaxdrones.flights.fly import fly
+from jaxdrones.flights.record import Record
 from jaxdrones.urdf import load_params
 
 

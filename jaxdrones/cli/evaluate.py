@@ -28,8 +28,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     import jax
 
     from jaxdrones.learning import evaluate
-    from jaxdrones.learning.runs import as_dict, run_in
     from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
+    from jaxdrones.training.runs import as_dict, run_in
 
     check_at_most("episodes", options.episodes, LARGEST_COUNT)
     check_seed("seed", options.seed)

@@ -8,13 +8,13 @@ from pathlib import Path
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, check_writable, complain, folder, table
 from jaxdrones.cli.conditions import add_conditions, check_conditions, flown, progress, warn
-from jaxdrones.conditions import BACKENDS
-from jaxdrones.flights import scene_of
+from jaxdrones.flights.conditions import BACKENDS
+from jaxdrones.flights.examples import FLIGHTS
+from jaxdrones.flights.fly import scene_of
+from jaxdrones.flights.record import Record, check_pwm
 from jaxdrones.limits import check_seed
-from jaxdrones.record import Record, check_pwm
 from jaxdrones.render import plots, video
 from jaxdrones.sensing.scene import Scene
-from jaxdrones.tasks.examples import FLIGHTS
 
 _LATE = 0.6  # share of an episode from which on its results are taken
 
@@ -90,8 +90,8 @@ def _fly_example(options: argparse.Namespace) -> int:
 def _fly_policy(options: argparse.Namespace) -> int:
     import jax
 
-    from jaxdrones.learning.episode import PolicyFlight, fly_episode, record_of
-    from jaxdrones.learning.runs import run_in
+    from jaxdrones.training.episode import PolicyFlight, fly_episode, record_of
+    from jaxdrones.training.runs import run_in
 
     check_choice("backend", options.backend, BACKENDS)
     run, seed = run_in(options.policy), options.seed or 0

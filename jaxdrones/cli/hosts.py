@@ -37,7 +37,7 @@ def _together(train: Callable[[argparse.Namespace], int], options: argparse.Name
         raise ValueError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
     if options.library == "sb3":
         raise ValueError("--library sb3 trains on one host; leave out --hosts, --host and --coordinator")
-    from jaxdrones.learning import hosts
+    from jaxdrones.training import hosts
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(hosts.together(*asked))

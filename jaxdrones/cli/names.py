@@ -4,14 +4,14 @@ import argparse
 import json
 
 from jaxdrones import assets
-from jaxdrones.conditions import BACKENDS
 from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
-from jaxdrones.tasks.examples import FLIGHTS
+from jaxdrones.flights.conditions import BACKENDS
+from jaxdrones.flights.examples import FLIGHTS
 
 ALGORITHMS = ("bptt", "ppo", "shac")  # of jaxdrones.learning, which takes long to import
-SB3_ALGORITHMS = ("ppo", "a2c", "sac")  # of jaxdrones.learning.sb3, which may not be installed
+SB3_ALGORITHMS = ("ppo", "a2c", "sac")  # of jaxdrones.training.sb3, which may not be installed
 LIBRARIES = ("jaxdrones", "sb3")
 
 

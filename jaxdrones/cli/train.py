@@ -39,7 +39,7 @@ def add(commands) -> None:
         "A run that is trained longer goes on as if all updates had been asked for at the start: the learning rate\n"
         "rises to what it would be then, and falls to the new end. The best policy stays unless a better one comes.\n\n"
         "With --library sb3, Stable-Baselines3 trains the paper's network (512-512-256-128, ReLU); `hover` then is\n"
-        "`paper-hover`, the one-dimensional hover of the paper's equation 12, and there is no state to resume from.",
+        "`hover-2021`, the one-dimensional hover of the paper's equation 12, and there is no state to resume from.",
         epilog="JAX_COMPILATION_CACHE_DIR=folder keeps compiled programs, so that a second training starts sooner.\n\n"
         + hosts.HELP,
         allow_abbrev=False,
@@ -90,9 +90,9 @@ def _train(options: argparse.Namespace) -> int:
         from jaxdrones.cli import train_sb3
 
         return train_sb3.train(options)
-    from jaxdrones.learning.hosts import checked
-    from jaxdrones.learning.runs import Run
-    from jaxdrones.learning.training import Diverged, Trainer
+    from jaxdrones.training.hosts import checked
+    from jaxdrones.training.loop import Diverged, Trainer
+    from jaxdrones.training.runs import Run
 
     begin = time.perf_counter()
     with checked():
@@ -169,7 +169,7 @@ def _check_numbers(options: argparse.Namespace) -> None:
 
 def _runs(options: argparse.Namespace, output: Path) -> dict:
     """Seed -> run."""
-    from jaxdrones.learning.runs import Run
+    from jaxdrones.training.runs import Run
 
     run = Run(output)
     if options.seeds > 1:
@@ -190,8 +190,8 @@ def _nothing(run) -> ValueError:
 
 def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
     """The recipe that is asked for, if it may be written where it is to go."""
-    from jaxdrones.learning.presets import algorithm_for
-    from jaxdrones.learning.runs import Recipe, Run
+    from jaxdrones.training.presets import algorithm_for
+    from jaxdrones.training.runs import Recipe, Run
 
     algorithm = algorithm_for(options.task) if options.algo is None else options.algo
     recipe = Recipe.of(options.task, algorithm, options.realistic, **asked)
@@ -202,7 +202,7 @@ def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
 
 def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: float | None):
     """The recipe that the runs began with, and maybe more updates; nothing else that is asked for may differ."""
-    from jaxdrones.learning.runs import Recipe
+    from jaxdrones.training.runs import Recipe
 
     started = [run for run in runs.values() if run.started]
     if not started:

@@ -13,7 +13,7 @@ from jaxdrones.envs import TASKS
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.render import plots
 
-_PAPER = {"hover": "paper-hover"}  # what the paper's own command means by the name
+_PAPER = {"hover": "hover-2021"}  # what the paper's own command means by the name
 _EPISODES = 100
 
 
@@ -37,9 +37,9 @@ def train(options: argparse.Namespace) -> int:
     asked = once("steps", settings(options.set), steps, seconds)
     if not options.no_figure:
         plots.check_matplotlib()
-    from jaxdrones.learning import sb3
-    from jaxdrones.learning.sb3_training import Trainer
-    from jaxdrones.learning.training import Diverged
+    from jaxdrones.training import sb3
+    from jaxdrones.training.loop import Diverged
+    from jaxdrones.training.sb3_training import Trainer
 
     run = sb3.Run(options.output or Path("runs") / f"{options.task}-sb3-{algorithm}")
     with fitting(asked, task):

@@ -166,8 +166,8 @@ def finish(options: argparse.Namespace, runs: dict, output: Path) -> int:
         runs: seed -> run.
         output: where the figure goes and, of several seeds, the best.
     """
-    from jaxdrones.learning.runs import Run
-    from jaxdrones.learning.training import best_of, score_of
+    from jaxdrones.training.loop import best_of, score_of
+    from jaxdrones.training.runs import Run
 
     reports = {seed: run.report() for seed, run in runs.items()}
     evaluations = [report["evaluation"] for report in reports.values()]

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_shape
-from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
+from jaxdrones.vector import safe_sqrt
 
 _LEAST_SHARE = 0.01  # of thrust or yaw that a rotor must make to be relieved by less of it; usually all make 0.25
 _ACTIVE_SETS = np.array([[i >> k & 1 for k in range(4)] for i in range(16)], bool)  # which rotors turn

@@ -3,9 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
-from jaxdrones.numerics import sin_cos
-from jaxdrones.rotation import dot
+from jaxdrones import vector
+from jaxdrones.vector import dot, sin_cos
 
 Axes = list[Float[Array, "3"]]
 """The body's x, y and z in the world frame."""
@@ -15,9 +14,9 @@ def from_thrust(force: Float[Array, "3"], yaw: Float[Array, ""]) -> Axes:
     """The attitude with body z along `force` (N, world) and body x as near to the heading `yaw` (rad) as it can be."""
     sin, cos = sin_cos(yaw)
     heading = jnp.stack([cos, sin, jnp.zeros_like(yaw)])
-    z = rotation.unit(force)
-    y = rotation.unit(rotation.cross(z, heading))
-    return [rotation.cross(y, z), y, z]
+    z = vector.unit(force)
+    y = vector.unit(vector.cross(z, heading))
+    return [vector.cross(y, z), y, z]
 
 
 def error(axes: Axes, target: Axes) -> Float[Array, "3"]:

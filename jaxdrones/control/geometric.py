@@ -8,7 +8,7 @@ import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.checks import check_positive
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import rpm_from_wrench
@@ -72,14 +72,14 @@ def control(
     axes = rotation.axes(state.quat)
     target = attitude.from_thrust(acc, setpoint.yaw)
 
-    thrust = params.mass * rotation.dot(acc, axes[2])
-    rates = zip(rotation.unstack(setpoint.omega), target, strict=True)
+    thrust = params.mass * vector.dot(acc, axes[2])
+    rates = zip(vector.components(setpoint.omega), target, strict=True)
     asked = cast(Array, sum(rate * axis for rate, axis in rates))  # world
-    omega_target = jnp.stack([rotation.dot(axis, asked) for axis in axes])
+    omega_target = jnp.stack([vector.dot(axis, asked) for axis in axes])
     omega_rate = (
         -gains.attitude * attitude.error(axes, target)
         - gains.rate * (state.omega - omega_target)
-        - rotation.cross(state.omega, omega_target)
+        - vector.cross(state.omega, omega_target)
     )
-    torque = params.inertia * omega_rate + rotation.cross(state.omega, params.inertia * state.omega)
+    torque = params.inertia * omega_rate + vector.cross(state.omega, params.inertia * state.omega)
     return memory, rpm_from_wrench(params, jnp.maximum(thrust, 0), torque)

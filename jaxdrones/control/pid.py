@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
-from jaxdrones.numerics import safe_sqrt, stored
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
+from jaxdrones.vector import safe_sqrt
 
 VEHICLES = ("cf2x", "cf2p")
 
@@ -151,7 +151,7 @@ def position_loop(
     integral = jnp.clip(memory.pos_integral + error * dt, -limit, limit)
     force = gains.pos_p * error + gains.pos_i * integral + gains.pos_d * (setpoint.vel - state.vel)
     force = force + jnp.stack([jnp.zeros_like(params.mass), jnp.zeros_like(params.mass), params.weight])
-    thrust = jnp.maximum(rotation.dot(force, rotation.z_axis(state.quat)), 0)
+    thrust = jnp.maximum(vector.dot(force, rotation.z_axis(state.quat)), 0)
     pwm = rpm_to_pwm(safe_sqrt(thrust / (4 * params.kf)))
     return memory.replace(pos_integral=integral), pwm, attitude.from_thrust(force, setpoint.yaw)
 
@@ -172,10 +172,10 @@ def attitude_loop(
     integral = jnp.clip(memory.rpy_integral - error * dt, -limit, limit)
     torque = -gains.rpy_p * error + gains.rpy_d * rate_error + gains.rpy_i * integral
     memory = memory.replace(rpy_integral=integral, rpy=rpy)
-    return stored((memory, jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE)))
+    return memory, jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE)
 
 
 def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
     """RPM of a thrust per rotor and a torque (PWM), each rotor's PWM cut to the Crazyflie's range, and `max_rpm`."""
-    pwm = jnp.clip(thrust + jax.vmap(rotation.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
+    pwm = jnp.clip(thrust + jax.vmap(vector.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
     return jnp.minimum(_PWM_TO_RPM * pwm + _PWM_OFFSET, params.max_rpm)

@@ -8,14 +8,14 @@ import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.checks import check_positive, check_shape
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
-from jaxdrones.numerics import sin_cos
 from jaxdrones.params import Params
 from jaxdrones.state import State
+from jaxdrones.vector import sin_cos
 
 
 class Gains(flax.struct.PyTreeNode):
@@ -73,13 +73,13 @@ def command(
     check_single(params, state, setpoint)
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
     acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
-    collective = rotation.dot(acc, rotation.z_axis(state.quat))
+    collective = vector.dot(acc, rotation.z_axis(state.quat))
 
     sin, cos = sin_cos(setpoint.yaw)
     left = jnp.stack([-sin, cos, jnp.zeros_like(sin)])
-    z = rotation.unit(acc)
-    x = rotation.unit(rotation.cross(left, z))
-    target = rotation.from_matrix(jnp.stack([x, rotation.cross(z, x), z], axis=-1))
+    z = vector.unit(acc)
+    x = vector.unit(vector.cross(left, z))
+    target = rotation.from_matrix(jnp.stack([x, vector.cross(z, x), z], axis=-1))
     error = rotation.multiply(rotation.conjugate(state.quat), target)
     shorter_way = jnp.where(error[3] < 0, -1, 1)
     turn = jnp.where(jnp.any(acc != 0), shorter_way, 0)  # no force, no attitude to turn to
@@ -92,6 +92,6 @@ def follow(
     """Inner loop: rotor speeds (RPM, up to `max_rpm`) for a collective thrust per mass and body rates."""
     check_single(params, state)
     check_shape("omega", omega, (3,), "body rates of one drone; use jax.vmap for a team")
-    gyroscopic = rotation.cross(state.omega, params.inertia * state.omega)
+    gyroscopic = vector.cross(state.omega, params.inertia * state.omega)
     torque = params.inertia * gains.rate * (omega - state.omega) + gyroscopic
     return rpm_from_wrench(params, jnp.maximum(params.mass * collective, 0), torque)

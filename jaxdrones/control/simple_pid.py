@@ -11,9 +11,9 @@ from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
-from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 from jaxdrones.state import State
+from jaxdrones.vector import safe_sqrt
 
 _MAX_TILT = jnp.pi / 6  # rad, of the roll and pitch targets
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.checks import check_shape
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
@@ -44,4 +44,4 @@ def setpoint(params: Params, state: State, action: Float[Array, "4"]) -> Setpoin
 
 def commanded(params: Params, action: Float[Array, "4"]) -> Float[Array, "3"]:
     """The velocity that an action asks for, m/s, world."""
-    return SPEED_SHARE * params.max_speed * jnp.abs(action[3]) * rotation.unit(action[:3])
+    return SPEED_SHARE * params.max_speed * jnp.abs(action[3]) * vector.unit(action[:3])

@@ -1,6 +1,6 @@
 """Effects of the surroundings on one drone: drag (paper, equation 4), ground effect (equation 5), a push.
 
-`drag` and `ground_effect` are the smooth, physical ones; `drag_world_axes` and `ground_effect_paper`
+`drag` and `ground_effect` are the smooth, physical ones; `drag_world_axes` and `ground_effect_2021`
 compute what the paper's simulator does, for its figures and its recorded data.
 """
 
@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.dynamics.rotors import thrust
-from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 from jaxdrones.state import State
+from jaxdrones.vector import safe_sqrt
 from jaxdrones.wrench import Wrench
 
 _RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
@@ -46,7 +46,7 @@ def ground_effect(params: Params, state: State) -> Wrench:
     return Wrench.of_thrusts(params.rotor_pos, upright * gain * thrust(params, state))
 
 
-def ground_effect_paper(params: Params, state: State) -> Wrench:
+def ground_effect_2021(params: Params, state: State) -> Wrench:
     """Equation 5 with the reference's clip of the height and its gate at 90 degrees of roll or pitch."""
     clip = params.prop_radius / 4 * safe_sqrt(15 / 4 * params.ground_effect_coeff)
     height = jnp.maximum(_rotor_heights(params, state), clip)
@@ -59,17 +59,17 @@ def ground_effect_paper(params: Params, state: State) -> Wrench:
     return Wrench.of_thrusts(params.rotor_pos, jnp.where(upright, gain * thrust(params, state), 0))
 
 
-def external_push(params: Params, state: State) -> Wrench:
-    """The force `push` of somebody else, through the centre of mass."""
-    return Wrench.of_force(rotation.rotate_inverse(state.quat, params.push))
+def external_force(params: Params, state: State) -> Wrench:
+    """The force `external_force` of somebody else, through the centre of mass."""
+    return Wrench.of_force(rotation.rotate_inverse(state.quat, params.external_force))
 
 
 def _summed_rotor_speed(state: State) -> Float[Array, ""]:
     """rad/s."""
-    return _RADIANS_PER_SECOND * cast(Array, sum(rotation.unstack(state.rpm)))
+    return _RADIANS_PER_SECOND * cast(Array, sum(vector.components(state.rpm)))
 
 
 def _rotor_heights(params: Params, state: State) -> Float[Array, "4"]:
     """World z of each rotor, m."""
     up = rotation.z_axis(rotation.conjugate(state.quat))  # the world's z axis in the body frame
-    return state.pos[2] + jax.vmap(rotation.dot, (0, None))(params.rotor_pos, up)
+    return state.pos[2] + jax.vmap(vector.dot, (0, None))(params.rotor_pos, up)

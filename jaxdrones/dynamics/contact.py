@@ -24,10 +24,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.numerics import stored
 from jaxdrones.params import Params
-from jaxdrones.rotation import cross, dot, unstack
 from jaxdrones.state import State
+from jaxdrones.vector import components, cross, dot
 from jaxdrones.wrench import Wrench
 
 _BALLS = 8  # as in Bullet
@@ -37,7 +36,7 @@ _ONSET = 2.5e-3  # m, d: half of the damping is there; a drone at rest is 1.5 mm
 _PUSH = 20.0  # m/s^2, a: about twice gravity, so that a drone rests near the surface
 _DAMPING = 120.0  # 1/s, a b: half of 1/dt for a drone that heaves; the tilting of a level hb is 3.3 times as fast
 _STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; with the damping just above critical, so that little bounces
-_GRIP = 400.0  # 1/s: the fastest at which friction slows a point of the rim, for all ways it can move together
+_GRIP = 400.0  # 1/s: the fastest rate at which friction slows a point of the rim, for all ways it can move together
 _GRIP_ON_DRONE = 15.0  # 1/s: the same at one of 16 points between drones, so that one below another does not shake
 _SHARE_ON_DRONE = 4.0  # share of the push for one point over that of its lever: three that share it stay below 2/dt
 _SLOW = 0.01  # m/s: friction is viscous below, however light the touch; a drone's weight makes it 0.05 (cf2x)
@@ -61,15 +60,15 @@ def ground_contact(params: Params, state: State) -> Wrench:
     cos, sin = (jnp.asarray(f(_ANGLES), ball.dtype) for f in (np.cos, np.sin))
 
     def around(a: Array, b: Array, c: Array) -> list[Float[Array, " balls"]]:
-        return [i + j * cos + k * sin for i, j, k in zip(unstack(a), unstack(b), unstack(c), strict=True)]
+        return [i + j * cos + k * sin for i, j, k in zip(components(a), components(b), components(c), strict=True)]
 
     _, _, height = around(state.pos + p, x, y)
-    vel = stored(around(state.vel + cross(omega, p), cross(omega, x), cross(omega, y)))
-    normal = stored(params.mass / _BALLS * _push(-height, -vel[2]))
+    vel = around(state.vel + cross(omega, p), cross(omega, x), cross(omega, y))
+    normal = params.mass / _BALLS * _push(-height, -vel[2])
     rub = _rub(_ON_GROUND * normal, vel[0] ** 2 + vel[1] ** 2, _GRIP * _sliding_mass(params) / _BALLS)
     forces = [-rub * vel[0], -rub * vel[1], normal]
 
-    force = jnp.stack([sum(unstack(f)) for f in forces])
+    force = jnp.stack([sum(components(f)) for f in forces])
     torque = cross(p, force)
     torque += cross(x, jnp.stack([dot(cos, f) for f in forces])) + cross(y, jnp.stack([dot(sin, f) for f in forces]))
     return Wrench(rotation.rotate_inverse(state.quat, force), rotation.rotate_inverse(state.quat, torque))
@@ -92,7 +91,7 @@ def drone_contact(params: Params, state: State, other: Params, other_state: Stat
     point, normal, depth = (
         jnp.concatenate(pair) for pair in zip(mine, (theirs[0], -theirs[1], theirs[2]), strict=True)
     )
-    share = _both(_tilting_mass(params), _tilting_mass(other)) / (1 + sum(unstack(_onset(depth))))
+    share = _both(_tilting_mass(params), _tilting_mass(other)) / (1 + sum(components(_onset(depth))))
     grip = share * _GRIP_ON_DRONE
 
     def at(point: Float[Array, "3"], normal: Float[Array, "3"], depth: Float[Array, ""]) -> Wrench:
@@ -104,7 +103,7 @@ def drone_contact(params: Params, state: State, other: Params, other_state: Stat
         return Wrench(force, cross(point, force))
 
     total = jax.tree.map(
-        lambda x: jnp.stack([sum(unstack(row)) for row in _rows(x.T)]), jax.vmap(at)(point, normal, depth)
+        lambda x: jnp.stack([sum(components(row)) for row in _rows(x.T)]), jax.vmap(at)(point, normal, depth)
     )
     return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), total)
 
@@ -177,13 +176,13 @@ def _sliding_mass(params: Params) -> Float[Array, ""]:
     """What a force on the rim must move if it slides, tilts and turns the drone at once, kg."""
     ball, ring = _shape(params)
     low = jnp.abs(params.collision_offset) + ball
-    ix, _, iz = unstack(params.inertia)
+    ix, _, iz = components(params.inertia)
     return 1 / (1 / params.mass + low**2 / ix + ring**2 / iz)
 
 
 def _tilting_mass(params: Params) -> Float[Array, ""]:
     """What a ball that is hit along the thrust axis must move, times a constant, but not more than the mass, kg."""
-    ix, _, _ = unstack(params.inertia)
+    ix, _, _ = components(params.inertia)
     return jnp.minimum(params.mass, _SHARE_ON_DRONE / (1 / params.mass + _shape(params)[1] ** 2 / ix))
 
 

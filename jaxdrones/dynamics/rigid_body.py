@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
@@ -13,7 +13,7 @@ def newton_euler(params: Params, state: State, wrench: Wrench) -> tuple[Float[Ar
     """Linear acceleration (m/s^2, world) and angular acceleration (rad/s^2, body); paper, equations 2 and 3."""
     gravity = jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
     acc = rotation.rotate(state.quat, wrench.force) / params.mass - gravity
-    gyroscopic = rotation.cross(state.omega, params.inertia * state.omega)
+    gyroscopic = vector.cross(state.omega, params.inertia * state.omega)
     return acc, (wrench.torque - gyroscopic) / params.inertia
 
 

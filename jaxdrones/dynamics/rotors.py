@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.params import Params
-from jaxdrones.rotation import dot
 from jaxdrones.state import State
+from jaxdrones.vector import dot
 from jaxdrones.wrench import Wrench
 
 

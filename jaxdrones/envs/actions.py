@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.checks import check_callable, check_number, check_shape, check_whole
 from jaxdrones.control import Setpoint, attitude, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
@@ -141,7 +141,7 @@ def destination(stride: float = 1.0) -> Action:
 
     def target(params, state, action):
         way = action - state.pos
-        length = jnp.maximum(rotation.dot(way, rotation.unit(way)), stride)
+        length = jnp.maximum(vector.dot(way, vector.unit(way)), stride)
         return Setpoint.at(state.pos + way * stride / length)
 
     return _setpoint(3, target)

@@ -13,8 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxdrones.backends.explicit import Step
-from jaxdrones.backends.host import HostStep
 from jaxdrones.checks import (
     check_callable,
     check_finite,
@@ -26,8 +24,10 @@ from jaxdrones.checks import (
     check_shape,
     shown,
 )
+from jaxdrones.engine.explicit import Step
+from jaxdrones.engine.host import HostStep
 from jaxdrones.envs.actions import Action
-from jaxdrones.envs.randomize import Disturbance, Law, Noise, delayed, draw
+from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw
 from jaxdrones.envs.vision import Vision
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -40,7 +40,7 @@ _MOST_STEPS = 1e9  # of an episode
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
 
 
-class Truth(flax.struct.PyTreeNode):
+class PrivilegedObservation(flax.struct.PyTreeNode):
     """Of a team, as no sensor shows it."""
 
     obs: Array
@@ -65,7 +65,7 @@ class Env:
         dt: float,
         action: Action,
         observation: Sequence[Part],
-        laws: Sequence[Law] = (),
+        laws: Sequence[Randomization] = (),
         noise: Noise | None = None,
         disturb: Disturbance | None = None,
         delay: float = 0.0,
@@ -172,14 +172,16 @@ class Env:
             world = world.replace(images=self.vision.next(world))
         return self._seen(obs, world), world, *outcome
 
-    def truth(self, world: World) -> Truth:
+    def truth(self, world: World) -> PrivilegedObservation:
         """What a critic may know in training, and no policy in flight."""
         off = [_deviation(getattr(world.params, name), getattr(self.params, name)) for name in self._varied]
         secrets = [jnp.reshape(x, (self.drones, -1)) for x in off]
-        return Truth(self._shown(world), jnp.concatenate([jnp.zeros((self.drones, 0)), *secrets], axis=-1))
+        return PrivilegedObservation(
+            self._shown(world), jnp.concatenate([jnp.zeros((self.drones, 0)), *secrets], axis=-1)
+        )
 
     @property
-    def secret_size(self) -> int:
+    def privileged_size(self) -> int:
         """Numbers that `truth` has of a drone beside its observation."""
         return sum(getattr(self.params, name).size for name in self._varied) // self.drones
 

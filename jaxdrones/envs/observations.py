@@ -88,7 +88,7 @@ def kinematics(task: Task, world: World) -> Array:
     )
 
 
-def kinematics_v2(task: Task, world: World) -> Array:
+def kinematics_2x(task: Task, world: World) -> Array:
     """Position, roll-pitch-yaw, velocity, angular velocity (world): today's version of the paper's simulator."""
     drones = world.drones
     return jnp.concatenate([drones.pos, rpy(task, world), drones.vel, omega_world(task, world)], -1)
@@ -183,11 +183,11 @@ OBSERVATIONS: dict[str, Part] = {
     "omega_world": Part(omega_world, _SPINNING),
     "rotor_speed": Part(rotor_speed, 10.0),
     "kinematics": Part(kinematics, _KINEMATICS),
-    "kinematics_v2": Part(kinematics_v2, _KINEMATICS_V2),
+    "kinematics_2x": Part(kinematics_2x, _KINEMATICS_V2),
     "normalized_kinematics": Part(normalized_kinematics, _UNIT),
     "adjacency": Part(adjacency, 1.0),
     "last_action": last_actions(1),
-    "last_actions_v2": last_actions(15),
+    "last_actions_2x": last_actions(15),
     "neighbours": neighbours(2),
     "preview": preview(0.1, 0.2, 0.3),
 }

@@ -11,7 +11,7 @@ from jaxdrones.checks import POSITIVE, check_choice, check_number
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
-Law = Callable[[jax.Array, Params], Params]
+Randomization = Callable[[jax.Array, Params], Params]
 """(key, params) of one drone -> its parameters in this episode."""
 Noise = Callable[[jax.Array, State], State]
 """(key, state) of a team -> what its sensors show."""
@@ -27,7 +27,7 @@ def _check_law(field: str, low: float, high: float) -> None:
         raise ValueError(f"the range of {field} is ({low}, {high}); give the lower bound first")
 
 
-def scaled(field: str, low: float, high: float) -> Law:
+def scaled(field: str, low: float, high: float) -> Randomization:
     """The nominal value times U(low, high), one factor for the whole array.
 
     Raises:
@@ -44,7 +44,7 @@ def scaled(field: str, low: float, high: float) -> Law:
     return law
 
 
-def shifted(field: str, low: float, high: float) -> Law:
+def shifted(field: str, low: float, high: float) -> Randomization:
     """The nominal value plus U(low, high), drawn for each entry of the array.
 
     Raises:
@@ -59,7 +59,7 @@ def shifted(field: str, low: float, high: float) -> Law:
     return law
 
 
-def constant_wind(speed: float) -> Law:
+def constant_wind(speed: float) -> Randomization:
     """Wind U(-speed, speed) (m/s) along x and y, a quarter of that along z, the whole episode through.
 
     Raises:
@@ -74,7 +74,7 @@ def constant_wind(speed: float) -> Law:
     return law
 
 
-def draw(laws: Sequence[Law], key: jax.Array, params: Params) -> Params:
+def draw(laws: Sequence[Randomization], key: jax.Array, params: Params) -> Params:
     """Apply all laws to every drone of a team, each with a key of its own."""
     n = len(params.mass)
     for law, law_key in zip(laws, jax.random.split(key, max(len(laws), 1)), strict=False):
@@ -122,10 +122,10 @@ def pushes(force: float, every: float = 1.0, lasting: float = 0.1) -> Disturbanc
 
     def disturb(key: jax.Array, params: Params, dt: float) -> Params:
         n = len(params.mass)
-        u = jax.random.uniform(key, (n, 4), params.push.dtype)
+        u = jax.random.uniform(key, (n, 4), params.external_force.dtype)
         fresh = force * params.weight[:, None] * (2 * u[:, 1:] - 1)
         begins, ends = u[:, :1] < dt / every, u[:, :1] > 1 - dt / lasting
-        return params.replace(push=jnp.where(begins, fresh, jnp.where(ends, 0, params.push)))
+        return params.replace(external_force=jnp.where(begins, fresh, jnp.where(ends, 0, params.external_force)))
 
     return disturb
 
@@ -141,7 +141,7 @@ def delayed(actions: Array, steps: float) -> Array:
     return newest if share == 0 else (1 - share) * newest + share * actions[:, -2 - whole]
 
 
-REALISTIC_LAWS: tuple[Law, ...] = (
+REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
     scaled("mass", 0.9, 1.1),
     scaled("inertia", 0.8, 1.2),
     scaled("kf", 0.9, 1.1),

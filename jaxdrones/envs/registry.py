@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.backends.explicit import Step, make_step
 from jaxdrones.checks import (
     check_choice,
     check_finite,
@@ -25,14 +24,22 @@ from jaxdrones.dynamics import (
     PAIRS,
     ROTORS,
     drone_contact,
-    external_push,
+    external_force,
     ground_contact,
     lagging_rotors,
 )
+from jaxdrones.engine.explicit import Step, make_step
 from jaxdrones.envs.actions import ACTIONS, Action, check_loop
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
-from jaxdrones.envs.randomize import REALISTIC_DELAY, REALISTIC_LAWS, Disturbance, Law, Noise, sensor_noise
+from jaxdrones.envs.randomize import (
+    REALISTIC_DELAY,
+    REALISTIC_RANDOMIZATION,
+    Disturbance,
+    Noise,
+    Randomization,
+    sensor_noise,
+)
 from jaxdrones.envs.vision import IMAGES, Vision
 from jaxdrones.params import Params, repeat
 from jaxdrones.tasks import gates, hover, paper, swap, tracking
@@ -46,14 +53,14 @@ TASKS: dict[str, Callable[..., Task]] = {
     "tracking": tracking.tracking,
     "gates": gates.gates,
     "swap-goals": swap.swap_goals,
-    "paper-hover": paper.hover,
+    "hover-2021": paper.hover,
     "takeoff": paper.takeoff,
     "fly-through-gate": paper.fly_through_gate,
     "tune": paper.tune,
     "leader-follower": paper.leader_follower,
     "flock": paper.flock,
     "meetup": paper.meetup,
-    "hover-v2": paper.hover_v2,
+    "hover-2x": paper.hover_2x,
     "multi-hover": paper.multi_hover,
 }
 BACKENDS = ("explicit", "bullet")
@@ -75,7 +82,7 @@ def make(
     integrator: str = "semi_implicit_euler",
     control_hz: float | None = None,
     substeps: int | None = None,
-    laws: Sequence[Law] | None = None,
+    laws: Sequence[Randomization] | None = None,
     noise: Noise | None = None,
     disturb: Disturbance | None = None,
     delay: float | None = None,
@@ -124,13 +131,13 @@ def make(
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
     if disturb is not None:
-        effects = [*effects, external_push]
+        effects = [*effects, external_force]
     pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
     action = _action(task.action if action is None else action, nominal, rotors is lagging_rotors, dt)
     physics: dict[str, Any] = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
     step: Step
     if backend == "bullet":
-        from jaxdrones.backends import bullet  # an optional library behind it
+        from jaxdrones.engine import bullet  # an optional library behind it
 
         if integrator != "semi_implicit_euler":
             raise ValueError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
@@ -165,7 +172,7 @@ def make(
 
 _PLAIN: dict[str, Any] = dict(rotors="instant", effects=(), laws=(), noise=None, delay=0.0)
 _REALISTIC: dict[str, Any] = dict(
-    rotors="lagging", effects=("drag",), laws=REALISTIC_LAWS, noise=sensor_noise(), delay=REALISTIC_DELAY
+    rotors="lagging", effects=("drag",), laws=REALISTIC_RANDOMIZATION, noise=sensor_noise(), delay=REALISTIC_DELAY
 )
 
 

@@ -2,13 +2,13 @@
 
 from typing import TYPE_CHECKING, Any
 
-from jaxdrones.compiler import training_options
-from jaxdrones.learning import bptt, ppo, presets, shac
+from jaxdrones.accelerate.compiler import training_options
+from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.evaluation import Report, evaluate
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.result import Result
 
-__all__ = ["COMPILER_OPTIONS", "Policy", "Report", "Result", "bptt", "evaluate", "ppo", "presets", "shac"]
+__all__ = ["COMPILER_OPTIONS", "Policy", "Report", "Result", "bptt", "evaluate", "ppo", "shac"]
 
 
 if TYPE_CHECKING:

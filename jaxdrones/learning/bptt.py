@@ -35,7 +35,7 @@ class Config:
     """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
     settle: float = 0.2
     """Share of the updates after which the statistics stay as they are."""
-    per_role: bool = False
+    per_agent: bool = False
     learning_rate: float = 2e-2
     """At the start; falls to zero along a cosine."""
     discount: float = 1.0
@@ -76,7 +76,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key = jax.random.split(key)
-    policy = Policy.init(policy_key, env, config.sizes, config.per_role)
+    policy = Policy.init(policy_key, env, config.sizes, config.per_agent)
     return TrainState(
         jnp.zeros((), jnp.int32), key, policy, _optimiser(config).init(policy.params), collect.idle(env, config.worlds)
     )

@@ -40,7 +40,7 @@ def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
         ValueError: the policy has numbers that are not finite.
     """
     _check_finite(_numbers(Path(path)), policy)
-    own = {"network": _settings(policy.network), "per_role": policy.per_role}
+    own = {"network": _settings(policy.network), "per_agent": policy.per_agent}
     save_tree(path, policy, **about, policy=own)
 
 
@@ -64,7 +64,7 @@ def load(path: str | os.PathLike) -> Policy:
         network = VisionMLP(**settings) if "channels" in settings else MLP(**settings)
         statistics = Statistics(**{name: jnp.asarray(x) for name, x in numbers["statistics"].items()})
         params = jax.tree.map(jnp.asarray, numbers["params"])
-        policy = Policy(params, statistics, network, kept["policy"]["per_role"])
+        policy = Policy(params, statistics, network, kept["policy"]["per_agent"])
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(f"{path} does not hold a policy of this version ({line(error)}); {ANOTHER}") from error
     _check_shapes(path, kept, policy)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.envs import AutoReset, Env, autoreset
 from jaxdrones.envs.autoreset import Episode
-from jaxdrones.envs.env import Obs, Truth
+from jaxdrones.envs.env import Obs, PrivilegedObservation
 from jaxdrones.learning import sharding
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import Statistics
@@ -53,9 +53,9 @@ class Flight(flax.struct.PyTreeNode):
     """(t, w, n) sum of rewards of the episode so far."""
     error: Array
     """(t, w, n) distance from the target, m."""
-    truth: Truth | None
+    truth: PrivilegedObservation | None
     """(t, w, n, ...) before the step, where it was asked for."""
-    final_truth: Truth | None
+    final_truth: PrivilegedObservation | None
     """(t, w, n, ...) after the step, before a new episode started."""
     over: Array
     """(t, w) the episode was over before the step, which does not count; never so where episodes are reset."""

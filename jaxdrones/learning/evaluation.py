@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.accelerate.compiler import training_options
 from jaxdrones.checks import check_key
-from jaxdrones.compiler import training_options
 from jaxdrones.envs import Env
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxdrones.backends.explicit import Step, make_step
+from jaxdrones.engine.explicit import Step, make_step
 from jaxdrones.envs import Env
 
 GRADIENTS = ("exact", "decay", "surrogate")

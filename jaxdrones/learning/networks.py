@@ -120,25 +120,25 @@ class Policy(flax.struct.PyTreeNode):
     """What flies: observations of a team to its actions. A pytree, so it can be saved, mapped and differentiated."""
 
     params: Any
-    """Of the network; with `per_role` one set per drone, along a leading axis."""
+    """Of the network; with `per_agent` one set per drone, along a leading axis."""
     statistics: Statistics
     network: MLP | VisionMLP = flax.struct.field(pytree_node=False)
-    per_role: bool = flax.struct.field(pytree_node=False, default=False)
+    per_agent: bool = flax.struct.field(pytree_node=False, default=False)
 
     @classmethod
-    def init(cls, key: jax.Array, env: Env, sizes: Sequence[int], per_role: bool = False) -> Policy:
+    def init(cls, key: jax.Array, env: Env, sizes: Sequence[int], per_agent: bool = False) -> Policy:
         """A policy whose actions are nearly zero, which with most action types is to hover.
 
         Args:
             key: random key.
             env: what it is to fly.
             sizes: of the hidden layers.
-            per_role: a network for every drone, else one for all.
+            per_agent: a network for every drone, else one for all.
         """
         obs = seen_by_one(env)
         network = network_for(obs, sizes, env.action_size, scale=0.01)
-        params = init_params(key, network, obs, env.drones if per_role else None)
-        return cls(params, Statistics.none(env.observation_size), network, per_role)
+        params = init_params(key, network, obs, env.drones if per_agent else None)
+        return cls(params, Statistics.none(env.observation_size), network, per_agent)
 
     def __repr__(self) -> str:
         layers = (*np.shape(self.statistics.mean)[-1:], *self.network.sizes, self.network.outputs)
@@ -147,7 +147,7 @@ class Policy(flax.struct.PyTreeNode):
         known = isinstance(seen, jax.Array | np.ndarray) and is_known(seen) and seen.ndim == 0
         counted = f", statistics of {float(seen):,.0f} observations" if known else ""
         images = f" and images by {self.network.channels}" if isinstance(self.network, VisionMLP) else ""
-        whose = ", one network per drone" if self.per_role else ""
+        whose = ", one network per drone" if self.per_agent else ""
         return (
             f"<Policy {' -> '.join(map(str, layers))}{images}, {self.network.activation}, "
             f"{numbers:,} parameters{whose}{counted}>"
@@ -156,7 +156,7 @@ class Policy(flax.struct.PyTreeNode):
     def __call__(self, obs: Obs) -> Float[Array, "*batch n a"]:
         """The action, in (-1, 1), of observations (*batch, n, d), or of a dictionary of such arrays with images."""
         x = on_vector(self.statistics.normalize, obs)
-        return jnp.tanh(apply(self.network, self.params, x, self.per_role))
+        return jnp.tanh(apply(self.network, self.params, x, self.per_agent))
 
 
 def seen_by_one(env: Env) -> Obs:
@@ -172,9 +172,9 @@ def init_params(key: jax.Array, network: MLP | VisionMLP, example: Obs, roles: i
     return jax.vmap(network.init, in_axes=(0, None))(jax.random.split(key, roles), example)
 
 
-def apply(network: MLP | VisionMLP, params: Any, x: Obs, per_role: bool) -> Array:
+def apply(network: MLP | VisionMLP, params: Any, x: Obs, per_agent: bool) -> Array:
     """The network of every drone, or the one for all."""
-    if not per_role:
+    if not per_agent:
         return cast(Array, network.apply(params, x))
     drones = vector(x).ndim - 2
     return cast(Array, jax.vmap(network.apply, in_axes=(0, drones), out_axes=drones)(params, x))

@@ -41,37 +41,37 @@ class Config:
     batches: int = 8
     """Parts of the flown steps, each of which makes one gradient step; cut out of the worlds."""
     sizes: tuple[int, ...] = (32, 32)
-    critic_sizes: tuple[int, ...] = (32, 32)
+    critic_hidden_sizes: tuple[int, ...] = (32, 32)
     memory: float = 1e9
     """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
     settle: float = 0.1
     """Share of the updates after which the statistics stay as they are."""
-    per_role: bool = False
+    per_agent: bool = False
     """A policy and a value function for every drone, else one of each for all."""
-    central_critic: bool = False
+    centralized_critic: bool = False
     """Values are of all drones' observations and of the others' actions, else of a drone's own observation."""
-    informed_critic: bool = False
+    privileged_critic: bool = False
     """Values are of what a policy never sees: observations without noise, and drawn parameters (`Env.truth`)."""
     learning_rate: float = 2e-3
     """At the start; follows how much the policy changes in a gradient step."""
     change: float = 0.02
     """That is aimed at: divergence (KL) of the policy from the one that flew. The rate falls above twice of it and
-    grows below half of it, within `slowest` and `fastest`."""
-    slowest: float = 1e-5
-    fastest: float = 5e-3
+    grows below half of it, within `min_learning_rate` and `max_learning_rate`."""
+    min_learning_rate: float = 1e-5
+    max_learning_rate: float = 5e-3
     cool: float = 0.3
-    """Share of the updates, the last ones, in which the largest rate falls to the slowest, and the spread to `calm`."""
+    """Share of the updates, the last ones, in which the largest rate falls to the min_learning_rate, and the spread to `calm`."""
     discount: float = 0.99
     trace: float = 0.99
     """Lambda of the advantages."""
-    ratio_clip: float = 0.2
+    clip_epsilon: float = 0.2
     """Largest change of an action's probability that is rewarded."""
     entropy: float = 0.0
     """Reward for the spread of actions."""
-    value_weight: float = 0.5
+    value_coef: float = 0.5
     spread: float = 0.4
     """Standard deviation of actions at the start."""
-    narrowest: float = 0.1
+    min_std: float = 0.1
     """The least it may become before the last updates; what is tried next to the mean is what a policy learns from."""
     calm: float = 0.02
     """What it falls to in the last updates: rotors that are shaken lift more, so the mean is off without shaking."""
@@ -82,8 +82,13 @@ class Config:
 
     def __post_init__(self):
         check_settings(self, valued=True)
-        if is_known(self.slowest):
-            check_number("fastest", self.fastest, "not slower than slowest", at_least=self.slowest)
+        if is_known(self.min_learning_rate):
+            check_number(
+                "max_learning_rate",
+                self.max_learning_rate,
+                "not slower than min_learning_rate",
+                at_least=self.min_learning_rate,
+            )
         if self.worlds % self.batches:
             raise ValueError(f"worlds is {self.worlds}; give a multiple of batches, {self.batches}")
 
@@ -96,7 +101,7 @@ class TrainState(flax.struct.PyTreeNode):
     key: Array
     policy: Policy
     log_std: Array
-    """(a,), or (n, a) with `per_role`: logarithm of the spread of actions."""
+    """(a,), or (n, a) with `per_agent`: logarithm of the spread of actions."""
     critic: Any
     """Parameters of the value function."""
     optimiser: optax.OptState
@@ -125,13 +130,13 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.sizes, config.per_role)
+    policy = Policy.init(policy_key, env, config.sizes, config.per_agent)
     n, a = env.drones, env.action_size
-    d = env.observation_size + (env.secret_size if config.informed_critic else 0)
-    log_std = jnp.full((n, a) if config.per_role else (a,), jnp.log(config.spread))
-    inputs = n * d + (n - 1) * a if config.central_critic else d
+    d = env.observation_size + (env.privileged_size if config.privileged_critic else 0)
+    log_std = jnp.full((n, a) if config.per_agent else (a,), jnp.log(config.spread))
+    inputs = n * d + (n - 1) * a if config.centralized_critic else d
     obs = on_vector(lambda _: jnp.zeros(inputs), seen_by_one(env))
-    critic = init_params(critic_key, _critic(config, obs), obs, n if config.per_role else None)
+    critic = init_params(critic_key, _critic(config, obs), obs, n if config.per_agent else None)
     optimiser = _descent(config).init((policy.params, log_std, critic))
     rate = jnp.asarray(config.learning_rate, log_std.dtype)
     worlds = collect.idle(env, config.worlds)
@@ -152,12 +157,12 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         return action, log_prob(action, mean, log_std)
 
     pilot = jax.tree_util.Partial(act, state.policy, state.log_std)
-    worlds, flight = collect.fly(fly_key, env, pilot, worlds, config.horizon, informed=config.informed_critic)
+    worlds, flight = collect.fly(fly_key, env, pilot, worlds, config.horizon, informed=config.privileged_critic)
     sample = _judged(config, state, flight)
     learnt, optimiser, rate, losses = _learn(learn_key, config, state, sample)
     params, log_std, critic = learnt
     widest = _falling(config, state.step, config.spread, config.calm)
-    log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.narrowest, widest)), jnp.log(widest))
+    log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.min_std, widest)), jnp.log(widest))
     statistics = collect.remember(state.policy.statistics, vector(flight.obs), config, state.step)
     policy = state.policy.replace(params=params, statistics=statistics)
     metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std)), "rate": rate}
@@ -180,12 +185,12 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, sample: Sa
     """What PPO descends: the clipped surrogate of the return, the error of the values, minus entropy."""
     change = log_prob(sample.action, policy(sample.obs), log_std) - sample.log_prob
     ratio = jnp.exp(jnp.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE))
-    clipped = jnp.clip(ratio, 1 - config.ratio_clip, 1 + config.ratio_clip)
+    clipped = jnp.clip(ratio, 1 - config.clip_epsilon, 1 + config.clip_epsilon)
     gain = jnp.mean(jnp.minimum(ratio * sample.advantage, clipped * sample.advantage))
     miss = (1 - config.discount) * (_value(config, critic, sample.critic_obs) - sample.target)
     value_loss = jnp.mean(miss**2)
     entropy = jnp.mean(jnp.sum(log_std + 0.5 + _HALF_LOG_2_PI, axis=-1))
-    total = -gain + config.value_weight * value_loss - config.entropy * entropy
+    total = -gain + config.value_coef * value_loss - config.entropy * entropy
     kl = jnp.mean(ratio - 1 - change)
     return total, {"value_loss": value_loss, "kl": kl}
 
@@ -196,15 +201,15 @@ def _judged(config: Config, state: TrainState, flight: collect.Flight) -> Sample
 
     def seen(obs, truth, action):
         """What the critic sees, where the policy sees `obs`."""
-        if config.informed_critic:
+        if config.privileged_critic:
             obs = on_vector(lambda _: truth.obs, obs)
         obs = on_vector(policy.statistics.normalize, obs)
-        if config.informed_critic:
+        if config.privileged_critic:
             obs = on_vector(lambda x: jnp.concatenate([x, truth.secrets], axis=-1), obs)
-        return on_vector(lambda x: central(x, action), obs) if config.central_critic else obs
+        return on_vector(lambda x: central(x, action), obs) if config.centralized_critic else obs
 
     critic_obs = seen(flight.obs, flight.truth, flight.action)
-    final_action = policy(flight.final_obs) if config.central_critic else None
+    final_action = policy(flight.final_obs) if config.centralized_critic else None
     final_obs = seen(flight.final_obs, flight.final_truth, final_action)
     value = _value(config, state.critic, critic_obs)
     next_value = _value(config, state.critic, final_obs)
@@ -223,14 +228,18 @@ def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
         params, log_std, critic = learnt
         return loss(config, state.policy.replace(params=params), log_std, critic, batch)
 
-    fastest = _falling(config, state.step, config.fastest, config.slowest)
+    max_learning_rate = _falling(config, state.step, config.max_learning_rate, config.min_learning_rate)
 
     def step(carry, batch):
         learnt, optimiser, rate = carry
         (_, losses), gradient = jax.value_and_grad(cost, has_aux=True)(learnt, batch)
         step, optimiser = _descent(config).update(gradient, optimiser)
         slower, faster = losses["kl"] > 2 * config.change, losses["kl"] < config.change / 2
-        rate = jnp.clip(rate * jnp.where(slower, 1 / _PACE, jnp.where(faster, _PACE, 1)), config.slowest, fastest)
+        rate = jnp.clip(
+            rate * jnp.where(slower, 1 / _PACE, jnp.where(faster, _PACE, 1)),
+            config.min_learning_rate,
+            max_learning_rate,
+        )
         learnt = jax.tree.map(lambda x, s: x - rate.astype(x.dtype) * s, learnt, step)
         return (learnt, optimiser, rate), losses
 
@@ -256,12 +265,12 @@ def _falling(config: Config, step: Array, high: float, low: float) -> Array:
 
 
 def _critic(config: Config, critic_obs: Obs) -> MLP | VisionMLP:
-    return network_for(critic_obs, config.critic_sizes, 1, scale=0.01)
+    return network_for(critic_obs, config.critic_hidden_sizes, 1, scale=0.01)
 
 
 def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
     """(*batch, n) discounted sum of rewards to come; the network's output is a mean reward."""
-    return apply(_critic(config, critic_obs), critic, critic_obs, config.per_role)[..., 0] / (1 - config.discount)
+    return apply(_critic(config, critic_obs), critic, critic_obs, config.per_agent)[..., 0] / (1 - config.discount)
 
 
 def _descent(config: Config) -> optax.GradientTransformation:

@@ -35,12 +35,12 @@ class Config:
     horizon: int = 64
     """Control steps that a gradient goes back through."""
     sizes: tuple[int, ...] = (32, 32)
-    critic_sizes: tuple[int, ...] = (32, 32)
+    critic_hidden_sizes: tuple[int, ...] = (32, 32)
     memory: float = 1e9
     """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
     settle: float = 0.2
     """Share of the updates after which the statistics stay as they are."""
-    per_role: bool = False
+    per_agent: bool = False
     learning_rate: float = 2e-2
     """Of the policy, at the start; falls to zero along a cosine."""
     critic_rate: float = 5e-3
@@ -96,7 +96,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.sizes, config.per_role)
+    policy = Policy.init(policy_key, env, config.sizes, config.per_agent)
     critic = init_params(critic_key, _critic(config), jnp.zeros(env.observation_size))
     return TrainState(
         jnp.zeros((), jnp.int32),
@@ -181,7 +181,7 @@ def _fit(key, config: Config, state: TrainState, value, flight: collect.Flight):
 
 
 def _critic(config: Config) -> MLP:
-    return MLP(config.critic_sizes, 1, scale=0.01)
+    return MLP(config.critic_hidden_sizes, 1, scale=0.01)
 
 
 def _actor_descent(config: Config) -> optax.GradientTransformation:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxdrones.record import Record
+from jaxdrones.flights.record import Record
 
 # panel: (array of the record, column, label), in the order of the paper's figures, left and right in turn
 PANELS = {

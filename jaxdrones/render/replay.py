@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxdrones.backends import bullet
+from jaxdrones.engine import bullet
+from jaxdrones.flights.record import Record
 from jaxdrones.params import repeat
-from jaxdrones.record import Record
 from jaxdrones.render import video
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State

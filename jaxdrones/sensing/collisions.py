@@ -13,11 +13,10 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_shape
-from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
-from jaxdrones.rotation import cross, dot, unit, unstack
 from jaxdrones.sensing.scene import Box, Cylinder, Obstacle, Scene, Sphere
 from jaxdrones.state import State
+from jaxdrones.vector import components, cross, dot, safe_sqrt, unit
 
 _MARGIN = 1e-3  # m; a drone at rest is 0.01 mm (Bullet) or 1.5 mm (`ground_contact`) inside the ground
 _PROJECTIONS = 8  # to and fro; of random pairs of cf2x within 0.2 m 0.5 % then touch up to 6 mm too early
@@ -115,7 +114,7 @@ def _body(params: Params, state: State) -> _Cylinder:
 
 def _lowest(body: _Cylinder) -> Float[Array, ""]:
     """World z of the lowest point, m."""
-    _, _, z = unstack(body.pos)
+    _, _, z = components(body.pos)
     return z - body.reach(jnp.array([0, 0, 1], body.pos.dtype))
 
 

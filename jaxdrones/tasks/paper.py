@@ -1,4 +1,4 @@
-"""The tasks of the paper, and those of today's version of its simulator (`hover_v2`, `multi_hover`).
+"""The tasks of the paper, and those of today's version of its simulator (`hover_2x`, `multi_hover`).
 
 Rewards, ends and starts are the reference's. Its clock is read before the step, so rewards that follow a moving point
 lag one control step behind, and an episode of T seconds has two steps more than T / dt.
@@ -32,7 +32,7 @@ Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]  # of targets 
 @check_keywords
 def hover(drones: int = 1) -> Task:
     """Equation 12: the negative squared distance from (0, 0, 1)."""
-    return _task("paper-hover", "hover at z = 1 m (equation 12)", drones, _at(0.0, 0.0, 1.0), _squared_distance)
+    return _task("hover-2021", "hover at z = 1 m (equation 12)", drones, _at(0.0, 0.0, 1.0), _squared_distance)
 
 
 @check_keywords
@@ -118,9 +118,9 @@ def meetup(drones: int = 2) -> Task:
 
 
 @check_keywords
-def hover_v2(drones: int = 1) -> Task:
+def hover_2x(drones: int = 1) -> Task:
     """Hover at (0, 0, 1), rewarded by max(0, 2 - d^4)."""
-    return _task_v2("hover-v2", "hover at z = 1 m, bounded reward", drones, _at(0.0, 0.0, 1.0), box=1.5)
+    return _task_v2("hover-2x", "hover at z = 1 m, bounded reward", drones, _at(0.0, 0.0, 1.0), box=1.5)
 
 
 @check_keywords
@@ -191,7 +191,7 @@ def _task_v2(name: str, summary: str, drones: int, target: Target, box: float) -
         success=_close_at_the_end,
         contact=("ground",),
         action="one_d_rpm",
-        observation=("kinematics_v2", "last_actions_v2"),
+        observation=("kinematics_2x", "last_actions_2x"),
         control_hz=30.0,
         substeps=8,
         overtime=2,

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vector
 from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole
 from jaxdrones.control import Setpoint
-from jaxdrones.numerics import safe_sqrt
 from jaxdrones.params import Params
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
+from jaxdrones.vector import safe_sqrt
 
 
 class World(flax.struct.PyTreeNode):
@@ -141,12 +141,12 @@ class Task:
 
 def norm(v: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Length of every row, with a zero gradient at zero."""
-    return safe_sqrt(jax.vmap(rotation.dot)(v, v))
+    return safe_sqrt(jax.vmap(vector.dot)(v, v))
 
 
 def square(v: Float[Array, "n k"]) -> Float[Array, " n"]:
     """Squared length of every row."""
-    return jax.vmap(rotation.dot)(v, v)
+    return jax.vmap(vector.dot)(v, v)
 
 
 def distance(task: Task, world: World) -> Float[Array, " n"]:

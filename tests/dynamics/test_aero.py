@@ -10,7 +10,7 @@ import pytest
 from helpers import assert_close, assert_finite, flying
 
 import jaxdrones
-from jaxdrones import State, drag, drag_world_axes, ground_effect, ground_effect_paper, rotation
+from jaxdrones import State, drag, drag_world_axes, ground_effect, ground_effect_2021, rotation
 
 params = jaxdrones.load_params("cf2x")
 states = flying(jaxdrones.repeat(params, 50))
@@ -49,7 +49,7 @@ def test_forces_of_the_paper_are_the_recorded_ones(name):
     states = State(recorded["pos0"], recorded["quat0"], recorded["vel0"], zero, recorded["rpm0"])
     params = golden_data.recorded_params(case)
 
-    ground = on_each(ground_effect_paper, states, params)
+    ground = on_each(ground_effect_2021, states, params)
     per_rotor = recorded["ground_force"]
     np.testing.assert_allclose(ground.force[:, 2], jnp.sum(per_rotor, axis=1), rtol=1e-9, atol=1e-9)
     x, y, _ = params.rotor_pos.T
@@ -111,7 +111,7 @@ def test_ground_effect_approaches_equation_5_at_height(radii):
     equation = 4 * params.kf * params.ground_effect_coeff * (1 / (4 * radii)) ** 2 * params.hover_rpm**2
     lack = 1 - smooth / equation
     assert 0 < lack < (1.63 / radii) ** 4 / 2
-    np.testing.assert_allclose(ground_effect_paper(params, hovering(radii * RADIUS)).force[2], equation, rtol=1e-14)
+    np.testing.assert_allclose(ground_effect_2021(params, hovering(radii * RADIUS)).force[2], equation, rtol=1e-14)
 
 
 def test_ground_effect_falls_with_height_and_is_bounded():
@@ -131,7 +131,7 @@ def test_ground_effect_is_smooth_in_height():
     assert np.max(np.abs(np.diff(slope))) <= 4 * (4 / 15 * WEIGHT / floor**2) * 1e-4
 
 
-@pytest.mark.parametrize("effect", [ground_effect, ground_effect_paper])
+@pytest.mark.parametrize("effect", [ground_effect, ground_effect_2021])
 def test_there_is_no_ground_effect_upside_down(effect):
     tilts = jnp.array([jnp.pi / 2 + 0.01, jnp.pi, -2.0])
     wrench = on_each(effect, jax.vmap(partial(hovering, 0.05))(tilts))
@@ -156,13 +156,13 @@ def test_ground_effect_rights_a_tilted_drone():
 
 def test_a_vehicle_without_a_coefficient_has_no_ground_effect_and_no_drag():
     hummingbird = jaxdrones.load_params("hb")
-    for effect in ground_effect, ground_effect_paper, drag:
+    for effect in ground_effect, ground_effect_2021, drag:
         wrench = on_each(effect, states, hummingbird)
         np.testing.assert_array_equal(wrench.force, 0)
         np.testing.assert_array_equal(wrench.torque, 0)
 
 
-@pytest.mark.parametrize("effect", [ground_effect, ground_effect_paper])
+@pytest.mark.parametrize("effect", [ground_effect, ground_effect_2021])
 @pytest.mark.parametrize("height", [-0.1, 0.0, 0.1])
 def test_without_a_coefficient_values_and_gradients_stay_finite_at_any_height(effect, height):
     hummingbird = jaxdrones.load_params("hb")

@@ -9,9 +9,9 @@ import pytest
 from helpers import assert_finite, mostly_slow
 
 import jaxdrones
-from jaxdrones import State, drone_contact, ground_contact, rotation
-from jaxdrones.backends import bullet
-from jaxdrones.backends.wrenches import make_total_wrench
+from jaxdrones import State, drone_contact, ground_contact, rotation, vector
+from jaxdrones.engine import bullet
+from jaxdrones.engine.wrenches import make_total_wrench
 
 VEHICLES = {name: jaxdrones.load_params(name) for name in ("cf2x", "hb", "racer")}
 CRAZYFLIE = VEHICLES["cf2x"]
@@ -217,7 +217,7 @@ def both_ways(couples, vehicle, other):
         out = []
         for wrench, s in (drone_contact(params, a, others, b), a), (drone_contact(others, b, params, a), b):
             force = rotation.rotate(s.quat, wrench.force)
-            out.append((force, rotation.rotate(s.quat, wrench.torque) + rotation.cross(s.pos, force)))
+            out.append((force, rotation.rotate(s.quat, wrench.torque) + vector.cross(s.pos, force)))
         return out
 
     return jax.vmap(of_world)(couples)
@@ -308,7 +308,7 @@ def test_drones_in_exactly_the_same_place_come_apart_and_keep_their_momentum(veh
 @pytest.mark.float32
 def test_drones_in_the_same_place_come_apart_in_single_precision_far_away_and_with_cells():
     params = jaxdrones.load_params("cf2x")
-    for cells in None, jaxdrones.Cells(reach=0.5):
+    for cells in None, jaxdrones.NeighborGrid(reach=0.5):
         for pos in (0.0, 0.0, 1.0), (5000.0, 100.0, 20.0):
             end = part(params, in_one_place(3, pos=pos), cells)
             assert smallest_gap(end) > params.collision_height

@@ -12,7 +12,7 @@ from helpers import assert_close, to_world
 from scipy.spatial.transform import Rotation
 
 import jaxdrones
-from jaxdrones import State, downwash, downwash_paper, rotation
+from jaxdrones import State, downwash, downwash_2021, rotation
 
 README = (Path(__file__).parents[2] / "README.md").read_text()
 params = jaxdrones.load_params("cf2x")
@@ -45,7 +45,7 @@ def test_forces_of_the_paper_are_the_recorded_ones(name):
     first = State(recorded["pos0"], recorded["quat0"], recorded["vel0"], zero, recorded["rpm0"])
     second = State(recorded["pos1"], jnp.tile(jnp.array([[0.0, 0, 0, 1]]), (len(zero), 1)), zero, zero, first.rpm)
     params = golden_data.recorded_params(case)
-    force = jax.jit(jax.vmap(lambda a, b: downwash_paper(params, a, params, b).force))
+    force = jax.jit(jax.vmap(lambda a, b: downwash_2021(params, a, params, b).force))
     for on, expected in (force(first, second), "downwash_on_0"), (force(second, first), "downwash_on_1"):
         np.testing.assert_allclose(on[:, 2], recorded[expected], rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(on[:, :2], 0)
@@ -55,15 +55,15 @@ def test_the_guards_of_the_papers_downwash_leave_its_values_alone():
     """Equation 6 as written, wherever dz >= 0.05 m and its width is at least 0.5 mm."""
     rng = np.random.default_rng(0)
     k1, k2, k3 = np.asarray(params.downwash_coeff)
-    narrowest = (5e-4 * np.array([1, -1]) * (1 + 1e-9) - k3) / k2  # dz where the width is at its bound
-    dz = np.concatenate([[0.05, 0.6, 0.68], narrowest, rng.uniform(0.05, 3, 500)])
+    min_std = (5e-4 * np.array([1, -1]) * (1 + 1e-9) - k3) / k2  # dz where the width is at its bound
+    dz = np.concatenate([[0.05, 0.6, 0.68], min_std, rng.uniform(0.05, 3, 500)])
     beta = k2 * dz + k3
     dz, beta = dz[np.abs(beta) >= 5e-4], beta[np.abs(beta) >= 5e-4]
     assert len(dz) > 490
     off_axis = rng.uniform(-2, 2, (len(dz), 2)) * np.abs(beta)[:, None]  # where there is something to compare
     expected = -k1 * (float(params.prop_radius) / (4 * dz)) ** 2 * np.exp(-np.sum(off_axis**2, 1) / beta**2 / 2)
     upper = jax.vmap(hovering)(jnp.array(np.column_stack([off_axis, dz])))
-    actual = jax.vmap(lambda s: on_lower(s, pair=downwash_paper).force[2])(upper)
+    actual = jax.vmap(lambda s: on_lower(s, pair=downwash_2021).force[2])(upper)
     np.testing.assert_allclose(actual, expected, rtol=1e-9)  # beta cancels digits near zero width: 1e-16 * 0.1 / 5e-4
 
 
@@ -71,10 +71,10 @@ def test_the_guards_bound_the_papers_downwash():
     """At 5 cm it is 30 N; it grows no further, whatever the distance, and sideways it ends at 10 m."""
     bound = -params.downwash_coeff[0] * (params.prop_radius / 0.2) ** 2
     for dz in 1e-3, 1e-9, 0.05:
-        np.testing.assert_allclose(on_lower(hovering((0, 0, dz)), pair=downwash_paper).force[2], bound, rtol=1e-12)
+        np.testing.assert_allclose(on_lower(hovering((0, 0, dz)), pair=downwash_2021).force[2], bound, rtol=1e-12)
     for pos in (0, 0, 0), (0, 0, -1), (10.1, 0, 20):
-        assert on_lower(hovering(pos), pair=downwash_paper).force[2] == 0
-    assert on_lower(hovering((0, 0, 0.6875)), pair=downwash_paper).force[2] < 0
+        assert on_lower(hovering(pos), pair=downwash_2021).force[2] == 0
+    assert on_lower(hovering((0, 0, 0.6875)), pair=downwash_2021).force[2] < 0
 
 
 def test_the_jet_is_that_of_bauersfeld_below_the_rotors():
@@ -92,7 +92,7 @@ def test_the_jet_is_that_of_bauersfeld_below_the_rotors():
 
 def test_half_a_metre_below_another_a_crazyflie_loses_the_share_of_its_weight_that_the_readme_says():
     upper = hovering((0, 0, 0.5))
-    for pair, percent in (downwash, 14.3), (downwash_paper, 115):
+    for pair, percent in (downwash, 14.3), (downwash_2021, 115):
         push = -100 * float(on_lower(upper, pair=pair).force[2] / params.weight)
         np.testing.assert_allclose(push, percent, rtol=0, atol=0.5 if percent == 115 else 0.05)
         assert f"{percent} %" in README
@@ -104,7 +104,7 @@ def test_at_the_half_width_the_jet_blows_half_as_fast():
     np.testing.assert_allclose(side / centre, 0.5, rtol=1e-12)
 
 
-@pytest.mark.parametrize("pair", [downwash, downwash_paper])
+@pytest.mark.parametrize("pair", [downwash, downwash_2021])
 def test_nothing_blows_upwards(pair):
     for pos in np.random.default_rng(2).uniform([-0.2, -0.2, -1], [0.2, 0.2, 0], (20, 3)):
         np.testing.assert_array_equal(on_lower(hovering(pos), pair=pair).force, 0)

@@ -14,7 +14,7 @@ from jaxdrones.tasks.starts import standing_height
 
 KEY = jax.random.key(3)
 OTHER = jax.random.key(4)
-QUICK = ("hover", "gates", "hover-v2")
+QUICK = ("hover", "gates", "hover-2x")
 make_env = lru_cache(make)
 
 
@@ -74,14 +74,14 @@ def test_different_keys_start_differently_or_the_task_has_one_start(task):
     assert same == (
         env.task.name
         in {
-            "paper-hover",
+            "hover-2021",
             "takeoff",
             "fly-through-gate",
             "tune",
             "leader-follower",
             "flock",
             "meetup",
-            "hover-v2",
+            "hover-2x",
             "multi-hover",
             "gates",
         }

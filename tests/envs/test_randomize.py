@@ -98,7 +98,7 @@ def test_pushes_come_as_often_and_last_as_long_as_asked():
 
     def advance(team, key):
         team = disturb(key, team, 0.01)
-        return team, team.push
+        return team, team.external_force
 
     push = np.asarray(jax.lax.scan(advance, team, jax.random.split(KEY, 2000))[1])
     active = np.any(push != 0, axis=-1)
@@ -109,9 +109,9 @@ def test_pushes_come_as_often_and_last_as_long_as_asked():
 
 
 def test_a_push_accelerates_as_newton_says():
-    env = make("hover", effects=("external_push",), tilt=0.0, speed=0.0, omega=0.0)
+    env = make("hover", effects=("external_force",), tilt=0.0, speed=0.0, omega=0.0)
     _, world = env.reset(KEY)
-    world = world.replace(params=world.params.replace(push=jnp.array([[0.027, 0, 0]])))
+    world = world.replace(params=world.params.replace(external_force=jnp.array([[0.027, 0, 0]])))
     vel = env.step(KEY, world, jnp.zeros((1, 4)))[1].drones.vel
     np.testing.assert_allclose(vel[0, 0] - world.drones.vel[0, 0], 1.0 * env.dt, rtol=1e-9)
 
@@ -129,10 +129,10 @@ def test_the_truth_is_the_observation_without_noise_and_how_far_parameters_are_o
     env = make("hover", laws=laws, noise=sensor_noise())
     obs, world = env.reset(KEY)
     truth = env.truth(world)
-    assert truth.secrets.shape == (1, env.secret_size) == (1, 4)
+    assert truth.secrets.shape == (1, env.privileged_size) == (1, 4)
     np.testing.assert_allclose(truth.secrets[0, 0], world.params.mass[0] / env.params.mass[0] - 1, rtol=1e-12)
     np.testing.assert_array_equal(truth.secrets[0, 1:], world.params.wind[0])
     plain = make("hover", laws=laws)
     np.testing.assert_allclose(truth.obs, plain.reset(KEY)[0], rtol=0, atol=1e-15)
     assert np.abs(obs - truth.obs).max() > 1e-4
-    assert plain.reset(KEY)[0].shape == truth.obs.shape and make("hover").secret_size == 0
+    assert plain.reset(KEY)[0].shape == truth.obs.shape and make("hover").privileged_size == 0

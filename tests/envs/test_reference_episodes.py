@@ -14,14 +14,14 @@ from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.envs.registry import TASKS
 
 TASK = {
-    ("paper", "HoverAviary"): "paper-hover",
+    ("paper", "HoverAviary"): "hover-2021",
     ("paper", "TakeoffAviary"): "takeoff",
     ("paper", "FlyThruGateAviary"): "fly-through-gate",
     ("paper", "TuneAviary"): "tune",
     ("paper", "LeaderFollowerAviary"): "leader-follower",
     ("paper", "FlockAviary"): "flock",
     ("paper", "MeetupAviary"): "meetup",
-    ("main", "HoverAviary"): "hover-v2",
+    ("main", "HoverAviary"): "hover-2x",
     ("main", "MultiHoverAviary"): "multi-hover",
 }
 ACTION = {

@@ -10,7 +10,7 @@ from jaxdrones.learning.networks import Policy
 
 @pytest.fixture(scope="module")
 def env():
-    return envs.make("paper-hover")
+    return envs.make("hover-2021")
 
 
 CONFIG = bptt.Config(updates=4, worlds=3, horizon=2, sizes=(4,))
@@ -19,19 +19,19 @@ CONFIG = bptt.Config(updates=4, worlds=3, horizon=2, sizes=(4,))
 @pytest.mark.slow
 def test_a_policy_flies_on_as_it_was_saved(env, tmp_path):
     policy = Policy.init(jax.random.key(0), env, (8, 8))
-    checkpoint.save(tmp_path / "new" / "policy", policy, env="paper-hover", config=CONFIG)
+    checkpoint.save(tmp_path / "new" / "policy", policy, env="hover-2021", config=CONFIG)
     loaded = checkpoint.load(tmp_path / "new" / "policy")
     obs = jax.random.normal(jax.random.key(1), (1, 12))
     np.testing.assert_array_equal(loaded(obs), policy(obs))
     assert jax.tree.structure(loaded) == jax.tree.structure(policy)
     kept = checkpoint.about(tmp_path / "new" / "policy")
-    assert kept["env"] == "paper-hover" and kept["config"]["horizon"] == 2 and "jax" in kept["versions"]
+    assert kept["env"] == "hover-2021" and kept["config"]["horizon"] == 2 and "jax" in kept["versions"]
 
 
 @pytest.mark.slow
 @pytest.mark.float32
 def test_training_goes_on_bit_for_bit(tmp_path):
-    env = envs.make("paper-hover")
+    env = envs.make("hover-2021")
     step = jax.jit(lambda state: bptt.update(env, CONFIG, state)[0])
     state = step(bptt.init(jax.random.key(3), env, CONFIG))
     checkpoint.save_tree(tmp_path / "state", state)

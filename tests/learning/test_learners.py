@@ -16,8 +16,8 @@ from jaxdrones.learning.normalize import Statistics
 
 SMALL = {
     bptt: bptt.Config(updates=3, worlds=4, horizon=4, sizes=(8,)),
-    shac: shac.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_sizes=(8,), critic_steps=2),
-    ppo: ppo.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_sizes=(8,), epochs=2, batches=2),
+    shac: shac.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_hidden_sizes=(8,), critic_steps=2),
+    ppo: ppo.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_hidden_sizes=(8,), epochs=2, batches=2),
 }
 LEARNERS = pytest.mark.parametrize("learner", SMALL, ids=lambda module: module.__name__.rpartition(".")[2])
 
@@ -78,7 +78,7 @@ def flown_cost(env, policy, starts):
 TOY = {
     "bptt": (bptt, dict(updates=300, worlds=64, horizon=50, restart=1.0, learning_rate=1e-2), 1.02),
     "shac": (shac, dict(updates=300, worlds=64, horizon=10, trust=0.3, discount=0.99, learning_rate=5e-3), 1.05),
-    "ppo": (ppo, dict(updates=150, worlds=128, horizon=25, discount=0.95, trace=0.95, narrowest=0.02), 1.15),
+    "ppo": (ppo, dict(updates=150, worlds=128, horizon=25, discount=0.95, trace=0.95, min_std=0.02), 1.15),
 }
 
 
@@ -138,7 +138,7 @@ def optax_norm(tree):
 @pytest.mark.float32
 def test_a_central_critic_learns_with_a_policy_per_role():
     env = envs.make("leader-follower")
-    config = dataclasses.replace(SMALL[ppo], per_role=True, central_critic=True)
+    config = dataclasses.replace(SMALL[ppo], per_agent=True, centralized_critic=True)
     state = ppo.init(jax.random.key(0), env, config)
     kernel = state.critic["params"]["Dense_0"]["kernel"]
     assert kernel.shape == (2, 25, 8)
@@ -165,7 +165,7 @@ def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
             worlds=64,
             horizon=8,
             learning_rate=5e-3,
-            informed_critic=informed,
+            privileged_critic=informed,
             discount=0.9,
         )
         history = jax.jit(lambda key: ppo.train(key, env, config))(jax.random.key(0)).history
@@ -201,11 +201,11 @@ def test_the_logarithm_of_a_probability_is_that_of_a_normal_distribution():
 
 @pytest.mark.slow
 def test_ppo_at_the_policy_that_flew_has_the_plain_policy_gradient():
-    config = ppo.Config(value_weight=0.0, discount=0.9)
+    config = ppo.Config(value_coef=0.0, discount=0.9)
     rng = np.random.default_rng(0)
     network = MLP((4,), 2)
     policy = Policy(network.init(jax.random.key(0), jnp.zeros(3)), Statistics.none(3), network)
-    critic = MLP(config.critic_sizes, 1).init(jax.random.key(1), jnp.zeros(3))
+    critic = MLP(config.critic_hidden_sizes, 1).init(jax.random.key(1), jnp.zeros(3))
     obs, action, advantage = rng.normal(size=(20, 1, 3)), rng.normal(size=(20, 1, 2)), rng.normal(size=(20, 1))
     log_std = jnp.zeros(2)
     flown = ppo.log_prob(action, policy(obs), log_std)

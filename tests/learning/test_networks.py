@@ -26,15 +26,15 @@ def test_actions_are_bounded(team):
     assert jnp.max(jnp.abs(wild(jnp.ones((2, 12))))) <= 1
 
 
-@pytest.mark.parametrize("per_role", [False, True])
-def test_drones_share_a_network_or_have_their_own(team, per_role):
-    policy = Policy.init(jax.random.key(0), team, (16,), per_role)
+@pytest.mark.parametrize("per_agent", [False, True])
+def test_drones_share_a_network_or_have_their_own(team, per_agent):
+    policy = Policy.init(jax.random.key(0), team, (16,), per_agent)
     action = policy(jnp.ones((2, 12)))
-    assert (action[0] == action[1]) == (not per_role)
+    assert (action[0] == action[1]) == (not per_agent)
 
 
 def test_a_policy_is_the_same_for_one_world_and_for_many(team):
-    policy = Policy.init(jax.random.key(0), team, (16,), per_role=True)
+    policy = Policy.init(jax.random.key(0), team, (16,), per_agent=True)
     obs = jax.random.normal(jax.random.key(1), (3, 5, 2, 12))
     np.testing.assert_allclose(policy(obs)[1, 2], policy(obs[1, 2]), rtol=1e-12)
 

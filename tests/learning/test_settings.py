@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
-from jaxdrones.learning import bptt, ppo, presets, shac
-from jaxdrones.learning.runs import Recipe
+from jaxdrones.learning import bptt, ppo, shac
+from jaxdrones.training import presets
+from jaxdrones.training.runs import Recipe
 
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
 KEY = jax.random.key(0)
-WORDS = {"sizes", "critic_sizes", "gradient", "surrogate"}
-SWITCHES = {"per_role", "central_critic", "informed_critic"}
-ZERO_MAKES_SENSE = {"settle", "restart", "discount", "trace", "b2", "decay", "entropy", "value_weight", "cool"}
+WORDS = {"sizes", "critic_hidden_sizes", "gradient", "surrogate"}
+SWITCHES = {"per_agent", "centralized_critic", "privileged_critic"}
+ZERO_MAKES_SENSE = {"settle", "restart", "discount", "trace", "b2", "decay", "entropy", "value_coef", "cool"}
 SHARES = {"settle", "restart", "discount", "trace", "b2", "decay", "cool", "trust", "target_speed"}
 INFINITY_MAKES_SENSE = {"memory", "clip"}
 
@@ -53,9 +54,9 @@ def test_layers_switches_and_words_are_refused_where_they_make_no_sense(learner)
         with pytest.raises(ValueError, match=r"sizes is .*; give"):
             config(sizes=sizes)
     for value in ("yes", 1, None, np.nan):
-        with pytest.raises(ValueError, match=r"per_role is .*; give True or False"):
-            config(per_role=value)
-    for field, value in ("gradient", "surogate"), ("surrogate", "a step"), ("critic_sizes", (0,)):
+        with pytest.raises(ValueError, match=r"per_agent is .*; give True or False"):
+            config(per_agent=value)
+    for field, value in ("gradient", "surogate"), ("surrogate", "a step"), ("critic_hidden_sizes", (0,)):
         if field in {f.name for f in dataclasses.fields(config)}:
             with pytest.raises(ValueError, match=field):
                 config(**{field: value})
@@ -76,9 +77,10 @@ def test_what_vanishes_or_overflows_in_single_precision_is_refused():
 
 def test_settings_that_contradict_each_other_are_refused():
     with pytest.raises(
-        ValueError, match=r"fastest is 1e-06; give a number of at least 1e-05 \(not slower than slowest"
+        ValueError,
+        match=r"max_learning_rate is 1e-06; give a number of at least 1e-05 \(not slower than min_learning_rate",
     ):
-        ppo.Config(fastest=1e-6)
+        ppo.Config(max_learning_rate=1e-6)
     with pytest.raises(ValueError, match="worlds is 100; give a multiple of batches, 8"):
         ppo.Config(worlds=100)
 

@@ -144,19 +144,19 @@ def test_images_without_a_scale_such_as_labels_are_refused():
 
 @pytest.mark.slow
 @pytest.mark.needs("pybullet")
-@pytest.mark.parametrize("per_role", [False, True])
-def test_drones_that_see_the_same_do_the_same_unless_each_has_its_own_eyes(team, per_role):
-    policy = Policy.init(KEY, team, (8,), per_role)
+@pytest.mark.parametrize("per_agent", [False, True])
+def test_drones_that_see_the_same_do_the_same_unless_each_has_its_own_eyes(team, per_agent):
+    policy = Policy.init(KEY, team, (8,), per_agent)
     same = jax.tree.map(lambda x: jnp.stack([x[0], x[0]]), seen(team))
     action = policy(same)
-    assert jnp.all(action[0] == action[1]) == (not per_role)
+    assert jnp.all(action[0] == action[1]) == (not per_agent)
 
 
 @pytest.mark.slow
 @pytest.mark.needs("pybullet")
-@pytest.mark.parametrize("per_role", [False, True])
-def test_a_policy_of_many_worlds_is_that_of_each(team, per_role):
-    policy, obs = Policy.init(KEY, team, (8,), per_role), seen(team, 3, 2)
+@pytest.mark.parametrize("per_agent", [False, True])
+def test_a_policy_of_many_worlds_is_that_of_each(team, per_agent):
+    policy, obs = Policy.init(KEY, team, (8,), per_agent), seen(team, 3, 2)
     action = policy(obs)
     assert action.shape == (3, 2, 2, 4)
     alone = policy(jax.tree.map(lambda x: x[1, 1], obs))
@@ -165,7 +165,7 @@ def test_a_policy_of_many_worlds_is_that_of_each(team, per_role):
 
 @pytest.mark.needs("pybullet")
 def test_a_policy_that_sees_flies_on_as_it_was_saved(team, tmp_path):
-    policy, obs = Policy.init(KEY, team, (8,), per_role=True), seen(team)
+    policy, obs = Policy.init(KEY, team, (8,), per_agent=True), seen(team)
     checkpoint.save(tmp_path / "policy", policy)
     loaded = checkpoint.load(tmp_path / "policy")
     np.testing.assert_array_equal(loaded(obs), policy(obs))
@@ -174,7 +174,9 @@ def test_a_policy_that_sees_flies_on_as_it_was_saved(team, tmp_path):
 
 @pytest.mark.needs("pybullet")
 def test_a_central_critic_sees_every_vector_and_its_own_pictures(team):
-    config = ppo.Config(updates=1, worlds=8, horizon=2, per_role=True, central_critic=True, critic_sizes=(8,))
+    config = ppo.Config(
+        updates=1, worlds=8, horizon=2, per_agent=True, centralized_critic=True, critic_hidden_sizes=(8,)
+    )
     state = jax.eval_shape(lambda key: ppo.init(key, team, config), KEY)
     d, a, found = team.observation_size, team.action_size, state.policy.network.features
     assert state.critic["params"]["MLP_0"]["Dense_0"]["kernel"].shape == (2, 2 * d + a + found, 8)

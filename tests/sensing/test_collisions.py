@@ -9,7 +9,7 @@ import pytest
 
 import jaxdrones
 from jaxdrones import State, rotation
-from jaxdrones.backends import bullet
+from jaxdrones.engine import bullet
 from jaxdrones.sensing.collisions import collisions
 from jaxdrones.sensing.scene import Box, Cylinder, Mesh, Scene, Sphere, Urdf, gate
 

@@ -1,0 +1,43 @@
+"""Who touches whom, where and how hard."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from jaxdrones.engine.bullet.client import Client
+
+
+@dataclasses.dataclass(frozen=True)
+class Contact:
+    """One point at which two bodies press on each other."""
+
+    body: str
+    """`drone i`."""
+    other: str
+    """`ground`, `obstacle i` or `drone j`."""
+    pos: np.ndarray
+    """(3,) on `other`, m, world."""
+    normal: np.ndarray
+    """(3,) unit vector from `other` to `body`, world."""
+    force: float
+    """Normal force, N."""
+    impulse: float
+    """Normal impulse of the physics step, N s."""
+    depth: float
+    """How far the bodies are in each other, m; negative for a gap within the collision margin."""
+
+
+def of_last_step(client: Client, dt: float) -> list[Contact]:
+    """The contacts of Bullet's last physics step of length dt (s) that carry a force."""
+    names, contacts = client.names(), []
+    for point in client.p.getContactPoints(physicsClientId=client.id):
+        first, second, on_second, normal, distance, force = point[1], point[2], point[6], point[7], point[8], point[9]
+        if force <= 0:
+            continue
+        pos, normal = np.array(on_second), np.array(normal)
+        if first not in client.drones:  # name the drone first
+            first, second, pos, normal = second, first, np.array(point[5]), -normal
+        contacts.append(Contact(names[first], names[second], pos, normal, force, force * dt, -distance))
+    return contacts

@@ -1,0 +1,1 @@
+"""The demonstrations of the command line: what is flown, under which conditions, and the record of it."""

@@ -1,0 +1,153 @@
+"""What is to be flown, and under which conditions."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+
+from jaxdrones.checks import check_choice, check_positive, check_whole
+from jaxdrones.control import CONTROLLERS, pid
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.flights.examples import FLIGHTS
+from jaxdrones.limits import check_at_most, check_memory, check_seed
+
+BACKENDS = ("explicit", "bullet")
+PHYSICS_HZ = 240  # at least; raised to a multiple of the control rate
+
+_HIGHEST_HZ = 20_000  # above it a float32 position of 1 m loses what 1 mm/s adds in a step
+_LONGEST = 1e5  # s; later float32 times are further apart than control steps at 120 Hz
+_LOG_BYTES = 400  # of a drone and a control step: trajectory, log, figure
+_PAIR_BYTES = 32  # of two drones, while the effects between them are summed
+_VARIANTS = ("_paper", "_world_axes")  # endings of the names of other models of the same effect
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """A flight and its options; `None` stands for the flight's own and is filled in.
+
+    Raises:
+        ValueError: an unknown name or a number out of range; says what, what was given, what to do.
+    """
+
+    flight: str
+    """`circle`, `velocity`, `ground-effect` or `downwash`."""
+    vehicle: str | os.PathLike = "cf2x"
+    """A bundled vehicle or the path of a URDF."""
+    drones: int | None = None
+    effects: tuple[str, ...] | None = None
+    """Names of `EFFECTS` and `PAIRS`."""
+    controller: str | None = None
+    """A name of `CONTROLLERS`; the vehicle's own when left out."""
+    control_hz: int | None = None
+    duration: float | None = None
+    """s."""
+    rotors: str = "instant"
+    """`instant` or `lagging`."""
+    integrator: str = "semi_implicit_euler"
+    """A name of `INTEGRATORS`; Bullet has its own."""
+    backend: str = "explicit"
+    """`explicit` or `bullet`."""
+    obstacles: bool = False
+    """Whether the paper's obstacles stand around; in Bullet only."""
+    seed: int | None = None
+    """Of a random start, 1 cm about the flight's own; no disturbance when left out."""
+
+    def __post_init__(self):
+        check_choice("flight", self.flight, FLIGHTS)
+        flight = FLIGHTS[self.flight]
+        own = dict(drones=flight.drones, effects=flight.effects, control_hz=flight.control_hz, duration=flight.duration)
+        own["controller"] = "pid" if self.flight == "velocity" or self.vehicle in pid.VEHICLES else "geometric"
+        for name, value in own.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
+        object.__setattr__(self, "effects", tuple(self.effects))
+        object.__setattr__(self, "vehicle", str(self.vehicle))
+        self._check()
+
+    def _check(self) -> None:
+        flight = FLIGHTS[self.flight]
+        check_whole("drones", self.drones)
+        check_at_most("control rate (Hz)", self.control_hz, _HIGHEST_HZ)
+        check_positive("duration", self.duration, "s")
+        if self.duration > _LONGEST:
+            raise ValueError(f"duration is {self.duration} s; give at most {_LONGEST:g} s")
+        if self.seed is not None:
+            check_seed("seed", self.seed)
+        check_choice("controller", self.controller, CONTROLLERS)
+        check_choice("rotors", self.rotors, ROTORS)
+        check_choice("integrator", self.integrator, INTEGRATORS)
+        check_choice("backend", self.backend, BACKENDS)
+        for effect in self.effects:
+            check_choice("effect", effect, EFFECTS | PAIRS)
+        _check_once(self.effects)
+        if self.drones != flight.drones and not flight.any_number:
+            who = ", ".join(flight.labels)
+            raise ValueError(f"drones is {self.drones}; the {self.flight} flight takes {flight.drones}: {who}")
+        if self.flight == "velocity" and self.controller != "pid":
+            raise ValueError(f"controller is {self.controller!r}; the velocity flight is flown by 'pid'")
+        if self.steps == 0:
+            raise ValueError(
+                f"duration is {self.duration} s, less than half a control period; give {self.dt:.4g} s or more"
+            )
+        size = self.drones * self.steps * _LOG_BYTES
+        if any(effect in PAIRS for effect in self.effects):
+            size += self.drones**2 * _PAIR_BYTES
+        check_memory(
+            f"a flight of {str(self.drones)[:30]} drones for {self.duration:g} s at {self.control_hz} Hz",
+            size,
+            "give fewer drones, a shorter duration or a lower control rate",
+        )
+        if self.backend == "bullet" and self.integrator != "semi_implicit_euler":
+            raise ValueError(
+                f"integrator is {self.integrator!r}; the bullet backend integrates by itself, leave it out"
+            )
+        if self.obstacles and self.backend != "bullet":
+            raise ValueError(
+                "obstacles are asked for; the explicit backend flies through them, take the bullet backend"
+            )
+
+    @property
+    def dt(self) -> float:
+        """Control period, s."""
+        return 1 / self.control_hz
+
+    @property
+    def steps(self) -> int:
+        """Control steps of the flight."""
+        return round(self.duration * self.control_hz)
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps per control step."""
+        return math.ceil(PHYSICS_HZ / self.control_hz)
+
+    @property
+    def physics_hz(self) -> int:
+        """Physics steps per second."""
+        return self.control_hz * self.substeps
+
+    def as_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return dataclasses.asdict(self) | {"physics_hz": self.physics_hz}
+
+    def __str__(self) -> str:
+        integrator = "Bullet" if self.backend == "bullet" else self.integrator
+        return (
+            f"{self.flight}: {self.drones} x {self.vehicle}, {self.controller} at {self.control_hz} Hz, "
+            f"{integrator} at {self.physics_hz} Hz, {self.rotors} rotors, "
+            f"effects: {', '.join(self.effects) or 'none'}, {self.steps * self.dt:g} s"
+        )
+
+
+def _check_once(effects: tuple[str, ...]) -> None:
+    """Raise if an effect would be counted twice."""
+    seen: dict[str, str] = {}
+    for effect in effects:
+        kind = effect
+        for ending in _VARIANTS:
+            kind = kind.removesuffix(ending)
+        if kind in seen:
+            both = "twice" if seen[kind] == effect else f"beside {seen[kind]!r}, another model of the same effect"
+            raise ValueError(f"effect {effect!r} is given {both}; give one of them, once")
+        seen[kind] = effect

@@ -1,0 +1,111 @@
+"""The paper's four control examples (its figures 6 to 9)."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.tasks import curves
+
+_DIRECTIONS = np.array([[-0.5, 1.0, 0.0], [0.0, 1.0, 0.0], [0.2, 1.0, 0.2], [0.0, 1.0, 0.5]])
+_HEADINGS = np.array([0, np.pi / 3, np.pi / 4, np.pi / 2])  # rad
+
+
+@dataclasses.dataclass(frozen=True)
+class Flight:
+    """One of the paper's flights and its defaults."""
+
+    summary: str
+    start: Callable[[int], State]  # number of drones -> state
+    target: Callable[[int, jax.Array, float], Setpoint | jax.Array]  # (drones, time, duration) -> set points or actions
+    drones: int
+    duration: float  # s
+    control_hz: int
+    effects: tuple[str, ...] = ()
+    settled: float = 2.0  # s; results are taken from here on
+    panels: tuple[str, ...] = ()  # of the figure; all when empty
+    labels: tuple[str, ...] = ()
+    adapt: Callable[[Params], Params] = lambda team: team
+    any_number: bool = True
+
+
+def _circle() -> Flight:
+    curve = curves.circle()
+
+    def yaw(n):
+        return jnp.arange(n) * (jnp.pi / 2) / n
+
+    return Flight(
+        summary="a circle at staggered heights, each drone with a heading of its own (PID)",
+        start=lambda n: State.at_rest(curve.positions(n), yaw(n)),
+        target=lambda n, t, duration: Setpoint.at(curve.positions(n, t), yaw=yaw(n)),
+        drones=4,
+        duration=12.0,
+        control_hz=120,
+    )
+
+
+def _velocity() -> Flight:
+    def start(n):
+        i = jnp.arange(n)
+        pos = jnp.stack([0.3 * i, jnp.zeros(n), jnp.full(n, 0.1)], axis=-1)
+        return State.at_rest(pos, jnp.asarray(_HEADINGS)[i % 4])
+
+    def action(n, t, duration):
+        i = jnp.arange(n) % 4
+        reverse = t >= duration * (1 / 8 + i / 6)
+        direction = jnp.asarray(_DIRECTIONS)[i] * jnp.where(reverse, -1, 1)[:, None]
+        return jnp.concatenate([direction, jnp.full((n, 1), 0.99)], axis=-1)
+
+    return Flight(
+        summary="steps of the velocity input, reversed one drone after the other",
+        start=start,
+        target=action,
+        drones=4,
+        duration=12.0,
+        control_hz=120,
+        settled=10.0,
+    )
+
+
+def _ground_effect() -> Flight:
+    curve = curves.hop()
+    return Flight(
+        summary="a take-off with and without ground effect (equation 5)",
+        start=lambda n: State.at_rest(curve.positions(n, -1.0).at[:, 2].set(0.014)),
+        target=lambda n, t, duration: Setpoint.at(curve.positions(n, t)),
+        drones=2,
+        duration=0.5,
+        control_hz=240,
+        effects=("ground_effect_2021",),
+        settled=0.0,
+        panels=("z", "vz", "rpm0"),
+        labels=("with ground effect", "without"),
+        adapt=lambda team: team.replace(ground_effect_coeff=team.ground_effect_coeff.at[1].set(0)),
+        any_number=False,
+    )
+
+
+def _downwash() -> Flight:
+    def curve(n):
+        return curves.crossing(n)
+
+    return Flight(
+        summary="drones that cross above each other, subject to downwash (equation 6)",
+        start=lambda n: State.at_rest(curve(n).positions(n)),
+        target=lambda n, t, duration: Setpoint.at(curve(n).positions(n, t)),
+        drones=2,
+        duration=12.0,
+        control_hz=120,
+        effects=("downwash_2021",),
+        settled=3.0,
+        panels=("x", "vx", "z", "vz", "pitch", "omega_y", "rpm0", "rpm1"),
+    )
+
+
+FLIGHTS = {"circle": _circle(), "velocity": _velocity(), "ground-effect": _ground_effect(), "downwash": _downwash()}

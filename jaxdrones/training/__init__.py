@@ -1,0 +1,1 @@
+"""What the command line does with learners: presets, runs, the training loop, and Stable-Baselines3."""

@@ -1,0 +1,236 @@
+"""Many worlds in chunks, each chunk one kernel."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, flying, tape
+
+import jaxdrones as jd
+from jaxdrones.accelerate import compiler, worlds
+from jaxdrones.control import pid, setpoint
+
+team = jd.repeat(jd.load_params("cf2x"), 2)
+step = jd.make_step((jd.drag,), rotors=jd.lagging_rotors)
+starts = jax.vmap(lambda vz: flying(team).replace(vel=jnp.full((2, 3), vz)))(jnp.linspace(-1, 1, 5))
+commands = jnp.stack([tape(team, 10) * (1 + 0.01 * i) for i in range(5)])
+
+
+def fly(start, commands):
+    return jax.lax.scan(lambda state, rpm: (step(team, state, rpm), None), start, commands)[0]
+
+
+def miss(start, commands):
+    return jnp.sum(fly(start, commands).pos ** 2)
+
+
+@pytest.mark.parametrize("chunk", [2, 5, 100], ids=["with a rest", "all", "more than there are"])
+def test_a_flight_in_chunks_is_the_flight_at_once(chunk):
+    flown = jax.jit(jd.over_worlds(fly, chunk))(starts, commands)
+    assert_close(flown, jax.jit(jax.vmap(fly))(starts, commands), 1e-11)  # RPM of 10,000 to rounding
+
+
+@pytest.mark.parametrize("chunk", [2, 5])
+def test_commands_may_be_given_step_by_step(chunk):
+    flown = jax.jit(jd.over_worlds(fly, chunk, in_axes=(0, 1)))(starts, commands.swapaxes(0, 1))
+    assert_close(flown, jax.jit(jax.vmap(fly))(starts, commands), 1e-11)
+
+
+@pytest.mark.parametrize(
+    ("in_axes", "count", "says"),
+    [(0, 4, "4, 5.*worlds"), ((0,), 5, "1 arguments, 2"), (-1, 5, "in_axes is -1"), ((0, "x"), 5, "in_axes is 'x'")],
+)
+def test_arguments_that_do_not_fit_are_named(in_axes, count, says):
+    with pytest.raises(ValueError, match=says):
+        jd.over_worlds(fly, in_axes=in_axes)(starts, commands[:count])
+
+
+def test_a_number_for_all_worlds_is_no_argument():
+    with pytest.raises(ValueError, match="no axis 0 over worlds"):
+        jd.over_worlds(lambda start, gain: fly(start, commands[0] * gain))(starts, 1.01)
+
+
+@pytest.mark.slow
+def test_gradients_are_those_of_the_flight_at_once_inside_a_chunk_and_around_all():
+    at_once = jax.jit(jax.vmap(jax.grad(miss, 1)))(starts, commands)
+    inside = jax.jit(jd.over_worlds(jax.grad(miss, 1), 2))(starts, commands)
+    around = jax.jit(jax.grad(lambda c: jnp.sum(jd.over_worlds(miss, 2)(starts, c))))(commands)
+    assert_close(inside, at_once, 1e-12)
+    assert_close(around, at_once, 1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chunk", [300, 1000], ids=["with a rest", "all"])
+def test_a_large_gradient_alone_is_one_kernel_too(chunk):
+    many = jax.tree.map(lambda x: jnp.repeat(x, 200, axis=0), (starts, jnp.tile(commands, (1, 10, 1, 1))))
+    twice = jd.over_worlds(lambda start, commands: 2 * jax.grad(miss, 1)(start, commands), chunk)
+    gradient = jax.jit(twice, compiler_options=jd.KERNEL_OPTIONS)(*many)
+    one = jax.jit(jax.grad(miss, 1))(*jax.tree.map(lambda x: x[999], many))
+    assert_close(gradient[999], 2 * one, 1e-12)
+
+
+@pytest.mark.slow
+def test_an_argument_may_be_of_no_use():
+    def reached(start, commands):
+        return jnp.sum(fly(start, commands).pos)
+
+    gradient = jax.grad(reached, 1)  # wherever it starts
+    inside = jax.jit(jd.over_worlds(gradient, 2), compiler_options=jd.KERNEL_OPTIONS)(starts, commands)
+    assert_close(inside, jax.jit(jax.vmap(gradient))(starts, commands), 1e-12)
+
+
+@pytest.mark.slow
+def test_with_our_options_gradients_through_contacts_and_downwash_are_one_kernel():
+    meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
+
+    def sunk(start, commands):
+        return jnp.sum(jax.lax.scan(lambda s, rpm: (meeting(team, s, rpm), None), start, commands)[0].pos ** 2)
+
+    lower = jnp.array([[0.0, 0.0, 0.012], [0.05, 0.0, 0.4]])  # one touches the ground, below the other
+    low = starts.replace(pos=jnp.broadcast_to(lower, (5, 2, 3)))
+    inside = jax.jit(jd.over_worlds(jax.grad(sunk, 1), 5), compiler_options=jd.KERNEL_OPTIONS)(low, commands)
+    assert_close(inside, jax.jit(jax.vmap(jax.grad(sunk, 1)))(low, commands), 1e-12)
+    assert jnp.all(jnp.abs(inside) > 0)
+
+
+def test_a_controlled_flight_is_one_kernel():
+    gains, hold = pid.gains(), setpoint.Setpoint.at(jnp.array([[0.0, 0.0, 1.0]] * 2))
+
+    def control(params, memory, state, target):
+        return pid.control(gains, params, memory, state, target, dt=1 / 240)
+
+    def held(start):
+        return jd.rollout(step, lambda p, m, s, k: jax.vmap(control)(p, m, s, hold), team, start, pid.init(2), 10)[0]
+
+    assert_close(jax.jit(jd.over_worlds(held, 2))(starts), jax.jit(jax.vmap(held))(starts), 1e-10)
+
+
+@pytest.mark.parametrize("one_kernel", [True, False])
+def test_a_function_of_which_no_kernel_can_be_made_is_flown_by_many(one_kernel):
+    def solved(start):
+        return jnp.linalg.solve(jnp.eye(3) + start.pos.T @ start.pos, jnp.sort(start.vel).T)
+
+    assert_close(jax.jit(jd.over_worlds(solved, 2, one_kernel=one_kernel))(starts), jax.vmap(solved)(starts), 1e-12)
+
+
+def summed_squares(x):
+    """2 + 3^2 and so on, by primitives that hold a program of their own."""
+    return jax.lax.reduce_window(x, 0.0, lambda a, b: a + b * b, (2,), (1,), "SAME")
+
+
+def test_programs_that_a_reduction_holds_are_no_calls():
+    x = jnp.array([[1.0, 2.0, 3.0], [2.0, 0.0, 1.0]])
+    looped = jd.over_worlds(lambda x: jax.lax.fori_loop(0, 1, lambda _, x: summed_squares(x), x))
+    np.testing.assert_array_equal(jax.jit(looped)(x), jax.vmap(summed_squares)(x))
+    np.testing.assert_array_equal(jax.jit(jd.over_worlds(summed_squares))(x)[0], [5, 13, 9])
+
+
+DEGENERATE = {
+    "no passage": (lambda x: jax.lax.scan(lambda x, _: (x + 1, x), x, length=0), jnp.ones((3, 2))),
+    "no number": (lambda x: jax.lax.scan(lambda x, _: (x + 1, x), x, length=2), jnp.ones((3, 0))),
+    "no world": (lambda x: jax.lax.scan(lambda x, _: (x + 1, x), x, length=2), jnp.ones((0, 2))),
+    "nothing of a world": (lambda x: jnp.arange(3), jnp.ones((2, 2))),
+    "no result": (lambda x: (), jnp.ones((2, 2))),
+    "numbers that take the type of others": (lambda x: x * jnp.ones(2, jnp.float16), 2.0 * jnp.arange(3)[:, None]),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_where_there_is_nothing_to_do_it_is_done_as_vmap_does_it(name):
+    function, x = DEGENERATE[name]
+    found, expected = jd.over_worlds(function)(x), jax.vmap(function)(x)
+    assert jax.tree.map(lambda y: (y.shape, y.dtype), found) == jax.tree.map(lambda y: (y.shape, y.dtype), expected)
+    assert_close(found, expected, 0)
+
+
+def lines(number, size):
+    """Each of them uses the vector in two orders."""
+
+    def function(x):
+        for _ in range(number):
+            x = jnp.sin(x) * 1.1 + x[::-1] * 0.1
+        return x
+
+    return function, jnp.linspace(0, 1, 2 * size).reshape(2, size)
+
+
+@pytest.mark.parametrize("options", [None, "ours"])
+@pytest.mark.parametrize("size", [3, 50], ids=["numbers apart", "whole"])
+@pytest.mark.parametrize("looped", [False, True], ids=["straight", "in a loop"])
+def test_a_line_does_not_double_the_program(looped, size, options):
+    function, x = lines(24, size)
+    if looped:
+        flown = jd.over_worlds(lambda x: jax.lax.fori_loop(0, 2, lambda _, x: function(x), x))
+    else:
+        flown = jd.over_worlds(function)
+    program = jax.jit(flown, compiler_options=options and jd.KERNEL_OPTIONS).lower(x).compile()  # else it takes hours
+    np.testing.assert_allclose(program(x)[0], flown(x[:1])[0], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_gradients_of_teams_are_one_kernel_without_options_too():
+    meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))
+
+    def sunk(start, rpm):
+        return jnp.sum(jax.lax.scan(lambda s, rpm: (meeting(team, s, rpm), None), start, rpm)[0].pos ** 2)
+
+    inside = jax.jit(jd.over_worlds(jax.grad(sunk, 1)))(starts, commands)
+    assert_close(inside, jax.jit(jax.vmap(jax.grad(sunk, 1)))(starts, commands), 1e-12)
+
+
+def test_without_the_interfaces_that_it_needs_it_is_vmap_and_says_so_once(monkeypatch):
+    monkeypatch.setattr(compiler, "AVAILABLE", False)
+    worlds._warn.cache_clear()
+    with pytest.warns(RuntimeWarning, match="over_worlds is jax.vmap here") as caught:
+        for _ in range(2):
+            flown = jd.over_worlds(fly)(starts, commands)
+    assert len(caught) == 1
+    assert_close(flown, jax.vmap(fly)(starts, commands), 1e-11)
+
+
+def test_an_equation_that_is_not_as_expected_makes_it_vmap_too(monkeypatch):
+    def strange(equation):
+        raise compiler.Unknown("scan has x")
+
+    monkeypatch.setattr(compiler, "scan_counts", strange)
+    worlds._warn.cache_clear()
+    with pytest.warns(RuntimeWarning, match="scan has x"):
+        flown = jd.over_worlds(fly)(starts, commands)
+    assert_close(flown, jax.vmap(fly)(starts, commands), 1e-11)
+
+
+def test_options_are_those_that_the_compiler_knows():
+    known = compiler._known(xla_cpu_prefer_vector_width=512, xla_of_another_version=True)
+    assert known == {"xla_cpu_prefer_vector_width": 512}
+    jax.jit(lambda x: x, compiler_options=jd.KERNEL_OPTIONS)(1.0)
+
+
+@pytest.mark.parametrize("chunk", [0, 1.5])
+def test_a_chunk_is_a_whole_number(chunk):
+    with pytest.raises(ValueError, match="chunk"):
+        jd.over_worlds(fly, chunk)
+
+
+def test_two_devices_fly_what_one_flies():
+    script = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+jax.config.update("jax_enable_x64", True)
+from test_worlds import *
+flown = jax.jit(jd.over_worlds(fly, 2, devices=jax.devices()))
+args = [jax.tree.map(lambda x: x[:4], x) for x in (starts, commands)]
+assert len(flown(*args).pos.sharding.device_set) == 2
+assert_close(flown(*args), jax.jit(jax.vmap(fly))(*args), 1e-11)
+by_step = jax.jit(jd.over_worlds(fly, 2, in_axes=(0, 1), devices=jax.devices()))(args[0], args[1].swapaxes(0, 1))
+assert_close(by_step, jax.jit(jax.vmap(fly))(*args), 1e-11)
+with pytest.raises(ValueError, match="5 worlds.*2 devices"):
+    flown(starts, commands)
+"""
+    folders = [Path(__file__).parent, Path(__file__).parent.parent]
+    path = os.pathsep.join(map(str, folders))
+    subprocess.run([sys.executable, "-c", script], check=True, env=os.environ | {"PYTHONPATH": path})

@@ -1,0 +1,84 @@
+"""A flight that diverged is told from one that flew well."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxdrones.flights.conditions import Conditions
+from jaxdrones.flights.record import Record
+
+
+def hovering(steps=100, drones=2, commanded="position"):
+    """A level flight with a steady error of 0.1 m, or 0.1 m/s."""
+    shape = (steps, drones)
+    zeros, missing = np.zeros((*shape, 3), np.float32), np.full((*shape, 3), np.nan, np.float32)
+    level = np.zeros((*shape, 4), np.float32)
+    level[..., 3] = 1
+    position = commanded == "position"
+    return Record(
+        t=0.01 * np.arange(1, steps + 1),
+        pos=zeros + np.float32([0.1, 0, 1]),
+        quat=level,
+        rpy=zeros,
+        vel=zeros + np.float32([0.1, 0, 0]),
+        omega=zeros,
+        rpm=np.full((*shape, 4), 14_000, np.float32),
+        target_pos=zeros + np.float32([0, 0, 1]) if position else missing,
+        target_vel=missing if position else zeros,
+        labels=tuple(f"drone {i}" for i in range(drones)),
+        conditions=Conditions("circle"),
+    )
+
+
+def changed(record, name, rows, value):
+    array = np.array(getattr(record, name))
+    array[rows, 1] = value
+    return dataclasses.replace(record, **{name: array})
+
+
+@pytest.mark.parametrize("commanded", ["position", "velocity"])
+def test_a_steady_error_is_no_divergence(commanded):
+    assert hovering(commanded=commanded).diverged() == {}
+
+
+@pytest.mark.parametrize(
+    ("commanded", "name", "value", "message"),
+    [
+        ("position", "pos", [359, 0, 1], "drone 1 is 359 m off what was commanded"),
+        ("position", "pos", [1.2, 0, 1], "drone 1 is 1.2 m off what was commanded"),
+        ("position", "pos", [0, 0, -3e38], "drone 1 is 3e+38 m off what was commanded"),
+        ("velocity", "vel", [0, 0, -30], "drone 1 is 30 m/s off what was commanded"),
+        ("position", "quat", [1, 0, 0, 0], "drone 1 is upside down"),
+        ("velocity", "quat", [0, 0.8, 0, 0.6], "drone 1 is upside down"),
+        ("position", "pos", [np.nan, 0, 1], "the state of drone 1 is not finite from t = 0.910 s on"),
+        ("position", "vel", [np.inf, 0, 1], "the state of drone 1 is not finite from t = 0.910 s on"),
+        ("velocity", "omega", [0, np.nan, 1], "the state of drone 1 is not finite from t = 0.910 s on"),
+        ("velocity", "rpm", [0, 0, 0, np.nan], "the state of drone 1 is not finite from t = 0.910 s on"),
+    ],
+)
+def test_a_drone_that_is_lost_at_the_end_diverged(commanded, name, value, message):
+    record = changed(hovering(commanded=commanded), name, slice(90, None), value)
+    assert record.diverged() == {"drone 1": message}
+    assert record.not_finite() == ({"drone 1": message} if "finite" in message else {})
+
+
+@pytest.mark.parametrize(("name", "value"), [("pos", [5, 0, 1]), ("quat", [1, 0, 0, 0])])
+def test_a_drone_that_was_lost_and_came_back_did_not_diverge(name, value):
+    assert changed(hovering(), name, slice(20, 60), value).diverged() == {}
+
+
+def test_a_drone_that_starts_far_from_its_target_and_comes_nearer_did_not_diverge():
+    record = changed(hovering(), "pos", slice(None), [9, 0, 1])
+    assert changed(record, "pos", slice(50, None), [8, 0, 1]).diverged() == {}
+
+
+def test_a_state_that_is_not_finite_for_a_moment_is_named():
+    assert "t = 0.060 s" in changed(hovering(), "pos", 5, np.nan).diverged()["drone 1"]
+
+
+def test_pwm_is_of_a_crazyflie():
+    record = dataclasses.replace(hovering(), conditions=Conditions("circle", vehicle="racer"))
+    assert "pwm" in hovering().arrays(pwm=True)
+    with pytest.raises(ValueError, match="PWM is asked for of 'racer'; it is known of cf2x and cf2p only"):
+        record.arrays(pwm=True)

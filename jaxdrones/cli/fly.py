@@ -90,11 +90,11 @@ def _fly_example(options: argparse.Namespace) -> int:
 def _fly_policy(options: argparse.Namespace) -> int:
     import jax
 
-    from jaxdrones.training.episode import PolicyFlight, fly_episode, record_of
-    from jaxdrones.training.runs import run_in
+    from jaxdrones.training.episode import EpisodeConditions, fly_episode, to_record
+    from jaxdrones.training.open_run import open_run
 
     check_choice("backend", options.backend, BACKENDS)
-    run, seed = run_in(options.policy), options.seed or 0
+    run, seed = open_run(options.policy), options.seed or 0
     recipe = run.recipe()
     check_seed("seed", seed)
     vehicle = str(recipe.options.get("vehicle", "cf2x"))
@@ -105,18 +105,18 @@ def _fly_policy(options: argparse.Namespace) -> int:
         policy = run.policy(env=env)
         _check_files(options, output)
         episode = fly_episode(env, policy, jax.random.key(seed), tell or (lambda share: None))
-    conditions = PolicyFlight(
+    conditions = EpisodeConditions(
         str(options.policy),
         recipe.task,
-        recipe.learner,
+        recipe.trained_by,
         recipe.realistic,
         options.backend,
         seed,
         vehicle,
         recipe.options,
     )
-    record = record_of(episode, conditions)
-    title = f"{recipe.task}: {env.task.summary} ({recipe.learner}, {options.backend})"
+    record = to_record(episode, conditions)
+    title = f"{recipe.task}: {env.task.summary} ({recipe.trained_by}, {options.backend})"
     files = _write(record, options, output, title, plots.POLICY_PANELS, env.task.scene)
     results = record.results(_LATE * float(record.t[-1]))
     end = {

@@ -82,7 +82,7 @@ def save_curves(histories: dict[str, list[dict[str, float]]], path: Path, title:
     """Draw how training went: one line per run, over the control steps flown.
 
     Args:
-        histories: label -> lines of progress.csv, as `learning.runs.Run.history` returns them.
+        histories: label -> lines of progress.csv, as `training.run.Run.history` returns them.
         path: of the picture.
         title: above the figure.
     """

@@ -1,0 +1,28 @@
+"""The one place of this package that gives options to the compiler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from jaxdrones.accelerate.compiler import training_options
+
+
+def jit(function: Callable, **arguments: Any) -> Any:
+    """`jax.jit` with the compiler options that suit training.
+
+    The result may be called or lowered, but not inside another traced function, where JAX refuses compiler options.
+    The options are those of the device, so this starts it.
+
+    Args:
+        function: function to compile.
+        **arguments: further arguments of `jax.jit`.
+    """
+    return jax.jit(function, compiler_options=training_options(), **arguments)
+
+
+def is_tracing() -> bool:
+    """Whether the caller runs inside a function that JAX is tracing to compile it."""
+    return isinstance(jax.numpy.zeros(()) + 0, jax.core.Tracer)

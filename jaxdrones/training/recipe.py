@@ -29,7 +29,7 @@ class Recipe:
     """Settings of the learner, its `Config`."""
 
     @classmethod
-    def of(cls, task: str, algorithm: str = "bptt", realistic: bool = False, **changes) -> Recipe:
+    def of(cls, task: str, algorithm: str = "bptt", realistic: bool = False, **changes: Any) -> Recipe:
         """A preset with changes.
 
         Args:
@@ -57,7 +57,7 @@ class Recipe:
         """Name of the learner for titles."""
         return self.algorithm
 
-    def env(self, practice: bool = False, **options) -> Env:
+    def env(self, practice: bool = False, **options: Any) -> Env:
         """The environment to fly in or to train in; options of `jaxdrones.make` replace those of the recipe."""
         return preset(self.task, self.algorithm, self.realistic, practice, **self.options | options)[0]
 

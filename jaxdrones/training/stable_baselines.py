@@ -58,7 +58,7 @@ class SB3Recipe:
     library: str = "sb3"
 
     @classmethod
-    def of(cls, task: str, algorithm: str = "ppo", realistic: bool = False, **changes) -> SB3Recipe:
+    def of(cls, task: str, algorithm: str = "ppo", realistic: bool = False, **changes: Any) -> SB3Recipe:
         """A preset with changes.
 
         Args:
@@ -106,7 +106,7 @@ class SB3Recipe:
         """Name of the library and the algorithm for titles."""
         return f"{self.library} {self.algorithm}"
 
-    def env(self, **options) -> Env:
+    def env(self, **options: Any) -> Env:
         """The environment; options of `jaxdrones.make` replace those of the recipe."""
         return checked_preset(self.task, "ppo", self.realistic, self.options | options)[0]
 

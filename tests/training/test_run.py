@@ -62,7 +62,7 @@ def test_lines_after_the_update_that_training_goes_on_from_are_dropped(tmp_path)
 
 def test_a_recipe_survives_json():
     recipe = Recipe.of("tracking", "ppo", realistic=True, period=5.0, worlds=64, restart_fraction=1)
-    assert recipe.config.restart == 1.0 and recipe.options == {"period": 5.0}
+    assert recipe.config.restart_fraction == 1.0 and recipe.options == {"period": 5.0}
     assert Recipe.from_dict(recipe.as_dict()) == recipe
     assert recipe.env().observation_size > 0
 

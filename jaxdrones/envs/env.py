@@ -24,8 +24,7 @@ from jaxdrones.checks import (
     check_shape,
     shown,
 )
-from jaxdrones.engine.explicit import Step
-from jaxdrones.engine.host import HostStep
+from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw
 from jaxdrones.envs.vision import Vision

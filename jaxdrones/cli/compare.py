@@ -4,7 +4,7 @@ import argparse
 
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, table
-from jaxdrones.cli.conditions import add_conditions, flown, warn
+from jaxdrones.cli.flight_options import add_conditions, flown, warn
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.record import divergence

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, check_writable, complain, folder, table
-from jaxdrones.cli.conditions import add_conditions, check_conditions, flown, progress, warn
+from jaxdrones.cli.flight_options import add_conditions, check_conditions, flown, progress, warn
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.fly import scene_of

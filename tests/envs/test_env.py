@@ -47,7 +47,7 @@ def test_the_contract_holds_in_single_precision_and_realistic(task):
 
 def test_the_check_sees_a_broken_contract():
     env = make("hover")
-    broken = dataclasses.replace(env.task, rewards={"nan": (1.0, lambda world: world.drones.pos[:, 0] * jnp.nan)})
+    broken = dataclasses.replace(env.task, rewards={"nan": (1.0, lambda task, world: world.drones.pos[:, 0] * jnp.nan)})
     with pytest.raises(ContractError, match="reward is not finite"):
         check_env(make(broken))
 
@@ -114,7 +114,7 @@ def test_a_drone_that_is_lost_ends_the_episode_for_good():
     _, world = env.reset(KEY)
     world = world.replace(drones=world.drones.replace(pos=world.drones.pos + 100.0))
     *_, terminated, truncated, info = env.step(KEY, world, zeros(env))
-    assert terminated and not truncated and info["ends"]["lost"]
+    assert terminated and not truncated and info["terminations"]["lost"]
 
 
 def test_a_drone_that_spins_ends_the_episode_for_good():
@@ -122,7 +122,7 @@ def test_a_drone_that_spins_ends_the_episode_for_good():
     _, world = env.reset(KEY)
     world = world.replace(drones=world.drones.replace(omega=jnp.array([[0.0, 0.0, 200.0]])))
     *_, terminated, truncated, info = env.step(KEY, world, zeros(env))
-    assert terminated and not truncated and info["ends"]["spinning"]
+    assert terminated and not truncated and info["terminations"]["spinning"]
 
 
 def test_a_state_that_is_not_a_number_ends_the_episode():

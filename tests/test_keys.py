@@ -95,7 +95,7 @@ def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
 
 
 def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatch):
-    """Fake noise, pushes, randomizations, starts and resets tell which key they saw, even if all are given the same one."""
+    """Fake noise, pushes, randomizations, starts and resets record the key they saw, even if all get the same one."""
     seen = {}
 
     def tell(stream, key):

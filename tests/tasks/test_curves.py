@@ -4,7 +4,7 @@ import pytest
 from jaxdrones.tasks import curves
 
 
-def test_the_circle_is_a_circle_and_starts_where_the_paper_says():
+def test_the_circle_is_a_circle_and_starts_where_gym_pybullet_drones_does():
     circle = curves.circle(radius=0.3, period=10.0)
     start = circle.positions(4)
     angle = 2 * np.pi * np.arange(4) / 6 + np.pi / 2

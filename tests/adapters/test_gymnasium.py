@@ -159,6 +159,14 @@ def test_only_worlds_whose_episode_ended_are_masked(env_of):
     np.testing.assert_array_equal(infos["final_obs"][0], obs[0])
 
 
+def test_a_time_limit_is_that_of_the_adapter_and_not_of_the_environment_it_was_given(env_of):
+    env = short(env_of)
+    envs = VectorEnv(env, 2, max_episode_steps=2)
+    envs.reset(seed=0)
+    assert [bool(envs.step(np.zeros((2, 4)))[3].all()) for _ in range(2)] == [False, True]
+    assert env.steps == 5
+
+
 def test_wrappers_of_gymnasium_understand_the_infos(env_of):
     envs = RecordEpisodeStatistics(VectorEnv(short(env_of), 3))
     envs.reset(seed=0)

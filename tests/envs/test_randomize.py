@@ -8,7 +8,16 @@ from helpers import assert_close
 
 import jaxdrones as jd
 from jaxdrones.envs import make
-from jaxdrones.envs.randomize import constant_wind, delayed, draw, random_pushes, scaled, sensor_noise, shifted
+from jaxdrones.envs.randomize import (
+    constant_wind,
+    delayed,
+    draw,
+    drawn_fields,
+    random_pushes,
+    scaled,
+    sensor_noise,
+    shifted,
+)
 
 KEY = jax.random.key(5)
 TEAM = jd.repeat(jd.load_params("cf2x"), 200)
@@ -136,3 +145,25 @@ def test_a_privileged_observation_has_no_noise_and_shows_the_drawn_parameters():
     np.testing.assert_allclose(known.obs, plain.reset(KEY)[0], rtol=0, atol=1e-15)
     assert np.abs(obs - known.obs).max() > 1e-4
     assert plain.reset(KEY)[0].shape == known.obs.shape and make("hover").privileged_size == 0
+
+
+def rarely_twice_as_heavy(key, params):
+    rare = jax.random.uniform(key) < 0.001
+    return jax.lax.cond(rare, lambda params: params.replace(mass=2 * params.mass), lambda params: params, params)
+
+
+@pytest.mark.parametrize(
+    ("randomize", "drawn"),
+    [
+        (rarely_twice_as_heavy, ["mass"]),
+        (jax.jit(rarely_twice_as_heavy), ["mass"]),
+        (scaled("inertia", 0.5, 1.5), ["inertia"]),
+        (jax.jit(constant_wind(1.0)), ["wind"]),
+        (lambda key, params: params.replace(mass=2 * params.mass), []),
+    ],
+)
+def test_drawn_parameters_are_found_however_rarely_they_differ(randomize, drawn):
+    """From the program, not from what one key happens to draw; what is the same in every episode is not drawn."""
+    assert drawn_fields([randomize], TEAM) == drawn
+    env = make("hover", randomize=(randomize,))
+    assert env.privileged_size == sum(getattr(env.params, name).size for name in drawn)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxdrones.engine.host import HostStep
+from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.tasks.task import Task, World
 

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.checks import check_callable, check_finite, check_key, check_shape
-from jaxdrones.engine.explicit import Step
-from jaxdrones.engine.host import HostStep
+from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.arguments import check_randomizations, check_team, check_terms, delay_steps, episode_steps
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations

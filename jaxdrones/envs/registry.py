@@ -28,7 +28,8 @@ from jaxdrones.dynamics import (
     ground_contact,
     lagging_rotors,
 )
-from jaxdrones.engine.explicit import Step, make_step
+from jaxdrones.engine.explicit import make_step
+from jaxdrones.engine.step import Step
 from jaxdrones.envs.actions import ACTIONS, Action, check_loop
 from jaxdrones.envs.arguments import check_randomizations
 from jaxdrones.envs.env import Env

@@ -17,7 +17,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxdrones.engine.explicit import Step, make_step
+from jaxdrones.engine.explicit import make_step
+from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
 
 GRADIENTS = ("exact", "decay", "surrogate")

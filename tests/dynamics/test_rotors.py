@@ -34,7 +34,7 @@ def test_equal_speeds_give_no_torque():
 
 def test_instant_rotors_turn_as_commanded():
     params, command = jaxdrones.load_params("cf2x"), jnp.arange(4.0)
-    rpm, rate = instant_rotors(params, jnp.full(4, 9.0), command)
+    rpm, rate = instant_rotors(params, level, command)
     np.testing.assert_array_equal(rpm, command)
     np.testing.assert_array_equal(rate, 0)
 
@@ -42,10 +42,10 @@ def test_instant_rotors_turn_as_commanded():
 @pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
 def test_rotors_turn_neither_backwards_nor_faster_than_they_can(rotors):
     params = jaxdrones.load_params("cf2x")
-    speed = jnp.array([0.0, 5000, 10000, 20000])
+    state = level.replace(rpm=jnp.array([0.0, 5000, 10000, 20000]))
     command = jnp.array([-1000.0, 2 * params.max_rpm, jnp.inf, -jnp.inf])
     within = jnp.array([0, params.max_rpm, params.max_rpm, 0])
-    for beyond, limit in zip(rotors(params, speed, command), rotors(params, speed, within), strict=True):
+    for beyond, limit in zip(rotors(params, state, command), rotors(params, state, within), strict=True):
         np.testing.assert_array_equal(beyond, limit)
 
 
@@ -55,10 +55,10 @@ def test_rotors_without_a_limit_follow_any_command_forwards_and_have_finite_grad
     params = jaxdrones.load_params("cf2x").replace(max_rpm=jnp.array(jnp.inf))
     command = jnp.array([1e5, 0.0, -1.0, 2e4])
 
-    def sums(params, rpm, command):
-        return sum(jnp.sum(x) for x in rotors(params, rpm, command))
+    def sums(params, state, command):
+        return sum(jnp.sum(x) for x in rotors(params, state, command))
 
-    arguments = params, jnp.full(4, 3e4), command
+    arguments = params, level.replace(rpm=jnp.full(4, 3e4)), command
     if rotors is instant_rotors:
         np.testing.assert_array_equal(rotors(*arguments)[0], [1e5, 0, 0, 2e4])
     gradients = jax.grad(sums, (0, 1, 2))(*arguments)
@@ -69,7 +69,7 @@ def test_rotors_without_a_limit_follow_any_command_forwards_and_have_finite_grad
 def test_a_command_beyond_the_limits_has_no_gradient_and_one_on_them_has():
     params = jaxdrones.load_params("cf2x")
     command = jnp.array([-1.0, 0.0, params.max_rpm, params.max_rpm + 1])
-    gradient = jax.grad(lambda c: jnp.sum(instant_rotors(params, jnp.zeros(4), c)[0]))(command)
+    gradient = jax.grad(lambda c: jnp.sum(instant_rotors(params, level, c)[0]))(command)
     np.testing.assert_array_equal(gradient, [0, 1, 1, 0])
 
 
@@ -89,7 +89,8 @@ def test_lagging_rotors_close_the_gap_to_1_over_e_in_one_time_constant(start, co
 
 def test_lagging_rotors_rise_and_fall_with_their_own_time_constants():
     params = jaxdrones.load_params("cf2x")
-    rpm, rate = lagging_rotors(params, jnp.array([100.0, 100, 100, 100]), jnp.array([150.0, 50, 100, 0]))
+    state = level.replace(rpm=jnp.full(4, 100.0))
+    rpm, rate = lagging_rotors(params, state, jnp.array([150.0, 50, 100, 0]))
     np.testing.assert_array_equal(rpm, 100)
     np.testing.assert_allclose(rate, [50 / 0.055, -50 / 0.249, 0, -100 / 0.249], rtol=1e-12)
 

@@ -28,6 +28,7 @@ from jaxdrones.engine.rollout import rollout
 from jaxdrones.engine.wrenches import Effect, Pair
 from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
+from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
@@ -38,6 +39,7 @@ __all__ = [
     "NeighborGrid",
     "Pair",
     "Params",
+    "Sensor",
     "State",
     "Step",
     "Wrench",

@@ -12,6 +12,8 @@ from jax.typing import ArrayLike
 
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
+from jaxdrones.envs.surroundings import scene_in
+from jaxdrones.sensing.scene import Scene
 from jaxdrones.tasks.task import Task, World
 
 SEEDS = 2**32  # seeds are taken modulo this
@@ -32,6 +34,8 @@ class Session:
         """Start an episode; returns the observation."""
         self._key, self.world, obs = self._compiled(self.env, begin)(np.uint32(seed % SEEDS))
         self.running = True
+        if not isinstance(self.env.scene, Scene):
+            self._close_renderer()  # of the scene of the last episode
         return _numpy(obs)
 
     def step(self, action: np.ndarray) -> tuple[Any, np.ndarray, bool, bool, dict[str, Any]]:
@@ -68,8 +72,12 @@ class Session:
         """End the connections to Bullet; the session cannot go on."""
         self.running = False
         self.env.close()
+        self._close_renderer()
+
+    def _close_renderer(self) -> None:
         if "_renderer" in vars(self):
             self._renderer.close()
+            del self._renderer
 
     @functools.cached_property
     def _renderer(self):
@@ -77,7 +85,7 @@ class Session:
             return self.env.physics
         from jaxdrones.engine import bullet  # an optional library behind it
 
-        return bullet.make_step(scene=self.env.task.scene)
+        return bullet.make_step(scene=scene_in(self.env.scene, self.world))
 
 
 def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:

@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from jaxdrones.checks import check_shape
 from jaxdrones.envs import Env
+from jaxdrones.sensing.scene import Scene
 
 _MAX_DEPTH = 1001.0  # m; the farthest visible distance of the cameras, 1000 m, and rounding
 
@@ -109,4 +110,5 @@ def _image(env: Env, name: str) -> spaces.Box:
         return spaces.Box(0, 255, (48, 64, 4), np.uint8)
     if name == "depth":
         return spaces.Box(0, _MAX_DEPTH, (48, 64), np.float32)
-    return spaces.Box(-1, env.drones + len(env.task.scene.obstacles), (48, 64), np.int32)
+    assert isinstance(env.scene, Scene), "Bullet, which takes the pictures, has refused others"
+    return spaces.Box(-1, env.drones + len(env.scene.obstacles), (48, 64), np.int32)

@@ -121,7 +121,8 @@ def _fly_policy(options: argparse.Namespace) -> int:
     )
     record = record_of(episode, conditions)
     title = f"{recipe.task}: {env.task.summary} ({recipe.learner}, {options.backend})"
-    files = _write(record, options, output, title, plots.POLICY_PANELS, env.task.scene)
+    assert isinstance(env.scene, Scene), "tasks that have a name have a fixed scene"
+    files = _write(record, options, output, title, plots.POLICY_PANELS, env.scene)
     results = record.results(_SETTLING_SHARE * float(record.t[-1]))
     end = {
         "success": episode.success,

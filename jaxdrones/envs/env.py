@@ -9,24 +9,28 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.checks import check_callable, check_finite, check_key, check_shape
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.arguments import check_randomizations, check_team, check_terms, delay_steps, episode_steps
+from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
-from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_fields
+from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves
+from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step, scene_in, scene_of_episode
 from jaxdrones.envs.vision import Vision
 from jaxdrones.params import Params
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.sensor import Sensor, check_sensors, init_sensors, measure_sensors
 from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
-DISTURBANCE, NOISE, START, RANDOMIZE, RESET = range(5)
+DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE = range(7)
 """Random streams: what a key is folded with, so that only the draws that are used cost time."""
 
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
+Key = Any  # a random key; `None` where nothing is drawn
 
 
 class Env:
@@ -51,6 +55,8 @@ class Env:
         disturbance: Disturbance | None = None,
         delay: float = 0.0,
         vision: Vision | None = None,
+        sensors: Sequence[Sensor] = (),
+        scene: Scene | DrawScene | None = None,
         vehicle: str = "drones",
     ):
         """Put an environment together; `jaxdrones.make` does it by name.
@@ -67,6 +73,9 @@ class Env:
             disturbance: sets the surroundings before every control step, for example `random_pushes`.
             delay: delay between action and command, s.
             vision: cameras; only with the Bullet backend.
+            sensors: sensors of every drone, which measure after `reset` and after every control step.
+            scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's
+                when left out.
             vehicle: name of the vehicle, for people.
 
         Raises:
@@ -78,18 +87,20 @@ class Env:
             check_callable("noise", noise, "sensor_noise()")
         if disturbance is not None:
             check_callable("disturbance", disturbance, "random_pushes(0.3)")
+        self.scene = task.scene if scene is None else scene
+        """Obstacles and ground, or the function that draws them."""
+        check_scene(self.scene, step, task)
         self.task, self.params, self.dt, self.drones = task, params, dt, task.drones
         self.action, self.action_size = action.fitted(params), action.size
         self.physics, self.vision, self._vehicle = step, vision, vehicle
         self.steps = episode_steps(task, dt)
         """Number of control steps after which an episode is truncated."""
+        self.sensors = check_sensors(sensors)
         self._terms, self._randomize, self._noise, self._disturbance = terms, randomize, noise, disturbance
         self._delay = delay_steps(task, delay, dt)
         self._history = max(math.ceil(self._delay) + 1, *(term.history for term in terms))
-        self._drawn_fields = drawn_fields(randomize, params)
-        widths = self._widths()
-        bounds = [np.broadcast_to(term.bound, (width,)) for term, width in zip(terms, widths, strict=True)]
-        self.observation_bound = np.concatenate(bounds).astype(np.float32)
+        self._drawn = drawn_leaves(randomize, params)
+        self.observation_bound = bounds(terms, self._widths())
         """(d,) largest magnitude of every entry of the observation."""
         self.observation_size = len(self.observation_bound)
 
@@ -111,12 +122,14 @@ class Env:
     @property
     def constant_fields(self) -> tuple[str, ...]:
         """Names of the fields of a world that are the same in every episode."""
-        return () if self._randomize or self._disturbance else ("params",)
+        params = () if self._randomize or self._disturbance else ("params",)
+        return (*params, "scene") if isinstance(self.scene, Scene) else params
 
     @property
     def privileged_size(self) -> int:
         """How many numbers of a drone a privileged observation has beside the observation."""
-        return sum(getattr(self.params, name).size for name in self._drawn_fields) // self.drones
+        leaves = zip(jax.tree.leaves(self.params), self._drawn, strict=True)
+        return sum(leaf.size for leaf, drawn in leaves if drawn) // self.drones
 
     def reset(self, key: jax.Array) -> tuple[Obs, World]:
         """The first observation, and the world at the start of an episode.
@@ -125,7 +138,9 @@ class Env:
             ValueError: `key` is not one random key.
         """
         check_key("key", key)
-        world, obs = self.compiled(Env._start)(key)
+        world = self.compiled(Env._start)(key)
+        rate = self._rate(world, world.drones.rpm)
+        obs, world = self.compiled(Env._first_observation)(key, world, rate)
         if self.vision:
             world = world.replace(images=self.vision.look(world.params, world.drones))
         return self._with_images(obs, world), world
@@ -151,9 +166,12 @@ class Env:
         check_key("key", key)
         check_shape("action", action, (self.drones, self.action_size), "one row of the action type's size per drone")
         check_finite("action", action)
+        random = self._noise or self._disturbance or self.sensors
+        key = key if random else None  # a program without random keys can be a single kernel
         world, rpm = self.compiled(Env._command)(key, world, action)
-        drones = self.physics(world.params, world.drones, rpm)
-        obs, world, *outcome = self.compiled(Env._outcome)(key, world, drones)
+        drones = self.physics(world.params, world.drones, rpm, scene_for_step(self.scene, self.physics, world))
+        world = world.replace(drones=drones)
+        obs, world, *outcome = self.compiled(Env._outcome)(key, world, self._rate(world, rpm))
         if self.vision:
             world = world.replace(images=self.vision.next(world))
         return self._with_images(obs, world), world, *outcome
@@ -161,7 +179,7 @@ class Env:
     def privileged_observation(self, world: World) -> PrivilegedObservation:
         """What a critic may know in training: the observation without noise, and the drawn parameters."""
         return PrivilegedObservation(
-            self._observation(world), deviations(world.params, self.params, self._drawn_fields)
+            observe(self._terms, self.task, world), deviations(world.params, self.params, self._drawn)
         )
 
     def compiled(self, function: Callable) -> Callable:
@@ -182,22 +200,43 @@ class Env:
     def __exit__(self, *_) -> None:
         self.close()
 
-    def _start(self, key: jax.Array) -> tuple[World, Array]:
-        """The world at the start of an episode, and its observation."""
+    def _start(self, key: jax.Array) -> World:
+        """The world at the start of an episode, before the first measurement."""
         params = draw(self._randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
         drones, variables = self.task.start(jax.random.fold_in(key, START), self.params)
-        world = World(
+        return World(
             params=params,
-            drones=drones,
+            drones=self.physics.init(params, drones),
             variables=variables,
             memory=self.action.init(self.drones),
             actions=jnp.zeros((self.drones, self._history, self.action_size), drones.pos.dtype),
             step=jnp.zeros((), jnp.int32),
             dt=self.dt,
+            scene=scene_of_episode(self.scene, jax.random.fold_in(key, SCENE)),
         )
-        return world, self._noisy_observation(jax.random.fold_in(key, NOISE), world)
 
-    def _command(self, key: jax.Array, world: World, action: Array) -> tuple[World, Array]:
+    def _first_observation(self, key: jax.Array, world: World, rate: State | None) -> tuple[Array, World]:
+        """The observation at the start of an episode, and the world with the first readings."""
+        if rate is not None:
+            init_key, measure_key = jax.random.split(jax.random.fold_in(key, SENSORS))
+            world = world.replace(sensors=init_sensors(self.sensors, init_key, world.params))
+            world = self._measured(measure_key, world, rate)
+        return self._noisy_observation(key, world), world
+
+    def _rate(self, world: World, rpm: Array) -> State | None:
+        """The time derivative of the state for the sensors, if there are any."""
+        if not self.sensors:
+            return None
+        return self.physics.rate(world.params, world.drones, rpm, scene_for_step(self.scene, self.physics, world))
+
+    def _measured(self, key: jax.Array, world: World, rate: State) -> World:
+        """The world with new readings of the sensors."""
+        memories, readings = measure_sensors(
+            self.sensors, key, world.params, world.drones, rate, scene_in(self.scene, world), world.sensors
+        )
+        return world.replace(sensors=memories, readings=readings)
+
+    def _command(self, key: Key, world: World, action: Array) -> tuple[World, Array]:
         """The world with the new action and disturbance, and the commanded rotor speeds."""
         action = jnp.clip(jnp.asarray(action, world.actions.dtype), -1, 1)
         actions = jnp.concatenate([world.actions[:, 1:], action[:, None]], axis=1)
@@ -214,10 +253,12 @@ class Env:
         memory, rpm = jax.vmap(of_drone)(self.params, world.memory, world.drones, action_in_force, target)
         return world.replace(memory=memory), rpm
 
-    def _outcome(self, key: jax.Array, world: World, drones: State):
-        """Observation, world, reward and the rest of what `step` returns, from the state after the step."""
+    def _outcome(self, key: Key, world: World, rate: State | None):
+        """Observation, world, reward and the rest of what `step` returns, from the world with the state after it."""
         task = self.task
-        world = world.replace(drones=drones, step=world.step + 1)
+        world = world.replace(step=world.step + 1)
+        if rate is not None:
+            world = self._measured(jax.random.fold_in(key, SENSORS), world, rate)
         world = world.replace(variables=task.advance(task, world))
         rewards = {name: scale * term(task, world) for name, (scale, term) in task.rewards.items()}
         terminations, truncations = (
@@ -232,22 +273,20 @@ class Env:
             "terminations": terminations,
             "truncations": truncations,
         }
-        obs = self._noisy_observation(jax.random.fold_in(key, NOISE), world)
+        obs = self._noisy_observation(key, world)
         return obs, world, sum(rewards.values()), terminated, truncated, info
 
-    def _noisy_observation(self, key: jax.Array, world: World) -> Array:
+    def _noisy_observation(self, key: Key, world: World) -> Array:
         if self._noise:
-            world = world.replace(drones=self._noise(key, world.drones))
-        return self._observation(world)
-
-    def _observation(self, world: World) -> Array:
-        return jnp.concatenate([_clip(term.observe(self.task, world), term.bound) for term in self._terms], axis=-1)
+            world = world.replace(drones=self._noise(jax.random.fold_in(key, NOISE), world.drones))
+        return observe(self._terms, self.task, world)
 
     def _widths(self) -> list[int]:
         """How many numbers of a drone each observation term has."""
 
         def terms(key):
-            world, _ = self._start(key)
+            world = self._start(key)
+            _, world = self._first_observation(key, world, self._rate(world, world.drones.rpm))
             return [term.observe(self.task, world) for term in self._terms]
 
         return [x.shape[-1] for x in jax.eval_shape(terms, jax.random.key(0))]
@@ -258,8 +297,3 @@ class Env:
 
 def _any(conditions: Iterable[Array]) -> Array:
     return functools.reduce(jnp.logical_or, conditions, jnp.zeros((), bool))
-
-
-def _clip(x: Array, bound: float | tuple[float, ...]) -> Array:
-    limit = jnp.broadcast_to(jnp.asarray(bound, x.dtype), x.shape[-1:])[None]
-    return jnp.clip(x, -limit, limit)

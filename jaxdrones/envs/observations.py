@@ -6,9 +6,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
@@ -145,6 +147,16 @@ def neighbors(count: int) -> ObservationTerm:
     return ObservationTerm(observe, _MAX_DISTANCE)
 
 
+def reading(sensor: str, bound: float = math.inf) -> ObservationTerm:
+    """A term of the latest reading of a sensor of this name, flattened."""
+
+    def observe(task: Task, world: World) -> Array:
+        n = len(world.drones.pos)
+        return jnp.concatenate([jnp.reshape(x, (n, -1)) for x in jax.tree.leaves(world.readings[sensor])], axis=-1)
+
+    return ObservationTerm(observe, bound)
+
+
 def preview(*ahead: float) -> ObservationTerm:
     """A term of the future positions of the target, `ahead` (s) from now, relative to the drone, m, world axes."""
 
@@ -153,6 +165,22 @@ def preview(*ahead: float) -> ObservationTerm:
         return jnp.concatenate(later, axis=-1)
 
     return ObservationTerm(observe, _MAX_DISTANCE)
+
+
+def observe(terms: Sequence[ObservationTerm], task: Task, world: World) -> Float[Array, "n d"]:
+    """The observation: all terms side by side, clipped at their bounds."""
+    return jnp.concatenate([_clip(term.observe(task, world), term.bound) for term in terms], axis=-1)
+
+
+def bounds(terms: Sequence[ObservationTerm], widths: Sequence[int]) -> np.ndarray:
+    """(d,) largest magnitude of every entry of an observation, whose terms have so many entries."""
+    columns = [np.broadcast_to(term.bound, (width,)) for term, width in zip(terms, widths, strict=True)]
+    return np.concatenate(columns).astype(np.float32)
+
+
+def _clip(x: Array, bound: float | tuple[float, ...]) -> Array:
+    limit = jnp.broadcast_to(jnp.asarray(bound, x.dtype), x.shape[-1:])[None]
+    return jnp.clip(x, -limit, limit)
 
 
 def _to_body(world: World, v: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -20,11 +21,12 @@ class PrivilegedObservation(flax.struct.PyTreeNode):
     """(n, e) deviations of the drawn parameters from their nominal values, as shares of the largest nominal one."""
 
 
-def deviations(params: Params, nominal: Params, fields: Sequence[str]) -> Float[Array, "n e"]:
-    """How far some parameters of a team are off their nominal values, side by side."""
+def deviations(params: Params, nominal: Params, drawn: Sequence[bool]) -> Float[Array, "n e"]:
+    """Deviations of the drawn leaves of a team's parameters from their nominal values, side by side."""
     n = len(nominal.mass)
-    columns = [_deviation(getattr(params, name), getattr(nominal, name)) for name in fields]
-    return jnp.concatenate([jnp.zeros((n, 0)), *(jnp.reshape(x, (n, -1)) for x in columns)], axis=-1)
+    leaves = zip(jax.tree.leaves(params), jax.tree.leaves(nominal), drawn, strict=True)
+    columns = [jnp.reshape(_deviation(value, own), (n, -1)) for value, own, is_drawn in leaves if is_drawn]
+    return jnp.concatenate([jnp.zeros((n, 0)), *columns], axis=-1)
 
 
 def _deviation(value: Array, nominal: Array) -> Array:

@@ -83,11 +83,11 @@ def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> 
     return params
 
 
-def drawn_fields(randomize: Sequence[Randomization], params: Params) -> list[str]:
-    """Names of the parameters of a team that differ from episode to episode, however rarely."""
+def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[bool]:
+    """Which leaves of the parameters of a team differ from episode to episode, however rarely."""
     one = jax.tree.map(lambda x: x[0], params)
-    found = [vars(compiler.depends(randomization, jax.random.key(0), one)) for randomization in randomize]
-    return [name for name in vars(params) if any(jax.tree.leaves([each[name] for each in found]))]
+    found = [jax.tree.leaves(compiler.depends(each, jax.random.key(0), one)) for each in randomize]
+    return [any(flags) for flags in zip(*found, strict=True)] if found else [False] * len(jax.tree.leaves(params))
 
 
 def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, omega: float = 0.02) -> Noise:

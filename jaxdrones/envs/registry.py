@@ -23,6 +23,7 @@ from jaxdrones.dynamics import (
     INTEGRATORS,
     PAIRS,
     ROTORS,
+    Model,
     drone_contact,
     external_force,
     ground_contact,
@@ -30,10 +31,11 @@ from jaxdrones.dynamics import (
 )
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
+from jaxdrones.engine.wrenches import TeamEffect
 from jaxdrones.envs.actions import ACTIONS, Action, check_loop
 from jaxdrones.envs.arguments import check_randomizations
 from jaxdrones.envs.env import Env
-from jaxdrones.envs.observations import OBSERVATIONS
+from jaxdrones.envs.observations import OBSERVATIONS, reading
 from jaxdrones.envs.randomize import (
     REALISTIC_DELAY,
     REALISTIC_RANDOMIZATION,
@@ -42,8 +44,11 @@ from jaxdrones.envs.randomize import (
     Randomization,
     sensor_noise,
 )
+from jaxdrones.envs.surroundings import DrawScene
 from jaxdrones.envs.vision import IMAGES, Vision
 from jaxdrones.params import Params, repeat
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.sensor import Sensor, check_sensors
 from jaxdrones.tasks import gates, gym_pybullet_drones, hover, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
@@ -80,6 +85,8 @@ def make(
     realistic: bool = False,
     effects: Sequence[str | Callable] | None = None,
     pairs: Sequence[str | Callable] = (),
+    team_effects: Sequence[TeamEffect] = (),
+    models: Sequence[Model] = (),
     rotors: str | None = None,
     integrator: str = "semi_implicit_euler",
     control_hz: float | None = None,
@@ -88,6 +95,8 @@ def make(
     noise: Noise | None = None,
     disturbance: Disturbance | None = None,
     delay: float | None = None,
+    sensors: Sequence[Sensor] = (),
+    scene: Scene | DrawScene | None = None,
     **options: Any,
 ) -> Env:
     """Make an environment.
@@ -97,12 +106,15 @@ def make(
         backend: `explicit` or `bullet`, which must be closed: use the environment in a `with` block.
         vehicle: a bundled vehicle, the path of a URDF, or the parameters of one drone.
         action: a name of `ACTIONS` or an action type; the task's own when left out.
-        observation: names of `OBSERVATIONS` or observation terms, concatenated; the task's own when left out.
+        observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
+            out.
         vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest; with the Bullet backend.
         vision_hz: pictures per second; one per control step when left out.
         realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
+        team_effects: functions `(params, state) -> Wrench` of the whole team.
+        models: differential equations that are integrated along, such as a battery.
         rotors: `instant` or `lagging`.
         integrator: a name of `INTEGRATORS`; Bullet has its own.
         control_hz: control steps per second; the task's own when left out.
@@ -111,6 +123,9 @@ def make(
         noise: noise of the observed state.
         disturbance: sets the surroundings before every control step, for example `random_pushes`.
         delay: delay between action and command, s.
+        sensors: sensors of every drone; their names are observations too.
+        scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's own
+            when left out. On the explicit backend an effect must take it if it has obstacles.
         **options: options of the task, for example `drones`.
 
     Raises:
@@ -136,14 +151,24 @@ def make(
         effects = [*effects, external_force]
     pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
     action = _action(task.action if action is None else action, nominal, rotors is lagging_rotors, dt)
-    physics: dict[str, Any] = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
+    sensors = check_sensors(sensors)
+    physics: dict[str, Any] = dict(
+        effects=effects,
+        pairs=pairs,
+        team_effects=team_effects,
+        models=models,
+        rotors=rotors,
+        dt=dt / substeps,
+        substeps=substeps,
+    )
+    scene = task.scene if scene is None else scene
     step: Step
     if backend == "bullet":
         from jaxdrones.engine import bullet  # an optional library behind it
 
         if integrator != "semi_implicit_euler":
             raise ValueError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
-        step = bullet.make_step(**physics, scene=task.scene)
+        step = bullet.make_step(**physics, scene=scene if isinstance(scene, Scene) else None)
     else:
         if "ground" in task.contact:
             physics["effects"] = [*effects, ground_contact]
@@ -152,14 +177,15 @@ def make(
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
     observation = task.observation if observation is None else observation
-    terms = [_term(name, task) for name in check_sequence("observation", observation, "'position_error'")]
+    known = OBSERVATIONS | dict(task.observations) | {s.name: reading(s.name, s.bound) for s in sensors}
+    observation = check_sequence("observation", observation, "'position_error'")
     return Env(
         task,
         nominal,
         step,
         dt=dt,
         action=action,
-        observation=terms,
+        observation=[_named("observation", term, known) for term in observation],
         randomize=(
             *task.randomize,
             *check_randomizations(preset["randomize"] if randomize is None else randomize),
@@ -168,6 +194,8 @@ def make(
         disturbance=disturbance,
         delay=preset["delay"] if delay is None else delay,
         vision=_vision(step, backend, vision, vision_hz, control_hz),
+        sensors=sensors,
+        scene=scene,
         vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
     )
 
@@ -221,10 +249,6 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
         )
     check_loop(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
     return kind.fitted(nominal)
-
-
-def _term(name: str | ObservationTerm, task: Task) -> ObservationTerm:
-    return _named("observation", name, OBSERVATIONS | dict(task.observations))
 
 
 def _vision(step, backend: str, images: Sequence[str], hz: float | None, control_hz: float) -> Vision | None:

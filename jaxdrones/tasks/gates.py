@@ -117,6 +117,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
         randomize=() if level == 0 else (_random_inertia,),
         observations={"gates": ObservationTerm(_observe_gates, 20.0), "poles": ObservationTerm(_observe_poles, _SIGHT)},
         scene=_scene() if level < 2 else Scene(),
+        obstacles_terminate=True,
         contact=("ground",),
         observation=("position", "gates", "poles", "rotation_matrix", "velocity", "omega", "last_action"),
     )

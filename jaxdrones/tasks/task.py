@@ -37,6 +37,12 @@ class World(flax.struct.PyTreeNode):
     """() number of control steps since the start."""
     dt: float = flax.struct.field(pytree_node=False)
     """Control period, s."""
+    scene: Scene | None = None
+    """Obstacles and ground of this episode; `None` where there are no obstacles."""
+    sensors: dict[str, Any] = flax.struct.field(default_factory=dict)
+    """Memories of the sensors, by name."""
+    readings: dict[str, Any] = flax.struct.field(default_factory=dict)
+    """The latest readings of the sensors by name: arrays, or pytrees of arrays."""
     images: Any = None
     """The latest pictures of the cameras, if there are any."""
 
@@ -68,7 +74,7 @@ class ObservationTerm:
 
     def __post_init__(self):
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
-            check_number("bound of an observation", bound, above=0)
+            check_number("bound of an observation", bound, above=0, infinite=True)
         check_whole("history of an observation", self.history)
 
 
@@ -111,8 +117,10 @@ class Task:
     """Control steps per second, unless the environment says otherwise."""
     substeps: int = 5
     """Physics steps per control step, unless the environment says otherwise."""
-    scene: Scene = dataclasses.field(default_factory=Scene)
-    """Obstacles and ground."""
+    scene: Scene | Callable[[jax.Array], Scene] = dataclasses.field(default_factory=Scene)
+    """Obstacles and ground; or a function `(key) -> Scene` that draws them for every episode."""
+    obstacles_terminate: bool = False
+    """Whether the task's terminations find hits of its scene's obstacles, so that no force needs to do it."""
     contact: tuple[str, ...] = ()
     """What drones touch on purpose, `ground` or `drones`: adds those forces to the explicit backend."""
     action: str = "rpm"

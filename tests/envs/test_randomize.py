@@ -12,7 +12,7 @@ from jaxdrones.envs.randomize import (
     constant_wind,
     delayed,
     draw,
-    drawn_fields,
+    drawn_leaves,
     random_pushes,
     scaled,
     sensor_noise,
@@ -164,6 +164,8 @@ def rarely_twice_as_heavy(key, params):
 )
 def test_drawn_parameters_are_found_however_rarely_they_differ(randomize, drawn):
     """From the program, not from what one key happens to draw; what is the same in every episode is not drawn."""
-    assert drawn_fields([randomize], TEAM) == drawn
+    leaves = jax.tree_util.tree_leaves_with_path(TEAM)
+    found = zip(leaves, drawn_leaves([randomize], TEAM), strict=True)
+    assert [jax.tree_util.keystr(path, simple=True) for (path, _), is_drawn in found if is_drawn] == drawn
     env = make("hover", randomize=(randomize,))
     assert env.privileged_size == sum(getattr(env.params, name).size for name in drawn)

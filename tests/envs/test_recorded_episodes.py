@@ -8,6 +8,8 @@ from golden_data import explicit_params, load, names
 
 import jaxdrones
 from jaxdrones import State, rotation
+from jaxdrones.engine.physics import Physics
+from jaxdrones.engine.step import Step
 from jaxdrones.envs.actions import ACTIONS, rpm
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
@@ -36,13 +38,16 @@ ACTION = {
 }
 
 
-class Replay:
+class Replay(Step):
     """A step that hands out recorded states one after the other and keeps what was commanded."""
 
     def __init__(self, states: np.ndarray):
-        self.states, self.k, self.commands = states, 0, []
+        self.states, self.k, self.commands, self.physics = states, 0, [], Physics()
 
-    def __call__(self, params, state, rpm):
+    def rate(self, params, state, rpm, scene=None):
+        raise NotImplementedError("nothing asks for it")
+
+    def __call__(self, params, state, rpm, scene=None):
         self.k += 1
         self.commands.append(np.asarray(rpm))
         return to_state(self.states[self.k])

@@ -28,7 +28,7 @@ class PointWorld(flax.struct.PyTreeNode):
 class DoubleIntegrator:
     """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
 
-    drones, action_size, observation_size, dt, steps, kept = 1, 1, 2, 0.1, 50, ()
+    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 50, ()
 
     def reset(self, key):
         x = jax.random.uniform(key, (1, 2), minval=-0.1, maxval=0.1)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
-from jaxdrones.cli.common import INTERRUPTED, complain, folder, note
+from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
 from jaxdrones.cli.training import (
@@ -129,7 +129,9 @@ def _train(options: argparse.Namespace) -> int:
     if seconds is not None:
         spent = 0.0 if options.resume else time.perf_counter() - begin
         if spent > seconds:
-            note(f"compiling took all of --budget {options.budget}, so one update is made; --resume continues it")
+            print_warning(
+                f"compiling took all of --budget {options.budget}, so one update is made; --resume continues it"
+            )
         trainer.fit_budget(seconds - spent, made)
     total = trainer.recipe.config.updates
     say(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
@@ -146,15 +148,15 @@ def _train(options: argparse.Namespace) -> int:
                 loop.train(trainer, run, seed, display.tell)
         except KeyboardInterrupt:
             if not run.started:
-                return complain("interrupted before the first update; there is nothing to continue", INTERRUPTED)
+                return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
             draw_curves(options, {seed: run}, run.folder)
             again = f"jaxdrones train {options.task} --output {output} --resume"
             again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
             where = f"interrupted at update {run.sidecar_entry('state', 'update')}"
-            return complain(f"{where}; {remaining_best(run)}; continue with: {again}", INTERRUPTED)
+            return print_error(f"{where}; {remaining_best(run)}; continue with: {again}", INTERRUPTED)
         except Diverged as error:
             draw_curves(options, {seed: run}, run.folder)
-            return complain(
+            return print_error(
                 f"training diverged: {error}, for example --set learning_rate=1e-3; {remaining_best(run)}", 1
             )
     return show_results(options, runs, output)

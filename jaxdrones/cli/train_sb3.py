@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import INTERRUPTED, complain
+from jaxdrones.cli.common import INTERRUPTED, print_error
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import SB3_ALGORITHMS
 from jaxdrones.cli.training import (
@@ -69,12 +69,12 @@ def train(options: argparse.Namespace) -> int:
             trainer.train(run, display.tell, None if seconds is None else begin + seconds)
     except KeyboardInterrupt:
         if not run.files:
-            return complain("interrupted before the first evaluation; nothing is kept", INTERRUPTED)
+            return print_error("interrupted before the first evaluation; nothing is kept", INTERRUPTED)
         draw_curves(options, {seed: run}, run.folder)
-        return complain(f"interrupted; {remaining_best(run)}", INTERRUPTED)
+        return print_error(f"interrupted; {remaining_best(run)}", INTERRUPTED)
     except Diverged as error:
         draw_curves(options, {seed: run}, run.folder)
-        return complain(f"training diverged: {error}, --set learning_rate; {remaining_best(run)}", 1)
+        return print_error(f"training diverged: {error}, --set learning_rate; {remaining_best(run)}", 1)
     return show_results(options, {seed: run}, run.folder)
 
 

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.envs import AutoReset, Env, autoreset
+from jaxdrones.envs import AutoReset, Env
 from jaxdrones.envs.autoreset import Episode
-from jaxdrones.envs.env import Obs, PrivilegedObservation
+from jaxdrones.envs.env import Obs
+from jaxdrones.envs.privileged import PrivilegedObservation
 from jaxdrones.learning import sharding
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
@@ -70,7 +71,7 @@ class Trajectory(flax.struct.PyTreeNode):
 
 def empty_worlds(env: Env, count: int) -> Worlds:
     """Worlds in which no episode has begun; `restart` starts one in each."""
-    obs, episodes = jax.eval_shape(jax.vmap(autoreset(env).reset), jax.random.split(jax.random.key(0), count))
+    obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), count))
     episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
     return Worlds(episodes, obs, done=jnp.ones(count, bool))
 
@@ -88,7 +89,7 @@ def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) ->
     start_key, choice_key = jax.random.split(key)
     count = len(worlds.done)
     chosen = worlds.done | jax.random.bernoulli(choice_key, fraction, (count,))
-    obs, episodes = jax.vmap(autoreset(env).reset)(jax.random.split(start_key, count))
+    obs, episodes = jax.vmap(AutoReset(env).reset)(jax.random.split(start_key, count))
     return _select(chosen, Worlds(episodes, obs, jnp.zeros_like(chosen)), worlds)
 
 
@@ -116,8 +117,8 @@ def collect(
         between_steps: function that is applied to the worlds between steps, to change their gradient.
         privileged: whether to record privileged observations.
     """
-    privileged_of = jax.vmap(env.truth) if privileged else lambda worlds: None
-    step = jax.vmap((autoreset(env) if reset else _NoReset(env)).step)
+    privileged_of = jax.vmap(env.privileged_observation) if privileged else lambda worlds: None
+    step = jax.vmap((AutoReset(env) if reset else _NoReset(env)).step)
 
     def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Trajectory]:
         act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
@@ -165,9 +166,9 @@ class _NoReset(AutoReset):
 
     def step(self, key: jax.Array, episode: Episode, action: Array):
         obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
-        episode = Episode(world, episode.returned + reward, episode.length + 1)
+        episode = Episode(world, episode.episode_return + reward, episode.length + 1)
         final = {"final_obs": obs, "final_world": world}
-        info = info | final | {"episode": {"return": episode.returned, "length": episode.length}}
+        info = info | final | {"episode": {"return": episode.episode_return, "length": episode.length}}
         return obs, episode, reward, terminated, truncated, info
 
 

@@ -38,7 +38,7 @@ class Report(flax.struct.PyTreeNode):
     mean_length: float
     """Mean length of an episode, s."""
     end_rates: dict[str, float]
-    """Fraction of the episodes that ended by each condition of the task."""
+    """Fraction of the episodes that ended by each termination or truncation of the task."""
     final_metrics: dict[str, float]
     """Mean over drones of each of the task's metrics at the end of an episode."""
 
@@ -59,7 +59,7 @@ def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, flax.struct.PyTreeNode):
-        outcomes = _compiled_outcomes()(env, policy, keys)
+        outcomes = _compiled_outcomes()(compilation.Static(env), policy, keys)
     else:
         outcomes = jax.jit(functools.partial(_outcomes, env, policy))(keys)
     return _report(env, jax.tree.map(np.asarray, outcomes))
@@ -73,7 +73,7 @@ def check_episodes(env: Env, episodes: int) -> None:
 
 @functools.cache
 def _compiled_outcomes() -> Callable:
-    return compilation.jit(_outcomes, static_argnums=0)
+    return compilation.jit(lambda env, policy, keys: _outcomes(env.value, policy, keys), static_argnums=0)
 
 
 def _outcomes(env: Env, policy: Callable, keys: jax.Array) -> dict:
@@ -86,12 +86,12 @@ def _outcome(env: Env, policy: Callable, key: jax.Array) -> dict:
     start_key, key = jax.random.split(key)
     obs, world = env.reset(start_key)
     info = jax.eval_shape(env.step, key, world, jnp.zeros((env.drones, env.action_size)))[-1]
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (info["metrics"], info["ends"]))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), _metrics_and_ends(info))
 
     def control_step(carry, key):
         obs, world, diverged, done, last, episode_return, length = carry
         obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
-        last = jax.tree.map(lambda new, old: jnp.where(done, old, new), (info["metrics"], info["ends"]), last)
+        last = jax.tree.map(lambda new, old: jnp.where(done, old, new), _metrics_and_ends(info), last)
         episode_return = episode_return + jnp.where(done, 0, reward)
         length = length + ~done
         diverged = diverged | ~jnp.all(jnp.isfinite(world.drones.pos))
@@ -112,6 +112,10 @@ def _outcome(env: Env, policy: Callable, key: jax.Array) -> dict:
         "length": length,
         "rms_error": rms_error,
     }
+
+
+def _metrics_and_ends(info: dict) -> tuple[dict, dict]:
+    return info["metrics"], info["terminations"] | info["truncations"]
 
 
 def _report(env: Env, outcomes: dict) -> Report:

@@ -228,7 +228,7 @@ def _batch(config: Config, state: TrainState, trajectory: collect.Trajectory) ->
             obs = map_state_vector(lambda _: privileged.obs, obs)
         obs = map_state_vector(policy.obs_stats.normalize, obs)
         if config.privileged_critic:
-            obs = map_state_vector(lambda x: jnp.concatenate([x, privileged.secrets], axis=-1), obs)
+            obs = map_state_vector(lambda x: jnp.concatenate([x, privileged.params], axis=-1), obs)
         return (
             map_state_vector(lambda x: networks.centralized_input(x, action), obs) if config.centralized_critic else obs
         )

@@ -45,7 +45,7 @@ def run_training(init: Callable, update: Callable, key: jax.Array, env: Env, con
     """Make all updates of a learner in one compiled program.
 
     Inside a function that JAX traces, or with traced settings, the updates become part of that function. Otherwise the
-    program is compiled here, and kept for further calls with the same environment and equal settings.
+    program is compiled here, and kept for further calls with the same environment, as long as none of its attributes is set, and equal settings.
 
     Args:
         init: the learner's `init(key, env, config)`.
@@ -69,14 +69,15 @@ def run_training(init: Callable, update: Callable, key: jax.Array, env: Env, con
 
 def training_program(init: Callable, update: Callable, env: Env, config: Any) -> Any:
     """The compiled function of a random key that makes all updates, with the compiler options that suit training."""
+    static = compilation.Static(env)
     try:
-        return _cached_program(init, update, env, config)
+        return _cached_program(init, update, static, config)
     except TypeError:  # settings that cannot be hashed, such as arrays
-        return _program(init, update, env, config)
+        return _program(init, update, static, config)
 
 
-def _program(init: Callable, update: Callable, env: Env, config: Any) -> Any:
-    return compilation.jit(functools.partial(_all_updates, init, update, env, config))
+def _program(init: Callable, update: Callable, env: compilation.Static, config: Any) -> Any:
+    return compilation.jit(functools.partial(_all_updates, init, update, env.value, config))
 
 
 _cached_program = functools.lru_cache(maxsize=8)(_program)

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import jax
 
 from jaxdrones.checks import check_callable, check_choice, check_number, check_switch, check_whole, is_known, shown
-from jaxdrones.engine.explicit import Step
+from jaxdrones.engine.step import Step
 
 GRADIENTS = ("exact", "decay", "surrogate")
 """Names of the gradients that `learning.gradients` explains."""

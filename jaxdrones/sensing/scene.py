@@ -108,6 +108,11 @@ class Scene:
     obstacles: tuple[Obstacle, ...] = ()
     ground: bool = True
 
+    @property
+    def has_obstacles(self) -> bool:
+        """Whether something stands around."""
+        return bool(self.obstacles)
+
     def __post_init__(self):
         for obstacle in self.obstacles:
             if not isinstance(obstacle, Obstacle):

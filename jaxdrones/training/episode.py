@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.engine.host import HostStep
+from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.record import Record
 from jaxdrones.state import State
@@ -31,8 +31,8 @@ class EpisodeLog(flax.struct.PyTreeNode):
     """(K, n)"""
     metrics: dict[str, np.ndarray]
     """(K, n) for each of the task's metrics."""
-    ends: tuple[str, ...]
-    """Names of the conditions that ended the episode; none if its time was up."""
+    ended_by: tuple[str, ...]
+    """Names of the terminations and truncations that ended the episode; none if its time was up."""
     success: bool | None
     """Whether all drones met the task's criterion of success; `None` if the task has none."""
 
@@ -97,7 +97,13 @@ def fly_episode(
     def step(carry, key):
         obs, world = carry
         obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
-        row = (world.drones, env.task.target_now(world).pos, reward, info["metrics"], info["ends"])
+        row = (
+            world.drones,
+            env.task.target_now(world).pos,
+            reward,
+            info["metrics"],
+            info["terminations"] | info["truncations"],
+        )
         return (obs, world), (row, terminated | truncated)
 
     if isinstance(env.physics, HostStep):
@@ -122,7 +128,7 @@ def fly_episode(
         target=target,
         reward=reward,
         metrics=metrics,
-        ends=tuple(name for name, ended in ends.items() if ended[-1]),
+        ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
         success=_success(env, drones, metrics),
     )
 

@@ -64,7 +64,7 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("hover", "ppo"): dict(updates=750, critic_hidden_sizes=(64, 64), privileged_critic=True, target_kl=0.01),
 }
 
-_PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {"gates": dict(anywhere=True)}
+_PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {"gates": dict(random_start=True)}
 """Options of the environment to train in, for tasks that are trained with other options than they are flown with."""
 _DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo"}
 

@@ -9,8 +9,8 @@ import pytest
 from double_integrator import SMALL, DoubleIntegrator
 from helpers import mostly_slow
 
-from jaxdrones import learning
-from jaxdrones.learning import Diverged, bptt, ppo, shac
+from jaxdrones import envs, learning
+from jaxdrones.learning import Diverged, Policy, bptt, evaluate, ppo, shac
 from jaxdrones.learning.result import PATIENCE, check_gradients, clip_gradient, count_nonfinite
 
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
@@ -22,10 +22,10 @@ class Counted(DoubleIntegrator):
     """Counts how often its step is traced."""
 
     def __init__(self):
-        self.traced = 0
+        self.traced = []
 
     def step(self, key, world, action):
-        self.traced += 1
+        self.traced.append(True)
         return super().step(key, world, action)
 
 
@@ -82,11 +82,23 @@ def test_nobody_is_asked_about_compilers():
 def test_train_compiles_itself_once_for_all_keys_and_equal_settings():
     env = Counted()
     first = bptt.train(KEY, env, SMALL[bptt])
-    traced = env.traced
+    traced = len(env.traced)
     other = bptt.train(jax.random.key(1), env, dataclasses.replace(SMALL[bptt]))
-    assert env.traced == traced and not np.array_equal(first.history["reward"], other.history["reward"])
+    assert len(env.traced) == traced and not np.array_equal(first.history["reward"], other.history["reward"])
     bptt.train(KEY, env, dataclasses.replace(SMALL[bptt], learning_rate=1e-3))
-    assert env.traced > traced
+    assert len(env.traced) > traced
+
+
+def test_train_and_evaluate_notice_that_an_attribute_of_the_environment_was_set():
+    env = envs.make("hover")
+    policy = Policy.init(KEY, env, (4,))
+    for steps in (20, 10):
+        env.steps = steps
+        np.testing.assert_allclose(evaluate(env, policy, KEY, episodes=2).mean_length, steps * env.dt, rtol=1e-6)
+    toy, rewards = DoubleIntegrator(), []
+    for toy.steps in (50, 2):  # of which four are flown
+        rewards.append(bptt.train(KEY, toy, SMALL[bptt]).history["reward"])
+    assert not np.array_equal(*rewards)
 
 
 def test_train_in_a_program_of_the_user_does_what_it_does_alone():

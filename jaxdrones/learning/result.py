@@ -45,7 +45,8 @@ def run_training(init: Callable, update: Callable, key: jax.Array, env: Env, con
     """Make all updates of a learner in one compiled program.
 
     Inside a function that JAX traces, or with traced settings, the updates become part of that function. Otherwise the
-    program is compiled here, and kept for further calls with the same environment, as long as none of its attributes is set, and equal settings.
+    program is compiled here, and kept for further calls with equal settings and the same environment, as long as none
+    of its attributes is set.
 
     Args:
         init: the learner's `init(key, env, config)`.

@@ -1,7 +1,7 @@
-"""How much faster does a learner's update get on several devices than on one?
+"""How much faster is a learner's update on several devices than on one?
 
-Both programs run in one process, call by call in turn; medians. A CPU is cut into devices (`--cpu-devices`);
-XLA spreads the work of one device over all cores too, so that a CPU's figure says more about what sharing costs.
+Both programs run in one process, in alternation; the times are medians. A CPU is divided into devices
+(`--cpu-devices`); since XLA uses all cores for one device too, the result on a CPU shows the cost of sharing.
 """
 
 import argparse

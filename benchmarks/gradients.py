@@ -1,8 +1,8 @@
 """How large and how noisy is the gradient of a flight, as a function of its length and of how it is differentiated?
 
-The gradient of the mean reward of the first h control steps in the policy's parameters, world by world: the norm of
-its mean over worlds, and the root mean square distance from that mean (the noise of a single world). For a policy as
-it is at the start, and after training by BPTT.
+This is the gradient of the mean reward of the first h control steps with respect to the policy's parameters, for each
+world: the norm of its mean over worlds, and the root mean square distance from that mean (the noise of a single world),
+for a policy at the start of a training and for one that BPTT has trained.
 """
 
 import argparse

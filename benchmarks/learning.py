@@ -1,7 +1,7 @@
-"""How fast does a learner get how good? Seconds with and without compilation, success and error, seed by seed.
+"""How long does a learner train, and how well does its policy fly? Times, success and error of each seed.
 
-The seconds of compilation are those of a cold start (compilation cache off) unless --cache is given, tracing included;
-all seeds share one program. Evaluation is not counted.
+Compilation is timed for a cold start (compilation cache off) unless --cache is given, and includes tracing; all seeds
+share one program. The time of evaluations is not counted.
 """
 
 import argparse

@@ -1,9 +1,9 @@
 """Does a policy trained with the realistic preset fly a plant that it has not seen?
 
 Hover policies are trained on our plant and flown, with their weights frozen, on
-  own        our plant with all that the preset has: lag, drag, delay, noise, parameters drawn per episode;
-  bullet     the same with Bullet as integrator, contacts and the reference's damping, 0.04 1/s; 25 drones, 3 m apart,
-             share a world;
+  own        our plant with the realistic preset: lag, drag, delay, noise, parameters drawn per episode;
+  bullet     the same with Bullet as integrator, with contacts and the damping of gym-pybullet-drones (2021), 0.04 1/s;
+             25 drones, 3 m apart, share a world;
   crazyflow  crazyflow 0.4.0: its airframes, thrust curves, rotors and drag, at its rate and by its integrator, in an
              environment of its own (rivals_venv.py). Delay and noise are the preset's. An action asks for the same
              share of the hover speed as in training: mass and hover speed are all that is told of the airframe.
@@ -36,7 +36,7 @@ from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.run import Run
 
 PLANTS = ("own", "bullet", "crazyflow")
-DAMPING = 0.04  # 1/s, of the reference
+DAMPING = 0.04  # 1/s, of gym-pybullet-drones (2021)
 TEAM = 25  # drones of a Bullet world
 SEED = 1_000_000  # of the episodes: the same for every policy
 AGREED = 1e-9  # m, m/s, rad/s, RPM: largest difference that is rounding

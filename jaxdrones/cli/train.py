@@ -122,8 +122,8 @@ def _train(options: argparse.Namespace) -> int:
             loop.check_resumable(trainer, run)
         for run in (*runs.values(), Run(output)):
             trainer.prepare(run)
-    say = quiet if options.json else print
-    say(f"{_headline(recipe)}; compiling")
+    print_line = quiet if options.json else print
+    print_line(f"{_headline(recipe)}; compiling")
     trainer.compile()
     made = max((run.sidecar_entry("state", "update") for run in resumed), default=0)
     if seconds is not None:
@@ -134,7 +134,7 @@ def _train(options: argparse.Namespace) -> int:
             )
         trainer.fit_budget(seconds - spent, made)
     total = trainer.recipe.config.updates
-    say(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
+    print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
     if not options.resume:
         for run in (*runs.values(), Run(output)):
             run.clear()
@@ -142,10 +142,10 @@ def _train(options: argparse.Namespace) -> int:
     for seed, run in runs.items():
         if run.finished and run.sidecar_entry("state", "update") >= total:
             continue
-        display = ProgressDisplay(total, f"seed {seed}" if len(runs) > 1 else "training", trainer.episodes, say)
+        display = ProgressDisplay(total, f"seed {seed}" if len(runs) > 1 else "training", trainer.episodes, print_line)
         try:
             with display:
-                loop.train(trainer, run, seed, display.tell)
+                loop.train(trainer, run, seed, display.update)
         except KeyboardInterrupt:
             if not run.started:
                 return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)

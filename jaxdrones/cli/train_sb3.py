@@ -56,17 +56,17 @@ def train(options: argparse.Namespace) -> int:
     with user_mistakes(asked, options.task):
         recipe = SB3Recipe.of(options.task, algorithm, options.realistic, **asked)
     check_free(run, options.overwrite)
-    say = quiet if options.json else print
-    say(f"{_headline(recipe)}; compiling")
+    print_line = quiet if options.json else print
+    print_line(f"{_headline(recipe)}; compiling")
     with user_mistakes(asked, options.task):
         trainer = SB3Trainer(recipe, seed, episodes)
     trainer.prepare(run)
     run.clear()
     total = recipe.config["steps"] if seconds is None else None
-    say(f"compiled in {trainer.compile_seconds:.1f} s; control steps: {total or 'as many as the time allows'}")
+    print_line(f"compiled in {trainer.compile_seconds:.1f} s; control steps: {total or 'as many as the time allows'}")
     try:
-        with ProgressDisplay(total, "training", episodes, say, "step") as display:
-            trainer.train(run, display.tell, None if seconds is None else begin + seconds)
+        with ProgressDisplay(total, "training", episodes, print_line, "step") as display:
+            trainer.train(run, display.update, None if seconds is None else begin + seconds)
     except KeyboardInterrupt:
         if not run.files:
             return print_error("interrupted before the first evaluation; nothing is kept", INTERRUPTED)

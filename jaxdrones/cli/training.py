@@ -99,43 +99,43 @@ def check_free(run, overwrite: bool) -> None:
 class ProgressDisplay(contextlib.ExitStack):
     """A progress bar, and a line for every evaluation."""
 
-    def __init__(self, total: int | None, what: str, episodes: int, say, unit: str = "update"):
-        """Prepare; the bar appears with the first call of `tell`.
+    def __init__(self, total: int | None, what: str, episodes: int, print_line, unit: str = "update"):
+        """Prepare; the bar appears with the first call of `update`.
 
         Args:
             total: number of `unit` of the whole training; `None` if it is not known.
             what: label, such as the seed.
             episodes: number of episodes of an evaluation.
-            say: function that prints a line.
+            print_line: function that prints a line.
             unit: what is counted.
         """
         super().__init__()
-        self._total, self._what, self._episodes, self._say, self._unit = total, what, episodes, say, unit
+        self._total, self._what, self._episodes, self._print_line, self._unit = total, what, episodes, print_line, unit
         self._bar: Any = None
         self._evaluated, self._started = "", False
 
-    def tell(self, count: int, now: dict[str, float]) -> None:
+    def update(self, count: int, now: dict[str, float]) -> None:
         """Move the bar, and print the results of an evaluation."""
         if not self._started:
             self._started = True
             self._bar = self.enter_context(bar(self._total, self._what, self._unit, initial=count))
-        pace = _pace(now["steps_per_s"])
+        speed = _speed(now["steps_per_s"])
         if "success" in now:
             success = percent(now["success"], self._episodes)
             self._evaluated = f"return {now['evaluated_return']:.1f}, success {success}"
             of = "" if self._total is None else f"/{self._total}"
             line = f"{self._what}: {self._unit} {count:4}{of}  {self._evaluated}, "
-            line += f"median error {now['evaluated_error']:.3f} m, {pace}, {now['seconds']:.1f} s"
+            line += f"median error {now['evaluated_error']:.3f} m, {speed}, {now['seconds']:.1f} s"
             if self._bar is None or self._bar.disable:
-                self._say(line)
+                self._print_line(line)
             else:
-                self._bar.write(line, file=sys.stderr if self._say is quiet else sys.stdout)
+                self._bar.write(line, file=sys.stderr if self._print_line is quiet else sys.stdout)
         if self._bar is not None:
             self._bar.update(count - self._bar.n)
-            self._bar.set_postfix_str(", ".join(filter(None, (self._evaluated, f"reward {now['reward']:.3f}", pace))))
+            self._bar.set_postfix_str(", ".join(filter(None, (self._evaluated, f"reward {now['reward']:.3f}", speed))))
 
 
-def _pace(steps_per_s: float) -> str:
+def _speed(steps_per_s: float) -> str:
     return f"{steps_per_s / 1e6:.2f} M steps/s" if steps_per_s >= 1e5 else f"{steps_per_s:.0f} steps/s"
 
 

@@ -80,7 +80,7 @@ def to_record(log: EpisodeLog, conditions: EpisodeConditions) -> Record:
 
 
 def fly_episode(
-    env: Env, policy: Callable, key: jax.Array, tell: Callable[[float], Any] = lambda fraction: None
+    env: Env, policy: Callable, key: jax.Array, on_progress: Callable[[float], Any] = lambda fraction: None
 ) -> EpisodeLog:
     """Fly one episode with a policy.
 
@@ -88,7 +88,7 @@ def fly_episode(
         env: environment of either backend.
         policy: observations (n, d), or a dictionary with images, -> actions (n, a).
         key: random key of the start and of the noise.
-        tell: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
+        on_progress: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)
@@ -112,7 +112,7 @@ def fly_episode(
         for k in range(env.steps):
             (obs, world), (row, done) = step((obs, world), keys[k])
             rows.append(jax.device_get(row))
-            tell((k + 1) / env.steps)
+            on_progress((k + 1) / env.steps)
             if done:
                 break
         log = jax.tree.map(lambda *x: np.stack(x), *rows)

@@ -26,18 +26,18 @@ _CALL_SECONDS = 0.3  # aimed at for one call of the compiled program, during whi
 _SAVE_SECONDS = 30.0  # longest time between two training states on disk
 _EVALUATED = ("success", "evaluated_return", "evaluated_error")
 
-Tell = Callable[[int, dict[str, float]], None]
+OnProgress = Callable[[int, dict[str, float]], None]
 """(number of updates made, newest metrics) -> None: shows progress."""
 
 
-def train(trainer: Trainer, run: Run, seed: int, tell: Tell) -> None:
+def train(trainer: Trainer, run: Run, seed: int, on_progress: OnProgress) -> None:
     """Train one seed to the end, from the start or from the state that the run holds; evaluate the best policy.
 
     Args:
         trainer: compiled programs.
         run: run whose folder was prepared.
         seed: seed of everything that is random.
-        tell: function that shows progress.
+        on_progress: function that shows progress.
 
     Raises:
         Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so far is
@@ -48,7 +48,7 @@ def train(trainer: Trainer, run: Run, seed: int, tell: Tell) -> None:
     run.remove_report()
     loop.save()
     try:
-        loop.run_updates(tell)
+        loop.run_updates(on_progress)
     except KeyboardInterrupt:
         if jax.process_count() == 1:
             loop.save()
@@ -103,7 +103,7 @@ class _Loop:
             self.state, self.seconds, self.update = trainer.start(self.key), 0.0, 0
             self.evaluate(self.state.policy, 0)
 
-    def run_updates(self, tell: Tell) -> None:
+    def run_updates(self, on_progress: OnProgress) -> None:
         """Make all updates that remain."""
         updates, saved, length = self.config.updates, self.seconds, 1
         evaluations = {updates * (i + 1) // EVALUATIONS for i in range(EVALUATIONS)}
@@ -122,7 +122,7 @@ class _Loop:
                 if self.update in evaluations or self.seconds - saved > _SAVE_SECONDS:
                     self.save()
                     saved = self.seconds
-                tell(self.update, rows[-1] | {"steps_per_s": length * self._steps / seconds})
+                on_progress(self.update, rows[-1] | {"steps_per_s": length * self._steps / seconds})
                 length = max(1, round(_CALL_SECONDS / seconds * length))
 
     def advance(self, length: int) -> tuple[Any, list[dict[str, float]], float]:

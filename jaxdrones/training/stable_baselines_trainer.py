@@ -12,7 +12,7 @@ import numpy as np
 from jaxdrones.adapters.sb3 import VecEnv
 from jaxdrones.learning.evaluation import Report, check_episodes, evaluate
 from jaxdrones.learning.result import Diverged
-from jaxdrones.training.loop import Tell
+from jaxdrones.training.loop import OnProgress
 from jaxdrones.training.progress import Progress
 from jaxdrones.training.run import report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM
@@ -60,12 +60,12 @@ class SB3Trainer:
         """
         run.prepare(_DISK_FACTOR * sum(x.nbytes for x in self.model.policy.parameters()))
 
-    def train(self, run: SB3Run, tell: Tell, deadline: float | None = None) -> None:
+    def train(self, run: SB3Run, on_progress: OnProgress, deadline: float | None = None) -> None:
         """Train to the end, and evaluate the best model.
 
         Args:
             run: run whose folder was prepared.
-            tell: function that shows progress, by control steps.
+            on_progress: function that shows progress, by control steps.
             deadline: time of `time.perf_counter` at which to stop, s; when left out, training stops after the number of
                 steps of the recipe.
 
@@ -75,7 +75,7 @@ class SB3Trainer:
         """
         steps = self.recipe.config["steps"] if deadline is None else np.iinfo(np.int64).max
         with _one_thread(), Progress(run, _COLUMNS, 0) as progress:
-            callback = _Callback(self, run, tell, progress, deadline)
+            callback = _Callback(self, run, on_progress, progress, deadline)
             try:
                 self.model.learn(steps, callback=callback)
             except KeyboardInterrupt:
@@ -101,9 +101,17 @@ def _one_thread():
 class _Callback(BaseCallback):
     """Evaluates, saves and reports while Stable-Baselines3 trains."""
 
-    def __init__(self, trainer: SB3Trainer, run: SB3Run, tell: Tell, progress: Progress, deadline: float | None):
+    def __init__(
+        self, trainer: SB3Trainer, run: SB3Run, on_progress: OnProgress, progress: Progress, deadline: float | None
+    ):
         super().__init__()
-        self.trainer, self.run, self.tell, self.progress, self.deadline = trainer, run, tell, progress, deadline
+        self.trainer, self.run, self.on_progress, self.progress, self.deadline = (
+            trainer,
+            run,
+            on_progress,
+            progress,
+            deadline,
+        )
         self.about = {"recipe": trainer.recipe.as_dict(), "seed": trainer.seed, "episodes": trainer.episodes}
         key = jax.random.key(trainer.seed)
         self.selection_key, self.report_key = (jax.random.fold_in(key, x) for x in (SELECTION_STREAM, REPORT_STREAM))
@@ -126,7 +134,7 @@ class _Callback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         self.update += 1
-        self.tell(self.num_timesteps, self._metrics())
+        self.on_progress(self.num_timesteps, self._metrics())
 
     def _on_training_end(self) -> None:
         self.evaluate()
@@ -146,7 +154,7 @@ class _Callback(BaseCallback):
         row = {"update": self.update, "steps": self.num_timesteps * self.trainer.env.drones}
         self.progress.add([row | {name: metrics[name] for name in _COLUMNS if name in metrics}])
         self.reward_sum, self.reward_count = 0.0, 0
-        self.tell(self.num_timesteps, metrics)
+        self.on_progress(self.num_timesteps, metrics)
 
     def save(self) -> None:
         """Write the newest model."""

@@ -103,7 +103,7 @@ def optax_norm(tree):
 
 @pytest.mark.slow
 @pytest.mark.float32
-def test_a_central_critic_learns_with_a_policy_per_role():
+def test_a_centralized_critic_learns_with_a_policy_per_agent():
     env = envs.make("leader-follower")
     config = dataclasses.replace(SMALL[ppo], per_agent=True, centralized_critic=True)
     state = ppo.init(jax.random.key(0), env, config)
@@ -117,14 +117,14 @@ def test_a_central_critic_learns_with_a_policy_per_role():
 
 @pytest.mark.slow
 @pytest.mark.float32
-def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
-    """Reward is a parameter that nobody sees: told, the critic knows the value; else it knows the mean."""
+def test_a_privileged_critic_learns_the_value_of_drawn_parameters():
+    """The reward is a parameter that is not observed: a privileged critic knows it, another one only its mean."""
     task = envs.make("hover").task
     gain = {"mass": (100.0, lambda task, world: world.params.mass - 0.027)}
     task = dataclasses.replace(task, rewards=gain, terminations={}, duration=1.0)
     env = envs.make(task, randomize=(scaled("mass", 0.5, 1.5),))
 
-    def miss(informed):
+    def value_loss(privileged):
         config = dataclasses.replace(
             SMALL[ppo],
             updates=200,
@@ -132,13 +132,13 @@ def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
             worlds=64,
             horizon=8,
             learning_rate=5e-3,
-            privileged_critic=informed,
+            privileged_critic=privileged,
             gamma=0.9,
         )
         history = jax.jit(lambda key: ppo.train(key, env, config))(jax.random.key(0)).history
         return jnp.mean(history["value_loss"][-10:])
 
-    assert miss(True) < 0.2 * miss(False)
+    assert value_loss(True) < 0.2 * value_loss(False)
 
 
 @pytest.mark.float32
@@ -175,11 +175,11 @@ def test_ppo_at_the_policy_that_flew_has_the_plain_policy_gradient():
     critic = MLP(config.critic_hidden_sizes, 1).init(jax.random.key(1), jnp.zeros(3))
     obs, action, advantage = rng.normal(size=(20, 1, 3)), rng.normal(size=(20, 1, 2)), rng.normal(size=(20, 1))
     log_std = jnp.zeros(2)
-    flown = ppo.log_prob(action, policy(obs), log_std)
-    sample = ppo.Batch(obs, action, flown, obs, advantage, jnp.zeros((20, 1)))
+    behavior = ppo.log_prob(action, policy(obs), log_std)
+    batch = ppo.Batch(obs, action, behavior, obs, advantage, jnp.zeros((20, 1)))
 
     def clipped(params):
-        return ppo.loss(config, policy.replace(params=params), log_std, critic, sample)[0]
+        return ppo.loss(config, policy.replace(params=params), log_std, critic, batch)[0]
 
     def plain(params):
         return -jnp.mean(ppo.log_prob(action, policy.replace(params=params)(obs), log_std) * advantage)

@@ -128,7 +128,7 @@ def test_what_is_nearer_is_brighter_from_0_far_away_to_1_at_the_eye():
 
 
 @pytest.mark.needs("pybullet")
-def test_normalising_leaves_pictures_as_they_are(team):
+def test_normalizing_leaves_images_as_they_are(team):
     obs = seen(team)
     twice = map_state_vector(lambda x: 2 * x, obs)
     np.testing.assert_array_equal(twice["state"], 2 * obs["state"])

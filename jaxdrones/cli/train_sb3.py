@@ -74,7 +74,9 @@ def train(options: argparse.Namespace) -> int:
         return print_error(f"interrupted; {remaining_best(run)}", INTERRUPTED)
     except Diverged as error:
         draw_curves(options, {seed: run}, run.folder)
-        return print_error(f"training diverged: {error}, for example --set learning_rate=1e-4; {remaining_best(run)}", 1)
+        return print_error(
+            f"training diverged: {error}, for example --set learning_rate=1e-4; {remaining_best(run)}", 1
+        )
     return show_results(options, {seed: run}, run.folder)
 
 

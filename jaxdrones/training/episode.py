@@ -18,6 +18,9 @@ from jaxdrones.flights.record import Record
 from jaxdrones.state import State
 
 
+_LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
+
+
 class EpisodeLog(flax.struct.PyTreeNode):
     """K control steps of n drones, up to the end of the episode."""
 
@@ -69,7 +72,7 @@ def to_record(log: EpisodeLog, conditions: EpisodeConditions) -> Record:
     """The log of an episode in the form that demonstration flights have too."""
     drones = jax.tree.map(np.asarray, log.drones)
     return Record(
-        **vars(drones),
+        **{name: getattr(drones, name) for name in _LOGGED},
         t=log.t,
         rpy=np.asarray(jax.vmap(jax.vmap(rotation.to_rpy))(jnp.asarray(drones.quat))),
         target_pos=log.target,

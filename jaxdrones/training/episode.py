@@ -17,7 +17,6 @@ from jaxdrones.envs import Env
 from jaxdrones.flights.record import Record
 from jaxdrones.state import State
 
-
 _LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
 
 

@@ -6,7 +6,10 @@ import typing
 
 import pytest
 
+from jaxdrones.cli import main
 from jaxdrones.training.algorithms import ALGORITHMS, learner
+from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.trainer import Trainer
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -32,3 +35,13 @@ def test_every_setting_has_a_precise_type_with_a_check(name):
 def test_an_unknown_learner_names_the_closest_one():
     with pytest.raises(ValueError, match=r"unknown algorithm 'pppo'; did you mean 'ppo'\?"):
         learner("pppo")
+
+
+def test_a_new_learner_is_a_module_and_a_line_in_the_table(tmp_path, monkeypatch, capsys):
+    (tmp_path / "own_learner.py").write_text("from jaxdrones.learning.bptt import Config, init, train, update\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(ALGORITHMS, "own", "own_learner")
+    recipe = Recipe.of("hover", "own", worlds=4, horizon=2, hidden_sizes=(4,))
+    assert Recipe.from_dict(recipe.as_dict()) == recipe
+    assert "nonfinite_gradients" in Trainer(recipe, episodes=2).metrics
+    assert main(["list"]) == 0 and ", own" in capsys.readouterr().out

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.accelerate.stored import stored, stored_for_derivatives
+from jaxdrones.accelerate.shared import materialize_shared
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
@@ -137,8 +137,7 @@ class ExplicitStep(Step):
         def substep(params: Params, state: State, command: jax.Array, scene: Scene) -> State:
             speed, _ = physics.rotor_speed(params, state, command)
             state = jax.vmap(with_rotor_speed)(params, state, speed)
-            start, command = stored_for_derivatives((state, command))
-            return integrator(lambda s: stored(derivative(params, s, command, scene)), start, dt)
+            return integrator(lambda s: derivative(params, s, command, scene), state, dt)
 
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
             command = check_command(params, state, rpm)
@@ -147,7 +146,8 @@ class ExplicitStep(Step):
             # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
             @jax.checkpoint
             def advance(state: State, _: None) -> tuple[State, None]:
-                return substep(params, state, command, scene), None
+                after = materialize_shared(lambda state, command: substep(params, state, command, scene))
+                return after(state, command), None
 
             return advance(state, None)[0] if substeps == 1 else jax.lax.scan(advance, state, length=substeps)[0]
 

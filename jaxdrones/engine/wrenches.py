@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
-from jaxdrones.accelerate.stored import stored
 from jaxdrones.checks import check_shape, shown
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.params import Params
@@ -61,7 +60,6 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
     vectorises a pair along the latter.
     """
     index = jnp.arange(len(state.pos))
-    state = jax.tree.map(_stored, state)
 
     def because_of(j, counts, other, other_state, i, own_params, own_state):
         # A drone is not its own neighbor. What does not count is moved out of reach before it is masked, so that
@@ -91,7 +89,6 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
     else:
         near, meant, complete = neighbors.near(jax.lax.stop_gradient(state.pos))
         sums = jax.lax.cond(complete, on_near, on_all)
-    sums = [_stored(x) for x in sums]
     return Wrench(jnp.stack(sums[:3], axis=-1), jnp.stack(sums[3:], axis=-1))
 
 
@@ -112,13 +109,3 @@ def side_by_side(state: State) -> State:
 def _sum(x: jax.Array) -> jax.Array:
     """The sum over the first axis; written out where it is short, like `vector.dot`."""
     return cast(jax.Array, sum(components(x))) if len(x) <= _SHORT else jnp.sum(x, axis=0)
-
-
-def _stored(x: jax.Array) -> jax.Array:
-    """The same numbers of a team (n, ...), each component stored by itself.
-
-    They would be read at strides of 3 or 4, which XLA's CPU compiler does not vectorise.
-    """
-    if x.ndim == 1:
-        return stored(x)
-    return jnp.stack([_stored(jnp.squeeze(c, 1)) for c in jax.lax.split(x, [1] * x.shape[1], axis=1)], axis=1)

@@ -86,9 +86,9 @@ def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: 
 
     from jaxdrones.engine import bullet  # optional
 
-    with bullet.make_step(**common, scene=scene_of(conditions), gui=gui) as bullet_step:
-        shown: Any = bullet.Window(bullet_step, params, conditions.dt) if gui else bullet_step
-        return rollout(shown, control, params, start, memory, conditions.steps)[1]
+    with bullet.make_step(**common, scene=scene_of(conditions), gui=gui) as simulated:
+        watched = bullet.Window(simulated, params, conditions.dt) if gui else simulated
+        return rollout(watched, control, params, start, memory, conditions.steps)[1]
 
 
 def _controller(conditions: Conditions) -> tuple[Callable, object]:

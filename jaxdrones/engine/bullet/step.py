@@ -22,7 +22,7 @@ from jaxdrones.engine.host import HostStep, is_traced
 from jaxdrones.engine.team import check_team, flatten, unflatten
 from jaxdrones.engine.wrenches import Effect, Pair, check_functions, make_total_wrench
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 # The host sees a team as one array, a row per drone: pose and velocities in the world frame, rotor speeds, commands.

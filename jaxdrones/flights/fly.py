@@ -16,7 +16,7 @@ from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.examples import FLIGHTS, Flight
 from jaxdrones.flights.record import Record
 from jaxdrones.params import Params, repeat
-from jaxdrones.sensing.scene import Scene, paper_obstacles
+from jaxdrones.sensing import Scene, obstacles_2021
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
@@ -66,7 +66,7 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
 
 def scene_of(conditions: Conditions) -> Scene:
     """Obstacles and ground of a flight."""
-    return paper_obstacles() if conditions.obstacles else Scene()
+    return obstacles_2021() if conditions.obstacles else Scene()
 
 
 def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: State, memory) -> State:

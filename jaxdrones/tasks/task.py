@@ -15,7 +15,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
 

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Leader and follower
-# The paper's multi-agent example (equation 13): the leader is to hover at z = 0.5 m, the follower to be as high as the
-# leader. Each has a policy of its own, of its own twelve numbers. While they learn, a critic sees all: both drones'
-# observations and the other's action, 25 numbers. It is not needed to fly.
+# The multi-agent example of gym-pybullet-drones (2021), equation 13 of the paper: the leader is to hover at z = 0.5 m,
+# the follower to be as high as the leader. Each has a policy of its own, of its own twelve numbers. While they learn,
+# a critic sees all: both drones' observations and the other's action, 25 numbers. It is not needed to fly.
 
 # %%
 import time
@@ -33,7 +33,7 @@ print(report)
 assert report.success == 1
 
 # %% [markdown]
-# The paper's figure: the learning curve; height, climb and rotor speeds of both drones.
+# The learning curve; height, climb and rotor speeds of both drones.
 
 # %%
 log = fly_episode(env, result.policy, jax.random.key(2))

@@ -14,7 +14,7 @@ from jaxdrones.flights.fly import scene_of
 from jaxdrones.flights.record import Record, check_pwm
 from jaxdrones.limits import check_seed
 from jaxdrones.render import plots, video
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
 

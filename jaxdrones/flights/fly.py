@@ -16,7 +16,7 @@ from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.examples import FLIGHTS, Flight
 from jaxdrones.flights.record import Record
 from jaxdrones.params import Params, repeat
-from jaxdrones.sensing.scene import Scene, paper_obstacles
+from jaxdrones.sensing import Scene, obstacles_2021
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
@@ -54,7 +54,8 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
         target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
         target_pos, target_vel = _targets(target, params)
         rpy = jax.vmap(jax.vmap(rotation.to_rpy))(trajectory.quat)
-        return dict(vars(trajectory), t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
+        motion = {name: getattr(trajectory, name) for name in ("pos", "quat", "vel", "omega", "rpm")}
+        return dict(motion, t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
 
     params, start = prepare(load_params(conditions.vehicle))
     trajectory = _rollout(conditions, gui, control, params, start, memory)
@@ -65,7 +66,7 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
 
 def scene_of(conditions: Conditions) -> Scene:
     """Obstacles and ground of a flight."""
-    return paper_obstacles() if conditions.obstacles else Scene()
+    return obstacles_2021() if conditions.obstacles else Scene()
 
 
 def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: State, memory) -> State:

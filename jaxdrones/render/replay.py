@@ -9,7 +9,7 @@ from jaxdrones.engine import bullet
 from jaxdrones.flights.record import Record
 from jaxdrones.params import repeat
 from jaxdrones.render import video
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 

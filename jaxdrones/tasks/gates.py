@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_keywords, check_number, check_switch, check_whole, shown
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Cylinder, Scene, gate
+from jaxdrones.sensing import Cylinder, Scene, gate
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import hovering, standing_height
@@ -206,6 +206,7 @@ def _observe_poles(task: Task, world: World) -> Float[Array, "n 8"]:
 
 
 def _scene() -> Scene:
-    frames = [gate((x, y, z), yaw) for x, y, z, yaw in GATES.tolist()]
-    poles = [Cylinder(pos=(x, y, POLE_HEIGHT / 2), radius=POLE_RADIUS, height=POLE_HEIGHT) for x, y in POLES.tolist()]
-    return Scene((*(beam for frame in frames for beam in frame), *poles))
+    poles = np.column_stack([POLES, np.full(len(POLES), POLE_HEIGHT / 2)])
+    return Scene.of(
+        jax.vmap(gate)(GATES[:, :3], GATES[:, 3]), Cylinder(pos=poles, radius=POLE_RADIUS, height=POLE_HEIGHT)
+    )

@@ -14,7 +14,7 @@ from jaxdrones.envs.vision import Vision
 from jaxdrones.learning import checkpoint, evaluate, ppo
 from jaxdrones.learning.networks import IMAGE_CHANNELS, Policy
 from jaxdrones.learning.normalize import map_state_vector
-from jaxdrones.sensing.scene import Scene, Sphere
+from jaxdrones.sensing import Scene, Sphere
 from jaxdrones.tasks.starts import hovering
 from jaxdrones.tasks.task import Task
 
@@ -55,7 +55,7 @@ def look_at_the_ball() -> Task:
         rewards={"height": (-1 / REACH, height), "bearing": (-1 / TURN, bearing)},
         metrics={"height": height, "bearing": bearing},
         success=success,
-        scene=Scene((Sphere(pos=BALL, radius=0.2, color=(0.9, 0.1, 0.1, 1.0)),)),
+        scene=Scene.of(Sphere(pos=BALL, radius=0.2, color=(0.9, 0.1, 0.1, 1.0))),
         observation=("velocity", "omega"),
         control_hz=10.0,
         substeps=1,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import check_sensors, init_sensors, measure_sensors
 
 KEY = jax.random.key(0)

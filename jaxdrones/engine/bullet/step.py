@@ -25,7 +25,7 @@ from jaxdrones.engine.step import HostStep, is_traced
 from jaxdrones.engine.team import Layout, check_team, pack
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 _PAPER_CAMERA = Camera()

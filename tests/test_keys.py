@@ -16,7 +16,7 @@ from jaxdrones.envs.randomize import random_pushes, scaled, sensor_noise, shifte
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
 from jaxdrones.sensing import Scene, Sensor, Sphere
-from jaxdrones.training import loop
+from jaxdrones.training import selection
 
 DRAWS = ("uniform", "normal", "bernoulli", "randint")
 KEY = jax.random.key(3)
@@ -34,12 +34,12 @@ EVERYTHING = dict(
     scene=lambda key: Scene.of(Sphere(pos=jax.random.uniform(key, (3,)) + 50.0, radius=0.1)),
     effects=(lambda params, state, scene: jd.Wrench.of_force(0 * scene.spheres.pos[0]),),
 )
-SMALL = dict(updates=2, worlds=3, horizon=2, sizes=(2,))
+SMALL = dict(updates=2, worlds=3, horizon=2, hidden_sizes=(2,))
 CRITIC = dict(critic_hidden_sizes=(2,))
 LEARNERS = {
     "bptt": (bptt, bptt.Config(**SMALL)),
     "shac": (shac, shac.Config(**SMALL, **CRITIC, critic_steps=2)),
-    "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, batches=3)),
+    "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, minibatches=3)),
 }
 
 
@@ -199,6 +199,6 @@ def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(ke
         patched.setattr(learner, "Policy", type("Policy", (), {"init": staticmethod(init)}))
         state = learner.init(KEY, env, config)
     jax.jit(lambda state: learner.update(env, config, state))(state)
-    for purpose in (loop.CHOICE, loop.REPORT):
+    for purpose in (selection.SELECTION_STREAM, selection.REPORT_STREAM):
         jax.random.split(jax.random.fold_in(KEY, purpose))
     keys.check(least=10)

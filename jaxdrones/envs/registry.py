@@ -164,7 +164,7 @@ def make(
     scene = task.scene if scene is None else scene
     step: Step
     if backend == "bullet":
-        from jaxdrones.engine import bullet  # an optional library behind it
+        from jaxdrones.engine import bullet  # needs an optional library
 
         if integrator != "semi_implicit_euler":
             raise ValueError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")

@@ -1,4 +1,4 @@
-"""What a task is: what to start from, where to be, what is rewarded, when it ends."""
+"""A task: how an episode starts, where drones should be, what is rewarded, and when the episode ends."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class ObservationTerm:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What to start from, where to be, what is rewarded, when it ends; all functions of one world.
+    """How an episode starts, where drones should be, what is rewarded, and when it ends; all functions of one world.
 
     Rewards, conditions and metrics are functions `(task, world)`. The task is the one that the environment flies, so
     `task.target_now(world)` is its target, also where `dataclasses.replace` has given it another one.

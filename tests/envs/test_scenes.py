@@ -73,6 +73,19 @@ def test_a_drawn_scene_is_another_one_in_every_episode_and_the_same_within():
     np.testing.assert_allclose(obs[:, 0, 0], away, rtol=1e-6)
 
 
+def test_a_start_may_depend_on_the_scene():
+    """Above the ball, wherever that is."""
+    plain = TASKS["hover"]()
+
+    def start(key, params, scene):
+        state, variables = plain.start(key, params)
+        return state.replace(pos=scene.spheres.pos + jnp.array([[0.0, 0.0, 1.0]])), variables
+
+    env = make(dataclasses.replace(plain, start=start), scene=random_ball, effects=(repelled,))
+    _, worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(KEY, 3))
+    np.testing.assert_allclose(worlds.drones.pos - worlds.scene.spheres.pos, np.tile([0, 0, 1], (3, 1, 1)), atol=1e-12)
+
+
 def test_a_fixed_scene_is_not_copied_at_the_end_of_an_episode():
     fixed = make("hover", scene=BALL, effects=(repelled,))
     assert set(fixed.constant_fields) == {"params", "scene"}

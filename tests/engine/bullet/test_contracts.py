@@ -64,7 +64,7 @@ def test_a_checkpointed_rollout_is_refused_as_there_is_no_backward_pass(step):
 
 def test_an_effect_sees_the_scene_of_either_backend():
     """A fan at every box: it lifts a drone that is within a meter of one."""
-    scene = Scene((Box(pos=(0.0, 0.0, 1.5), size=(0.1, 0.1, 0.1)),))
+    scene = Scene.of(Box(pos=(0.0, 0.0, 1.5), size=(0.1, 0.1, 0.1)))
 
     def fan(params, state, scene):
         return jd.Wrench.of_force(jd.vector.along_z(jnp.where(state.pos[0] < 0.5, 0.1, 0.0) * scene.has_obstacles))
@@ -78,7 +78,7 @@ def test_an_effect_sees_the_scene_of_either_backend():
 
 
 def test_obstacles_that_nothing_honors_are_refused_by_the_explicit_backend():
-    scene = Scene((Box(pos=(0.0, 0.0, 1.5), size=(0.1, 0.1, 0.1)),))
+    scene = Scene.of(Box(pos=(0.0, 0.0, 1.5), size=(0.1, 0.1, 0.1)))
     with pytest.raises(ValueError, match=r"scene has obstacles and no effect takes it.*take the bullet backend"):
         jd.make_step(scene=scene)
     with pytest.raises(ValueError, match="scene has obstacles and no effect takes it"):

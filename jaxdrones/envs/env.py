@@ -203,7 +203,8 @@ class Env:
     def _start(self, key: jax.Array) -> World:
         """The world at the start of an episode, before the first measurement."""
         params = draw(self._randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
-        drones, variables = self.task.start(jax.random.fold_in(key, START), self.params)
+        scene = self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE))
+        drones, variables = self.task.begin(jax.random.fold_in(key, START), self.params, scene)
         return World(
             params=params,
             drones=self.physics.init(params, drones),
@@ -212,7 +213,7 @@ class Env:
             actions=jnp.zeros((self.drones, self._history, self.action_size), drones.pos.dtype),
             step=jnp.zeros((), jnp.int32),
             dt=self.dt,
-            scene=self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE)),
+            scene=scene,
         )
 
     def _first_observation(self, key: jax.Array, world: World, rate: State | None) -> tuple[Array, World]:

@@ -66,7 +66,7 @@ def measure(n: int, repeats: int) -> dict[str, float]:
     row = {"drones": n}
     programs = {}
     for name, cells in ways.items():
-        step = jd.make_step((jd.drag,), (jd.downwash,), cells=cells)
+        step = jd.make_step((jd.drag,), (jd.downwash,), neighbors=cells)
         program, row[f"{name}, compile"] = compiled(lambda s, step=step: _flown(step, params, s), state)
         programs[name] = lambda program=program: program(state)
     return row | {name: taken["median"] / STEPS for name, taken in in_turn(programs, repeats).items()}

@@ -125,7 +125,7 @@ def on_crazyflow(recipe: Recipe, runs: list[Run], options) -> list[dict]:
     nominal = jax.tree.map(lambda x: x[0], recipe.env().params)
     for airframe in options.airframes or crazyflow.AIRFRAMES:
         sim = crazyflow.make_sim(airframe)
-        env = recipe.env(vehicle=crazyflow.calibrated(airframe, nominal), laws=())
+        env = recipe.env(vehicle=crazyflow.calibrated(airframe, nominal), randomize=())
         env = with_physics(env, crazyflow.make_step(sim, substeps=round(env.dt * sim.freq)))
         rows += [flown(f"crazyflow {airframe}", run, env, options.episodes) for run in runs]
     return rows

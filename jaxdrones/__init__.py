@@ -6,6 +6,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.accelerate.compiler import kernel_options
 from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.dynamics import (
+    Model,
     downwash,
     downwash_2021,
     drag,
@@ -22,10 +23,11 @@ from jaxdrones.dynamics import (
     rk4,
     semi_implicit_euler,
 )
-from jaxdrones.engine.explicit import Step, make_step
+from jaxdrones.engine.explicit import make_derivative, make_step
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.rollout import rollout
-from jaxdrones.engine.wrenches import Effect, Pair
+from jaxdrones.engine.step import Step
+from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
 from jaxdrones.sensing.sensor import Sensor
@@ -36,12 +38,14 @@ from jaxdrones.wrench import Wrench
 __all__ = [
     "KERNEL_OPTIONS",
     "Effect",
+    "Model",
     "NeighborGrid",
     "Pair",
     "Params",
     "Sensor",
     "State",
     "Step",
+    "TeamEffect",
     "Wrench",
     "downwash",
     "downwash_2021",
@@ -58,6 +62,7 @@ __all__ = [
     "lagging_rotors",
     "load_params",
     "make",
+    "make_derivative",
     "make_step",
     "over_worlds",
     "repeat",

@@ -189,10 +189,13 @@ def check_keywords(function: Function) -> Function:
     return cast(Function, checked)
 
 
-def check_arrays(name: str, tree: dict[str, Any]) -> None:
-    """Raise unless every entry is an array or a number: JAX takes lists, tuples and `None` apart, not as one array."""
-    for field, leaf in tree.items():
-        if isinstance(leaf, _NO_ARRAYS):
+def check_arrays(name: str, tree: Any) -> None:
+    """Raise unless every field but `aux` is an array or a number.
+
+    JAX takes lists, tuples and `None` apart, not as one array.
+    """
+    for field, leaf in vars(tree).items():
+        if field != "aux" and isinstance(leaf, _NO_ARRAYS):
             raise ValueError(f"{name}.{field} is {shown(leaf)}; give an array, for example with jax.numpy.array(...)")
 
 
@@ -204,7 +207,7 @@ def check_params(params: Any, finite: bool = True) -> None:
         finite: whether to look at all of them, not only at those that must be positive.
     """
     constants = vars(params)
-    check_arrays("params", constants)
+    check_arrays("params", params)
     if finite:
         check_finite(
             "params", params.replace(**{name: _without_infinity(constants[name]) for name in _MAY_BE_INFINITE})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import flax.struct
 import jax
@@ -15,7 +16,7 @@ from jaxdrones.checks import check_params, check_shape, check_whole, shown
 class Params(flax.struct.PyTreeNode):
     """Constants of one drone, or of a team with a leading drone axis on every array.
 
-    Surroundings that somebody else drives (wind, air density, a push) are here too and may be set anew each step.
+    The surroundings (wind, air density, an external force) are here too and may be set anew at every step.
     """
 
     mass: Array
@@ -36,6 +37,8 @@ class Params(flax.struct.PyTreeNode):
     """() time constant of a lagging rotor that speeds up, s."""
     rotor_fall_time: Array
     """() time constant of a lagging rotor that slows down, s."""
+    rotor_inertia: Array
+    """() moment of inertia of one rotor about its axis, kg m^2. Zero leaves out what the spin of a rotor does."""
     gravity: Array
     """() acceleration towards -z, m/s^2."""
     air_density: Array
@@ -43,7 +46,7 @@ class Params(flax.struct.PyTreeNode):
     wind: Array
     """(3,) velocity of the air, m/s, world."""
     external_force: Array
-    """(3,) force of somebody else on the centre of mass, N, world; acts through the effect `external_force`."""
+    """(3,) force on the center of mass, N, world; acts through the effect `external_force`."""
     drag_coeff: Array
     """(3,) rotor drag per axis, N per m/s of air speed and rad/s of summed rotor speed."""
     ground_effect_coeff: Array
@@ -62,6 +65,8 @@ class Params(flax.struct.PyTreeNode):
     """() height of the collision cylinder, m."""
     collision_offset: Array
     """() height of the cylinder's centre above the centre of mass, m."""
+    aux: dict[str, Any] = flax.struct.field(default_factory=dict)
+    """Constants of models that are not in the core, by name: pytrees of arrays."""
 
     @property
     def weight(self) -> Array:

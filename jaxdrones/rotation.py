@@ -65,7 +65,8 @@ def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
 def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
     """The unit quaternion along q (not zero)."""
-    return q / jnp.sqrt(dot(q, q))
+    norm = jnp.sqrt(dot(q, q))
+    return jnp.stack([x / norm for x in components(q)])
 
 
 def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:

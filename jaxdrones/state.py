@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -23,6 +25,8 @@ class State(flax.struct.PyTreeNode):
     """(3,) angular velocity, rad/s, body."""
     rpm: Array
     """(4,) rotor speeds, revolutions per minute."""
+    aux: dict[str, Any] = flax.struct.field(default_factory=dict)
+    """Continuous states of models by the model's name: pytrees of arrays. `Step.init` puts them there."""
 
     @classmethod
     def at_rest(cls, pos: ArrayLike, yaw: ArrayLike | None = None) -> State:

@@ -10,6 +10,7 @@ import os
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +35,7 @@ _PROPERTIES = {  # attribute: (length, meaning and unit, range)
     "rotor_spin": (4, "signs of the reaction torques about body z", _SIGN),
     "rotor_rise_time": (1, "rotor time constant when speeding up, s", _TIME_CONSTANT),
     "rotor_fall_time": (1, "rotor time constant when slowing down, s", _TIME_CONSTANT),
+    "rotor_inertia": (1, "moment of inertia of a rotor about its axis, kg m^2", (0, 1e6)),
     "drag_coeff": (3, "rotor drag, N per m/s and rad/s", (0, 1)),
     "ground_effect_coeff": (1, "k_G of equation 5", (0, 100)),
     "downwash_coeff": (3, "k_D1 (N), k_D2, k_D3 (m) of equation 6", (-1e6, 1e6)),
@@ -41,6 +43,7 @@ _PROPERTIES = {  # attribute: (length, meaning and unit, range)
     "prop_radius": (1, "propeller radius, m", _LENGTH),
 }
 """The ranges are those of anything from an insect to an airliner; within them single precision holds a flight."""
+_DEFAULTS = {"rotor_inertia": "0"}
 
 _MASS = (1e-6, 1e6)  # kg
 _INERTIA = (1e-15, 1e9)  # kg m^2
@@ -89,6 +92,7 @@ def _params(urdf: "_Urdf") -> Params:
         max_rpm=np.sqrt(thrust2weight * mass * GRAVITY / (4 * kf)),
         rotor_rise_time=properties["rotor_rise_time"],
         rotor_fall_time=properties["rotor_fall_time"],
+        rotor_inertia=properties["rotor_inertia"],
         gravity=GRAVITY,
         air_density=AIR_DENSITY,
         wind=[0, 0, 0],
@@ -107,7 +111,8 @@ def _params(urdf: "_Urdf") -> Params:
     )
     urdf.check_what_params_cannot_hold()
     _check_flies(urdf.name, {name: np.asarray(value, float) for name, value in values.items()}, float(thrust2weight))
-    return Params(**{name: jnp.asarray(value, float) for name, value in values.items()})
+    arrays: dict[str, Any] = {name: jnp.asarray(value, float) for name, value in values.items()}
+    return Params(**arrays)
 
 
 def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> None:
@@ -218,7 +223,7 @@ class _Urdf:
 
     def property(self, name: str) -> float | np.ndarray:
         length, meaning, within = _PROPERTIES[name]
-        values = self.numbers("properties", name, length, meaning, within)
+        values = self.numbers("properties", name, length, meaning, within, _DEFAULTS.get(name))
         return values[0] if length == 1 else values
 
     def number(

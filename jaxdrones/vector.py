@@ -35,6 +35,11 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
+def along_z(x: Float[Array, ""]) -> Float[Array, "3"]:
+    """The vector (0, 0, x)."""
+    return jnp.stack([jnp.zeros_like(x), jnp.zeros_like(x), x])
+
+
 def unit(v: Float[Array, "3"]) -> Float[Array, "3"]:
     """The direction of v; zero, with a zero gradient, where v is zero."""
     length = safe_sqrt(dot(v, v))

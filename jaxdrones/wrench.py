@@ -26,6 +26,11 @@ class Wrench(flax.struct.PyTreeNode):
         return cls(force, jnp.zeros_like(force))
 
     @classmethod
+    def of_torque(cls, torque: Float[Array, "3"]) -> Wrench:
+        """A torque (N m, body) without a force."""
+        return cls(jnp.zeros_like(torque), torque)
+
+    @classmethod
     def of_thrusts(cls, rotor_pos: Float[Array, "4 3"], thrust: Float[Array, "4"]) -> Wrench:
         """Forces along body z (N) at the rotors (m, body): sum of f and of r x f."""
         x, y, _ = components(rotor_pos.T)

@@ -1,5 +1,6 @@
 """Teams in flight, and comparisons that say which array differs."""
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from functools import lru_cache, partial
 
@@ -14,6 +15,11 @@ from jaxdrones import Params, State
 VEHICLES = ("cf2x", "cf2p", "hb", "racer")
 INTEGRATORS = (jaxdrones.euler, jaxdrones.semi_implicit_euler, jaxdrones.implicit_midpoint, jaxdrones.rk4)
 
+
+STATE = [field.name for field in dataclasses.fields(State) if field.name != "aux"]
+"""Names of the arrays of a state."""
+CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name != "aux"]
+"""Names of the arrays of parameters."""
 
 make_step = lru_cache(jaxdrones.make_step)  # one compilation for all tests of a module that ask for the same step
 

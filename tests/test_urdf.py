@@ -72,7 +72,7 @@ def test_a_path_and_a_name_load_the_same():
 
 @pytest.mark.float32
 def test_constants_have_the_default_precision():
-    assert {leaf.dtype for leaf in vars(jaxdrones.load_params("cf2x")).values()} == {np.dtype("float32")}
+    assert {leaf.dtype for leaf in jax.tree.leaves(jaxdrones.load_params("cf2x"))} == {np.dtype("float32")}
 
 
 def test_an_unknown_vehicle_lists_the_known_ones():

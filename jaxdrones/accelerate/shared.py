@@ -1,33 +1,52 @@
-"""What several expressions of a function use, stored once. XLA's CPU compiler computes it in each of them anew."""
+"""Storing what several expressions of a function share. XLA's CPU compiler would compute it anew in each of them."""
 
-import collections
-from collections.abc import Callable, Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.compiler import Equation, Variable, is_literal
-from jaxdrones.accelerate.stored import stored
+from jaxdrones.accelerate.stored import stored, stored_for_derivatives
 
-_WORTH = 6
-"""Operations that are saved where a number is stored."""
+_MIN_SAVED_IN_KERNEL = 6
+"""Operations that storing a number must save within one kernel, where it costs a write and a few reads."""
 
-_MOST_VIEWS = 8
-"""Of arrays in other orders that a body has; each may double what XLA's CPU compiler makes of it."""
-
-_REORDERING = frozenset("dynamic_slice gather pad rev slice".split())
+_MIN_SAVED_BETWEEN_KERNELS = 40
+"""Operations that storing a number must save where it ends a kernel of XLA's and starts another."""
 
 _COSTS = {"div": 4, "sqrt": 4, "broadcast_in_dim": 0, "convert_element_type": 0}
-"""In operations, where it is not one."""
+"""Operations that a primitive takes for one number, where it is not one."""
+
+
+def materialize_shared(function: Callable) -> Callable:
+    """The same function, for a CPU: what its expressions share is stored, and what its arguments' derivatives are.
+
+    It works under `jit`, `vmap` and `grad` alike. On other devices, and with versions of JAX that lack what it needs,
+    the function is traced as it is.
+
+    Args:
+        function: of pytrees of arrays, and traceable. What it closes over is not stored.
+    """
+
+    def materialized(*arguments):
+        if jax.default_backend() != "cpu" or not compiler.AVAILABLE:
+            return function(*arguments)
+        return _store_shared(function, _MIN_SAVED_BETWEEN_KERNELS)(*stored_for_derivatives(arguments))
+
+    return materialized
 
 
 def store_shared(function: Callable) -> Callable:
-    """The same function; what several of its equations use, and is not cheap, is stored."""
+    """The same function, for the inside of a single kernel: what its expressions share, and is not cheap, is stored."""
+    return _store_shared(function, _MIN_SAVED_IN_KERNEL)
 
+
+def _store_shared(function: Callable, min_saved: float) -> Callable:
     def storing(*arguments):
         program, consts, shape = compiler.trace(function, *arguments)
         same, equations = _without_repetition(program)
@@ -37,7 +56,7 @@ def store_shared(function: Callable) -> Callable:
             (eqn, [same.get(v, v) for v in eqn.invars if not is_literal(v)], [v for v in eqn.outvars if v in uses])
             for eqn in equations
         ]
-        chosen = _shared(used, uses)
+        chosen = _shared(used, uses, min_saved)
         values = dict(zip(program.constvars, consts, strict=True))
         values |= dict(zip(program.invars, jax.tree.leaves(arguments), strict=True))
         for eqn, _, results in used:
@@ -45,7 +64,7 @@ def store_shared(function: Callable) -> Callable:
             found = compiler.alone(eqn, variables, results)(*(values[same.get(v, v)] for v in variables))
             values |= {v: stored(x) if v in chosen else x for v, x in zip(results, found, strict=True)}
         results = [
-            np.asarray(v.val, v.aval.dtype) if is_literal(v) else values[same.get(v, v)] for v in program.outvars
+            jnp.asarray(v.val, v.aval.dtype) if is_literal(v) else values[same.get(v, v)] for v in program.outvars
         ]
         return jax.tree.structure(shape).unflatten(results)
 
@@ -53,7 +72,7 @@ def store_shared(function: Callable) -> Callable:
 
 
 def _without_repetition(program: Any) -> tuple[dict[Variable, Variable], list[Equation]]:
-    """Names of what was computed before, and the other equations."""
+    """The equations that compute something new, and for every result of the others the variable that has its value."""
     same, known, equations = {}, {}, []
     for eqn in program.eqns:
         inputs = (_exactly(v) if is_literal(v) else same.get(v, v) for v in eqn.invars)
@@ -71,84 +90,37 @@ def _exactly(literal: Any) -> str:
 
 
 def _needed(program: Any, same: dict, equations: list[Equation]) -> tuple[dict[Variable, int], list[Equation]]:
-    """How many equations use each variable that the results depend on, and the equations that compute them."""
+    """How often each variable is used on which the results depend, and the equations that compute them or act."""
 
     def names(variables):
         return {same.get(v, v) for v in variables if not is_literal(v)}
 
     uses, needed = dict.fromkeys(names(program.outvars), 1), []
     for eqn in reversed(equations):
-        if any(v in uses for v in eqn.outvars):
+        if eqn.effects or any(v in uses for v in eqn.outvars):
             needed.append(eqn)
             for v in names(eqn.invars):
-                uses[v] = uses.get(v, 0) + 1
+                uses[v] = uses.get(v, 0) + _copies(eqn)
     return uses, needed[::-1]
 
 
+def _copies(eqn: Equation) -> int:
+    """How often an equation uses a number of its input: a broadcast once for each of its copies."""
+    if eqn.primitive.name != "broadcast_in_dim":
+        return 1
+    return max(1, eqn.outvars[0].aval.size // max(1, eqn.invars[0].aval.size))
+
+
 _Used = tuple[Equation, list[Variable], list[Variable]]
-"""An equation, what it reads, and those of its results that are needed."""
+"""An equation, the variables that it reads, and those of its results that are needed."""
 
 
-def _shared(equations: Sequence[_Used], uses: dict[Variable, int]) -> set[Variable]:
-    """Results that take more to compute again for every use than to store."""
+def _shared(equations: Sequence[_Used], uses: dict[Variable, int], min_saved: float) -> set[Variable]:
+    """Results that take `min_saved` operations more to compute again for every use than to store."""
     costs, chosen = {}, set()
     for eqn, inputs, results in equations:
         cost = _COSTS.get(eqn.primitive.name, 1) + sum(costs.get(v, 0) for v in set(inputs))
-        worth = {v for v in results if v.aval.ndim and cost * (uses[v] - 1) >= _WORTH}
+        worth = {v for v in results if v.aval.ndim and cost * (uses[v] - 1) >= min_saved}
         chosen |= worth
         costs |= {v: 0 if v in worth else cost for v in results}
     return chosen
-
-
-def without_copies(
-    program: Any, consts: Sequence[Array], *inputs: Array, rules: Mapping[str, Callable] | None = None
-) -> list[Array]:
-    """The results of a program for one world.
-
-    Arrays that it uses in another order too are stored where they are many: each might double what the compiler makes.
-
-    Args:
-        program: traced.
-        consts: what it closes over.
-        *inputs: of the program.
-        rules: how to evaluate equations of some primitives, `(equation, *inputs) -> results`. With rules, derivatives
-            are no longer those of the program.
-    """
-    viewed = _viewed(program)
-    values = dict(zip(program.constvars, consts, strict=True)) | dict(zip(program.invars, inputs, strict=True))
-    inlined = compiler.CALLS if rules else compiler.PLAIN_CALLS
-
-    def inner(*arguments):
-        return without_copies(*arguments, rules=rules)
-
-    def results(eqn, inputs):
-        name = eqn.primitive.name
-        if rules and name in rules:
-            return rules[name](eqn, *inputs)
-        if name == "scan":
-            return compiler.scan_of(eqn, inner, inputs)
-        if name in inlined and (called := compiler.called(eqn))[0].eqns:
-            return inner(*called, *inputs)
-        return compiler.evaluated(eqn, inputs)
-
-    def read(v):
-        return jnp.asarray(v.val, v.aval.dtype) if is_literal(v) else values[v]
-
-    for eqn in program.eqns:
-        found = zip(eqn.outvars, results(eqn, [read(v) for v in eqn.invars]), strict=True)
-        values |= {v: stored(x) if v in viewed else x for v, x in found}
-    return [read(v) for v in program.outvars]
-
-
-def has_copies(program: Any) -> bool:
-    """Whether `without_copies` stores something."""
-    return bool(_viewed(program)) or any(has_copies(inner) for eqn in program.eqns for inner in compiler.held(eqn))
-
-
-def _viewed(program: Any) -> set[Variable]:
-    """Variables that are used in another order beside another use; none where there are few."""
-    read = [v for eqn in program.eqns for v in eqn.invars if not is_literal(v)]
-    uses = collections.Counter(read)
-    views = [eqn.invars[0] for eqn in program.eqns if eqn.primitive.name in _REORDERING]
-    views = [v for v in views if not is_literal(v) and uses[v] > 1]
-    return set(views) if len(views) > _MOST_VIEWS else set()

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler
-from jaxdrones.accelerate.shared import store_shared, without_copies
+from jaxdrones.accelerate.reordered import store_reordered
+from jaxdrones.accelerate.shared import store_shared
 
 _LARGEST = 36
 """Numbers of an array: the places of three drones' rotors. Arrays of four drones fill vectors as they are."""
@@ -119,7 +120,7 @@ def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Arra
     """
     if not _is_small(program):
         return jax.vmap(
-            functools.partial(without_copies, program, consts, rules=dict.fromkeys(_REDUCTIONS, _reduced)), -1, -1
+            functools.partial(store_reordered, program, consts, rules=dict.fromkeys(_REDUCTIONS, _reduced)), -1, -1
         )(*leaves)
 
     def apart(consts, leaves):

@@ -10,15 +10,16 @@ from jaxdrones.accelerate import compiler
 def stored(tree):
     """The same numbers, which XLA's CPU compiler stores before they are used.
 
-    It would otherwise compute them anew in every expression that reads them, or read them there out of the stack of a
-    `scan`, which it does not vectorise. It fuses nothing across a call: so they go through one that does nothing.
+    The compiler would otherwise compute them anew in every expression that reads them, or read them there out of the
+    stack of a `scan`, which it does not vectorize. It fuses nothing across a call, so they go through a call that does
+    nothing.
     """
     return compiler.set_notes(_same(tree), inlineable="false") if jax.default_backend() == "cpu" else tree
 
 
 @jax.custom_jvp
 def stored_for_derivatives(tree):
-    """The same numbers, stored where derivatives are taken."""
+    """The same numbers, which are stored only where derivatives are taken."""
     return tree
 
 
@@ -28,12 +29,14 @@ _same = jax.jit(lambda tree: tree)
 @stored.defjvp
 @stored_for_derivatives.defjvp
 def _by_quotient(tree, tangent):
-    """A gradient by rk4 takes 240 ns a step with it, 400 with calls.
+    """Derivatives are stored by a division by one, which takes less than a call.
 
-    A quotient that is used several times is stored, and the compiler sees too late that the divisor is one.
+    The compiler stores a quotient that is used several times, and sees too late that the divisor is one.
     """
 
-    def quotient(tree):
-        return jax.tree.map(lambda x: x / jax.lax.optimization_barrier(jnp.ones((), x.dtype)), tree)
+    def quotient(x):
+        if not jnp.issubdtype(x.dtype, jnp.inexact):
+            return x
+        return x / jax.lax.optimization_barrier(jnp.ones((), x.dtype))
 
-    return jax.jvp(quotient, tree, tangent)
+    return jax.jvp(lambda tree: jax.tree.map(quotient, tree), tree, tangent)

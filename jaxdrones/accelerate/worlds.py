@@ -13,7 +13,7 @@ from jax.sharding import AxisType, PartitionSpec
 from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler
-from jaxdrones.accelerate.shared import has_copies, without_copies
+from jaxdrones.accelerate.reordered import has_reordered, store_reordered
 from jaxdrones.accelerate.soa import NoKernel, fits_a_kernel, vmap_for_kernel
 from jaxdrones.checks import check_whole
 
@@ -123,7 +123,7 @@ def _on_a_cpu(function: Callable, chunk: int | None, axes: tuple[int, ...], one_
         program, consts, shape = compiler.trace(lambda *leaves: function(*tree.unflatten(leaves)), *of_one_world)
 
         def by_vmap(consts, leaves):
-            evaluate = without_copies if has_copies(program) else _as_it_is
+            evaluate = store_reordered if has_reordered(program) else _as_it_is
             of_many = jax.vmap(functools.partial(evaluate, program, consts), along)
             if program.effects:
                 return of_many(*leaves)

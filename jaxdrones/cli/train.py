@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
-from jaxdrones.cli.common import INTERRUPTED, complain, folder, note
+from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
 from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, fitting, kept, once, quiet, settings
@@ -118,7 +118,9 @@ def _train(options: argparse.Namespace) -> int:
     if seconds is not None:
         spent = 0.0 if options.resume else time.perf_counter() - begin
         if spent > seconds:
-            note(f"compiling took all of --budget {options.budget}, so one update is made; --resume trains it longer")
+            print_warning(
+                f"compiling took all of --budget {options.budget}, so one update is made; --resume trains it longer"
+            )
         trainer.fit(seconds - spent, made)
     total = trainer.recipe.config.updates
     say(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
@@ -135,16 +137,16 @@ def _train(options: argparse.Namespace) -> int:
                 trainer.train(run, seed, shown.tell)
         except KeyboardInterrupt:
             if not run.started:
-                return complain("interrupted before the first update; there is nothing to go on with", INTERRUPTED)
+                return print_error("interrupted before the first update; there is nothing to go on with", INTERRUPTED)
             draw(options, {seed: run}, run.folder)
             again = f"jaxdrones train {options.task} --output {output} --resume"
             again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
-            return complain(
+            return print_error(
                 f"interrupted at update {run.told('state', 'update')}; {kept(run)}; go on with: {again}", INTERRUPTED
             )
         except Diverged as error:
             draw(options, {seed: run}, run.folder)
-            return complain(
+            return print_error(
                 f"training diverged: {error}; {kept(run)}; try smaller steps, for example --set learning_rate=1e-3", 1
             )
     return finish(options, runs, output)

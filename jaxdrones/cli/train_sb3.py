@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import INTERRUPTED, complain
+from jaxdrones.cli.common import INTERRUPTED, print_error
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import SB3_ALGORITHMS
 from jaxdrones.cli.training import Shown, budget, check_free, draw, finish, fitting, kept, once, quiet, settings
@@ -58,12 +58,12 @@ def train(options: argparse.Namespace) -> int:
             trainer.train(run, shown.tell, None if seconds is None else begin + seconds)
     except KeyboardInterrupt:
         if not run.files:
-            return complain("interrupted before the first evaluation; nothing is kept", INTERRUPTED)
+            return print_error("interrupted before the first evaluation; nothing is kept", INTERRUPTED)
         draw(options, {seed: run}, run.folder)
-        return complain(f"interrupted; {kept(run)}", INTERRUPTED)
+        return print_error(f"interrupted; {kept(run)}", INTERRUPTED)
     except Diverged as error:
         draw(options, {seed: run}, run.folder)
-        return complain(f"training diverged: {error}; {kept(run)}; try a smaller --set learning_rate", 1)
+        return print_error(f"training diverged: {error}; {kept(run)}; try a smaller --set learning_rate", 1)
     return finish(options, {seed: run}, run.folder)
 
 

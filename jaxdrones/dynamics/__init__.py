@@ -4,6 +4,7 @@ from jaxdrones.dynamics.aero import drag, drag_world_axes, external_force, groun
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021
+from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors, rotor_wrench
 
@@ -19,6 +20,7 @@ __all__ = [
     "INTEGRATORS",
     "PAIRS",
     "ROTORS",
+    "Model",
     "downwash",
     "downwash_2021",
     "drag",

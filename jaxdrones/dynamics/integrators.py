@@ -30,16 +30,9 @@ def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> Stat
     see the table in the README before using it above a few rad/s.
     """
     state = _normalized(state)  # the exponential map keeps the length, but for rounding
-    rate = derivative(state)
-    vel = state.vel + dt * rate.vel
-    omega = state.omega + dt * rate.omega
-    return State(
-        pos=state.pos + dt * vel,
-        quat=jax.vmap(_turn)(state.quat, dt * omega),
-        vel=vel,
-        omega=omega,
-        rpm=state.rpm + dt * rate.rpm,
-    )
+    after = _add(state, dt, derivative(state))
+    pos, quat = state.pos + dt * after.vel, jax.vmap(_turn)(state.quat, dt * after.omega)
+    return after.replace(pos=pos, quat=quat)
 
 
 def rk4(derivative: Derivative, state: State, dt: float) -> State:

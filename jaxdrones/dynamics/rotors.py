@@ -1,12 +1,14 @@
-"""Rotors: how their speed follows the command, and the wrench they produce (paper, equations 1 to 3)."""
+"""Rotors: how their speed follows the command, and the wrenches they produce (paper, equations 1 to 3)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import dot
+from jaxdrones.vector import along_z, components, dot
 from jaxdrones.wrench import Wrench
+
+_RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
 
 
 def limited(params: Params, rpm: Float[Array, "4"]) -> Float[Array, "4"]:
@@ -19,22 +21,22 @@ def limited(params: Params, rpm: Float[Array, "4"]) -> Float[Array, "4"]:
 
 
 def instant_rotors(
-    params: Params, rpm: Float[Array, "4"], command: Float[Array, "4"]
+    params: Params, state: State, command: Float[Array, "4"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """The paper's rotors: the limited command (RPM) acts at once. Returns the speed and its rate, RPM and RPM/s."""
+    """Rotors that take the limited command at once (paper). Returns their speed and its rate, RPM and RPM/s."""
     return limited(params, command), jnp.zeros_like(command)
 
 
 def lagging_rotors(
-    params: Params, rpm: Float[Array, "4"], command: Float[Array, "4"]
+    params: Params, state: State, command: Float[Array, "4"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """First-order lag behind the limited command, with separate rise and fall times.
+    """Rotors that follow the limited command by a first-order lag, with time constants of their own up and down.
 
-    Returns the speed and its rate, RPM and RPM/s.
+    Returns their speed and its rate, RPM and RPM/s.
     """
-    error = limited(params, command) - rpm
-    tau = jnp.where(error > 0, params.rotor_rise_time, params.rotor_fall_time)
-    return rpm, error / tau
+    error = limited(params, command) - state.rpm
+    time_constant = jnp.where(error > 0, params.rotor_rise_time, params.rotor_fall_time)
+    return state.rpm, error / time_constant
 
 
 def thrust(params: Params, state: State) -> Float[Array, "4"]:
@@ -43,8 +45,31 @@ def thrust(params: Params, state: State) -> Float[Array, "4"]:
 
 
 def rotor_wrench(params: Params, state: State) -> Wrench:
-    """Thrusts at the rotors and reaction torques about body z: T = sum of spin_i k_T P_i^2."""
-    wrench = Wrench.of_thrusts(params.rotor_pos, thrust(params, state))
-    yaw_torque = params.km * dot(params.rotor_spin, state.rpm**2)
-    zero = jnp.zeros_like(yaw_torque)
-    return wrench + Wrench(jnp.zeros_like(wrench.force), jnp.stack([zero, zero, yaw_torque]))
+    """Aerodynamic wrench of the rotors: their thrusts and drag torques, T = sum of spin_i k_T P_i^2 about body z."""
+    drag_torque = params.km * dot(params.rotor_spin, state.rpm**2)
+    return Wrench.of_thrusts(params.rotor_pos, thrust(params, state)) + Wrench.of_torque(along_z(drag_torque))
+
+
+def rotor_reaction(params: Params, state: State, rpm_rate: Float[Array, "4"]) -> Wrench:
+    """Torque of the spinning rotors on the body: -h' of rotors that change speed, -omega x h of a body that turns.
+
+    h is the angular momentum of the rotors relative to the body, along its z axis.
+    """
+    x, y, _ = components(state.omega)
+    h, h_rate = angular_momentum(params, state.rpm), angular_momentum(params, rpm_rate)
+    return Wrench.of_torque(jnp.stack([-y * h, x * h, -h_rate]))
+
+
+def angular_momentum(params: Params, rpm: Float[Array, "4"]) -> Float[Array, ""]:
+    """Angular momentum of the rotors relative to the body, about body z, kg m^2/s.
+
+    A rotor turns against the torque that its drag exerts on the body. Linear: of RPM/s it is the rate.
+    """
+    return -params.rotor_inertia * _RADIANS_PER_SECOND * dot(params.rotor_spin, rpm)
+
+
+def with_rotor_speed(params: Params, state: State, rpm: Float[Array, "4"]) -> State:
+    """The state after the rotors have taken another speed at once; the body keeps the angular momentum of both."""
+    change = angular_momentum(params, rpm) - angular_momentum(params, state.rpm)
+    _, _, inertia = components(params.inertia)
+    return state.replace(rpm=rpm, omega=state.omega - along_z(change / inertia))

@@ -1,45 +1,110 @@
-"""The pure-JAX backend: `step(params, state, rpm) -> state` for one world."""
+"""The pure-JAX backend: the derivative of a team, and `step(params, state, rpm) -> state` for one world."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
-from jaxdrones.accelerate.stored import stored, stored_for_derivatives
+from jaxdrones.accelerate.shared import materialize_shared
 from jaxdrones.checks import check_positive, check_whole
-from jaxdrones.dynamics import instant_rotors, newton_euler, quat_rate, semi_implicit_euler
+from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
-from jaxdrones.dynamics.rotors import limited
-from jaxdrones.engine.host import is_traced
+from jaxdrones.dynamics.rotors import limited, with_rotor_speed
 from jaxdrones.engine.neighbors import NeighborGrid
-from jaxdrones.engine.team import check_team, check_values
-from jaxdrones.engine.wrenches import Effect, Pair, check_functions, describe, make_total_wrench
+from jaxdrones.engine.physics import Physics, Rotors, check_functions
+from jaxdrones.engine.step import Step, is_traced
+from jaxdrones.engine.team import check_command, check_values
+from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
 from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
-Step = Callable[[Params, State, jax.Array], State]
+Derivative = Callable[..., State]
+"""`(params, state, command, scene=Scene())` -> time derivative of the state, of a team."""
+
+_BARE = Scene()
+
+
+def make_derivative(
+    effects: Sequence[Effect] = (),
+    pairs: Sequence[Pair] = (),
+    team_effects: Sequence[TeamEffect] = (),
+    models: Sequence[Model] = (),
+    rotors: Rotors = instant_rotors,
+    neighbors: NeighborGrid | None = None,
+) -> Derivative:
+    """Build the law of motion of a team: for linearization, sensors, and integrators of your own.
+
+    Args:
+        effects: as for `make_step`.
+        pairs: as for `make_step`.
+        team_effects: as for `make_step`.
+        models: as for `make_step`.
+        rotors: as for `make_step`.
+        neighbors: as for `make_step`.
+
+    Returns:
+        `derivative(params, state, command, scene=Scene()) -> State`, pure: params and state of a team of n drones,
+        command (n, 4) the commanded rotor speeds, RPM. The rate has the type of the state: `pos` m/s, `quat` 1/s,
+        `vel` m/s^2 (world), `omega` rad/s^2 (body), `rpm` RPM/s, and that of every model in `aux`. What no law moves
+        (a further field of a subclass of `State`, the aux of no model) has the rate zero. Rotors that take their speed
+        at once have it, whatever `state.rpm` is.
+
+    Raises:
+        ValueError: an argument that should be a function, a model or a neighbor grid and is not.
+    """
+    return _derivative_of(Physics(effects, pairs, team_effects, models, rotors, neighbors))
+
+
+def _derivative_of(physics: Physics) -> Derivative:
+    def derivative(params: Params, state: State, command: Float[Array, "n 4"], scene: Scene = _BARE) -> State:
+        loads = physics.loads(params, state, command, scene)
+        acc, omega_rate = jax.vmap(newton_euler)(params, loads.state, loads.wrench)
+        still = jax.tree.map(jnp.zeros_like, state)
+        return still.replace(
+            pos=state.vel,
+            quat=jax.vmap(quat_rate)(state),
+            vel=acc,
+            omega=omega_rate,
+            rpm=loads.rpm_rate,
+            aux=still.aux | loads.aux_rate,
+        )
+
+    return derivative
 
 
 def make_step(
     effects: Sequence[Effect] = (),
     pairs: Sequence[Pair] = (),
-    rotors: Callable = instant_rotors,
+    rotors: Rotors = instant_rotors,
     integrator: Integrator = semi_implicit_euler,
     dt: float = 1 / 240,
     substeps: int = 1,
-    cells: NeighborGrid | None = None,
-) -> Callable[[Params, State, ArrayLike], State]:
+    *,
+    team_effects: Sequence[TeamEffect] = (),
+    models: Sequence[Model] = (),
+    neighbors: NeighborGrid | None = None,
+    scene: Scene = _BARE,
+) -> ExplicitStep:
     """Build the step of a world.
 
     Args:
-        effects: wrenches on a drone by itself, `(params, state) -> Wrench`: `drag`, `ground_effect`, your own.
+        effects: wrenches on a drone by itself, `(params, state) -> Wrench`: `drag`, `ground_effect`, your own. One
+            that has a third argument called `scene` is given what stands around.
         pairs: wrenches on a drone because of another, `(params, state, other, other_state) -> Wrench`: `downwash`.
-        rotors: `instant_rotors` or `lagging_rotors`.
+        rotors: `instant_rotors`, `lagging_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
         integrator: `semi_implicit_euler`, `euler`, `rk4` or `implicit_midpoint`.
         dt: physics step, s.
         substeps: physics steps per call, with the command held.
-        cells: limits pairs to drones near each other, which is faster from some 700 drones on.
+        team_effects: wrenches on all drones of the team, `(params, state) -> Wrench` with force and torque (n, 3):
+            cables between chosen drones.
+        models: differential equations that are integrated along, such as a battery; their states are in `state.aux`.
+        neighbors: limits pairs to drones near each other, which is faster from some 700 drones on.
+        scene: what stands around; effects that take it honor it. It can be another one at every call.
 
     Returns:
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
@@ -50,56 +115,78 @@ def make_step(
         attitude.
 
     Raises:
-        ValueError: `dt` or `substeps` not positive, or an argument that should be a function and is not.
+        ValueError: `dt` or `substeps` not positive, an argument that should be a function or a model and is not, or a
+            scene with obstacles and no effect that takes it.
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)
-    check_functions("rotors", [rotors])
+    physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
     check_functions("integrator", [integrator])
-    effects, pairs = check_functions("effects", effects), check_functions("pairs", pairs)
-    total_wrench = make_total_wrench(effects, pairs, cells)
-
-    def derivative(params: Params, state: State, command: jax.Array) -> State:
-        rpm, rpm_rate = jax.vmap(rotors)(params, state.rpm, command)
-        state = state.replace(rpm=rpm)
-        acc, omega_rate = jax.vmap(newton_euler)(params, state, total_wrench(params, state))
-        rate = State(pos=state.vel, quat=jax.vmap(quat_rate)(state), vel=acc, omega=omega_rate, rpm=rpm_rate)
-        return stored(rate)  # rk4 takes 39 instead of 72 ns, its gradient 240 instead of 570
-
-    def step(params: Params, state: State, rpm: ArrayLike) -> State:
-        rpm = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
-        check_team(params, state, rpm)
-        speed, _ = jax.vmap(rotors)(params, jax.vmap(limited)(params, state.rpm), rpm)
-        state = state.replace(rpm=speed)
-
-        # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
-        @jax.checkpoint
-        def substep(state: State, _: None) -> tuple[State, None]:
-            start, command = stored_for_derivatives((state, rpm))
-            return integrator(lambda s: derivative(params, s, command), start, dt), None
-
-        return substep(state, None)[0] if substeps == 1 else jax.lax.scan(substep, state, length=substeps)[0]
-
-    text = f"{describe([integrator])} at {1 / (dt * substeps):.4g} Hz x {substeps}, {describe([rotors])}"
-    text += f", effects: {describe(effects)}, pairs: {describe(pairs)}" + (f", {cells}" if cells else "")
-    return _ExplicitStep(jax.jit(step, inline=True), text)
+    return ExplicitStep(physics, integrator, dt, substeps, scene)
 
 
-class _ExplicitStep:
+class ExplicitStep(Step):
     """A compiled step that looks at what it is given, where that has values: once at constants and at a start."""
 
-    def __init__(self, compiled: Callable[..., State], text: str):
-        self._compiled, self._text = compiled, text
+    def __init__(self, physics: Physics, integrator: Integrator, dt: float, substeps: int, scene: Scene):
+        self.physics, self._scene = physics, scene
+        self._check_scene(scene)
+        self._text = f"{describe([integrator])} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
+        derivative = _derivative_of(physics)
+
+        def substep(params: Params, state: State, command: jax.Array, scene: Scene) -> State:
+            speed, _ = physics.rotor_speed(params, state, command)
+            state = jax.vmap(with_rotor_speed)(params, state, speed)
+            return integrator(lambda s: derivative(params, s, command, scene), state, dt)
+
+        def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
+            command = check_command(params, state, rpm)
+            state = state.replace(rpm=jax.vmap(limited)(params, state.rpm))
+
+            # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
+            @jax.checkpoint
+            def advance(state: State, _: None) -> tuple[State, None]:
+                after = materialize_shared(lambda state, command: substep(params, state, command, scene))
+                return after(state, command), None
+
+            return advance(state, None)[0] if substeps == 1 else jax.lax.scan(advance, state, length=substeps)[0]
+
+        def rate(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
+            return derivative(params, state, check_command(params, state, rpm), scene)
+
+        self._step, self._rate = jax.jit(step, inline=True), jax.jit(rate, inline=True)
         self._params: Params | None = None  # what was looked at last, and the attitude that was flown to
         self._quat: jax.Array | None = None
 
-    def __call__(self, params: Params, state: State, rpm: ArrayLike) -> State:
+    def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """Advance a team by one control step; see `make_step`."""
         if params is not self._params or state.quat is not self._quat:
             check_values(params, state)
-        state = self._compiled(params, state, rpm)
+        state = self._step(params, state, rpm, self._given(scene))
         if not is_traced(state.quat):
             self._params, self._quat = params, state.quat
         return state
 
+    def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """The derivative that is integrated; see `make_derivative`."""
+        return self._rate(params, state, rpm, self._given(scene))
+
     def __repr__(self) -> str:
         return f"<step: {self._text}>"
+
+    def _given(self, scene: Scene | None) -> Scene | None:
+        """The scene of a call; `None` where no effect depends on it."""
+        if scene is None:
+            scene = self._scene
+        else:
+            self._check_scene(scene)
+        return scene if self.physics.takes_scene else None
+
+    def _check_scene(self, scene: Scene) -> None:
+        if not isinstance(scene, Scene):
+            raise ValueError(f"scene is {scene!r}; give a jaxdrones.sensing.Scene")
+        if scene.has_obstacles and not self.physics.takes_scene:
+            raise ValueError(
+                "the scene has obstacles and no effect takes it, so drones would fly through them; give an effect "
+                "(params, state, scene) -> Wrench, leave the obstacles out, or take the bullet backend"
+            )

@@ -16,16 +16,16 @@ from jaxdrones.checks import (
     check_whole,
     shown,
 )
-from jaxdrones.engine.explicit import Step
-from jaxdrones.engine.host import HostStep, is_traced
+from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
+Advance = Callable[[Params, State, jax.Array], State]
 Control = Callable[[Params, Any, State, jax.Array], tuple[Any, jax.Array]]
 
 
 def rollout(
-    step: Step,
+    step: Advance,
     control: Control,
     params: Params,
     state: State,
@@ -39,7 +39,7 @@ def rollout(
         step: of either backend, `(params, state, rpm) -> state`.
         control: `(params, memory, state, k) -> (memory, rpm)`, rpm (n, 4); k counts control steps.
         params: of the team.
-        state: of the team, at the start.
+        state: of the team, at the start; the models of the step that have no state in it start anew.
         memory: what the controller keeps between calls, any pytree; `None` if nothing.
         length: number of control steps.
         checkpoint: control steps between those that a backward pass keeps; it flies the others again, and needs memory
@@ -56,10 +56,13 @@ def rollout(
     check_whole("length", length)
     check_callable("control", control, "lambda params, memory, state, k: (memory, rpm)")
     check_params(params)
-    check_arrays("state", vars(state))
+    check_arrays("state", state)
     check_finite("state", state)
     check_quaternion("state.quat", state.quat)
 
+    state = step.init(params, state) if isinstance(step, Step) else state
+    if isinstance(step, HostStep) and checkpoint is not None:
+        raise ValueError("checkpoint is given and the bullet backend has no backward pass; leave it out")
     if isinstance(step, HostStep) and not is_traced((params, state, memory)):
         return _loop(step, control, params, state, memory, length)
 

@@ -1,14 +1,15 @@
-"""What every backend demands of a team, and its parameters as one array."""
+"""What every backend demands of a team, and pytrees of a team as one array."""
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape
+from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape, shown
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -22,42 +23,83 @@ _SHAPES = {
     "downwash_coeff": (3,),
 }
 _STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
+_CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name != "aux"]
+
+
+def check_command(params: Params, state: State, rpm: ArrayLike) -> Float[Array, "n 4"]:
+    """The commanded rotor speeds as numbers of the state's precision.
+
+    Raises:
+        ValueError: the arrays are not those of one team of n drones.
+    """
+    command = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
+    check_team(params, state, command)
+    return command
 
 
 def check_team(params: Params, state: State, rpm: Any) -> None:
     """Raise `ValueError` unless the arrays are those of one team of n drones."""
-    check_arrays("state", vars(state))
-    check_arrays("params", vars(params))
+    check_arrays("state", state)
+    check_arrays("params", params)
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap")
     n = len(state.pos)
     for name, width in _STATE.items():
         check_shape(f"state.{name}", getattr(state, name), (n, width), f"state.pos has {n} drones")
-    for name, leaf in vars(params).items():
+    for name in _CONSTANTS:
         hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
-        check_shape(f"params.{name}", leaf, (n, *_SHAPES.get(name, ())), hint)
+        check_shape(f"params.{name}", getattr(params, name), (n, *_SHAPES.get(name, ())), hint)
+    for name, aux in ("state.aux", state.aux), ("params.aux", params.aux):
+        _check_aux(name, aux, n)
     check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")
+
+
+def _check_aux(name: str, aux: Any, n: int) -> None:
+    if not isinstance(aux, dict):
+        raise ValueError(f"{name} is {shown(aux)}; give a dictionary by the names of models")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(aux):
+        where = name + jax.tree_util.keystr(path)
+        if jnp.shape(leaf)[:1] != (n,):
+            raise ValueError(f"{where} has shape {jnp.shape(leaf)}; give arrays with a leading axis over {n} drones")
+        if name == "state.aux" and not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise ValueError(f"{where} holds {jnp.result_type(leaf)}; give floating-point numbers")
 
 
 def check_values(params: Params, state: State) -> None:
     """Raise `ValueError` where values, not shapes, make no flight, and can be looked at: constants and attitudes."""
     check_params(params, finite=False)
-    check_arrays("state", vars(state))
+    check_arrays("state", state)
     check_quaternion("state.quat", state.quat)
 
 
-def flatten(params: Params) -> Float[Array, "n k"]:
-    """All numbers of a team's parameters as one array, a row per drone."""
-    return jnp.concatenate([jnp.reshape(leaf, (len(leaf), -1)) for leaf in vars(params).values()], axis=-1)
+class Layout(NamedTuple):
+    """How a pytree of arrays (n, ...) is laid out as the columns of one array; hashable."""
+
+    structure: Any
+    shapes: tuple[tuple[int, ...], ...]
+    """Of the leaves, without the axis over drones."""
+
+    @classmethod
+    def of(cls, tree: Any) -> "Layout":
+        """The layout of a pytree."""
+        leaves, structure = jax.tree.flatten(tree)
+        return cls(structure, tuple(jnp.shape(leaf)[1:] for leaf in leaves))
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return sum(map(math.prod, self.shapes))
+
+    def unpack(self, flat: Any) -> Any:
+        """The pytree that `pack` made an array (n, k) of; the array may be one of NumPy."""
+        leaves, start = [], 0
+        for shape in self.shapes:
+            end = start + math.prod(shape)
+            leaves.append(flat[:, start:end].reshape(len(flat), *shape))
+            start = end
+        return self.structure.unflatten(leaves)
 
 
-def unflatten(flat: Float[Array, "n k"]) -> Params:
-    """The parameters that `flatten` made one array of."""
-    shapes = {field.name: _SHAPES.get(field.name, ()) for field in dataclasses.fields(Params)}
-    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])[:-1]
-    columns = jnp.split(flat, ends, axis=-1)
-    return Params(
-        **{
-            name: jnp.reshape(column, (len(flat), *shape))
-            for (name, shape), column in zip(shapes.items(), columns, strict=True)
-        }
-    )
+def pack(tree: Any, n: int) -> Float[Array, "n k"]:
+    """All numbers of a pytree of arrays (n, ...) as one array, a row per drone."""
+    leaves = [jnp.reshape(leaf, (n, -1)) for leaf in jax.tree.leaves(tree)]
+    return jnp.concatenate([jnp.zeros((n, 0)), *leaves], axis=-1)

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdrones.engine.host import is_traced
+from jaxdrones.engine.step import is_traced
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks.task import World

@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.envs import AutoReset, Env, autoreset
+from jaxdrones.envs import AutoReset, Env
 from jaxdrones.envs.autoreset import Episode
-from jaxdrones.envs.env import Obs, PrivilegedObservation
+from jaxdrones.envs.env import Obs
+from jaxdrones.envs.privileged import PrivilegedObservation
 from jaxdrones.learning import sharding
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import Statistics
@@ -68,7 +69,7 @@ class Flight(flax.struct.PyTreeNode):
 
 def idle(env: Env, worlds: int) -> Worlds:
     """Worlds in which nothing has begun yet."""
-    obs, episodes = jax.eval_shape(jax.vmap(autoreset(env).reset), jax.random.split(jax.random.key(0), worlds))
+    obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), worlds))
     episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
     return Worlds(episodes, obs, ended=jnp.ones(worlds, bool))
 
@@ -78,7 +79,7 @@ def restart(key: jax.Array, env: Env, worlds: Worlds, share: float = 0.0) -> Wor
     start_key, choice_key = jax.random.split(key)
     w = len(worlds.ended)
     chosen = worlds.ended | jax.random.bernoulli(choice_key, share, (w,))
-    obs, episodes = jax.vmap(autoreset(env).reset)(jax.random.split(start_key, w))
+    obs, episodes = jax.vmap(AutoReset(env).reset)(jax.random.split(start_key, w))
     fresh = Worlds(episodes, obs, jnp.zeros_like(chosen))
     return _where(chosen, fresh, worlds)
 
@@ -107,8 +108,8 @@ def fly(
         link: applied to the worlds between steps; changes their gradients, not their values.
         informed: keep the truth beside what is seen.
     """
-    truth = jax.vmap(env.truth) if informed else lambda worlds: None
-    step = jax.vmap((autoreset(env) if reset else _Endless(env)).step)
+    truth = jax.vmap(env.privileged_observation) if informed else lambda worlds: None
+    step = jax.vmap((AutoReset(env) if reset else _Endless(env)).step)
 
     def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Flight]:
         act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
@@ -154,9 +155,9 @@ class _Endless(AutoReset):
 
     def step(self, key: jax.Array, episode: Episode, action: Array):
         obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
-        episode = Episode(world, episode.returned + reward, episode.length + 1)
+        episode = Episode(world, episode.episode_return + reward, episode.length + 1)
         last = {"final_obs": obs, "final_world": world}
-        info = info | last | {"episode": {"return": episode.returned, "length": episode.length}}
+        info = info | last | {"episode": {"return": episode.episode_return, "length": episode.length}}
         return obs, episode, reward, terminated, truncated, info
 
 

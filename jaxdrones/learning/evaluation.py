@@ -85,12 +85,14 @@ def _episode(env: Env, policy: Callable, key: jax.Array) -> dict:
     start_key, key = jax.random.split(key)
     obs, world = env.reset(start_key)
     first = jax.eval_shape(env.step, key, world, jnp.zeros((env.drones, env.action_size)))[-1]
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (first["metrics"], first["ends"]))
+    nothing = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), (first["metrics"], first["terminations"] | first["truncations"])
+    )
 
     def control_step(carry, key):
         obs, world, lost, done, outcome, returned, length = carry
         obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
-        now = (info["metrics"], info["ends"])
+        now = (info["metrics"], info["terminations"] | info["truncations"])
         outcome = jax.tree.map(lambda new, old: jnp.where(done, old, new), now, outcome)
         returned = returned + jnp.where(done, 0, reward)
         length = length + ~done

@@ -16,9 +16,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
-from jaxdrones.engine.explicit import Step, make_step
+from jaxdrones.engine.explicit import make_step
+from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.state import State
 
 GRADIENTS = ("exact", "decay", "surrogate")
 
@@ -28,7 +33,7 @@ def with_gradient(env: Env, config: Any) -> Env:
     if config.gradient != "surrogate":
         return env
     changed = copy.copy(env)
-    changed.physics = differentiated_as(env.physics, config.surrogate or make_step(dt=env.dt))
+    changed.physics = Surrogate(env.physics, config.surrogate or make_step(dt=env.dt))
     return changed
 
 
@@ -50,18 +55,30 @@ def scale_gradient(tree: Any, factor: float) -> Any:
     return jax.tree.map(scale, tree)
 
 
-def differentiated_as(step: Step, simple: Step) -> Step:
+class Surrogate(Step):
     """A step with the values of one and the derivatives of another, at the same state."""
 
-    @jax.custom_vjp
-    def mixed(params, state, rpm):
-        return step(params, state, rpm)
+    def __init__(self, step: Step, simple: Step):
+        self.physics, self._step = step.physics, step
 
-    def forward(params, state, rpm):
-        return step(params, state, rpm), (params, state, rpm)
+        @jax.custom_vjp
+        def mixed(scene, *arguments):
+            return step(*arguments, scene)
 
-    def backward(saved, cotangent):
-        return jax.vjp(simple, *saved)[1](cotangent)
+        def forward(scene, *arguments):
+            return step(*arguments, scene), (scene, arguments)
 
-    mixed.defvjp(forward, backward)
-    return mixed
+        def backward(saved, cotangent):
+            scene, arguments = saved
+            return jax.tree.map(jnp.zeros_like, scene), *jax.vjp(simple, *arguments)[1](cotangent)
+
+        mixed.defvjp(forward, backward)
+        self._mixed = mixed
+
+    def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """Advance a team by one control step."""
+        return self._mixed(scene, params, state, rpm)
+
+    def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """The time derivative of the step that gives the values."""
+        return self._step.rate(params, state, rpm, scene)

@@ -205,7 +205,7 @@ def _judged(config: Config, state: TrainState, flight: collect.Flight) -> Sample
             obs = on_vector(lambda _: truth.obs, obs)
         obs = on_vector(policy.statistics.normalize, obs)
         if config.privileged_critic:
-            obs = on_vector(lambda x: jnp.concatenate([x, truth.secrets], axis=-1), obs)
+            obs = on_vector(lambda x: jnp.concatenate([x, truth.params], axis=-1), obs)
         return on_vector(lambda x: central(x, action), obs) if config.centralized_critic else obs
 
     critic_obs = seen(flight.obs, flight.truth, flight.action)

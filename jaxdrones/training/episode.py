@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.engine.host import HostStep
+from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.record import Record
 from jaxdrones.state import State
@@ -97,7 +97,13 @@ def fly_episode(
     def step(carry, key):
         obs, world = carry
         obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
-        seen = (world.drones, env.task.target_now(world).pos, reward, info["metrics"], info["ends"])
+        seen = (
+            world.drones,
+            env.task.target_now(world).pos,
+            reward,
+            info["metrics"],
+            info["terminations"] | info["truncations"],
+        )
         return (obs, world), (seen, terminated | truncated)
 
     if isinstance(env.physics, HostStep):

@@ -51,7 +51,7 @@ _REALISTIC: dict[tuple[str, str], dict[str, Any]] = {
     ("hover", "ppo"): dict(updates=750, critic_hidden_sizes=(64, 64), privileged_critic=True, change=0.01),
 }
 
-_PRACTICE: dict[str, dict[str, Any]] = {"gates": dict(anywhere=True)}
+_PRACTICE: dict[str, dict[str, Any]] = {"gates": dict(random_start=True)}
 """Options with which a task is learnt, where they are not those with which it is flown."""
 _ALGORITHM: dict[str, str] = {"gates": "ppo"}
 

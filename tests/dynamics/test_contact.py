@@ -11,7 +11,8 @@ from helpers import assert_finite, mostly_slow
 import jaxdrones
 from jaxdrones import State, drone_contact, ground_contact, rotation, vector
 from jaxdrones.engine import bullet
-from jaxdrones.engine.wrenches import make_total_wrench
+from jaxdrones.engine.physics import Physics
+from jaxdrones.sensing import Scene
 
 VEHICLES = {name: jaxdrones.load_params(name) for name in ("cf2x", "hb", "racer")}
 CRAZYFLIE = VEHICLES["cf2x"]
@@ -274,7 +275,7 @@ def part(params, start, cells=None):
     """A fifth of a second of a team without weight and with its rotors at rest."""
     team = jaxdrones.repeat(params.replace(gravity=jnp.zeros_like(params.gravity)), len(start.pos))
     still = jnp.zeros_like(start.rpm)
-    step = jaxdrones.make_step(pairs=(drone_contact,), dt=STEP, cells=cells)
+    step = jaxdrones.make_step(pairs=(drone_contact,), dt=STEP, neighbors=cells)
     return jax.lax.scan(lambda state, _: (step(team, state, still), None), start, length=48)[0]
 
 
@@ -308,7 +309,7 @@ def test_drones_in_exactly_the_same_place_come_apart_and_keep_their_momentum(veh
 @pytest.mark.float32
 def test_drones_in_the_same_place_come_apart_in_single_precision_far_away_and_with_cells():
     params = jaxdrones.load_params("cf2x")
-    for cells in None, jaxdrones.NeighborGrid(reach=0.5):
+    for cells in None, jaxdrones.NeighborGrid(cutoff=0.5):
         for pos in (0.0, 0.0, 1.0), (5000.0, 100.0, 20.0):
             end = part(params, in_one_place(3, pos=pos), cells)
             assert smallest_gap(end) > params.collision_height
@@ -316,10 +317,10 @@ def test_drones_in_the_same_place_come_apart_in_single_precision_far_away_and_wi
 
 @pytest.mark.slow
 def test_gradients_of_drones_in_the_same_place_are_finite():
-    wrench = make_total_wrench((), (drone_contact,))
+    physics = Physics(pairs=(drone_contact,))
 
     def sums(state, params):
-        return sum(jnp.sum(x) for x in jax.tree.leaves(wrench(params, state)))
+        return sum(jnp.sum(x) for x in jax.tree.leaves(physics.wrench(params, state, Scene())))
 
     team, start = jaxdrones.repeat(CRAZYFLIE, 2), in_one_place(2)
     assert_finite(jax.jit(jax.grad(sums, (0, 1)))(start, team))

@@ -34,7 +34,7 @@ def test_equal_speeds_give_no_torque():
 
 def test_instant_rotors_turn_as_commanded():
     params, command = jaxdrones.load_params("cf2x"), jnp.arange(4.0)
-    rpm, rate = instant_rotors(params, jnp.full(4, 9.0), command)
+    rpm, rate = instant_rotors(params, level, command)
     np.testing.assert_array_equal(rpm, command)
     np.testing.assert_array_equal(rate, 0)
 
@@ -42,10 +42,10 @@ def test_instant_rotors_turn_as_commanded():
 @pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
 def test_rotors_turn_neither_backwards_nor_faster_than_they_can(rotors):
     params = jaxdrones.load_params("cf2x")
-    speed = jnp.array([0.0, 5000, 10000, 20000])
+    state = level.replace(rpm=jnp.array([0.0, 5000, 10000, 20000]))
     command = jnp.array([-1000.0, 2 * params.max_rpm, jnp.inf, -jnp.inf])
     within = jnp.array([0, params.max_rpm, params.max_rpm, 0])
-    for beyond, limit in zip(rotors(params, speed, command), rotors(params, speed, within), strict=True):
+    for beyond, limit in zip(rotors(params, state, command), rotors(params, state, within), strict=True):
         np.testing.assert_array_equal(beyond, limit)
 
 
@@ -55,10 +55,10 @@ def test_rotors_without_a_limit_follow_any_command_forwards_and_have_finite_grad
     params = jaxdrones.load_params("cf2x").replace(max_rpm=jnp.array(jnp.inf))
     command = jnp.array([1e5, 0.0, -1.0, 2e4])
 
-    def sums(params, rpm, command):
-        return sum(jnp.sum(x) for x in rotors(params, rpm, command))
+    def sums(params, state, command):
+        return sum(jnp.sum(x) for x in rotors(params, state, command))
 
-    arguments = params, jnp.full(4, 3e4), command
+    arguments = params, level.replace(rpm=jnp.full(4, 3e4)), command
     if rotors is instant_rotors:
         np.testing.assert_array_equal(rotors(*arguments)[0], [1e5, 0, 0, 2e4])
     gradients = jax.grad(sums, (0, 1, 2))(*arguments)
@@ -69,7 +69,7 @@ def test_rotors_without_a_limit_follow_any_command_forwards_and_have_finite_grad
 def test_a_command_beyond_the_limits_has_no_gradient_and_one_on_them_has():
     params = jaxdrones.load_params("cf2x")
     command = jnp.array([-1.0, 0.0, params.max_rpm, params.max_rpm + 1])
-    gradient = jax.grad(lambda c: jnp.sum(instant_rotors(params, jnp.zeros(4), c)[0]))(command)
+    gradient = jax.grad(lambda c: jnp.sum(instant_rotors(params, level, c)[0]))(command)
     np.testing.assert_array_equal(gradient, [0, 1, 1, 0])
 
 
@@ -89,7 +89,8 @@ def test_lagging_rotors_close_the_gap_to_1_over_e_in_one_time_constant(start, co
 
 def test_lagging_rotors_rise_and_fall_with_their_own_time_constants():
     params = jaxdrones.load_params("cf2x")
-    rpm, rate = lagging_rotors(params, jnp.array([100.0, 100, 100, 100]), jnp.array([150.0, 50, 100, 0]))
+    state = level.replace(rpm=jnp.full(4, 100.0))
+    rpm, rate = lagging_rotors(params, state, jnp.array([150.0, 50, 100, 0]))
     np.testing.assert_array_equal(rpm, 100)
     np.testing.assert_allclose(rate, [50 / 0.055, -50 / 0.249, 0, -100 / 0.249], rtol=1e-12)
 
@@ -98,3 +99,44 @@ def test_thrust_of_rotors_that_stand_still_has_a_finite_gradient():
     params = jaxdrones.load_params("cf2x")
     gradient = jax.jacobian(lambda rpm: rotor_wrench(params, level.replace(rpm=rpm)).force)(jnp.zeros(4))
     np.testing.assert_array_equal(gradient, 0)
+
+
+def spinning(rotors, integrator, rotor_spin=None, **aerodynamics):
+    """A team of one in weightless, airless space with rotors that have inertia, and its step."""
+    team = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1)
+    none = dict(gravity=jnp.zeros(1), kf=1e-30 * team.kf, km=1e-30 * team.km, rotor_inertia=jnp.full(1, 3e-8))
+    team = team.replace(**none | aerodynamics)
+    team = team if rotor_spin is None else team.replace(rotor_spin=jnp.array([rotor_spin]))
+    return team, jaxdrones.make_step(rotors=rotors, integrator=integrator, dt=1e-3, substeps=20)
+
+
+def total_angular_momentum(team, state):
+    """Of body and rotors, world, kg m^2/s."""
+    params, state = jax.tree.map(lambda x: x[0], (team, state))
+    rotors = -params.rotor_inertia * 2 * np.pi / 60 * np.sum(params.rotor_spin * state.rpm)
+    return jaxdrones.rotation.rotate(state.quat, params.inertia * state.omega + jaxdrones.vector.along_z(rotors))
+
+
+@pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
+def test_a_change_of_rotor_speed_turns_the_body_as_angular_momentum_demands(rotors):
+    """Without aerodynamic torque; the four rotors turn the same way, so that their momenta add up."""
+    team, step = spinning(rotors, jaxdrones.rk4, rotor_spin=[1.0, 1, 1, 1])
+    start = State.at_rest(np.zeros((1, 3)))
+    after = step(team, start, jnp.full((1, 4), 2e4))
+    turned = team.rotor_inertia * 2 * np.pi / 60 * 4 * after.rpm[:, 0] / team.inertia[:, 2]
+    assert after.rpm[0, 0] > 1000
+    np.testing.assert_allclose(after.omega, [[0, 0, turned[0]]], rtol=1e-9, atol=1e-30)
+    np.testing.assert_allclose(total_angular_momentum(team, after), 0, atol=1e-9 * 4 * 3e-8 * 2e3)
+
+
+def test_a_tumbling_drone_with_spinning_rotors_keeps_its_angular_momentum():
+    """Gyroscopic torque of rotors about a body that turns about all axes; rk4 is exact to 1e-9 here."""
+    team, step = spinning(lagging_rotors, jaxdrones.rk4, rotor_spin=[1.0, -1, 1, 1])
+    start = State.at_rest(np.zeros((1, 3))).replace(omega=jnp.array([[3.0, -2, 1]]), rpm=jnp.full((1, 4), 1e4))
+    after = start
+    for _ in range(5):
+        after = step(team, after, jnp.array([[2e4, 5e3, 1e4, 1.5e4]]))
+    before = total_angular_momentum(team, start)
+    np.testing.assert_allclose(total_angular_momentum(team, after), before, atol=1e-9 * float(jnp.linalg.norm(before)))
+    without = step(team.replace(rotor_inertia=jnp.zeros(1)), start, jnp.full((1, 4), 1e4))
+    assert np.abs(step(team, start, jnp.full((1, 4), 1e4)).omega - without.omega).max() > 0.01

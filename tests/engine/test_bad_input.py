@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import CONSTANTS, STATE
 
 import jaxdrones
 from jaxdrones import State, Wrench, downwash, drag
@@ -30,7 +31,7 @@ def test_wrong_rotor_speeds(wrong):
         step(team, start, wrong)
 
 
-@pytest.mark.parametrize("name", vars(start))
+@pytest.mark.parametrize("name", STATE)
 def test_wrong_states(name):
     leaf = getattr(start, name)
     for wrong in leaf[0], leaf[:, :2], leaf[None], jnp.zeros((0, leaf.shape[1])):
@@ -43,7 +44,7 @@ def test_a_state_with_fewer_velocities_than_positions_names_the_velocities():
         step(team, start.replace(vel=jnp.zeros((1, 3))), rpm)
 
 
-@pytest.mark.parametrize("name", vars(team))
+@pytest.mark.parametrize("name", CONSTANTS)
 def test_wrong_constants(name):
     leaf = getattr(team, name)
     for wrong in leaf[0], leaf[:1], leaf[None], leaf[..., None]:
@@ -136,7 +137,7 @@ def test_an_effect_that_returns_no_wrench_is_named(effects, pairs, message):
             r"effects: downwash takes .*give a function of \(params, state\); .*belongs to pairs",
         ),
         ({"pairs": (drag,)}, r"pairs: drag takes .*\(params, state, other, other_state\); .*belongs to effects"),
-        ({"rotors": drag}, r"rotors: drag takes .*give a function of \(params, rpm, command\)"),
+        ({"rotors": drag}, r"rotors: drag takes .*give a function of \(params, state, command\)"),
         ({"integrator": drag}, r"integrator: drag takes .*give a function of \(derivative, state, dt\)"),
     ],
 )

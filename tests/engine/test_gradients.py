@@ -28,7 +28,7 @@ FLIGHTS = {
     "default": jaxdrones.make_step((drag, ground_effect), (downwash, downwash_2021)),
     "lagging": jaxdrones.make_step((drag,), rotors=lagging_rotors, integrator=rk4),
 }
-BODY = {"mass", "inertia", "rotor_pos", "rotor_spin", "kf", "km", "gravity", "wind", "drag_coeff"}
+BODY = {"mass", "inertia", "rotor_pos", "rotor_spin", "kf", "km", "gravity", "wind", "drag_coeff", "rotor_inertia"}
 FELT = {  # what the flights must feel of `Params`; the rest of it describes limits and the collision shape
     "default": BODY | {"ground_effect_coeff", "downwash_coeff", "inflow_loss", "air_density", "prop_radius"},
     "lagging": BODY | {"rotor_rise_time", "rotor_fall_time"},
@@ -41,7 +41,7 @@ jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 def flight():
     """Params, start and commands of a cf2p just above the ground with a cf2x half a metre above it, in wind."""
     team = jaxdrones.stack([jaxdrones.load_params("cf2p"), jaxdrones.load_params("cf2x")])
-    team = team.replace(wind=jnp.array([[0.5, -0.3, 0.2], [-0.4, 0.6, 0.1]]))
+    team = team.replace(rotor_inertia=jnp.full(2, 5e-8), wind=jnp.array([[0.5, -0.3, 0.2], [-0.4, 0.6, 0.1]]))
     start = State.at_rest([[0, 0, 0.08], [0.06, 0.05, 0.5]], [0.4, -1.0]).replace(
         vel=jnp.array([[0.1, 0.2, 0.1], [-0.1, 0.1, 0.0]]),
         omega=jnp.array([[0.3, -0.2, 0.5], [-0.4, 0.1, 0.2]]),

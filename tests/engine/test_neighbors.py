@@ -7,7 +7,8 @@ import pytest
 from helpers import assert_close
 
 import jaxdrones as jd
-from jaxdrones.engine.wrenches import make_total_wrench
+from jaxdrones.engine.physics import Physics
+from jaxdrones.sensing import Scene
 
 N, REACH = 60, 2.0
 rng = np.random.default_rng(0)
@@ -32,15 +33,20 @@ def cut_off(pair):
     return within
 
 
+def total_wrench(pairs, neighbors=None):
+    physics = Physics(pairs=pairs, neighbors=neighbors)
+    return lambda params, state: physics.wrench(params, state, Scene())
+
+
 @pytest.mark.parametrize("spread", [1.0, 8.0, 100.0], ids=["more than fit: all pairs", "some near", "hardly any"])
 def test_nobody_within_reach_is_left_out_and_nobody_else_counts(spread):
     params, state = team(spread)
-    cells = jd.NeighborGrid(REACH, most=16)
+    cells = jd.NeighborGrid(REACH, capacity=16)
     assert bool(cells.near(state.pos)[2]) == (spread > 1.0)
-    by_cells = jax.jit(make_total_wrench((), (jd.downwash,), cells))(params, state)
-    by_pairs = jax.jit(make_total_wrench((), (cut_off(jd.downwash),)))(params, state)
+    by_cells = jax.jit(total_wrench((jd.downwash,), cells))(params, state)
+    by_pairs = jax.jit(total_wrench((cut_off(jd.downwash),)))(params, state)
     assert_close(by_cells, by_pairs, 1e-13)
-    alone = jax.jit(make_total_wrench((), ()))(params, state)
+    alone = jax.jit(total_wrench(()))(params, state)
     assert (np.max(np.abs(by_cells.force - alone.force)) > 1e-6) == (spread < 100)
 
 
@@ -49,7 +55,7 @@ def test_gradients_are_those_of_all_pairs():
     params, state = team(8.0)
 
     def lift(state, pairs, cells=None):
-        return jnp.sum(make_total_wrench((), pairs, cells)(params, state).force[:, 2] ** 2)
+        return jnp.sum(total_wrench(pairs, cells)(params, state).force[:, 2] ** 2)
 
     by_cells = jax.jit(jax.grad(lambda s: lift(s, (jd.downwash,), jd.NeighborGrid(REACH))))(state)
     by_pairs = jax.jit(jax.grad(lambda s: lift(s, (cut_off(jd.downwash),))))(state)
@@ -60,18 +66,18 @@ def test_gradients_are_those_of_all_pairs():
 @pytest.mark.parametrize("far", [1e7, jnp.nan, jnp.inf], ids=["10,000 km away", "nowhere", "infinitely far"])
 def test_a_drone_that_is_lost_does_not_change_the_others(far):
     params, state = team(8.0)
-    wrench = jax.jit(make_total_wrench((), (jd.downwash,), jd.NeighborGrid(REACH)))
+    wrench = jax.jit(total_wrench((jd.downwash,), jd.NeighborGrid(REACH)))
     away = state.replace(pos=state.pos.at[0].set(jnp.array([1e7, 0, 0])))
     gone = state.replace(pos=state.pos.at[0].set(jnp.array([far, 0, 0])))
     assert_close(*(jax.tree.map(lambda x: x[1:], wrench(params, s)) for s in (gone, away)), 1e-13)
 
 
-@pytest.mark.parametrize("settings, message", [({"reach": 0}, "reach"), ({"reach": 2.0, "most": 0}, "most")])
+@pytest.mark.parametrize("settings, message", [({"cutoff": 0}, "cutoff"), ({"cutoff": 2.0, "capacity": 0}, "capacity")])
 def test_cells_have_a_size_and_room(settings, message):
     with pytest.raises(ValueError, match=message):
         jd.NeighborGrid(**settings)
 
 
 def test_cells_are_asked_for_by_name():
-    with pytest.raises(ValueError, match=r"cells is 3\.0"):
-        jd.make_step(pairs=(jd.downwash,), cells=3.0)
+    with pytest.raises(ValueError, match=r"neighbors is 3\.0"):
+        jd.make_step(pairs=(jd.downwash,), neighbors=3.0)

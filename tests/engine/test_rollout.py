@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, flying, tape
+from helpers import CONSTANTS, STATE, assert_close, flying, tape
 
 import jaxdrones
 from jaxdrones import State, drag
@@ -82,7 +82,7 @@ def test_the_length_is_a_whole_number_of_steps(length):
         jaxdrones.rollout(step, replay, team, start, None, length)
 
 
-@pytest.mark.parametrize("name", vars(start))
+@pytest.mark.parametrize("name", STATE)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_start_that_is_not_finite_is_named(name, value):
     broken = start.replace(**{name: getattr(start, name).at[1, 0].set(value)})
@@ -90,7 +90,7 @@ def test_a_start_that_is_not_finite_is_named(name, value):
         jaxdrones.rollout(step, replay, team, broken, None, 1)
 
 
-@pytest.mark.parametrize("name", vars(team))
+@pytest.mark.parametrize("name", CONSTANTS)
 def test_constants_that_are_not_finite_are_named(name):
     broken = team.replace(**{name: jnp.full_like(getattr(team, name), np.nan)})
     with pytest.raises(ValueError, match=rf"params\.{name} is not finite.*nan"):

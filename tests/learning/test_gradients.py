@@ -9,7 +9,7 @@ import pytest
 import jaxdrones as jd
 from jaxdrones import envs
 from jaxdrones.learning import bptt, collect
-from jaxdrones.learning.gradients import differentiated_as, linked, scale_gradient, with_gradient
+from jaxdrones.learning.gradients import Surrogate, linked, scale_gradient, with_gradient
 
 CONFIG = bptt.Config(updates=2, worlds=2, horizon=6, sizes=(4,))
 
@@ -28,7 +28,7 @@ def test_a_surrogate_has_the_values_of_one_step_and_the_derivative_of_the_other(
     def height(step, rpm):
         return step(params, state, rpm).pos[0, 2]
 
-    mixed = differentiated_as(fine, coarse)
+    mixed = Surrogate(fine, coarse)
     assert height(mixed, rpm) == height(fine, rpm)
     mine, theirs = (jax.grad(height, 1)(step, rpm) for step in (mixed, coarse))
     np.testing.assert_allclose(mine, theirs, rtol=1e-12)

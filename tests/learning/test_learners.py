@@ -153,9 +153,9 @@ def test_a_central_critic_learns_with_a_policy_per_role():
 def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
     """Reward is a parameter that nobody sees: told, the critic knows the value; else it knows the mean."""
     task = envs.make("hover").task
-    gain = {"mass": (100.0, lambda world: world.params.mass - 0.027)}
-    task = dataclasses.replace(task, rewards=gain, ends={}, duration=1.0)
-    env = envs.make(task, laws=(scaled("mass", 0.5, 1.5),))
+    gain = {"mass": (100.0, lambda task, world: world.params.mass - 0.027)}
+    task = dataclasses.replace(task, rewards=gain, terminations={}, duration=1.0)
+    env = envs.make(task, randomize=(scaled("mass", 0.5, 1.5),))
 
     def miss(informed):
         config = dataclasses.replace(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,22 +14,19 @@ from jax.typing import ArrayLike
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_number, check_params, check_positive, check_quaternion, check_whole
-from jaxdrones.dynamics import instant_rotors
-from jaxdrones.dynamics.rotors import limited
+from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors
+from jaxdrones.engine.bullet import arrays
 from jaxdrones.engine.bullet.camera import Camera, look, of_drones
 from jaxdrones.engine.bullet.client import BALLS, TINY, Client
 from jaxdrones.engine.bullet.contacts import Contact, of_last_step
-from jaxdrones.engine.host import HostStep, is_traced
-from jaxdrones.engine.team import check_team, flatten, unflatten
-from jaxdrones.engine.wrenches import Effect, Pair, check_functions, make_total_wrench
+from jaxdrones.engine.neighbors import NeighborGrid
+from jaxdrones.engine.physics import Physics, Rotors
+from jaxdrones.engine.step import HostStep, is_traced
+from jaxdrones.engine.team import Layout, check_team, pack
+from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-
-# The host sees a team as one array, a row per drone: pose and velocities in the world frame, rotor speeds, commands.
-_BODY, _COMMAND = slice(0, 13), slice(17, 21)
-_QUAT, _OMEGA, _RPM = slice(3, 7), slice(10, 13), slice(13, 17)
-_COLUMNS = dict(pos=slice(0, 3), quat=_QUAT, vel=slice(7, 10), omega=_OMEGA, rpm=_RPM)
 
 _PAPER_CAMERA = Camera()
 _FILM_CAMERA = Camera(width=640, height=480)
@@ -38,9 +36,13 @@ _FILM_NEAR = 0.1  # m
 def make_step(
     effects: Sequence[Effect] = (),
     pairs: Sequence[Pair] = (),
-    rotors: Callable = instant_rotors,
+    rotors: Rotors = instant_rotors,
     dt: float = 1 / 240,
     substeps: int = 1,
+    *,
+    team_effects: Sequence[TeamEffect] = (),
+    models: Sequence[Model] = (),
+    neighbors: NeighborGrid | None = None,
     scene: Scene | None = None,
     damping: float = 0.0,
     collision: str = BALLS,
@@ -50,14 +52,18 @@ def make_step(
     """Build the step of a world in which Bullet integrates and resolves contacts.
 
     Args:
-        effects: as for the explicit backend.
-        pairs: as for the explicit backend.
-        rotors: `instant_rotors` or `lagging_rotors`.
+        effects: as for the explicit backend, but for `ground_contact`.
+        pairs: as for the explicit backend, but for `drone_contact`.
+        rotors: as for the explicit backend.
         dt: physics step, s.
         substeps: physics steps per call, with the command held.
+        team_effects: as for the explicit backend.
+        models: as for the explicit backend; their states take explicit Euler steps of `dt`, as rotors do.
+        neighbors: as for the explicit backend.
         scene: ground and obstacles; a bare ground plane when left out.
-        damping: Bullet's linear and angular damping, 1/s; the reference's is 0.04.
-        collision: `balls`, a ring of balls on a disc, which rests and rebounds stably, or `cylinder`, the reference's.
+        damping: Bullet's linear and angular damping, 1/s; that of gym-pybullet-drones is 0.04.
+        collision: `balls`, a ring of balls on a disc, which rests and rebounds stably, or `cylinder`, the shape in
+            gym-pybullet-drones.
         renderer: of the cameras: `tiny`, on the CPU, or `egl`, on a GPU.
         gui: open a window, in which the cameras render too.
 
@@ -66,40 +72,34 @@ def make_step(
         commanded speeds to [0, `params.max_rpm`].
 
     Raises:
-        ValueError: an argument out of range.
+        ValueError: an argument out of range, or contact as an effect: Bullet resolves it already.
         ImportError: pybullet is not installed.
         OSError: a window is asked for and there is no display.
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)
     check_number("damping", damping, "1/s", at_least=0)
-    check_functions("rotors", [rotors])
-    total_wrench = make_total_wrench(effects, pairs)
-
-    @jax.jit
-    def loads(flat_params: jax.Array, team: jax.Array) -> jax.Array:
-        """Force and torque (world) and the next rotor speeds of every drone: (n, 10)."""
-        params = unflatten(flat_params)
-        state = State(**{name: team[:, columns] for name, columns in _COLUMNS.items()})
-        speed, speed_rate = jax.vmap(rotors)(params, jax.vmap(limited)(params, state.rpm), team[:, _COMMAND])
-        omega = jax.vmap(rotation.rotate_inverse)(state.quat, state.omega)
-        wrench = total_wrench(params, state.replace(omega=omega, rpm=speed))
-        force = jax.vmap(rotation.rotate)(state.quat, wrench.force).at[:, 2].add(-params.weight)
-        torque = jax.vmap(rotation.rotate)(state.quat, wrench.torque)
-        return jnp.concatenate([force, torque, speed + dt * speed_rate], axis=-1)
-
-    client = Client(Scene() if scene is None else scene, dt, damping, collision, renderer, gui)
-    return BulletStep(client, loads, substeps, dt)
+    physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
+    for contact in ground_contact, drone_contact:
+        if physics.contains(contact):
+            raise ValueError(
+                f"{contact.__name__} is given and Bullet resolves contacts by itself, so drones would touch twice; "
+                "leave it out"
+            )
+    scene = Scene() if scene is None else scene
+    return BulletStep(Client(scene, dt, damping, collision, renderer, gui), physics, substeps, dt)
 
 
 class BulletStep(HostStep):
     """`step(params, state, rpm) -> state`. The same input gives the same output whatever was called between."""
 
-    def __init__(self, client: Client, loads: Callable[[jax.Array, ArrayLike], jax.Array], substeps: int, dt: float):
-        self.client, self._loads, self._substeps, self._dt = client, loads, substeps, dt
+    def __init__(self, client: Client, physics: Physics, substeps: int, dt: float):
+        self.client, self.physics, self._substeps, self._dt = client, physics, substeps, dt
+        self._loads = arrays.make_loads(physics, client.scene, dt)
         # What the last call with values was checked for and what was made of it, kept as long as it stays the same:
         self._params: Params | None = None
         self._shapes: list[tuple[int, ...]] = []
+        self._layout: Layout
         self._flat_params: jax.Array  # one array is handed over faster than twenty
         self._arms: np.ndarray
 
@@ -116,25 +116,40 @@ class BulletStep(HostStep):
         """End the connection to Bullet."""
         self.client.close()
 
-    def __call__(self, params: Params, state: State, rpm: ArrayLike) -> State:
+    def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """Advance a team by one control step; arrays as for the explicit backend.
 
         Given values it returns NumPy arrays; under `jit` and `vmap` it goes through a callback.
 
         Raises:
-            ValueError: a wrong shape, a closed client, or a number that is not finite (where it can be looked at).
+            ValueError: a wrong shape, a closed client, a scene, or a number that is not finite (where it can be looked
+                at).
             TypeError: a gradient is asked for.
         """
+        return self._flown(params, state, rpm, scene, self._substeps)
+
+    def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """The mean time derivative over the physics step that follows `state`, contacts included."""
+        after = self._flown(params, state, rpm, scene, substeps=1)
+        same_sign = jnp.sign(jnp.sum(after.quat * state.quat, axis=-1, keepdims=True))
+        after = after.replace(quat=same_sign * after.quat)
+        return jax.tree.map(lambda b, a: (b - a) / self._dt, after, state)
+
+    def _flown(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None, substeps: int) -> State:
+        if scene is not None and scene is not self.client.scene:
+            raise ValueError("a scene is given to a call of a Bullet step; give it to make_step instead")
         if is_traced((state, rpm)) or (params is not self._params and is_traced(params)):
             self.client.check_open()
             check_team(params, state, rpm)
-            return _refuse_gradients(self._traced)(params, state, rpm)
+            return _refuse_gradients(functools.partial(self._traced, substeps))(params, state, rpm)
         team = self._pack(params, state, rpm)
-        for _ in range(self._substeps):
-            loads = self._loads_on(team)
-            team[:, _BODY] = self.client.advance(team, loads)
-            team[:, _RPM] = loads[:, 6:]
-        return self._unpack(team)
+        aux = Layout.of(state.aux)
+        for _ in range(substeps):
+            loads = self._loads_on(team, aux)
+            team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
+            team[:, arrays.BODY] = self.client.advance(team, loads)
+            team[:, arrays.RPM], team[:, arrays.AUX] = loads[:, arrays.NEXT_RPM], loads[:, arrays.NEXT_AUX]
+        return self._unpack(team, state)
 
     def contacts(self, params: Params, state: State) -> list[Contact]:
         """Who touches whom in the physics step that follows `state` with the rotors held at `state.rpm`.
@@ -143,7 +158,9 @@ class BulletStep(HostStep):
             ValueError: a wrong shape, a closed client, or a state that is not finite.
         """
         team = self._pack(params, state, state.rpm)
-        self.client.advance(team, self._loads_on(team))
+        loads = self._loads_on(team, Layout.of(state.aux))
+        team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
+        self.client.advance(team, loads)
         return of_last_step(self.client, self._dt)
 
     def camera(
@@ -178,54 +195,63 @@ class BulletStep(HostStep):
         self.client.place(team)
         return team
 
-    def _loads_on(self, team: np.ndarray) -> np.ndarray:
-        return np.asarray(self._loads(self._flat_params, team.astype(self._flat_params.dtype)))
+    def _loads_on(self, team: np.ndarray, aux: Layout) -> np.ndarray:
+        return np.asarray(self._loads(self._layout, aux, self._flat_params, team.astype(self._flat_params.dtype)))
 
     def _pack(self, params: Params, state: State, rpm: ArrayLike) -> np.ndarray:
         """Check a call with values and make one array of it; the bodies are those of the team from here on."""
         self.client.check_open()
-        shapes = [np.shape(x) for x in (state.pos, state.quat, state.vel, state.omega, state.rpm, rpm)]
+        n = len(state.pos)
+        shapes = [np.shape(x) for x in (*jax.tree.leaves(state), rpm)]
         if params is not self._params or shapes != self._shapes:
             check_team(params, state, rpm)
             check_params(params)
-            self._flat_params = flatten(params)
-            self.client.set_team(np.asarray(_bodies(params), float))
+            self._layout, self._flat_params = Layout.of(params), pack(params, n)
+            self.client.set_team(np.asarray(arrays.bodies_of(params), float))
             self._arms = np.asarray(params.arm, float)
             self._params, self._shapes = params, shapes
-        team = np.empty((len(state.pos), _COMMAND.stop))
-        for name, columns in _COLUMNS.items():
+        team = np.empty((n, arrays.COMMAND.stop + Layout.of(state.aux).width))
+        for name, columns in arrays.COLUMNS.items():
             team[:, columns] = getattr(state, name)
-        team[:, _COMMAND] = rpm
+        team[:, arrays.COMMAND] = rpm
+        if state.aux:
+            team[:, arrays.AUX] = pack(state.aux, n)
         if not np.isfinite(team).all():
             check_finite("state", state)
             check_finite("rpm", rpm)
-        check_quaternion("state.quat", team[:, _QUAT])
-        team[:, _OMEGA] = (self.client.matrices(team[:, _QUAT]) @ team[:, _OMEGA, None])[..., 0]
+        check_quaternion("state.quat", team[:, arrays.QUAT])
+        team[:, arrays.OMEGA] = (self.client.matrices(team[:, arrays.QUAT]) @ team[:, arrays.OMEGA, None])[..., 0]
         return team
 
-    def _unpack(self, team: np.ndarray) -> State:
-        team[:, _OMEGA] = (team[:, None, _OMEGA] @ self.client.matrices(team[:, _QUAT]))[:, 0]
+    def _unpack(self, team: np.ndarray, state: State) -> State:
+        """The state with the numbers of a team, as arrays of NumPy."""
+        team[:, arrays.OMEGA] = (team[:, None, arrays.OMEGA] @ self.client.matrices(team[:, arrays.QUAT]))[:, 0]
         team = team.astype(self._flat_params.dtype)
-        arrays: dict[str, Any] = {name: team[:, columns] for name, columns in _COLUMNS.items()}  # of NumPy
-        return State(**arrays)
+        fields: dict[str, Any] = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
+        return state.replace(**fields, aux=Layout.of(state.aux).unpack(team[:, arrays.AUX]))
 
-    def _traced(self, params: Params, state: State, rpm: jax.Array) -> State:
+    def _traced(self, substeps: int, params: Params, state: State, rpm: jax.Array) -> State:
         """The same in a compiled program, which computes the wrenches itself and calls back for every physics step."""
-        bodies, flat_params = _bodies(params), flatten(params)
-        team = _one_array(state, rpm)
+        bodies, flat_params = arrays.bodies_of(params), pack(params, len(state.pos))
+        layout, aux = Layout.of(params), Layout.of(state.aux)
+        team = arrays.one_array(state, rpm)
 
         def advance(bodies, team, loads):
             self._become(bodies)
             return self.client.advance(np.asarray(team, float), np.asarray(loads, float)).astype(team.dtype)
 
         def substep(team, _):
-            loads = self._loads(flat_params, team)
-            after = jax.ShapeDtypeStruct((len(team), _BODY.stop), team.dtype)
+            loads = self._loads(layout, aux, flat_params, team)
+            team = team.at[:, arrays.OMEGA].set(loads[:, arrays.START_OMEGA])
+            after = jax.ShapeDtypeStruct((len(team), arrays.BODY.stop), team.dtype)
             body = jax.pure_callback(advance, after, bodies, team, loads, vmap_method="sequential")
-            return jnp.concatenate([body, loads[:, 6:], team[:, _COMMAND]], axis=-1), None
+            return jnp.concatenate(
+                [body, loads[:, arrays.NEXT_RPM], team[:, arrays.COMMAND], loads[:, arrays.NEXT_AUX]], axis=-1
+            ), None
 
-        team, _ = jax.lax.scan(substep, team, length=self._substeps)
-        state = State(**{name: team[:, columns] for name, columns in _COLUMNS.items()})
+        team, _ = jax.lax.scan(substep, team, length=substeps)
+        fields = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
+        state = state.replace(**fields, aux=aux.unpack(team[:, arrays.AUX]))
         return state.replace(omega=jax.vmap(rotation.rotate_inverse)(state.quat, state.omega))
 
     def _traced_camera(self, params: Params, state: State, camera: Camera, raw_depth: bool) -> Any:
@@ -241,27 +267,14 @@ class BulletStep(HostStep):
             self.client.place(team)
             return of_drones(self.client, team, np.asarray(arms, float), camera, raw_depth)
 
-        team = _one_array(state, state.rpm)
-        return jax.pure_callback(take, pictures, _bodies(params), params.arm, team, vmap_method="sequential")
+        team = arrays.one_array(state, state.rpm)
+        return jax.pure_callback(take, pictures, arrays.bodies_of(params), params.arm, team, vmap_method="sequential")
 
     def _become(self, bodies: jax.Array) -> None:
         """The bodies of the team that a compiled program calls back with; no longer those of a call with values."""
         self.client.check_open()
         self._params = None
         self.client.set_team(np.asarray(bodies, float))
-
-
-def _one_array(state: State, rpm: jax.Array) -> jax.Array:
-    """What the host sees of a team."""
-    omega = jax.vmap(rotation.rotate)(state.quat, state.omega)
-    return jnp.concatenate([state.pos, state.quat, state.vel, omega, state.rpm, rpm], axis=-1)
-
-
-def _bodies(params: Params) -> jax.Array:
-    """What Bullet must know of every drone, (n, 20): see `Client.set_team`."""
-    shape = [params.collision_radius, params.collision_height, params.collision_offset, params.prop_radius]
-    rotor_pos = jnp.reshape(params.rotor_pos, (-1, 12))
-    return jnp.concatenate([jnp.stack(shape, axis=-1), rotor_pos, params.mass[:, None], params.inertia], axis=-1)
 
 
 def _refuse_gradients(function: Callable) -> Callable:

@@ -8,8 +8,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdrones.engine.bullet.step import BulletStep
-from jaxdrones.engine.host import HostStep
+from jaxdrones.engine.step import HostStep
 from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 _AXES_HZ = 24  # how often the body axes are drawn, per simulated second
@@ -21,6 +22,7 @@ class Window(HostStep):
 
     def __init__(self, step: BulletStep, params: Params, control_dt: float):
         self._step, self._dt, self._count = step, control_dt, 0
+        self.physics = step.physics
         p, client = step.client.p, step.client.id
         rpm_max, hover = float(params.max_rpm[0]), float(params.hover_rpm[0])
         rpm_max = rpm_max if np.isfinite(rpm_max) else 2 * hover
@@ -32,18 +34,22 @@ class Window(HostStep):
         p.resetDebugVisualizerCamera(1.5, -30, -30, [0, 0, 0.3], physicsClientId=client)
         self._start = time.monotonic()
 
-    def __call__(self, params: Params, state: State, rpm: ArrayLike) -> State:
+    def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """Advance a team, then wait until as much real time has passed as simulated time."""
         p, client = self._step.client.p, self._step.client.id
         if p.readUserDebugParameter(self._button, physicsClientId=client) % 2:
             sliders = [p.readUserDebugParameter(slider, physicsClientId=client) for slider in self._sliders]
             rpm = np.tile(np.array(sliders, np.asarray(rpm).dtype), (len(state.pos), 1))
-        state = self._step(params, state, rpm)
+        state = self._step(params, state, rpm, scene)
         self._count += 1
         if self._count % max(1, round(1 / (self._dt * _AXES_HZ))) == 0:
             self._draw_axes(2 * float(params.arm[0]))
         time.sleep(max(0.0, self._start + self._count * self._dt - time.monotonic()))
         return state
+
+    def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """The time derivative of the step that is watched."""
+        return self._step.rate(params, state, rpm, scene)
 
     def close(self) -> None:
         """End the connection of the step that is watched, and the window with it."""

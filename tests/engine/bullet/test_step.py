@@ -38,6 +38,8 @@ def apart(state: State) -> State:
 
 @pytest.mark.parametrize("rotors", [jaxdrones.instant_rotors, jaxdrones.lagging_rotors])
 def test_free_flight_equals_the_explicit_backend(team, rotors):
+    """Also what the inertia of the rotors does."""
+    team = team.replace(rotor_inertia=2e-3 * team.inertia[:, 2])
     start, commands = apart(flying(team, tilt=0.2)), np.asarray(tape(team, 120))
     explicit = jaxdrones.make_step(**EVERYTHING, rotors=rotors)
     with bullet.make_step(**EVERYTHING, rotors=rotors) as step:

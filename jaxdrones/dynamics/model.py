@@ -1,0 +1,62 @@
+"""Models with a continuous state of their own: a battery, a gust filter, flapping blades, a motor controller."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_arguments, check_callable, shown
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A differential equation that is integrated along with the rigid body; its state is `state.aux[name]`.
+
+    Every integrator treats it at its own order; Bullet takes explicit Euler steps beside its own.
+    """
+
+    name: str
+    """Key of `State.aux`."""
+    init: Callable[[Params], Any]
+    """`init(params)`: the state at the start, a pytree of floating-point arrays."""
+    rate: Callable[[Params, State, Float[Array, "4"]], Any]
+    """`rate(params, state, command)`: the time derivative of the state, a pytree of the same type; `command` holds
+    the commanded rotor speeds, RPM, as they were given."""
+    of_team: bool = False
+    """Whether `init` and `rate` are of a whole team, with a leading drone axis on every array, not of one drone."""
+
+    def __post_init__(self):
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"name of a model is {shown(self.name)}; give a string that is not empty")
+        for field, arguments in ("init", ("params",)), ("rate", ("params", "state", "command")):
+            function = getattr(self, field)
+            check_callable(f"{field} of the model {self.name!r}", function, f"a function of ({', '.join(arguments)})")
+            check_arguments(f"{field} of the model {self.name!r}", function, arguments)
+
+    def start(self, params: Params) -> Any:
+        """The state of a team at the start, every array with a leading drone axis."""
+        return self.init(params) if self.of_team else jax.vmap(self.init)(params)
+
+    def team_rate(self, params: Params, state: State, command: Float[Array, "n 4"]) -> Any:
+        """The time derivative of the state of a team.
+
+        Raises:
+            ValueError: `rate` returns something of another type than the state.
+        """
+        rate = (self.rate if self.of_team else jax.vmap(self.rate))(params, state, command)
+        given, wanted = jax.eval_shape(lambda: rate), jax.eval_shape(lambda: state.aux[self.name])
+        if _type(given) != _type(wanted):
+            raise ValueError(
+                f"rate of the model {self.name!r} returned {given}; return a pytree like the model's state, {wanted}"
+            )
+        return rate
+
+
+def _type(tree: Any) -> tuple:
+    return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]

@@ -1,0 +1,177 @@
+"""What acts on a team: the same sum of wrenches and the same models for every backend."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_arguments, check_sequence
+from jaxdrones.dynamics import Model, drone_contact, instant_rotors
+from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench
+from jaxdrones.engine.neighbors import NeighborGrid
+from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.state import State
+from jaxdrones.wrench import Wrench
+
+Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
+
+_EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}
+_ARGUMENTS = {
+    "effects": ("params", "state"),
+    "pairs": ("params", "state", "other", "other_state"),
+    "team_effects": ("params", "state"),
+    "rotors": ("params", "state", "command"),
+    "integrator": ("derivative", "state", "dt"),
+}
+_ELSEWHERE = {
+    "effects": "; what depends on another drone belongs to pairs, what depends on the team to team_effects",
+    "pairs": "; what depends on one drone alone belongs to effects",
+}
+
+
+class Loads(NamedTuple):
+    """What acts on a team at an instant; every array has the leading drone axis."""
+
+    state: State
+    """With the rotor speeds of this instant."""
+    wrench: Wrench
+    rpm_rate: Float[Array, "n 4"]
+    aux_rate: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Physics:
+    """Effects, models and rotors of a team, as both `make_step` take them.
+
+    Raises:
+        ValueError: a sequence that holds something else than functions, two models of one name, or a neighbor grid
+            that is none.
+    """
+
+    effects: Sequence[Effect] = ()
+    pairs: Sequence[Pair] = ()
+    team_effects: Sequence[TeamEffect] = ()
+    models: Sequence[Model] = ()
+    rotors: Rotors = instant_rotors
+    neighbors: NeighborGrid | None = None
+
+    def __post_init__(self):
+        check_functions("rotors", [self.rotors])
+        for name in "effects", "pairs", "team_effects":
+            object.__setattr__(self, name, check_functions(name, getattr(self, name)))
+        models = check_sequence("models", self.models, "jaxdrones.Model(name, init, rate)")
+        for model in models:
+            if not isinstance(model, Model):
+                raise ValueError(f"models: {model!r} is not a model; give jaxdrones.Model(name, init, rate)")
+        names = [model.name for model in models]
+        if len(set(names)) < len(names):
+            raise ValueError(f"models are named {', '.join(names)}; give each a name of its own")
+        object.__setattr__(self, "models", models)
+        if not (self.neighbors is None or isinstance(self.neighbors, NeighborGrid)):
+            raise ValueError(
+                f"neighbors is {self.neighbors!r}; give for example jaxdrones.NeighborGrid(cutoff=3.0), or leave it out"
+            )
+
+    def __str__(self) -> str:
+        text = f"{describe([self.rotors])}, effects: {describe(self.effects)}, pairs: {describe(self.pairs)}"
+        text += f", team effects: {describe(self.team_effects)}" if self.team_effects else ""
+        text += f", models: {', '.join(model.name for model in self.models)}" if self.models else ""
+        return text + (f", {self.neighbors}" if self.neighbors else "")
+
+    @functools.cached_property
+    def takes_scene(self) -> bool:
+        """Whether an effect depends on what stands around."""
+        return any(_takes_scene(effect) for effect in self.effects)
+
+    def contains(self, function: Callable) -> bool:
+        """Whether a function is among the effects or pairs, also with arguments bound by `functools.partial`."""
+        return any(_unbound(f) is function for f in (*self.effects, *self.pairs))
+
+    def init(self, params: Params, state: State) -> State:
+        """The state of a team with the states of its models, which start anew unless they are there."""
+        fresh = {model.name: model.start(params) for model in self.models if model.name not in state.aux}
+        return state.replace(aux=state.aux | fresh)
+
+    def loads(self, params: Params, state: State, command: Float[Array, "n 4"], scene: Scene) -> Loads:
+        """Rotor speeds and everything that acts on a team.
+
+        Raises:
+            ValueError: the state lacks that of a model, or a function returns something of another type.
+        """
+        rpm, rpm_rate = self.rotor_speed(params, state, command)
+        state = state.replace(rpm=rpm)
+        aux_rate = {model.name: model.team_rate(params, state, command) for model in self.models}
+        wrench = self.wrench(params, state, scene) + jax.vmap(rotor_reaction)(params, state, rpm_rate)
+        return Loads(state, wrench, rpm_rate, aux_rate)
+
+    def rotor_speed(
+        self, params: Params, state: State, command: Float[Array, "n 4"]
+    ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
+        """Rotor speeds of a team and their rates, RPM and RPM/s.
+
+        Raises:
+            ValueError: the state lacks that of a model.
+        """
+        for model in self.models:
+            if model.name not in state.aux:
+                raise ValueError(
+                    f"state.aux lacks {model.name!r}, the state of a model; start from step.init(params, state)"
+                )
+        return jax.vmap(self.rotors)(params, state, command)
+
+    def wrench(self, params: Params, state: State, scene: Scene) -> Wrench:
+        """The sum of the rotors' aerodynamic wrench and of all effects, one row per drone."""
+
+        def alone(params: Params, state: State) -> Wrench:
+            def acting(effect):
+                return effect(params, state, scene) if _takes_scene(effect) else effect(params, state)
+
+            own = (check_wrench("effects", effect, acting(effect)) for effect in self.effects)
+            return sum(own, rotor_wrench(params, state))
+
+        wrench = jax.vmap(alone)(params, state)
+        of_team = (check_wrench("team_effects", f, f(params, state), len(state.pos)) for f in self.team_effects)
+        wrench = sum(of_team, wrench)
+        state = side_by_side(state) if self.contains(drone_contact) else state
+        return sum((from_others(pair, params, state, self.neighbors) for pair in self.pairs), wrench)
+
+
+def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable, ...]:
+    """The functions that an argument of `make_step` holds.
+
+    Raises:
+        ValueError: it is not a sequence of functions that can be called as they will be.
+    """
+    example = f"jaxdrones.{_EXAMPLE[name]}" if name in _EXAMPLE else "a function (params, state) -> Wrench of the team"
+    if callable(functions):
+        raise ValueError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
+    functions = check_sequence(name, functions, example)
+    for function in functions:
+        if not callable(function):
+            raise ValueError(f"{name}: {function!r} is not a function; give for example {example}")
+        if not (name == "effects" and _takes_scene(function)):
+            check_arguments(name, function, _ARGUMENTS[name], _ELSEWHERE.get(name, ""))
+    return functions
+
+
+def _takes_scene(effect: Callable) -> bool:
+    """Whether the third argument of an effect is called `scene`."""
+    try:
+        parameters = list(inspect.signature(effect).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    return len(parameters) == 3 and parameters[2].name == "scene"
+
+
+def _unbound(function: Callable) -> Callable:
+    while isinstance(function, functools.partial):
+        function = function.func
+    return function

@@ -100,7 +100,7 @@ def placed(devices: Sequence[jax.Device], params: jd.Params, start: jd.State, co
     """The same, but of all worlds on each device its share."""
     if len(devices) < 2:
         return params, start, commands
-    mesh = sharding.devices(len(start.pos), devices)
+    mesh = sharding.make_mesh(len(start.pos), devices)
     shares = (jax.NamedSharding(mesh, jax.P(*[None] * along, *sharding.WORLDS)) for along in (0, axis))
     return params, *map(jax.device_put, (start, commands), shares)
 

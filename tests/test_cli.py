@@ -11,7 +11,7 @@ from helpers import mostly_slow
 from jaxdrones.cli import main
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.fly import fly
-from jaxdrones.training import presets
+from jaxdrones.training import algorithms
 
 FILMS = pytest.mark.needs("pybullet", "imageio_ffmpeg")
 SHORT = ["--duration", "0.25", "--drones", "2"]
@@ -179,7 +179,7 @@ def test_list_names_what_can_be_chosen(capsys):
     names = json.loads(capsys.readouterr().out)
     assert {"cf2x", "cf2p", "hb", "racer"} == set(names["vehicles"])
     assert {"drag", "ground_effect", "downwash", "downwash_2021"} <= set(names["effects"])
-    assert names["algorithms"] == list(presets.ALGORITHMS)
+    assert names["algorithms"] == list(algorithms.ALGORITHMS)
     assert main(["list"]) == 0
     assert "integrators" in capsys.readouterr().out
 

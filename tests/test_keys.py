@@ -14,7 +14,7 @@ from jaxdrones.envs import AutoReset, make
 from jaxdrones.envs.randomize import random_pushes, scaled, sensor_noise, shifted
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
-from jaxdrones.training import loop
+from jaxdrones.training import selection
 
 DRAWS = ("uniform", "normal", "bernoulli", "randint")
 KEY = jax.random.key(3)
@@ -23,12 +23,12 @@ EVERYTHING = dict(
     noise=sensor_noise(),
     disturbance=random_pushes(0.3),
 )
-SMALL = dict(updates=2, worlds=3, horizon=2, sizes=(2,))
+SMALL = dict(updates=2, worlds=3, horizon=2, hidden_sizes=(2,))
 CRITIC = dict(critic_hidden_sizes=(2,))
 LEARNERS = {
     "bptt": (bptt, bptt.Config(**SMALL)),
     "shac": (shac, shac.Config(**SMALL, **CRITIC, critic_steps=2)),
-    "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, batches=3)),
+    "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, minibatches=3)),
 }
 
 
@@ -188,6 +188,6 @@ def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(ke
         patched.setattr(learner, "Policy", type("Policy", (), {"init": staticmethod(init)}))
         state = learner.init(KEY, env, config)
     jax.jit(lambda state: learner.update(env, config, state))(state)
-    for purpose in (loop.CHOICE, loop.REPORT):
+    for purpose in (selection.SELECTION_STREAM, selection.REPORT_STREAM):
         jax.random.split(jax.random.fold_in(KEY, purpose))
     keys.check(least=10)

@@ -12,7 +12,6 @@ from jax.typing import ArrayLike
 
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
-from jaxdrones.envs.surroundings import scene_in
 from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Task, World
 
@@ -85,7 +84,7 @@ class Session:
             return self.env.physics
         from jaxdrones.engine import bullet  # an optional library behind it
 
-        return bullet.make_step(scene=scene_in(self.env.scene, self.world))
+        return bullet.make_step(scene=self.world.scene)
 
 
 def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:

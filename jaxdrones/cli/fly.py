@@ -94,11 +94,11 @@ def _fly_example(options: argparse.Namespace) -> int:
 def _fly_policy(options: argparse.Namespace) -> int:
     import jax
 
-    from jaxdrones.training.episode import PolicyFlight, fly_episode, record_of
-    from jaxdrones.training.runs import run_in
+    from jaxdrones.training.episode import EpisodeConditions, fly_episode, to_record
+    from jaxdrones.training.open_run import open_run
 
     check_choice("backend", options.backend, BACKENDS)
-    run, seed = run_in(options.policy), options.seed or 0
+    run, seed = open_run(options.policy), options.seed or 0
     recipe = run.recipe()
     check_seed("seed", seed)
     vehicle = str(recipe.options.get("vehicle", "cf2x"))
@@ -108,26 +108,26 @@ def _fly_policy(options: argparse.Namespace) -> int:
     with recipe.env(backend=options.backend) as env, progress() as report:
         policy = run.policy(env=env)
         _check_files(options, output)
-        episode = fly_episode(env, policy, jax.random.key(seed), report or (lambda share: None))
-    conditions = PolicyFlight(
+        episode = fly_episode(env, policy, jax.random.key(seed), report or (lambda fraction: None))
+    conditions = EpisodeConditions(
         str(options.policy),
         recipe.task,
-        recipe.learner,
+        recipe.trained_by,
         recipe.realistic,
         options.backend,
         seed,
         vehicle,
         recipe.options,
     )
-    record = record_of(episode, conditions)
-    title = f"{recipe.task}: {env.task.summary} ({recipe.learner}, {options.backend})"
+    record = to_record(episode, conditions)
+    title = f"{recipe.task}: {env.task.summary} ({recipe.trained_by}, {options.backend})"
     assert isinstance(env.scene, Scene), "tasks that have a name have a fixed scene"
     files = _write(record, options, output, title, plots.POLICY_PANELS, env.scene)
     results = record.results(_SETTLING_SHARE * float(record.t[-1]))
     end = {
         "success": episode.success,
         "return": float(episode.reward.sum(axis=0).mean()),
-        "ended_by": list(episode.ends),
+        "ended_by": list(episode.ended_by),
         "duration": float(record.t[-1]),
         "metrics": {name: x[-1].astype(float).tolist() for name, x in episode.metrics.items()},
     }

@@ -18,7 +18,7 @@ from jaxdrones.envs.arguments import check_randomizations, check_team, check_ter
 from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
 from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves
-from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step, scene_in, scene_of_episode
+from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import Vision
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -167,11 +167,11 @@ class Env:
         check_shape("action", action, (self.drones, self.action_size), "one row of the action type's size per drone")
         check_finite("action", action)
         random = self._noise or self._disturbance or self.sensors
-        key = key if random else None  # a program without random keys can be a single kernel
-        world, rpm = self.compiled(Env._command)(key, world, action)
-        drones = self.physics(world.params, world.drones, rpm, scene_for_step(self.scene, self.physics, world))
+        key_of_draws: Key = key if random else None  # a program without random keys can be a single kernel
+        world, rpm = self.compiled(Env._command)(key_of_draws, world, action)
+        drones = self.physics(world.params, world.drones, rpm, scene_for_step(self.physics, world))
         world = world.replace(drones=drones)
-        obs, world, *outcome = self.compiled(Env._outcome)(key, world, self._rate(world, rpm))
+        obs, world, *outcome = self.compiled(Env._outcome)(key_of_draws, world, self._rate(world, rpm))
         if self.vision:
             world = world.replace(images=self.vision.next(world))
         return self._with_images(obs, world), world, *outcome
@@ -212,7 +212,7 @@ class Env:
             actions=jnp.zeros((self.drones, self._history, self.action_size), drones.pos.dtype),
             step=jnp.zeros((), jnp.int32),
             dt=self.dt,
-            scene=scene_of_episode(self.scene, jax.random.fold_in(key, SCENE)),
+            scene=self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE)),
         )
 
     def _first_observation(self, key: jax.Array, world: World, rate: State | None) -> tuple[Array, World]:
@@ -227,12 +227,12 @@ class Env:
         """The time derivative of the state for the sensors, if there are any."""
         if not self.sensors:
             return None
-        return self.physics.rate(world.params, world.drones, rpm, scene_for_step(self.scene, self.physics, world))
+        return self.physics.rate(world.params, world.drones, rpm, scene_for_step(self.physics, world))
 
     def _measured(self, key: jax.Array, world: World, rate: State) -> World:
         """The world with new readings of the sensors."""
         memories, readings = measure_sensors(
-            self.sensors, key, world.params, world.drones, rate, scene_in(self.scene, world), world.sensors
+            self.sensors, key, world.params, world.drones, rate, world.scene, world.sensors
         )
         return world.replace(sensors=memories, readings=readings)
 

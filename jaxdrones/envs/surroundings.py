@@ -39,23 +39,6 @@ def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> None:
         )
 
 
-def scene_of_episode(scene: Scene | DrawScene, key: jax.Array) -> Scene | None:
-    """What a world keeps as its scene: none where it is the same in every episode and has no obstacles."""
-    if isinstance(scene, Scene):
-        return scene if scene.has_obstacles else None
-    return scene(key)
-
-
-def scene_for_step(scene: Scene | DrawScene, step: Step, world: World) -> Scene | None:
-    """The scene that a step is given at every call; none where it was built with it or no effect takes it."""
-    if isinstance(step, HostStep) or not step.physics.takes_scene:
-        return None
-    return scene_in(scene, world)
-
-
-def scene_in(scene: Scene | DrawScene, world: World) -> Scene:
-    """The scene of a world, also where that keeps none."""
-    if world.scene is not None:
-        return world.scene
-    assert isinstance(scene, Scene)
-    return scene
+def scene_for_step(step: Step, world: World) -> Scene | None:
+    """The scene that a step is given at every call; none where it was built with it, or no effect takes it."""
+    return None if isinstance(step, HostStep) or not step.physics.takes_scene else world.scene

@@ -54,7 +54,8 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
         target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
         target_pos, target_vel = _targets(target, params)
         rpy = jax.vmap(jax.vmap(rotation.to_rpy))(trajectory.quat)
-        return dict(vars(trajectory), t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
+        motion = {name: getattr(trajectory, name) for name in ("pos", "quat", "vel", "omega", "rpm")}
+        return dict(motion, t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
 
     params, start = prepare(load_params(conditions.vehicle))
     trajectory = _rollout(conditions, gui, control, params, start, memory)

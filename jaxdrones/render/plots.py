@@ -82,7 +82,7 @@ def save_curves(histories: dict[str, list[dict[str, float]]], path: Path, title:
     """Draw learning curves: one line per run, over the number of control steps.
 
     Args:
-        histories: label -> rows of progress.csv, as `training.runs.Run.history` returns them.
+        histories: label -> rows of progress.csv, as `training.run.Run.history` returns them.
         path: path of the picture.
         title: title of the figure.
     """

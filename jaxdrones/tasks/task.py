@@ -37,8 +37,8 @@ class World(flax.struct.PyTreeNode):
     """() number of control steps since the start."""
     dt: float = flax.struct.field(pytree_node=False)
     """Control period, s."""
-    scene: Scene | None = None
-    """Obstacles and ground of this episode; `None` where there are no obstacles."""
+    scene: Scene = flax.struct.field(default_factory=Scene)
+    """Obstacles and ground of this episode."""
     sensors: dict[str, Any] = flax.struct.field(default_factory=dict)
     """Memories of the sensors, by name."""
     readings: dict[str, Any] = flax.struct.field(default_factory=dict)

@@ -128,7 +128,7 @@ def test_an_unknown_reading_is_named():
 def test_without_models_sensors_and_obstacles_a_world_has_nothing_more_and_a_step_is_one_kernel():
     env = make("hover")
     _, world = env.reset(KEY)
-    assert world.scene is None and not jax.tree.leaves((world.sensors, world.readings, world.drones.aux))
+    assert not jax.tree.leaves((world.scene, world.sensors, world.readings, world.drones.aux))
     assert all(leaf.size for leaf in jax.tree.leaves(world))
     program = compiler.trace(lambda world, action: env.step(KEY, world, action)[:5], world, ZERO)[0]
     assert fits_a_kernel(program)

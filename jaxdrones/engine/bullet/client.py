@@ -62,8 +62,8 @@ class Client:
                 "it a scene of numbers, or take the explicit backend"
             )
         obstacles = jax.device_get(scene).obstacles
-        self.p = import_pybullet()
         self.scene = scene
+        self.p = import_pybullet()
         self.drones: list[int] = []
         self._damping = float(np.float32(damping))  # Bullet's default of 0.04 is in single precision
         self._collision = collision

@@ -16,7 +16,7 @@ from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 

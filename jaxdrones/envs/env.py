@@ -21,7 +21,7 @@ from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed,
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import Vision
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors, init_sensors, measure_sensors
 from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World

@@ -47,7 +47,7 @@ from jaxdrones.envs.randomize import (
 from jaxdrones.envs.surroundings import DrawScene
 from jaxdrones.envs.vision import IMAGES, Vision
 from jaxdrones.params import Params, repeat
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
 from jaxdrones.tasks import gates, gym_pybullet_drones, hover, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task

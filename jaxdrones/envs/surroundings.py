@@ -8,7 +8,7 @@ import jax
 
 from jaxdrones.checks import shown
 from jaxdrones.engine.step import HostStep, Step
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Task, World
 
 DrawScene = Callable[[jax.Array], Scene]

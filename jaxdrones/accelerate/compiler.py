@@ -1,6 +1,6 @@
 """The one place that touches what JAX does not promise to keep: traced programs, notes and options to XLA.
 
-Where a version of JAX lacks something, `AVAILABLE` is False or a function raises `Unknown`; others do without it then.
+Where a version of JAX lacks something, `AVAILABLE` is False or a function raises `UnknownError`; others do without it then.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ CALLS = PLAIN_CALLS | frozenset("remat remat2 checkpoint custom_jvp_call custom_
 """These, and those that say besides how derivatives are taken."""
 
 
-class Unknown(Exception):
+class UnknownError(Exception):
     """Something in a traced program is not as this code knows it."""
 
 
@@ -123,7 +123,7 @@ def called(equation: Equation) -> tuple[Any, list]:
     for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         if name in equation.params:
             return opened(equation.params[name])
-    raise Unknown(f"{equation.primitive.name} holds no program")
+    raise UnknownError(f"{equation.primitive.name} holds no program")
 
 
 def scan_counts(equation: Equation) -> tuple[int, int]:
@@ -135,7 +135,7 @@ def scan_counts(equation: Equation) -> tuple[int, int]:
         consts, carry, _ = params["ft_in"].unpack()
         return len(consts), len(carry)
     except (KeyError, AttributeError, TypeError, ValueError) as error:
-        raise Unknown(f"scan has {', '.join(params)}") from error
+        raise UnknownError(f"scan has {', '.join(params)}") from error
 
 
 def scan_of(equation: Equation, evaluate: Callable[..., list], inputs: Sequence) -> list:

@@ -34,7 +34,7 @@ def miss(start: jd.State) -> jax.Array:
 
 
 many = jax.tree.map(lambda x: jnp.stack([x, x]), start)
-last: jd.State = jax.jit(jd.over_worlds(fly))(many)
+last: jd.State = jd.over_worlds(fly)(many)
 slope: jd.State = jax.grad(miss)(start)
 
 env = jd.make("hover", action="rpm", drones=1, duration=0.1)

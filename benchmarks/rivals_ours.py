@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxdrones as jd
 from jaxdrones import rotation
-from jaxdrones.control import pid
+from jaxdrones.control import for_team, pid
 from jaxdrones.learning import sharding
 
 DRAG = np.array([0.015, 0.015, 0.02], np.float32)
@@ -154,6 +154,6 @@ def piloted(step: jd.Step, dt: float) -> Callable:
             memory, rpm = jax.vmap(control)(params, memory, state, command)
             return (memory, step(params, state, rpm)), None
 
-        return jax.lax.scan(advance, (pid.init(1), start), commands)[0][1]
+        return jax.lax.scan(advance, (for_team(pid.init(), 1), start), commands)[0][1]
 
     return fly

@@ -24,6 +24,7 @@ from jaxdrones.checks import (
     check_shape,
     shown,
 )
+from jaxdrones.control import for_team
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw
@@ -210,7 +211,7 @@ class Env:
             params=params,
             drones=drones,
             variables=variables,
-            memory=self.action.init(self.drones),
+            memory=for_team(self.action.init(), self.drones),
             actions=jnp.zeros((self.drones, self._history, self.action_size), drones.pos.dtype),
             step=jnp.zeros((), jnp.int32),
             dt=self.dt,

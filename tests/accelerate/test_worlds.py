@@ -14,7 +14,7 @@ from helpers import assert_close, flying, tape
 import jaxdrones as jd
 from jaxdrones.accelerate import compiler, fitting, worlds
 from jaxdrones.accelerate.worlds import in_chunks
-from jaxdrones.control import pid, setpoint
+from jaxdrones.control import for_team, pid, setpoint
 
 team = jd.repeat(jd.load_params("cf2x"), 2)
 step = jd.make_step((jd.drag,), rotors=jd.lagging_rotors)
@@ -106,7 +106,9 @@ def test_a_controlled_flight_is_one_kernel():
         return pid.control(gains, params, memory, state, target, dt=1 / 240)
 
     def held(start):
-        return jd.rollout(step, lambda p, m, s, k: jax.vmap(control)(p, m, s, hold), team, start, pid.init(2), 10)[0]
+        return jd.rollout(
+            step, lambda p, m, s, k: jax.vmap(control)(p, m, s, hold), team, start, for_team(pid.init(), 2), 10
+        )[0]
 
     assert_close(in_chunks(held, 2)(starts), jax.jit(jax.vmap(held))(starts), 1e-10)
 

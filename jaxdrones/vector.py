@@ -48,7 +48,8 @@ def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 def tangent(s: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Two numbers a and b with tan x = x b/a, as functions of s = x^2.
 
-    They are smooth, and never both zero. Exact to the precision of s up to x = 0.8, to 1e-12 (float32: 1e-6) up to pi/2.
+    They are smooth, and never both zero. The quotient is exact to the precision of s up to x = 0.8, and to 1e-12
+    (float32: 1e-6) up to pi/2.
     """
     return _fraction(s, lambda k: -1, terms=9 if _is_double(s) else 6)
 
@@ -116,7 +117,7 @@ def _is_double(x: Array) -> bool:
 
 
 def _fraction(s: Array, numerator: Callable[[int], int], terms: int) -> tuple[Array, Array]:
-    """Polynomials a and b of s with b/a = 1/(1 + n(1) s/(3 + n(2) s/(5 + ...))), Lambert's fraction of `terms` terms."""
+    """Polynomials a and b of s: b/a = 1/(1 + n(1) s/(3 + n(2) s/(5 + ...))), Lambert's fraction of `terms` terms."""
     a, b = [np.poly1d([1]), np.poly1d([1])], [np.poly1d([0]), np.poly1d([1])]
     for k in range(1, terms):
         for p in (a, b):

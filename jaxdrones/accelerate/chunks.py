@@ -59,7 +59,7 @@ class ChunkedProgram:
         return fits_a_kernel(self.program)
 
     def by_vmap(self, *leaves: Array) -> list[Array]:
-        """The results for many worlds, chunk by chunk by `jax.vmap`; all at once where the program has effects."""
+        """The results for many worlds by `jax.vmap`, chunk by chunk unless the program has effects."""
         return self._by_vmap(self.consts, leaves)
 
     def by_one_kernel(self, *leaves: Array) -> list[Array]:
@@ -101,7 +101,7 @@ def _as_it_is(program: Any, consts: Sequence[Array], *inputs: Array) -> list[Arr
 
 
 def _chunks(function: Callable, leaves: Sequence[Array], axes: tuple[int, ...], size: int) -> list[Array]:
-    """The results of a function of many worlds for one chunk of them after another, (chunks, worlds of a chunk, ...)."""
+    """The results of a function for one chunk of the worlds after another, (chunks, worlds of a chunk, ...)."""
     worlds = leaves[0].shape[axes[0]]
     size = min(size, worlds)
 

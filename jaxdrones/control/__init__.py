@@ -1,8 +1,8 @@
 """Controllers of one drone.
 
-Each module has `gains()`, `init()` and `control(gains, params, memory, state, setpoint, dt=...) -> (memory, rpm)`, all of
-one drone; `velocity.control` takes an action in place of the setpoint. A team is `jax.vmap` of `control`, and its memory
-`for_team(init(), n)`. The table lists the controllers by the names that the command line uses.
+Each module has `gains()`, `init()` and `control(gains, params, memory, state, setpoint, dt=...) -> (memory, rpm)`, all
+of one drone; `velocity.control` takes an action in place of the setpoint. A team is `jax.vmap` of `control`, and its
+memory is `for_team(init(), n)`. The table lists the controllers by the names that the command line uses.
 """
 
 from jaxdrones.control import geometric, pid, rates, simple_pid, velocity

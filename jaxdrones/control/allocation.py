@@ -23,12 +23,12 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
     """Rotor speeds in [0, `max_rpm`] that produce a thrust (N, body z) and a torque (N m, body) as nearly as they can.
 
     A demand that the rotors can produce is produced exactly. Otherwise yaw torque is given up first, as much as it
-    takes for no rotor to turn backwards or faster than `max_rpm`. Then thrust is given up where it is too high, and roll
-    and pitch torque keep their direction (the priorities of Faessler, Falanga and Scaramuzza 2017). Where thrust is too low for
-    roll and pitch, it is the non-negative least-squares solution of A P^2 = b, with rows 1, y/L, -x/L, spin and
-    b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` it is that solution for every
-    demand, as in gym-pybullet-drones, whose allocation has no upper limit. It is differentiable; where a rotor is held
-    at a limit, its derivative is zero.
+    takes for no rotor to turn backwards or faster than `max_rpm`. Then thrust is given up where it is too high, and
+    roll and pitch torque keep their direction (the priorities of Faessler, Falanga and Scaramuzza 2017). Where thrust
+    is too low for roll and pitch, the squared speeds are the non-negative least-squares solution of A P^2 = b, with
+    rows 1, y/L, -x/L, spin and b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` they
+    are that solution for every demand, as in gym-pybullet-drones, whose allocation has no upper limit. The allocation
+    is differentiable; where a rotor is held at a limit, its derivative is zero.
 
     Raises:
         ValueError: arrays of a team (use `jax.vmap`).

@@ -32,7 +32,7 @@ class Gains(flax.struct.PyTreeNode):
 
 
 def gains() -> Gains:
-    """Gains for rotors that do not lag: position at 2.5 rad/s, tilt at 20 rad/s, yaw at 10 rad/s, damping 0.7 to 0.8."""
+    """Gains for rotors that do not lag: position at 2.5 rad/s, tilt at 20, yaw at 10, damping 0.7 to 0.8."""
     return Gains(
         pos=jnp.array([6.25, 6.25, 6.25]),
         vel=jnp.array([4.0, 4.0, 4.0]),

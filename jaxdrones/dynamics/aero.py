@@ -16,7 +16,7 @@ from jaxdrones.vector import safe_sqrt
 from jaxdrones.wrench import Wrench
 
 _RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
-_FLOOR = 1.63  # propeller radii; height below which ground effect levels off: the clip of gym-pybullet-drones for the Crazyflie
+_FLOOR = 1.63  # propeller radii; below this height ground effect levels off, as for the Crazyflie of (2021)
 
 
 def drag(params: Params, state: State) -> Wrench:

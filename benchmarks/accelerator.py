@@ -164,8 +164,7 @@ def flown(
     options = dict(effects="drag", rotors="lagging", integrator="semi_implicit_euler", substeps=1)
     options |= dict(
         drones=drones,
-        chunk=None,
-        many_kernels=False,
+        vmap=False,
         float64=False,
         gradient_worlds=MOST_WITH_GRADIENT,
         quick=quick,
@@ -174,9 +173,9 @@ def flown(
     options = Namespace(**options | changes)
     found = throughput.measure(throughput.make_step(options), worlds, options)
     of = {"worlds": worlds, "unit": "drone-steps/s"}
-    compiling = f"compiled in {found['forward compile']:.1f} s"
+    compiling = f"first call {found['forward first call']:.1f} s"
     yield row(what, 1e6 * found["forward"], figure, note=compiling, **of)
-    compiling = f"compiled in {found['backward compile']:.1f} s"
+    compiling = f"first call {found['backward first call']:.1f} s"
     of["worlds"] = min(worlds, MOST_WITH_GRADIENT)
     yield row(f"{what}, with gradient", 1e6 * found["with backward"], None, note=compiling, **of)
 

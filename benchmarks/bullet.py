@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
-from jaxdrones.control import Setpoint, pid
+from jaxdrones.control import Setpoint, for_team, pid
 from jaxdrones.engine import bullet
 from jaxdrones.sensing import Box, Cylinder, Scene, Sphere
 
@@ -68,7 +68,7 @@ def closed_loop(steps: int, repeats: int) -> float:
         return jax.vmap(pilot)(params, memory, state, target)
 
     with bullet.make_step(**EFFECTS, substeps=5) as step:
-        work = functools.partial(jd.rollout, step, control, params, start, pid.init(1), steps)
+        work = functools.partial(jd.rollout, step, control, params, start, for_team(pid.init(), 1), steps)
         return median_rate(work, 5 * steps, repeats)
 
 

@@ -34,6 +34,14 @@ def compiled(function, *arguments, options: dict | None = None):
     return program, time.perf_counter() - start
 
 
+def first_call(function, *arguments) -> float:
+    """Seconds of the first call, in which a function compiles itself, the compilation cache switched off."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    start = time.perf_counter()
+    jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - start
+
+
 def seconds(program, *arguments, repeats: int) -> dict[str, float]:
     """Median and best seconds of a call, after calls that warm up; short calls are timed many at a time."""
 

@@ -14,9 +14,9 @@ crazyflow 0.4.0 and rotorpy 3.0.0 live with this library in an environment of th
 
 Everybody flies many steps in one compiled program if it can (rotorpy cannot) and returns the whole final state; starts,
 commands and vehicle are known at run time only. crazyflow flies on one device and shared by its own sharding, compiled
-by default and with our options; we do all at once, in chunks, and in chunks on all devices. A ratio is of the best of
-each, and printed only if all end a flight of 64 worlds and two seconds (rotorpy 0.2 s) in the same state (`AGREED`), or
-`attitude` in the attitude asked for.
+by default and with our options; we do by `jax.vmap`, by `over_worlds`, and by that on all devices. A ratio is of the
+best of each, and printed only if all end a flight of 64 worlds and two seconds (rotorpy 0.2 s) in the same state
+(`AGREED`), or `attitude` in the attitude asked for.
 
 PyFlyt 0.29.0 is not raced: it needs numpy below 2, this library 2 or later, so they cannot share a process.
 """

@@ -18,6 +18,7 @@ from crazyflow.sim.sharding import placement, world_mesh
 from rivals_crazyflow import AIRFRAMES, make_sim, told
 
 import jaxdrones as jd
+from jaxdrones.accelerate.compiler import kernel_options
 
 
 def plant(
@@ -66,7 +67,7 @@ def _ways(fly: Callable, devices: Sequence[jax.Device], data, *commands) -> dict
     """On one device, and on all by its own sharding; compiled as JAX does it by default, and with our options."""
 
     def programs_of(name, *inputs):
-        for options, said in ((None, ""), (jd.KERNEL_OPTIONS, ", our options")):
+        for options, said in ((None, ""), (kernel_options(), ", our options")):
             compiled = jax.jit(fly).lower(*inputs).compile(options)
             programs[name + said] = lambda compiled=compiled: _state(compiled(*inputs))
 

@@ -1,4 +1,4 @@
-"""Our plant as the benchmarks of rivals and of the limit fly it: by the public API, every input an argument."""
+"""Our plant as the benchmarks of rivals and of the limit fly it, by the public API."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxdrones as jd
 from jaxdrones import rotation
-from jaxdrones.control import pid
+from jaxdrones.control import for_team, pid
 from jaxdrones.learning import sharding
 
 DRAG = np.array([0.015, 0.015, 0.02], np.float32)
@@ -34,19 +34,6 @@ def flight(step: jd.Step, length: int) -> Callable:
         return jax.lax.scan(lambda state, _: (step(params, state, rpm), None), start, length=length)[0]
 
     return fly
-
-
-def many(fly: Callable, chunks: bool = True, devices: Sequence[jax.Device] = (), axis: int = 0) -> Callable:
-    """The same for many worlds of one vehicle: all at once or chunk after chunk, on one device or shared by several.
-
-    `axis` is that over worlds of the commands.
-    """
-
-    def batched(params, start, commands):
-        ways = {} if chunks else dict(chunk=len(start.pos), one_kernel=False)
-        return jd.over_worlds(partial(fly, params), in_axes=(0, axis), devices=devices, **ways)(start, commands)
-
-    return batched
 
 
 def starts(worlds: int, key: jax.Array, params: jd.Params) -> tuple[jd.State, jax.Array]:
@@ -77,32 +64,57 @@ def attitudes(worlds: int, steps: int, key: jax.Array) -> tuple[np.ndarray, np.n
     return 0.1 * first + 0.05 * rate * t, 1 + 0.02 * thrust[..., :1] * (1 - t)
 
 
-def ways(fly: Callable, devices: Sequence[jax.Device], *inputs, axis: int = 0) -> dict[str, Callable[[], jd.State]]:
-    """Compiled programs: all worlds at once, in chunks, and in chunks on all devices."""
+def ways(
+    fly: Callable,
+    devices: Sequence[jax.Device],
+    params: jd.Params,
+    start: jd.State,
+    commands: jax.Array,
+    axis: int = 0,
+) -> dict[str, Callable[[], jd.State]]:
+    """The flight of all worlds by `jax.vmap`, by `over_worlds`, and by `over_worlds` on all devices."""
     programs = {
-        "ours": program(fly, *inputs, chunks=False, axis=axis),
-        "ours, chunks": program(fly, *inputs, axis=axis),
+        "ours, vmap": by_vmap(fly, params, start, commands, axis),
+        "ours": program(fly, params, start, commands, axis=axis),
     }
-    if len(devices) > 1 and len(inputs[1].pos) % len(devices) == 0:
-        programs[f"ours, chunks, {len(devices)} devices"] = program(fly, *inputs, devices=devices, axis=axis)
+    if len(devices) > 1 and len(start.pos) % len(devices) == 0:
+        programs[f"ours, {len(devices)} devices"] = program(fly, params, start, commands, devices, axis)
     return programs
 
 
 def program(
-    fly: Callable, *inputs, chunks: bool = True, devices: Sequence[jax.Device] = (), axis: int = 0
+    fly: Callable,
+    params: jd.Params,
+    start: jd.State,
+    commands: jax.Array,
+    devices: Sequence[jax.Device] = (),
+    axis: int = 0,
 ) -> Callable[[], jd.State]:
-    """Compiled with our options; a call without arguments flies from these inputs."""
-    inputs = placed(devices, *inputs, axis=axis)
-    return partial(jax.jit(many(fly, chunks, devices, axis)).lower(*inputs).compile(jd.KERNEL_OPTIONS), *inputs)
+    """The flight of many worlds of one vehicle by `over_worlds`, from these inputs; the first call compiles.
+
+    `axis` is that over worlds of the commands.
+    """
+    flown = jd.over_worlds(partial(fly, params), in_axes=(0, axis), devices=devices)
+    return partial(flown, *placed(devices, start, commands, axis))
 
 
-def placed(devices: Sequence[jax.Device], params: jd.Params, start: jd.State, commands: jax.Array, axis: int = 0):
-    """The same, but of all worlds on each device its share."""
+def by_vmap(
+    fly: Callable, params: jd.Params, start: jd.State, commands: jax.Array, axis: int = 0
+) -> Callable[[], jd.State]:
+    """The flight of many worlds of one vehicle by `jax.vmap`, from these inputs; the first call compiles."""
+    return partial(jax.jit(jax.vmap(fly, (None, 0, axis))), params, start, commands)
+
+
+def placed(
+    devices: Sequence[jax.Device], start: jd.State, commands: jax.Array, axis: int = 0
+) -> tuple[jd.State, jax.Array]:
+    """The inputs with an equal share of the worlds on each device."""
     if len(devices) < 2:
-        return params, start, commands
+        return start, commands
     mesh = sharding.make_mesh(len(start.pos), devices)
     shares = (jax.NamedSharding(mesh, jax.P(*[None] * along, *sharding.WORLDS)) for along in (0, axis))
-    return params, *map(jax.device_put, (start, commands), shares)
+    start, commands = map(jax.device_put, (start, commands), shares)
+    return start, commands
 
 
 def difference(state: jd.State, other: jd.State) -> dict[str, float]:
@@ -142,6 +154,6 @@ def piloted(step: jd.Step, dt: float) -> Callable:
             memory, rpm = jax.vmap(control)(params, memory, state, command)
             return (memory, step(params, state, rpm)), None
 
-        return jax.lax.scan(advance, (pid.init(1), start), commands)[0][1]
+        return jax.lax.scan(advance, (for_team(pid.init(), 1), start), commands)[0][1]
 
     return fly

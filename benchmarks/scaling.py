@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import rivals_ours as ours
-from common import about, compiled, report
+from common import about, first_call, report
 from figure import loglog
 from rivals_timing import in_turn
 
 import jaxdrones as jd
+from jaxdrones.accelerate.compiler import kernel_options
 
 WORLDS = (1, 16, 256, 4096, 65536, 1048576)
 STEPS_OF_A_CALL = 2**22  # drone-steps, about
@@ -80,15 +81,19 @@ def measure(worlds: int, options) -> dict[str, object]:
     for flight, (fly, asked, axis, length) in flights.items():
         for place, devices in places.items():
             name = flight + place
-            inputs = ours.placed(devices, params, start, asked, axis)
-            flown = ours.many(fly, devices=devices, axis=axis)
-            program, compiling[name] = compiled(flown, *inputs, options=jd.KERNEL_OPTIONS)
-            memory[name] = program.memory_analysis().temp_size_in_bytes
-            programs[name] = partial(program, *inputs)
+            programs[name] = ours.program(fly, params, start, asked, devices, axis)
+            compiling[name] = first_call(programs[name])
+            memory[name] = _memory(programs[name])
             steps[name] = worlds * length / 1e6
     times = in_turn(programs, options.repeats, 0 if options.quick else 0.05)
     rates = {name: steps[name] / taken["median"] for name, taken in times.items()}
     return {"worlds": worlds, "rates": rates, "memory": memory, "compile": compiling}
+
+
+def _memory(program: partial) -> int:
+    """Bytes that the compiled program takes beside its inputs and results."""
+    compiled = jax.jit(program.func).lower(*program.args).compile(kernel_options())
+    return compiled.memory_analysis().temp_size_in_bytes
 
 
 if __name__ == "__main__":

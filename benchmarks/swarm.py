@@ -1,9 +1,9 @@
 """What does a step cost with many drones in one world, each in the jets of all others?
 
 Drones 1 m apart on a jittered grid, 1 to 4 m high, drag and downwash, semi-implicit Euler at 240 Hz, float32.
-`all pairs` tries every pair; `cells` those within 2 m of each other in the horizontal plane. `the reference's loop` is
-its downwash alone (equation 6) as it computes it, a Python loop over pairs, timed here for 30 drones, without its call
-of PyBullet for each, and extrapolated by the number of pairs.
+`all pairs` tries every pair; `cells` those within 2 m of each other in the horizontal plane. `gym-pybullet-drones`
+is the downwash of gym-pybullet-drones alone (equation 6), a Python loop over pairs, timed here for 30 drones, without
+its call of PyBullet for each, and extrapolated by the number of pairs.
 """
 
 import argparse
@@ -37,11 +37,11 @@ def main() -> None:
     if options.quick:
         options.drones, options.repeats = (1, 40), 1
 
-    a_pair = reference_pair(options.repeats)
-    rows = [measure(n, options.repeats) | {"the reference's loop": a_pair * n * (n - 1)} for n in options.drones]
-    names = ("all pairs", "cells", "the reference's loop")
+    a_pair = gym_pybullet_drones_pair(options.repeats)
+    rows = [measure(n, options.repeats) | {"gym-pybullet-drones": a_pair * n * (n - 1)} for n in options.drones]
+    names = ("all pairs", "cells", "gym-pybullet-drones")
     lines = [f"{name}: {value}" for name, value in about().items()]
-    lines.append("ms per step of the world; cells over N log N, us; the reference's loop over our faster one")
+    lines.append("ms per step of the world; cells over N log N, us; gym-pybullet-drones over our faster one")
     for row in rows:
         n, ours = row["drones"], min(row[name] for name in names[:2] if name in row)
         cells = "          " if "cells" not in row else f"{1e6 * row['cells'] / (n * math.log2(max(n, 2))):10.3f}"
@@ -76,8 +76,8 @@ def _flown(step: jd.Step, params: jd.Params, state: jd.State) -> jd.State:
     return jax.lax.scan(lambda s, _: (step(params, s, s.rpm), None), state, length=STEPS)[0]
 
 
-def reference_pair(repeats: int) -> float:
-    """Seconds that the reference's Python takes for the downwash of one drone on another."""
+def gym_pybullet_drones_pair(repeats: int) -> float:
+    """Seconds that the Python of gym-pybullet-drones takes for the downwash of one drone on another."""
     params = jd.load_params("cf2x")
     k1, k2, k3 = (float(k) for k in params.downwash_coeff)
     radius = float(params.prop_radius)

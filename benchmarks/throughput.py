@@ -1,14 +1,13 @@
 """How many drone-steps per second does the explicit backend make, forward, and forward with backward?
 
-A world is one drone with constant rotor speeds of its own. One dispatch flies many steps. More worlds than a chunk
-are flown chunk after chunk, so that the state of a chunk stays in the cache.
+A world is one drone with constant rotor speeds of its own. One dispatch flies many steps. The first call compiles.
 """
 
 import argparse
 
 import jax
 import jax.numpy as jnp
-from common import about, compiled, report, seconds
+from common import about, first_call, report, seconds
 
 import jaxdrones as jd
 from jaxdrones.checks import check_choice
@@ -23,8 +22,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     parser.add_argument("--drones", type=int, default=1, help="drones per world")
-    parser.add_argument("--chunk", type=int, help="worlds flown at a time (128; 512 with --many-kernels)")
-    parser.add_argument("--many-kernels", action="store_true", help="do not compile a chunk's flight as one kernel")
+    parser.add_argument("--vmap", action="store_true", help="fly by plain jax.vmap instead of jaxdrones.over_worlds")
     parser.add_argument("--effects", default="drag", help="names as in `jaxdrones list`, or none")
     parser.add_argument("--rotors", default="instant")
     parser.add_argument("--integrator", default="semi_implicit_euler")
@@ -49,18 +47,17 @@ def main() -> None:
         "effects": options.effects,
         "controller": "none, constant rotor speeds",
         "drones per world": options.drones,
-        "chunk": options.chunk or "as over_worlds chooses",
-        "kernels": "as XLA cuts them" if options.many_kernels else "one for a chunk's flight",
+        "many worlds": "jax.vmap" if options.vmap else "jaxdrones.over_worlds",
         "dtype": "float64" if options.float64 else "float32",
         "gradient": f"of the mean squared final position in the rotor speeds of {GRADIENT_STEPS} steps",
     }
     lines = [f"{name}: {value}" for name, value in (a_step | about()).items()]
     lines.append(
-        "   worlds | forward M/s (best) | with backward M/s | time over forward | compile s, forward and backward"
+        "   worlds | forward M/s (best) | with backward M/s | time over forward | first call s, forward and backward"
     )
     lines += [
         f"{row['worlds']:9} | {row['forward']:8.1f} ({row['forward best']:6.1f})  | {row['with backward']:17.2f} |"
-        f" {row['time over forward']:17.1f} | {row['forward compile']:.2f} {row['backward compile']:.2f}"
+        f" {row['time over forward']:17.1f} | {row['forward first call']:.2f} {row['backward first call']:.2f}"
         for row in rows
     ]
     report({"step": a_step, "about": about(), "rows": rows}, options.json, lines)
@@ -99,19 +96,18 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         final, _ = jax.lax.scan(lambda state, rpm: (step(params, state, rpm), None), start, rpms)
         return jnp.mean(final.pos**2)
 
-    ours = None if options.many_kernels else jd.KERNEL_OPTIONS
+    def many(world):
+        return jax.jit(jax.vmap(world)) if options.vmap else jd.over_worlds(world)
 
-    def in_chunks(world):
-        return jd.over_worlds(world, options.chunk, one_kernel=not options.many_kernels)
-
-    forward, forward_compile = compiled(in_chunks(fly), starts, rpm, options=ours)
+    forward = many(fly)
+    first_forward = first_call(forward, starts, rpm)
     time = seconds(forward, starts, rpm, repeats=options.repeats)
     steps = worlds * n * options.substeps / 1e6
 
     few = min(worlds, options.gradient_worlds)  # on a CPU a part of many shows the same: memory grows, speed does not
     starts, rpms = jax.tree.map(lambda x: x[:few], (starts, jnp.repeat(rpm[:, None], grad_length, axis=1)))
-    value, _ = compiled(in_chunks(loss), starts, rpms, options=ours)
-    gradient, backward_compile = compiled(in_chunks(jax.value_and_grad(loss, 1)), starts, rpms, options=ours)
+    value, gradient = many(loss), many(jax.value_and_grad(loss, 1))
+    first_backward = first_call(gradient, starts, rpms)
     value_time = seconds(value, starts, rpms, repeats=options.repeats)["median"]
     gradient_time = seconds(gradient, starts, rpms, repeats=options.repeats)["median"]
     return {
@@ -121,8 +117,8 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         "forward best": steps * length / time["best"],
         "with backward": steps * few / worlds * grad_length / gradient_time,
         "time over forward": gradient_time / value_time,
-        "forward compile": forward_compile,
-        "backward compile": backward_compile,
+        "forward first call": first_forward,
+        "backward first call": first_backward,
     }
 
 

@@ -1,9 +1,6 @@
 """A vectorised, differentiable simulator of quadrotor teams."""
 
-from typing import TYPE_CHECKING, Any
-
 from jaxdrones import rotation, vector
-from jaxdrones.accelerate.compiler import kernel_options
 from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.dynamics import (
     Model,
@@ -36,7 +33,6 @@ from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
 
 __all__ = [
-    "KERNEL_OPTIONS",
     "Effect",
     "Model",
     "NeighborGrid",
@@ -73,13 +69,3 @@ __all__ = [
     "stack",
     "vector",
 ]
-
-
-if TYPE_CHECKING:
-    KERNEL_OPTIONS: dict[str, Any]
-else:
-
-    def __getattr__(name: str):
-        if name == "KERNEL_OPTIONS":  # the compiler of the device is asked, which importing should not start
-            return kernel_options()
-        raise AttributeError(f"module 'jaxdrones' has no attribute {name!r}")

@@ -1,7 +1,7 @@
 """Unit quaternions (x, y, z, w), body to world.
 
-Every function is about one rotation, never a batch: use `jax.vmap` for more. All are differentiable
-everywhere they are defined, also at zero rotation.
+Every function is about one rotation, never a batch: use `jax.vmap` for more. All are differentiable wherever they are
+defined, also at zero rotation.
 """
 
 import jax.numpy as jnp
@@ -72,8 +72,8 @@ def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
 def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
     """The rotation by |v| rad about v.
 
-    By the tangent of |v|/4, without a root: it is as smooth at zero as elsewhere, faster than `sin` and `cos`, and of
-    unit length whatever the error of the tangent. Exact to the precision of v up to a full turn.
+    It is computed from the tangent of |v|/4, without a root, and so it is as smooth at zero as elsewhere and has unit
+    length whatever the error of the tangent. Exact to the precision of v up to a full turn.
     """
     s = dot(v, v) / 16
     a, b = tangent(s)

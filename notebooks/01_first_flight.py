@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxdrones as jd
-from jaxdrones.control import Setpoint, pid
+from jaxdrones.control import Setpoint, for_team, pid
 from jaxdrones.tasks import curves
 
 # %% [markdown]
@@ -37,7 +37,7 @@ def control(params, memory, state, k):
 
 @jax.jit
 def fly(params, state):
-    return jd.rollout(step, control, params, state, memory=pid.init(4), length=12 * HZ)
+    return jd.rollout(step, control, params, state, memory=for_team(pid.init(), 4), length=12 * HZ)
 
 
 final, trajectory = fly(params, start)

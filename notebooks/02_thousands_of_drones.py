@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 
 import jaxdrones as jd
-from jaxdrones.control import Setpoint, pid
+from jaxdrones.control import Setpoint, for_team, pid
 
 # %%
 HZ, WORLDS = 120, 2000
@@ -29,7 +29,7 @@ def control(params, memory, state, k):
 
 def fly(mass):
     params = jd.repeat(nominal.replace(mass=mass), 1)
-    return jd.rollout(step, control, params, start, memory=pid.init(1), length=5 * HZ)[1].pos[:, 0]
+    return jd.rollout(step, control, params, start, memory=for_team(pid.init(), 1), length=5 * HZ)[1].pos[:, 0]
 
 
 # %% [markdown]

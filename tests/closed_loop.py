@@ -11,7 +11,7 @@ import numpy as np
 
 import jaxdrones
 from jaxdrones import Params, State
-from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control import Setpoint, for_team
 
 make_step = lru_cache(jaxdrones.make_step)
 
@@ -101,7 +101,7 @@ def reaches(
     team = team_of(*vehicles)
     team = team.replace(**{name: jnp.full_like(getattr(team, name), value) for name, value in constants.items()})
     start = hovering(team) if start is None else start
-    memory = controller.init(n) if memory is None else memory
+    memory = for_team(controller.init(), n) if memory is None else memory
     targets = always(at(n, target), seconds * hz)
     flown = fly(controller.control, controller.gains(), team, start, memory, targets, control_hz=hz)
     return distance(flown, target)

@@ -100,7 +100,7 @@ def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
         (["fly", "circle", "--effects", "drag,drag_world_axes"], "'drag_world_axes' is given beside 'drag'"),
         (["fly", "circle", "--effects", "downwash_2021,downwash"], "'downwash' is given beside 'downwash_2021'"),
         (["fly", "circle", "--effects", "drag,"], "unknown effect ''"),
-        (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for of 'racer'"),
+        (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for with 'racer'"),
         pytest.param(
             ["fly", "circle", "--video", "folder.mp4"],
             "--video folder.mp4 cannot be written: Is a directory",

@@ -285,7 +285,7 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
         (["train", "hover", "--set", "surrogate=3"], "unknown setting 'surrogate'"),
         (["train", "hover", "--set", "task=x"], "--set task is not a setting"),
         (["train", "hover", "--set", "updates=3", "--budget", "4"], "--set updates=3 is given beside --budget"),
-        (["train", "hover", "--set", "disturb=3"], "disturb"),
+        (["train", "hover", "--set", "disturbance=3"], "disturbance"),
         (["train", "hover", "--set", "worlds=" + "9" * 5000], "worlds is"),
         (["train", "hover", "--budget", "1e30s"], "or a time up to 1000h"),
         (["train", "hover", "--budget", "99999999999"], "--budget is '99999999999'; give updates"),

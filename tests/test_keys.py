@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from helpers import mostly_slow
 
+import jaxdrones as jd
 from jaxdrones.envs import AutoReset, make
 from jaxdrones.envs.randomize import random_pushes, scaled, sensor_noise, shifted
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
+from jaxdrones.sensing import Scene, Sensor, Sphere
 from jaxdrones.training import selection
 
 DRAWS = ("uniform", "normal", "bernoulli", "randint")
@@ -22,6 +24,15 @@ EVERYTHING = dict(
     randomize=(scaled("mass", 0.9, 1.1), scaled("kf", 0.9, 1.1), shifted("wind", -1, 1)),
     noise=sensor_noise(),
     disturbance=random_pushes(0.3),
+    sensors=(
+        Sensor(
+            "noisy",
+            lambda key, params, state, rate, scene, memory: (memory, memory + jax.random.normal(key)),
+            lambda key, params: jax.random.normal(key),
+        ),
+    ),
+    scene=lambda key: Scene.of(Sphere(pos=jax.random.uniform(key, (3,)) + 50.0, radius=0.1)),
+    effects=(lambda params, state, scene: jd.Wrench.of_force(0 * scene.spheres.pos[0]),),
 )
 SMALL = dict(updates=2, worlds=3, horizon=2, hidden_sizes=(2,))
 CRITIC = dict(critic_hidden_sizes=(2,))
@@ -86,12 +97,12 @@ def keys(monkeypatch):
 
 @pytest.mark.parametrize("task", mostly_slow(["hover", "tracking", "swap-goals"], ["hover"]))
 def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
-    """Start, parameters, noise, pushes, and those of the next episode: in one step that ends one."""
+    """Start, parameters, scene, sensors, noise, pushes, and those of the next episode: in one step that ends one."""
     env = make(task, **EVERYTHING)
     _, episode = AutoReset(env).reset(jax.random.key(2))
     episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
     AutoReset(env).step(KEY, episode, jnp.zeros((env.drones, 4)))
-    keys.check(least=2 * 5 + 2)
+    keys.check(least=2 * 8 + 3)
 
 
 def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatch):

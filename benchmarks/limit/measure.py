@@ -2,7 +2,7 @@
 
 Both fly one Crazyflie per world: lagging rotors, drag, semi-implicit Euler at 240 Hz, float32, rotor speeds held. The C
 (`plant.c`, structure of arrays, all cores) is compiled here, counts only after it has flown our trajectory, and is
-measured in turn with ours. Ours flies all worlds at once and in chunks, on one device and on one for each core.
+measured in turn with ours. Ours flies by `jax.vmap`, by `over_worlds`, and by that on one device for each core.
 
 For accelerators: a step reads and writes 17 numbers and reads a command of 4, 152 bytes in float32, and makes about 290
 additions and multiplications, 15 divisions and a root, 2 operations a byte. An H100 (3.35 TB/s, 67 T operations/s) is
@@ -70,11 +70,11 @@ def main() -> None:
 def agreement(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int = 100) -> dict[str, float]:
     """Largest difference after a second, C against ours, as a share of the largest value of each quantity."""
     start, rpm = ours.starts(worlds, jax.random.key(0), params)
-    expected = jax.jit(ours.many(ours.flight(step, round(1 / DT))))(params, start, rpm)
+    expected = ours.program(ours.flight(step, round(1 / DT)), params, start, rpm)()
     found = native.states_of(plant.fly(native.rows_of(start), _command(rpm), round(1 / DT), threads=2))
     return {
         name: float(np.max(np.abs(getattr(found, name) - value)) / np.max(np.abs(value)))
-        for name, value in vars(expected).items()
+        for name, value in ((name, getattr(expected, name)) for name in native.ROWS)
     }
 
 
@@ -84,16 +84,13 @@ def measure(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int, 
     start, rpm = ours.starts(worlds, jax.random.key(0), params)
     fly = ours.flight(step, length)
     several = jax.devices()[: min(options.devices, worlds)]
-    ways = {"at once": dict(chunks=False), "chunks": {}}
-    if len(several) > 1 and worlds % len(several) == 0:
-        ways[f"at once, {len(several)} devices"] = dict(chunks=False, devices=several)
-        ways[f"chunks, {len(several)} devices"] = dict(devices=several)
+    ways = ours.ways(fly, several, params, start, rpm)
 
     rows, command = native.rows_of(start), _command(rpm)
     programs = {
         "C, 1 thread": lambda: plant.fly(rows.copy(), command, length, threads=1),
         f"C, {options.devices} threads": lambda: plant.fly(rows.copy(), command, length, threads=options.devices),
-    } | {name: ours.program(fly, params, start, rpm, **way) for name, way in ways.items()}
+    } | ways
     times = in_turn(programs, options.repeats, shortest=0 if options.quick else 0.05)
     rates = {name: worlds * length / 1e6 / taken["median"] for name, taken in times.items()}
     best = {name: worlds * length / 1e6 / taken["best"] for name, taken in times.items()}

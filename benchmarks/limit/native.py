@@ -14,7 +14,7 @@ import jaxdrones as jd
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp", "-shared", "-fPIC")
 
 _SOURCE = Path(__file__).parent / "plant.c"
-_ROWS = ("pos", "quat", "vel", "omega", "rpm")
+ROWS = ("pos", "quat", "vel", "omega", "rpm")
 
 
 class NoCompilerError(RuntimeError):
@@ -81,7 +81,7 @@ class Plant:
 
 def rows_of(states: jd.State) -> np.ndarray:
     """(17, n) of the states of n worlds with one drone each."""
-    return np.concatenate([np.asarray(getattr(states, name))[:, 0].T for name in _ROWS]).copy()
+    return np.concatenate([np.asarray(getattr(states, name))[:, 0].T for name in ROWS]).copy()
 
 
 def states_of(rows: np.ndarray) -> jd.State:

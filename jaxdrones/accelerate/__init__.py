@@ -1,1 +1,1 @@
-"""Everything that exists for a compiler: many worlds at once, and what XLA should keep."""
+"""Everything that exists for a compiler: many worlds in one kernel, and numbers that are stored, not repeated."""

@@ -1,6 +1,7 @@
-"""The one place that touches what JAX does not promise to keep: traced programs, notes and options to XLA.
+"""Traced programs, notes to XLA and its options: the interfaces that JAX does not promise to keep.
 
-Where a version of JAX lacks something, `AVAILABLE` is False or a function raises `Unknown`; others do without it then.
+They are used here and nowhere else. Where a version of JAX lacks one of them, `AVAILABLE` is False or a function raises
+`UnknownError`, and callers do without.
 """
 
 from __future__ import annotations
@@ -21,27 +22,26 @@ except ImportError:
     AVAILABLE = False
 
 Equation = Any
-"""Of a traced program: `primitive`, `params`, `invars`, `outvars`, `effects`."""
+"""One line of a traced program, with `primitive`, `params`, `invars`, `outvars` and `effects`."""
 Variable = Any
-"""Of a traced program; it has an `aval`."""
+"""An array in a traced program; its shape and type are its `aval`."""
 
 PLAIN_CALLS = frozenset("jit pjit closed_call core_call".split())
-"""Primitives that do what the program does that they hold, and nothing else."""
+"""Primitives that run the program that they hold, and do nothing else."""
 
 CALLS = PLAIN_CALLS | frozenset("remat remat2 checkpoint custom_jvp_call custom_vjp_call".split())
-"""These, and those that say besides how derivatives are taken."""
+"""The plain calls, and those that also say how derivatives are taken."""
 
 
-class Unknown(Exception):
-    """Something in a traced program is not as this code knows it."""
+class UnknownError(Exception):
+    """A traced program has a form that this code does not know."""
 
 
 def kernel_options() -> dict[str, Any]:
-    """For `jax.jit(over_worlds(...), compiler_options=...)` on a CPU, as `jaxdrones.KERNEL_OPTIONS`.
+    """The options of `jax.jit` with which a single kernel is fastest on a CPU; none on other devices.
 
-    Wider vectors where the CPU has them, and the elder emitters; together 1.3 to 1.5 times as many steps of a single
-    kernel. And no sums by a library, which do not compile in one. Only what the compiler of the device knows; on other
-    devices than CPUs nothing.
+    Wider vectors where the CPU has them, the older code generator of XLA, and no sums by a library, which a single
+    kernel cannot call. Options that the installed compiler does not know are left out.
     """
     return _known(
         xla_cpu_prefer_vector_width=512, xla_cpu_use_fusion_emitters=False, xla_cpu_experimental_ynn_fusion_type=""
@@ -49,7 +49,7 @@ def kernel_options() -> dict[str, Any]:
 
 
 def training_options() -> dict[str, Any]:
-    """For `jax.jit(train).lower(key).compile(...)`: a third less time to compile on a CPU, and the same speed after."""
+    """The options with which training compiles faster on a CPU, and runs as fast; none on other devices."""
     return _known(xla_cpu_use_fusion_emitters=False)
 
 
@@ -71,7 +71,7 @@ def _is_known(name: str, value: Any) -> bool:
 
 
 def set_notes(result: Any, **notes: str) -> Any:
-    """The result of a call, which carries notes to XLA; without them where this version of JAX has none."""
+    """The result of a call that carries notes to XLA, or is the plain result where this version of JAX has none."""
     return set_xla_metadata(result, **notes) if AVAILABLE else result
 
 
@@ -82,7 +82,7 @@ def trace(function: Callable, *arguments: Any) -> tuple[Any, list, Any]:
 
 
 def opened(program: Any) -> tuple[Any, list]:
-    """A program, and the values that it closes over: one object since JAX 0.12, before it one of two kinds."""
+    """A program, and the values that it closes over. Since JAX 0.12 they are one object."""
     if hasattr(program, "consts"):
         return getattr(program, "jaxpr", program), list(program.consts)
     return program, []
@@ -94,24 +94,24 @@ def as_function(program: Any, consts: Sequence) -> Callable[..., list]:
 
 
 def alone(equation: Equation, variables: Iterable[Variable], results: Iterable[Variable]) -> Callable[..., list]:
-    """An equation as a function of some of its variables, that gives some of its results."""
+    """An equation as a function of some of its variables, which returns some of its results."""
     parts = dict(invars=[*variables], outvars=[*results], eqns=[equation], effects=equation.effects)
     return as_function(opened(_nothing())[0].replace(**parts), ())
 
 
 @functools.cache
 def _nothing() -> Any:
-    """A program without equations, which has what a program must tell about its source."""
+    """A program without equations, as a template for others."""
     return jax.make_jaxpr(lambda: ())()
 
 
 def is_literal(variable: Variable) -> bool:
-    """Whether it stands for a number that is written in the program."""
+    """Whether a variable stands for a number that is written in the program."""
     return isinstance(variable, Literal)
 
 
 def held(equation: Equation) -> Iterator[Any]:
-    """Programs that an equation holds, in whatever place."""
+    """The programs that an equation holds, whatever its parameters are called."""
     for value in equation.params.values():
         for each in value if isinstance(value, tuple | list) else (value,):
             if hasattr(each, "eqns"):
@@ -123,11 +123,11 @@ def called(equation: Equation) -> tuple[Any, list]:
     for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         if name in equation.params:
             return opened(equation.params[name])
-    raise Unknown(f"{equation.primitive.name} holds no program")
+    raise UnknownError(f"{equation.primitive.name} holds no program")
 
 
 def scan_counts(equation: Equation) -> tuple[int, int]:
-    """Of a scan: how many of its inputs are the same in all passages, and how many are carried."""
+    """How many inputs of a scan are the same in all passages, and how many are carried."""
     params = equation.params
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
@@ -135,11 +135,11 @@ def scan_counts(equation: Equation) -> tuple[int, int]:
         consts, carry, _ = params["ft_in"].unpack()
         return len(consts), len(carry)
     except (KeyError, AttributeError, TypeError, ValueError) as error:
-        raise Unknown(f"scan has {', '.join(params)}") from error
+        raise UnknownError(f"scan has {', '.join(params)}") from error
 
 
 def scan_of(equation: Equation, evaluate: Callable[..., list], inputs: Sequence) -> list:
-    """The results of a scan, each passage by `evaluate(program, consts, *inputs)`."""
+    """The results of a scan whose passages are evaluated by `evaluate(program, consts, *inputs)`."""
     consts, carried = scan_counts(equation)
     program, own_consts = opened(equation.params["jaxpr"])
     same, first, stacks = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]

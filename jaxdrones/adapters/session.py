@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Task, World
 
 SEEDS = 2**32  # seeds are taken modulo this

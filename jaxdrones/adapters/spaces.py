@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from jaxdrones.checks import check_shape
 from jaxdrones.envs import Env
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 
 _MAX_DEPTH = 1001.0  # m; the farthest visible distance of the cameras, 1000 m, and rounding
 

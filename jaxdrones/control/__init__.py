@@ -1,12 +1,14 @@
 """Controllers of one drone.
 
-Each module has `gains()`, `init(n)` and `control(gains, params, memory, state, setpoint, dt=...) -> (memory, rpm)`;
-`velocity.control` takes an action in place of the setpoint. The table is what the command line knows by name.
+Each module has `gains()`, `init()` and `control(gains, params, memory, state, setpoint, dt=...) -> (memory, rpm)`, all
+of one drone; `velocity.control` takes an action in place of the setpoint. A team is `jax.vmap` of `control`, and its
+memory is `for_team(init(), n)`. The table lists the controllers by the names that the command line uses.
 """
 
 from jaxdrones.control import geometric, pid, rates, simple_pid, velocity
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control.team import for_team
 
 CONTROLLERS = {"pid": pid, "simple_pid": simple_pid, "geometric": geometric, "rates": rates}
 
-__all__ = ["CONTROLLERS", "Setpoint", "geometric", "pid", "rates", "simple_pid", "velocity"]
+__all__ = ["CONTROLLERS", "Setpoint", "for_team", "geometric", "pid", "rates", "simple_pid", "velocity"]

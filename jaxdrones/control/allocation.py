@@ -22,13 +22,13 @@ def mixer(params: Params) -> Float[Array, "4 3"]:
 def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
     """Rotor speeds in [0, `max_rpm`] that produce a thrust (N, body z) and a torque (N m, body) as nearly as they can.
 
-    What the rotors can produce they do. Beyond that, yaw torque is given up first: as much of it as it takes for no
-    rotor to turn backwards or faster than `max_rpm`. Then thrust is given up where it is too high, and roll and pitch
-    torque keep their direction (the priorities of Faessler, Falanga and Scaramuzza 2017). Where thrust is too low for
-    roll and pitch, it is the non-negative least-squares solution of A P^2 = b, with rows 1, y/L, -x/L, spin and
-    b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` it is that solution for every
-    demand, as in the reference, whose allocation has no upper limit. Differentiable; where a rotor is held at a limit
-    its derivative is zero.
+    A demand that the rotors can produce is produced exactly. Otherwise yaw torque is given up first, as much as it
+    takes for no rotor to turn backwards or faster than `max_rpm`. Then thrust is given up where it is too high, and
+    roll and pitch torque keep their direction (the priorities of Faessler, Falanga and Scaramuzza 2017). Where thrust
+    is too low for roll and pitch, the squared speeds are the non-negative least-squares solution of A P^2 = b, with
+    rows 1, y/L, -x/L, spin and b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` they
+    are that solution for every demand, as in gym-pybullet-drones, whose allocation has no upper limit. The allocation
+    is differentiable; where a rotor is held at a limit, its derivative is zero.
 
     Raises:
         ValueError: arrays of a team (use `jax.vmap`).
@@ -54,13 +54,13 @@ def _square_of_limit(params: Params) -> Float[Array, ""]:
     return jnp.where(unlimited, jnp.inf, jnp.where(unlimited, 0, params.max_rpm) ** 2)
 
 
-@jax.checkpoint  # a gradient of a flight keeps less
+@jax.checkpoint  # cheaper to compute again in a backward pass than to keep
 def _within_authority(
     inverse: Float[Array, "4 4"], target: Float[Array, "4"], limit: Float[Array, ""]
 ) -> Float[Array, "4"]:
-    """The demand with roll and pitch scaled down to what rotors can do, and then yaw to what they can do beside.
+    """The demand with roll and pitch scaled down to what the rotors can produce, and then yaw to what is left.
 
-    Otherwise least squares would trade thrust for torques that cannot be had. Without a limit nothing changes.
+    Otherwise least squares would trade thrust for torques that are out of reach. Without a limit nothing changes.
     """
     turning = inverse[:, 1:3] @ target[1:3]
     exact = inverse @ target
@@ -86,9 +86,9 @@ def _excess(
 
 
 def _inverses(matrix: Float[Array, "4 4"]) -> Float[Array, "16 4 4"]:
-    """Least-squares inverses of A on all sixteen sets of unknowns that are not zero; the last one is the inverse.
+    """Least-squares inverses of A for all sixteen sets of unknowns that are not zero; the last one is the inverse.
 
-    They depend on the vehicle alone, so they are computed once however many drones of that vehicle there are.
+    They depend on the vehicle alone.
     """
 
     def solve_on(active):
@@ -102,7 +102,7 @@ def _inverses(matrix: Float[Array, "4 4"]) -> Float[Array, "16 4 4"]:
 def _non_negative_least_squares(
     matrix: Float[Array, "4 4"], inverses: Float[Array, "16 4 4"], target: Float[Array, "4"]
 ) -> Float[Array, "4"]:
-    """The x >= 0 that minimises |A x - b| for a regular A: the best that is not negative of the sixteen candidates."""
+    """The x >= 0 that minimizes |A x - b| for a regular A: the best of the sixteen candidates that are not negative."""
     candidates = jnp.swapaxes(inverses, 0, 1) @ target  # (4, 16)
     misses = (matrix[None] @ inverses - jnp.eye(4, dtype=matrix.dtype)[None]) @ jax.lax.stop_gradient(target)
     residuals = jnp.sum(misses**2, axis=-1)

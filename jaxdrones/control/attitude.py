@@ -1,4 +1,4 @@
-"""What the tracking controllers share: the attitude that points a force, and the error to it."""
+"""The attitude that points the thrust along a force, and the error of an attitude. Tracking controllers share them."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

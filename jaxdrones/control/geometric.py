@@ -32,7 +32,7 @@ class Gains(flax.struct.PyTreeNode):
 
 
 def gains() -> Gains:
-    """Position at 2.5 rad/s, tilt at 20 rad/s, yaw at 10 rad/s, damping 0.7 to 0.8: for rotors that do not lag."""
+    """Gains for rotors that do not lag: position at 2.5 rad/s, tilt at 20, yaw at 10, damping 0.7 to 0.8."""
     return Gains(
         pos=jnp.array([6.25, 6.25, 6.25]),
         vel=jnp.array([4.0, 4.0, 4.0]),
@@ -41,24 +41,24 @@ def gains() -> Gains:
     )
 
 
-def init(n: int) -> None:
-    """Memory for a team of n drones: none is kept."""
+def init() -> None:
+    """The memory of a drone: this controller keeps none."""
 
 
 def control(
     gains: Gains, params: Params, memory: Any, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Any, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`.
+    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`.
 
     f = m (a_d - k_x e_x - k_v e_v + g e_z), thrust f . R e_z, and
     tau = -J (k_R e_R + k_w e_w) + w x J w - J (w x R^T R_d w_d), with e_w = w - R^T R_d w_d.
 
     Args:
-        gains: of the two loops.
+        gains: of position and attitude.
         params: of the drone.
-        memory: none is kept; handed through.
+        memory: handed through; this controller keeps none.
         state: of the drone.
-        setpoint: pos, vel, acc, yaw, omega; all are used.
+        setpoint: pos, vel, acc, yaw and omega.
         dt: time between calls, s; only checked.
 
     Raises:
@@ -68,14 +68,14 @@ def control(
     check_single(params, state, setpoint)
 
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
-    acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
+    acc = acc + vector.along_z(params.gravity)
     axes = rotation.axes(state.quat)
     target = attitude.from_thrust(acc, setpoint.yaw)
 
     thrust = params.mass * vector.dot(acc, axes[2])
     rates = zip(vector.components(setpoint.omega), target, strict=True)
-    asked = cast(Array, sum(rate * axis for rate, axis in rates))  # world
-    omega_target = jnp.stack([vector.dot(axis, asked) for axis in axes])
+    target_omega = cast(Array, sum(rate * axis for rate, axis in rates))  # world
+    omega_target = jnp.stack([vector.dot(axis, target_omega) for axis in axes])
     omega_rate = (
         -gains.attitude * attitude.error(axes, target)
         - gains.rate * (state.omega - omega_target)

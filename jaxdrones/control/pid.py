@@ -1,6 +1,6 @@
-"""The paper's PID for Crazyflies: position loop, attitude loop, PWM mixer.
+"""The PID of gym-pybullet-drones for Crazyflies: position loop, attitude loop, PWM mixer.
 
-After the controller of the University of Toronto's Dynamic Systems Lab. Torques and thrust are in units of the
+It goes back to the Dynamic Systems Lab of the University of Toronto. Torques and thrust are in units of the
 Crazyflie's 16-bit PWM, whatever the vehicle.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_positive, check_whole
+from jaxdrones.checks import check_positive
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
@@ -27,7 +27,7 @@ from jaxdrones.vector import safe_sqrt
 
 VEHICLES = ("cf2x", "cf2p")
 
-_LIKENESS = np.log(1.25)  # between the numbers of a vehicle that the gains suit and those of cf2x
+_LIKENESS = np.log(1.25)  # between the constants of a vehicle that the gains suit and those of cf2x or cf2p
 _PWM_TO_RPM = 0.2685  # RPM per unit of the 16-bit PWM
 _PWM_OFFSET = 4070.3  # RPM
 _PWM_RANGE = (20000.0, 65535.0)
@@ -54,7 +54,7 @@ class Gains(flax.struct.PyTreeNode):
 
 
 class Memory(flax.struct.PyTreeNode):
-    """What the controller of one drone keeps between calls; a fresh one is zero."""
+    """What the controller of one drone keeps between calls; zero before the first."""
 
     pos_integral: Array
     """(3,) integrated position error, m s."""
@@ -70,7 +70,7 @@ def rpm_to_pwm(rpm: Any) -> Any:
 
 
 def gains(vehicle: str = "cf2x") -> Gains:
-    """The paper's gains for `cf2x` and `cf2p`.
+    """The gains of gym-pybullet-drones for `cf2x` and `cf2p`.
 
     Raises:
         ValueError: another vehicle; the gains fit a Crazyflie's mass, inertia and PWM.
@@ -107,15 +107,14 @@ def fits(params: Params) -> bool:
 
 
 def _numbers(params: Params) -> np.ndarray:
-    """What the gains depend on: (7,) of one drone, (n, 7) of a team."""
+    """The constants that the gains depend on: (7,) of one drone, (n, 7) of a team."""
     scalars = np.stack([params.mass, params.arm, params.kf, params.km], axis=-1)
     return np.concatenate([scalars, params.inertia], axis=-1)
 
 
-def init(n: int) -> Memory:
-    """Fresh memory for a team of n drones."""
-    check_whole("number of drones", n)
-    return Memory(jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 3)))
+def init() -> Memory:
+    """The memory of a drone before the first call."""
+    return Memory(jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
 
 
 def control(
@@ -141,7 +140,7 @@ def control(
     return memory, rotor_speeds(params, thrust, torque)
 
 
-@jax.checkpoint  # both loops: a gradient of a flight takes a third less time
+@jax.checkpoint  # both loops are cheaper to compute again in a backward pass than to keep
 def position_loop(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, dt: float
 ) -> tuple[Memory, Float[Array, ""], attitude.Axes]:
@@ -150,7 +149,7 @@ def position_loop(
     limit = jnp.array(_MAX_POS_INTEGRAL)
     integral = jnp.clip(memory.pos_integral + error * dt, -limit, limit)
     force = gains.pos_p * error + gains.pos_i * integral + gains.pos_d * (setpoint.vel - state.vel)
-    force = force + jnp.stack([jnp.zeros_like(params.mass), jnp.zeros_like(params.mass), params.weight])
+    force = force + vector.along_z(params.weight)
     thrust = jnp.maximum(vector.dot(force, rotation.z_axis(state.quat)), 0)
     pwm = rpm_to_pwm(safe_sqrt(thrust / (4 * params.kf)))
     return memory.replace(pos_integral=integral), pwm, attitude.from_thrust(force, setpoint.yaw)
@@ -162,7 +161,7 @@ def attitude_loop(
 ) -> tuple[Memory, Float[Array, "3"]]:
     """Torque (PWM) towards the attitude `target`.
 
-    The rate is a difference of roll, pitch, yaw that is not unwrapped, as in the reference: it kicks where yaw
+    The rate is a difference of roll, pitch and yaw that is not unwrapped, as in gym-pybullet-drones: it jumps where yaw
     crosses +-180 degrees.
     """
     rpy = rotation.to_rpy(state.quat)
@@ -176,6 +175,6 @@ def attitude_loop(
 
 
 def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-    """RPM of a thrust per rotor and a torque (PWM), each rotor's PWM cut to the Crazyflie's range, and `max_rpm`."""
+    """Rotor speeds (RPM) of a thrust per rotor and a torque (PWM), limited to the Crazyflie's PWM and to `max_rpm`."""
     pwm = jnp.clip(thrust + jax.vmap(vector.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
     return jnp.minimum(_PWM_TO_RPM * pwm + _PWM_OFFSET, params.max_rpm)

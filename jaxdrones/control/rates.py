@@ -19,7 +19,7 @@ from jaxdrones.vector import sin_cos
 
 
 class Gains(flax.struct.PyTreeNode):
-    """Gains of the outer loop (the reference's, for its racer) and of the inner one."""
+    """Gains of the outer loop (those of gym-pybullet-drones for its racer) and of the inner one."""
 
     pos: Array
     """(3,) 1/s^2."""
@@ -32,7 +32,7 @@ class Gains(flax.struct.PyTreeNode):
 
 
 def gains() -> Gains:
-    """The reference's outer loop; an inner loop of 40 rad/s in roll and pitch and 15 rad/s in yaw."""
+    """Gains with the outer loop of gym-pybullet-drones, and an inner one of 40 rad/s in roll and pitch, 15 in yaw."""
     return Gains(
         pos=jnp.array([3.0, 3.0, 8.0]),
         vel=jnp.array([2.5, 2.5, 5.0]),
@@ -41,19 +41,19 @@ def gains() -> Gains:
     )
 
 
-def init(n: int) -> None:
-    """Memory for a team of n drones: none is kept."""
+def init() -> None:
+    """The memory of a drone: this controller keeps none."""
 
 
 def control(
     gains: Gains, params: Params, memory: Any, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Any, Float[Array, "4"]]:
-    """Both loops: rotor speeds of one drone, RPM, up to `max_rpm`.
+    """Rotor speeds of one drone by both loops, RPM, up to `max_rpm`.
 
     Args:
         gains: of both loops.
         params: of the drone.
-        memory: none is kept; handed through.
+        memory: handed through; this controller keeps none.
         state: of the drone.
         setpoint: pos, vel, acc and yaw; omega is not used.
         dt: time between calls, s; only checked.
@@ -72,7 +72,7 @@ def command(
     """Outer loop: collective thrust per mass (m/s^2, body z) and body rates (rad/s) towards a setpoint."""
     check_single(params, state, setpoint)
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
-    acc = acc + jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
+    acc = acc + vector.along_z(params.gravity)
     collective = vector.dot(acc, rotation.z_axis(state.quat))
 
     sin, cos = sin_cos(setpoint.yaw)

@@ -1,4 +1,4 @@
-"""What a controller is asked to do."""
+"""The target of a controller."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Setpoint(flax.struct.PyTreeNode):
         yaw: ArrayLike | None = None,
         omega: ArrayLike | None = None,
     ) -> Setpoint:
-        """A position to be at, (*n, 3), and the other targets; what is left out is zero."""
+        """The target of a position, (*n, 3), and of everything else that is given; the rest is zero."""
         pos = jnp.asarray(pos)
         zero = jnp.zeros_like(pos)
         return cls(

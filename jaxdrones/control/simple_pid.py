@@ -1,4 +1,7 @@
-"""The paper's simple PID for the Hummingbird: angles from a desired force, thrust and torque by least squares."""
+"""The simple PID of gym-pybullet-drones for the Hummingbird.
+
+Angles follow from a desired force; rotor speeds follow from thrust and torque by least squares.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,14 @@ import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones import rotation
-from jaxdrones.checks import check_positive, check_whole
+from jaxdrones import rotation, vector
+from jaxdrones.checks import check_positive
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import safe_sqrt
+from jaxdrones.vector import atan2, safe_sqrt
 
 _MAX_TILT = jnp.pi / 6  # rad, of the roll and pitch targets
 
@@ -36,7 +39,7 @@ class Gains(flax.struct.PyTreeNode):
 
 
 class Memory(flax.struct.PyTreeNode):
-    """What the controller of one drone keeps between calls; a fresh one is zero."""
+    """What the controller of one drone keeps between calls; zero before the first."""
 
     pos_integral: Array
     """(3,) integrated position error, m s; not limited."""
@@ -49,7 +52,7 @@ class Memory(flax.struct.PyTreeNode):
 
 
 def gains() -> Gains:
-    """The paper's gains for the Hummingbird (`hb`)."""
+    """The gains of gym-pybullet-drones for the Hummingbird (`hb`)."""
     return Gains(
         pos_p=jnp.array([0.1, 0.1, 0.2]),
         pos_i=jnp.array([1e-4, 1e-4, 1e-4]),
@@ -60,19 +63,18 @@ def gains() -> Gains:
     )
 
 
-def init(n: int) -> Memory:
-    """Fresh memory for a team of n drones."""
-    check_whole("number of drones", n)
-    return Memory(jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 3)))
+def init() -> Memory:
+    """The memory of a drone before the first call."""
+    return Memory(jnp.zeros(3), jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
 
 
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`; the reference's are not limited.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`; those of gym-pybullet-drones are not limited.
 
-    Heads north: of the setpoint only `pos` is used. Derivatives are differences of errors, so the first call kicks.
-    With the Hummingbird's own inertia it needs 60 calls per second; the paper's 48 go with a fivefold one.
+    The drone keeps yaw zero: of the setpoint only `pos` is used. Derivatives are differences of errors, so the first
+    call jumps. With the inertia of the Hummingbird it needs 60 calls per second; the paper's 48 go with a fivefold one.
 
     Args:
         gains: of the two loops.
@@ -92,23 +94,22 @@ def control(
     pos_integral = memory.pos_integral + pos_error * dt
     pos_rate = (pos_error - memory.pos_error) / dt
     force = gains.pos_p * pos_error + gains.pos_i * pos_integral + gains.pos_d * pos_rate
-    force = force + jnp.stack([jnp.zeros_like(params.mass), jnp.zeros_like(params.mass), params.weight])
+    force = force + vector.along_z(params.weight)
 
     rpy_error = _wrap_yaw(_angles_of(force) - rotation.to_rpy(state.quat))
     rpy_integral = memory.rpy_integral + rpy_error * dt
     rpy_rate = (rpy_error - memory.rpy_error) / dt
     torque = gains.rpy_p * rpy_error + gains.rpy_i * rpy_integral + gains.rpy_d * rpy_rate
 
-    thrust = rotation.rotate(state.quat, force)[2]  # as the reference has it; the force along body z would be R^T f
+    thrust = rotation.rotate(state.quat, force)[2]  # as in gym-pybullet-drones; the force along body z would be R^T f
     return Memory(pos_integral, rpy_integral, pos_error, rpy_error), rpm_from_wrench(params, thrust, torque)
 
 
 def _angles_of(force: Float[Array, "3"]) -> Float[Array, "3"]:
     """Roll and pitch that point body z (or -z) along the force, limited, and yaw zero; rad."""
     x, y, z = jnp.where(force[2] < 0, -force, force)
-    no_pitch = (x == 0) & (z == 0)  # arctan2 has no derivative at (0, 0)
-    roll = jnp.arctan2(-y, jnp.where(no_pitch & (y == 0), 1, safe_sqrt(x**2 + z**2)))
-    pitch = jnp.arctan2(x, jnp.where(no_pitch, 1, z))
+    roll = atan2(-y, safe_sqrt(x**2 + z**2))
+    pitch = atan2(x, z)
     return jnp.clip(jnp.stack([roll, pitch, jnp.zeros_like(roll)]), -_MAX_TILT, _MAX_TILT)
 
 

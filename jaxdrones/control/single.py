@@ -1,4 +1,4 @@
-"""What every controller demands of its arguments."""
+"""A check that every controller makes: its arguments are those of one drone."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ _SETPOINT: dict[str, tuple[int, ...]] = {"pos": (3,), "vel": (3,), "acc": (3,), 
 
 
 def check_single(params: Params, state: State, setpoint: Setpoint | None = None, memory: Any = None) -> None:
-    """Raise `ValueError` unless the arrays are those of one drone; what is `None` is not looked at."""
+    """Raise `ValueError` unless the arrays are those of one drone; `None` is not checked."""
     for name, shape in _STATE.items():
         check_shape(f"state.{name}", getattr(state, name), shape, _HINT)
     check_quaternion("state.quat", state.quat)

@@ -1,4 +1,4 @@
-"""The paper's velocity input (equation 8): a direction and a share of a speed limit, flown by the PID."""
+"""The velocity input of the paper (equation 8): a direction and a share of a speed limit, flown by the PID."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -27,7 +27,7 @@ def control(
         action: (4,) direction x, y, z of any length, and magnitude: the share of the speed limit, sign ignored.
         dt: time between calls, s.
 
-    The position target is where the drone is and the yaw target how it is headed, so only the velocity error acts.
+    The position target is the position of the drone and the yaw target its heading, so only the velocity error acts.
 
     Raises:
         ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
@@ -38,7 +38,7 @@ def control(
 
 
 def setpoint(params: Params, state: State, action: Float[Array, "4"]) -> Setpoint:
-    """What an action asks of a controller: to be where the drone is, headed as it is, at the commanded velocity."""
+    """The setpoint of an action: the position and heading of the drone, and the commanded velocity."""
     return Setpoint.at(state.pos, vel=commanded(params, action), yaw=rotation.to_rpy(state.quat)[2])
 
 

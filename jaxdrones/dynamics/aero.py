@@ -1,10 +1,8 @@
-"""Effects of the surroundings on one drone: drag (paper, equation 4), ground effect (equation 5), a push.
+"""Effects of the surroundings on one drone: drag (paper, equation 4), ground effect (equation 5), external forces.
 
-`drag` and `ground_effect` are the smooth, physical ones; `drag_world_axes` and `ground_effect_2021`
-compute what the paper's simulator does, for its figures and its recorded data.
+`drag` and `ground_effect` are the smooth, physical laws. `drag_world_axes` and `ground_effect_2021` are those of
+gym-pybullet-drones (2021), for its figures and its recorded data.
 """
-
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +16,17 @@ from jaxdrones.vector import safe_sqrt
 from jaxdrones.wrench import Wrench
 
 _RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
-_FLOOR = 1.63  # propeller radii; height below which ground effect levels off: the paper's clip for the Crazyflie
+_FLOOR = 1.63  # propeller radii; below this height ground effect levels off, as for the Crazyflie of (2021)
 
 
 def drag(params: Params, state: State) -> Wrench:
-    """Rotor drag on the air-relative velocity: -k_D sum(rotor speed) v, coefficients along the body axes."""
+    """Rotor drag, -k_D sum(rotor speed) v with v the velocity relative to the air and k_D along the body axes."""
     air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
     return Wrench.of_force(-params.drag_coeff * _summed_rotor_speed(state) * air_velocity)
 
 
 def drag_world_axes(params: Params, state: State) -> Wrench:
-    """Rotor drag as the reference computes it, with the coefficients along the world axes."""
+    """Rotor drag as in gym-pybullet-drones, with the coefficients along the world axes."""
     force = -params.drag_coeff * _summed_rotor_speed(state) * (state.vel - params.wind)
     return Wrench.of_force(rotation.rotate_inverse(state.quat, force))
 
@@ -47,7 +45,7 @@ def ground_effect(params: Params, state: State) -> Wrench:
 
 
 def ground_effect_2021(params: Params, state: State) -> Wrench:
-    """Equation 5 with the reference's clip of the height and its gate at 90 degrees of roll or pitch."""
+    """Equation 5 with the height limited from below, and no effect beyond 90 degrees of roll or pitch."""
     clip = params.prop_radius / 4 * safe_sqrt(15 / 4 * params.ground_effect_coeff)
     height = jnp.maximum(_rotor_heights(params, state), clip)
     above = height > 0  # below the ground there is no clip where the coefficient is zero
@@ -60,13 +58,13 @@ def ground_effect_2021(params: Params, state: State) -> Wrench:
 
 
 def external_force(params: Params, state: State) -> Wrench:
-    """The force `external_force` of somebody else, through the centre of mass."""
+    """The force `params.external_force` on the center of mass."""
     return Wrench.of_force(rotation.rotate_inverse(state.quat, params.external_force))
 
 
 def _summed_rotor_speed(state: State) -> Float[Array, ""]:
-    """rad/s."""
-    return _RADIANS_PER_SECOND * cast(Array, sum(vector.components(state.rpm)))
+    """Sum of the four rotor speeds, rad/s."""
+    return _RADIANS_PER_SECOND * jnp.sum(state.rpm)
 
 
 def _rotor_heights(params: Params, state: State) -> Float[Array, "4"]:

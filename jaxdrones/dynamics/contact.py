@@ -1,19 +1,20 @@
-"""Compliant contact: of a drone with the ground, and of two drones with each other.
+"""Compliant contact of a drone with the ground, and of two drones with each other.
 
-For the explicit backend only. Bullet resolves contacts itself; with these effects it would do so twice.
+For the explicit backend only: Bullet resolves contacts itself, and with these effects it would do so twice.
 
-A drone touches with what it touches with in Bullet: a ring of balls as high as its collision cylinder, on a disc. What
-is a depth x inside and moves further in at x' is pushed out, per mass, by
+The collision shape of a drone is that of Bullet: a disc whose rim is a ring of spheres, as high as its collision
+cylinder. The normal force per mass at a penetration depth x that grows at the rate x' is
 
-    s (a + b x') + c x,  s = x^2 / (d^2 + x^2),  and never pulled in.
+    s (a + b x') + c x,  s = x^2 / (d^2 + x^2),  and never pulls.
 
-This is the law of Hunt and Crossley (1975) where it sets in: the damping grows from zero with the depth, so that no
-force jumps and what leaves leaves slowly. Further in, the damping levels off, because an explicit step cannot
-do with more. Friction is Coulomb's, and viscous at low speed. All forces are in proportion to a mass, so that one set
-of numbers serves every vehicle.
+At the surface this is the law of Hunt and Crossley (1975): the damping grows from zero with the depth, so that no force
+jumps at touchdown, and a drone that leaves is not held back. Deeper inside the damping levels off, because explicit
+integration is unstable with more. Friction is Coulomb's, and viscous at low slip speed. All forces are in proportion to
+a mass, so that one set of coefficients serves every vehicle.
 
-The numbers are for `semi_implicit_euler` with steps of up to 1/240 s: what is damped at a rate above 1/dt overshoots,
-at one above 2/dt it gains energy. The price is depth: what lands at 1 m/s sinks in 8 mm, at 5 m/s 3 cm.
+The coefficients suit `semi_implicit_euler` with steps of up to 1/240 s: a velocity that is damped at a rate above 1/dt
+overshoots, and at a rate above 2/dt it gains energy. The price of such soft contact is depth: a drone that lands at
+1 m/s sinks in 8 mm, at 5 m/s 3 cm.
 """
 
 from typing import NamedTuple
@@ -26,171 +27,183 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import components, cross, dot
+from jaxdrones.vector import along_z, components, cross, dot
 from jaxdrones.wrench import Wrench
 
-_BALLS = 8  # as in Bullet
-_ANGLES = 2 * np.pi / _BALLS * np.arange(_BALLS)
+_SPHERES = 8  # as in Bullet
+_ANGLES = 2 * np.pi / _SPHERES * np.arange(_SPHERES)
 
-_ONSET = 2.5e-3  # m, d: half of the damping is there; a drone at rest is 1.5 mm deep; 1 mm makes gradients noisier
-_PUSH = 20.0  # m/s^2, a: about twice gravity, so that a drone rests near the surface
-_DAMPING = 120.0  # 1/s, a b: half of 1/dt for a drone that heaves; the tilting of a level hb is 3.3 times as fast
-_STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; with the damping just above critical, so that little bounces
-_GRIP = 400.0  # 1/s: the fastest rate at which friction slows a point of the rim, for all ways it can move together
-_GRIP_ON_DRONE = 15.0  # 1/s: the same at one of 16 points between drones, so that one below another does not shake
-_SHARE_ON_DRONE = 4.0  # share of the push for one point over that of its lever: three that share it stay below 2/dt
-_SLOW = 0.01  # m/s: friction is viscous below, however light the touch; a drone's weight makes it 0.05 (cf2x)
-_ON_GROUND = 0.5  # friction coefficient: the reference's drone 0.5 times its plane 1.0
-_ON_DRONE = 0.25  # friction coefficient: 0.5 times 0.5
-_NEAR = 1e-4  # m: rounds off the distance of two points that meet
+_ONSET_DEPTH = 2.5e-3  # m, d: depth of half the damping; a drone at rest is 1.5 mm deep; 1 mm makes gradients noisier
+_PRELOAD = 20.0  # m/s^2, a: about twice gravity, so that a drone rests near the surface
+_DAMPING = 120.0  # 1/s, a b: half of 1/dt for a drone that heaves; a level hb tilts at 3.3 times that rate
+_STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; the damping is just above critical, so that drones hardly bounce
+_FRICTION_RATE = 400.0  # 1/s: the highest rate at which friction on the ground slows a point of the rim
+_FRICTION_RATE_ON_DRONE = 15.0  # 1/s: the same between drones at each of 16 points; more shakes a drone that is carried
+_MAX_SHARE_ON_DRONE = 4.0  # normal force at one point over that of its lever; three loaded points then stay below 2/dt
+_STICTION_SPEED = 0.01  # m/s: friction is viscous below; with the weight of a cf2x below 0.05 m/s
+_GROUND_FRICTION = 0.5  # coefficient: gym-pybullet-drones gives its drones 0.5 and its plane 1.0
+_DRONE_FRICTION = 0.25  # coefficient: 0.5 times 0.5
+_ROUNDING = 1e-4  # m: rounds off the distance of two points that coincide
 
 
 def ground_contact(params: Params, state: State) -> Wrench:
-    """What the ground, the plane z = 0, does to a drone that touches it: it pushes and rubs, and never pulls.
+    """Normal force and friction of the ground, the plane z = 0, on a drone that touches it. The ground never pulls.
 
-    Not for the Bullet backend, whose ground does it already.
+    Not for the Bullet backend, which has a ground of its own.
     """
-    ball, ring = _shape(params)
+    radius, ring = _rim(params)
     x_axis, y_axis, z_axis = rotation.axes(state.quat)
     omega = rotation.rotate(state.quat, state.omega)
-    # Everything below is world frame. The lowest point of the ball at angle t is p + x cos t + y sin t from the centre
-    # of mass, and so are its velocity and, summed over the balls, the moments of the forces.
-    p = params.collision_offset * z_axis - ball * jnp.array([0, 0, 1], ball.dtype)
+    # Everything below is in the world frame. The lowest point of the sphere at angle t is p + x cos t + y sin t from
+    # the center of mass, and so are its velocity and, summed over the spheres, the moments of the forces.
+    p = params.collision_offset * z_axis - along_z(radius)
     x, y = ring * x_axis, ring * y_axis
-    cos, sin = (jnp.asarray(f(_ANGLES), ball.dtype) for f in (np.cos, np.sin))
+    cos, sin = (jnp.asarray(f(_ANGLES), radius.dtype) for f in (np.cos, np.sin))
 
-    def around(a: Array, b: Array, c: Array) -> list[Float[Array, " balls"]]:
+    def around(a: Array, b: Array, c: Array) -> list[Float[Array, " spheres"]]:
+        """The components of a + b cos t + c sin t at every sphere."""
         return [i + j * cos + k * sin for i, j, k in zip(components(a), components(b), components(c), strict=True)]
 
     _, _, height = around(state.pos + p, x, y)
-    vel = around(state.vel + cross(omega, p), cross(omega, x), cross(omega, y))
-    normal = params.mass / _BALLS * _push(-height, -vel[2])
-    rub = _rub(_ON_GROUND * normal, vel[0] ** 2 + vel[1] ** 2, _GRIP * _sliding_mass(params) / _BALLS)
-    forces = [-rub * vel[0], -rub * vel[1], normal]
+    vx, vy, vz = around(state.vel + cross(omega, p), cross(omega, x), cross(omega, y))
+    normal_force = params.mass / _SPHERES * _normal_force_per_mass(-height, -vz)
+    max_viscosity = _FRICTION_RATE * _sliding_mass(params) / _SPHERES
+    viscosity = _friction_per_slip(_GROUND_FRICTION * normal_force, vx**2 + vy**2, max_viscosity)
+    forces = [-viscosity * vx, -viscosity * vy, normal_force]
 
-    force = jnp.stack([sum(components(f)) for f in forces])
+    force = jnp.stack([jnp.sum(f) for f in forces])
     torque = cross(p, force)
     torque += cross(x, jnp.stack([dot(cos, f) for f in forces])) + cross(y, jnp.stack([dot(sin, f) for f in forces]))
     return Wrench(rotation.rotate_inverse(state.quat, force), rotation.rotate_inverse(state.quat, torque))
 
 
 def drone_contact(params: Params, state: State, other: Params, other_state: State) -> Wrench:
-    """What a drone does to another that it touches, here to the first; the second gets the opposite.
+    """Normal force and friction of another drone on a drone that it touches; the other one gets the opposite.
 
-    The balls of each meet the disc of the other, rounded by its balls: 16 points, which share one push, so that two
-    edges that meet and two discs that lie on each other give way alike. Not for the Bullet backend, which does it
-    already.
+    The spheres of each drone meet the disc of the other, which is rounded by its spheres. These 16 points share one
+    normal force, so that two rims that meet and two discs that lie on each other give way alike. Not for the Bullet
+    backend, which resolves these contacts itself.
 
-    Softer than the ground, and than Bullet. Two cf2x that meet rim to rim stop each other at 1 m/s; at 3 m/s most slip
-    past each other, one over the other (26 of 30, in Bullet 1 of 30). Flat onto each other they stop up to 3 m/s and
-    pass through at 5 m/s. A drone that lies on another, off its middle, slides down; in Bullet it stays.
+    Contact of drones is softer than that with the ground, and softer than in Bullet. Two cf2x that meet rim to rim stop
+    each other at 1 m/s; at 3 m/s most slip past each other, one over the other (26 of 30, in Bullet 1 of 30). Flat onto
+    each other they stop up to 3 m/s, and pass through each other at 5 m/s. A drone that lies on another, off its
+    middle, slides down; in Bullet it stays.
     """
-    # World frame, positions from the first's centre of mass, so that they are as exact far from the origin.
-    own, its = _body(params, state, jnp.zeros_like(state.pos)), _body(other, other_state, other_state.pos - state.pos)
-    mine, theirs = _touch(own, its), _touch(its, own)
-    point, normal, depth = (
-        jnp.concatenate(pair) for pair in zip(mine, (theirs[0], -theirs[1], theirs[2]), strict=True)
-    )
-    share = _both(_tilting_mass(params), _tilting_mass(other)) / (1 + sum(components(_onset(depth))))
-    grip = share * _GRIP_ON_DRONE
+    # World frame, with positions from the center of mass of the first drone: so they are as exact far from the origin.
+    first = _body(params, state, jnp.zeros_like(state.pos))
+    second = _body(other, other_state, other_state.pos - state.pos)
+    ours, theirs = _contacts(first, second), _contacts(second, first)
+    contacts = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ours, theirs._replace(normal=-theirs.normal))
+    mass = _series_mass(_tilting_mass(params), _tilting_mass(other))
+    share = mass / (1 + jnp.sum(_onset(contacts.depth)))
 
-    def at(point: Float[Array, "3"], normal: Float[Array, "3"], depth: Float[Array, ""]) -> Wrench:
-        vel = _velocity(own, point) - _velocity(its, point)
-        inward = -dot(vel, normal)
-        slip = vel + inward * normal
-        push = share * _push(depth, inward)
-        force = push * normal - _rub(_ON_DRONE * push, dot(slip, slip), grip) * slip
-        return Wrench(force, cross(point, force))
+    def at_point(contact: _Contact) -> Wrench:
+        vel = _velocity(first, contact.point) - _velocity(second, contact.point)
+        depth_rate = -dot(vel, contact.normal)
+        slip = vel + depth_rate * contact.normal
+        normal_force = share * _normal_force_per_mass(contact.depth, depth_rate)
+        viscosity = _friction_per_slip(_DRONE_FRICTION * normal_force, dot(slip, slip), share * _FRICTION_RATE_ON_DRONE)
+        force = normal_force * contact.normal - viscosity * slip
+        return Wrench(force, cross(contact.point, force))
 
-    total = jax.tree.map(
-        lambda x: jnp.stack([sum(components(row)) for row in _rows(x.T)]), jax.vmap(at)(point, normal, depth)
-    )
+    total = jax.tree.map(lambda x: jnp.sum(x, axis=0), jax.vmap(at_point)(contacts))
     return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), total)
 
 
 class _Body(NamedTuple):
-    """A drone as it is touched; world frame, positions from where the caller has put the origin."""
+    """The collision shape of a drone and how it moves; world frame, with the origin where the caller puts it."""
 
     pos: Array
+    """Center of mass."""
     vel: Array
     omega: Array
     center: Array
-    """Of the disc."""
+    """Center of the disc."""
     axes: list[Array]
     """x, y, z of the body."""
-    ball: Array
+    radius: Array
+    """Radius of the spheres, and half the thickness of the disc."""
     ring: Array
+    """Radius of the circle of the spheres' centers."""
+
+
+class _Contact(NamedTuple):
+    """Where a sphere of one body is nearest to the disc of another."""
+
+    point: Float[Array, "3"]
+    """On the surface of the disc."""
+    normal: Float[Array, "3"]
+    """From the disc to the sphere, of unit length."""
+    depth: Float[Array, ""]
+    """Penetration, m; negative where they do not touch."""
 
 
 def _body(params: Params, state: State, pos: Float[Array, "3"]) -> _Body:
     axes = rotation.axes(state.quat)
     center = pos + params.collision_offset * axes[2]
-    return _Body(pos, state.vel, rotation.rotate(state.quat, state.omega), center, axes, *_shape(params))
+    return _Body(pos, state.vel, rotation.rotate(state.quat, state.omega), center, axes, *_rim(params))
 
 
 def _velocity(body: _Body, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The velocity of a point of a body."""
     return body.vel + cross(body.omega, point - body.pos)
 
 
-def _touch(balls: _Body, disc: _Body) -> tuple[Float[Array, "8 3"], Float[Array, "8 3"], Float[Array, " 8"]]:
-    """Where each ball of one body meets the disc of another: point, direction from disc to ball, depth (m)."""
-    x, y, _ = balls.axes
-    normal = disc.axes[2]
+def _contacts(spheres: _Body, disc: _Body) -> _Contact:
+    """The contact of each sphere of one body with the disc of another; arrays have a leading axis over spheres."""
+    x, y, _ = spheres.axes
+    axis = disc.axes[2]
 
-    def of_ball(cos: Float[Array, ""], sin: Float[Array, ""]):
-        to_ball = balls.center + balls.ring * (cos * x + sin * y) - disc.center
-        in_plane = to_ball - dot(to_ball, normal) * normal
+    def of_sphere(cos: Float[Array, ""], sin: Float[Array, ""]) -> _Contact:
+        to_sphere = spheres.center + spheres.ring * (cos * x + sin * y) - disc.center
+        in_plane = to_sphere - dot(to_sphere, axis) * axis
         nearest = in_plane * disc.ring / jnp.sqrt(jnp.maximum(dot(in_plane, in_plane), disc.ring**2))
-        apart = to_ball - nearest
-        distance = jnp.sqrt(dot(apart, apart) + _NEAR**2)
-        direction = apart / distance
-        return disc.center + nearest + disc.ball * direction, direction, balls.ball + disc.ball - distance
+        separation = to_sphere - nearest
+        distance = jnp.sqrt(dot(separation, separation) + _ROUNDING**2)
+        normal = separation / distance
+        point = disc.center + nearest + disc.radius * normal
+        return _Contact(point, normal, spheres.radius + disc.radius - distance)
 
     cos, sin = (jnp.asarray(f(_ANGLES), x.dtype) for f in (np.cos, np.sin))
-    return jax.vmap(of_ball)(cos, sin)
+    return jax.vmap(of_sphere)(cos, sin)
 
 
-def _push(depth: Array, rate: Array) -> Array:
-    """Normal force per mass at a depth (m) that grows at a rate (m/s): N/kg, not negative."""
-    return jnp.maximum(_onset(depth) * (_PUSH + _DAMPING * rate) + _STIFFNESS * jnp.maximum(depth, 0), 0)
+def _normal_force_per_mass(depth: Array, depth_rate: Array) -> Array:
+    """Normal force per mass at a penetration depth (m) that grows at a rate (m/s): N/kg, never negative."""
+    return jnp.maximum(_onset(depth) * (_PRELOAD + _DAMPING * depth_rate) + _STIFFNESS * jnp.maximum(depth, 0), 0)
 
 
 def _onset(depth: Array) -> Array:
-    """From 0 at the surface to 1 well inside, with a continuous slope."""
+    """The factor s, from 0 at the surface to 1 well inside, with a continuous slope."""
     square = jnp.maximum(depth, 0) ** 2
-    return square / (_ONSET**2 + square)
+    return square / (_ONSET_DEPTH**2 + square)
 
 
-def _rub(limit: Array, slip_squared: Array, grip: Array) -> Array:
-    """Friction per slip velocity, N s/m: of a force up to `limit` (N), and itself less than `grip` (N s/m)."""
-    return limit / jnp.sqrt(slip_squared + _SLOW**2 + (limit / grip) ** 2)
+def _friction_per_slip(max_friction: Array, slip_squared: Array, max_viscosity: Array) -> Array:
+    """Friction over slip velocity, N s/m: less than `max_viscosity`, and for a friction of up to `max_friction` (N)."""
+    return max_friction / jnp.sqrt(slip_squared + _STICTION_SPEED**2 + (max_friction / max_viscosity) ** 2)
 
 
-def _shape(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Radius of the balls and of the circle of their centres, m; as in Bullet."""
-    ball = jnp.minimum(params.collision_height, params.collision_radius) / 2
-    return ball, params.collision_radius - ball
+def _rim(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Radius of the spheres and of the circle of their centers, m; as in Bullet."""
+    radius = jnp.minimum(params.collision_height, params.collision_radius) / 2
+    return radius, params.collision_radius - radius
 
 
 def _sliding_mass(params: Params) -> Float[Array, ""]:
-    """What a force on the rim must move if it slides, tilts and turns the drone at once, kg."""
-    ball, ring = _shape(params)
-    low = jnp.abs(params.collision_offset) + ball
+    """Effective mass of a point of the rim that is pushed sideways, so that the drone slides, tilts and turns, kg."""
+    radius, ring = _rim(params)
+    low = jnp.abs(params.collision_offset) + radius
     ix, _, iz = components(params.inertia)
     return 1 / (1 / params.mass + low**2 / ix + ring**2 / iz)
 
 
 def _tilting_mass(params: Params) -> Float[Array, ""]:
-    """What a ball that is hit along the thrust axis must move, times a constant, but not more than the mass, kg."""
+    """Effective mass of a sphere that is pushed along the thrust axis, times a constant; at most the mass, kg."""
     ix, _, _ = components(params.inertia)
-    return jnp.minimum(params.mass, _SHARE_ON_DRONE / (1 / params.mass + _shape(params)[1] ** 2 / ix))
+    return jnp.minimum(params.mass, _MAX_SHARE_ON_DRONE / (1 / params.mass + _rim(params)[1] ** 2 / ix))
 
 
-def _both(a: Array, b: Array) -> Array:
-    """The mass that two masses put up against each other."""
+def _series_mass(a: Array, b: Array) -> Array:
+    """The reduced mass of two masses that push each other."""
     return a * b / (a + b)
-
-
-def _rows(matrix: Float[Array, "m n"]) -> list[Float[Array, " n"]]:
-    """The rows of a matrix."""
-    return [jnp.squeeze(row, 0) for row in jax.lax.split(matrix, [1] * len(matrix))]

@@ -1,6 +1,8 @@
-"""What one drone does to another through the air: downwash (paper, equation 6)."""
+"""Downwash: what one drone does to another through the air (paper, equation 6)."""
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
 from jaxdrones.params import Params
@@ -8,7 +10,7 @@ from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
 # Turbulent jet below a hovering multirotor, fitted to 16 h of flight by Bauersfeld et al., RA-L 2024.
-_JET_SPEED = 10.11  # centre speed over induced speed, at one motor distance per unit of the denominator
+_JET_SPEED = 10.11  # center speed over induced speed, at one motor distance per unit of the denominator
 _JET_ORIGIN = 5.817  # motor distances from the virtual origin of the jet to the rotors
 _JET_WIDTH = 0.07668  # half width over distance from the virtual origin
 
@@ -18,39 +20,40 @@ _MIN_WIDTH = 5e-4  # m; the paper's downwash has no width at a height of 0.6875 
 
 
 def downwash(params: Params, state: State, other: Params, other_state: State) -> Wrench:
-    """Thrust that the rotors of a drone lose in the jet of the other one. Smooth and bounded.
+    """Thrust that the rotors of a drone lose in the jet of the other one; smooth and bounded.
 
     The jet blows along the other drone's thrust axis. Its speed follows from the induced speed of the other's
     rotors, hence from its thrust, and falls with the distance z along and r off the axis as
     U(z, r) = U_0 10.11 / (z/l + 5.817) / (1 + (sqrt(2) - 1) (r/w)^2)^2, w = 0.07668 (z + 5.817 l),
-    l the distance of neighbouring motors; it sets in smoothly within one l below the other drone.
+    l the distance of neighboring motors; it sets in smoothly within one l below the other drone.
     A rotor loses the share `inflow_loss` of its thrust per m/s that blows down its own axis, so that a drone
-    that is half in the jet tilts. Valid from 2.5 l on (Bauersfeld et al. 2024); nearer it is only plausible.
+    that is half in the jet tilts. The law is valid from 2.5 l on (Bauersfeld et al. 2024); nearer it is an assumption.
     """
     length = jnp.sqrt(2.0) * other.arm
     axis = rotation.z_axis(other_state.quat)
-    down = _minus(other_state.pos, state.pos)
+    to_other = other_state.pos - state.pos
     speed = _JET_SPEED * _induced_speed(other, other_state)
     loss = params.inflow_loss * params.kf * vector.dot(axis, rotation.z_axis(state.quat))
-    thrusts = []
-    for rotor, rpm in zip(vector.components(params.rotor_pos), vector.components(state.rpm), strict=True):
-        below = _minus(down, rotation.rotate(state.quat, rotor))
-        along = vector.dot(axis, below)
-        off_axis = vector.dot(below, below) - along**2
+
+    def thrust_change(rotor: Float[Array, "3"], rpm: Float[Array, ""]) -> Float[Array, ""]:
+        above = to_other - rotation.rotate(state.quat, rotor)
+        along = vector.dot(axis, above)
+        off_axis = vector.dot(above, above) - along**2
         z = along / length
         depth = jnp.maximum(z, 0) + _JET_ORIGIN
         width = (_JET_WIDTH * depth * length) ** 2
         spread = width + (jnp.sqrt(2.0) - 1) * off_axis
         onset = jnp.clip(z, 0, 1)
-        thrusts.append(-speed * width**2 * onset**2 * (3 - 2 * onset) * loss * rpm**2 / (depth * spread**2))
-    return Wrench.of_thrusts(params.rotor_pos, jnp.stack(thrusts))
+        return -speed * width**2 * onset**2 * (3 - 2 * onset) * loss * rpm**2 / (depth * spread**2)
+
+    return Wrench.of_thrusts(params.rotor_pos, jax.vmap(thrust_change)(params.rotor_pos, state.rpm))
 
 
 def downwash_2021(params: Params, state: State, other: Params, other_state: State) -> Wrench:
     """Equation 6: a force along -z of the lower drone's body, whatever the two drones' thrusts and attitudes.
 
-    It diverges where the drones meet and has no width 0.6875 m apart: below 0.05 m of height difference and
-    0.5 mm of width the values at these bounds are used.
+    The force of the equation diverges where the drones meet, and its width vanishes 0.6875 m apart: below 0.05 m of
+    height difference and 0.5 mm of width, the values at these bounds are used.
     """
     k1, k2, k3 = other.downwash_coeff
     dx, dy, dz = other_state.pos - state.pos
@@ -59,15 +62,10 @@ def downwash_2021(params: Params, state: State, other: Params, other_state: Stat
     width = jnp.maximum((k2 * height + k3) ** 2, _MIN_WIDTH**2)
     strength = k1 * (other.prop_radius / (4 * height)) ** 2 * jnp.exp(-off_axis / width / 2)
     strength = jnp.where((dz > 0) & (off_axis < _CUTOFF**2), strength, 0)
-    zero = jnp.zeros_like(strength)
-    return Wrench.of_force(jnp.stack([zero, zero, -strength]))
+    return Wrench.of_force(vector.along_z(-strength))
 
 
-def _minus(a, b):
-    return jnp.stack([x - y for x, y in zip(vector.components(a), vector.components(b), strict=True)])
-
-
-def _induced_speed(params: Params, state: State):
+def _induced_speed(params: Params, state: State) -> Float[Array, ""]:
     """Air speed through the rotor discs in hover by momentum theory, m/s: the mean of sqrt(F_i / (2 rho A))."""
     area = jnp.pi * params.prop_radius**2
-    return sum(vector.components(jnp.abs(state.rpm))) / 4 * jnp.sqrt(params.kf / (2 * params.air_density * area))
+    return jnp.mean(jnp.abs(state.rpm)) * jnp.sqrt(params.kf / (2 * params.air_density * area))

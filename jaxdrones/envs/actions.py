@@ -23,8 +23,8 @@ from jaxdrones.state import State
 Command = Callable[[Params, Any, State, Array, Setpoint, float], tuple[Any, Float[Array, "4"]]]
 
 
-def _no_memory(n: int) -> None:
-    return None
+def _no_memory() -> None:
+    """The memory of an action type that keeps none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Action:
     """How many numbers an action of one drone has."""
     rpm: Command
     """(params, memory, state, action (size,), setpoint of the task, control period) -> (memory, rotor speeds, RPM)."""
-    init: Callable[[int], Any] = _no_memory
-    """Number of drones -> initial memory of the team's controllers."""
+    init: Callable[[], Any] = _no_memory
+    """() -> memory of one drone at the start of an episode."""
     for_vehicle: Callable[[Params], Action] | None = None
     """Nominal parameters of the team -> the action type for this vehicle; `None` where it is the same for all."""
 
@@ -51,7 +51,7 @@ class Action:
     def __post_init__(self):
         check_whole("size of an action type", self.size)
         check_callable("rpm of an action type", self.rpm, "jaxdrones.envs.ACTIONS['rpm']().rpm")
-        check_callable("init of an action type", self.init, "lambda n: None")
+        check_callable("init of an action type", self.init, "lambda: None")
 
 
 def rpm(near_hover: float | None = None) -> Action:

@@ -1,4 +1,4 @@
-"""Checks of what an environment is put together from."""
+"""Checks of the arguments of an environment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Episodes one after the other, for learners that never stop."""
+"""Automatic reset: a new episode begins in the step in which one ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxdrones.envs.env import RESET, Env, Obs
 from jaxdrones.tasks.task import World
 
-_FEW_SHARE = 64  # if more than one in so many worlds ends in a step, all worlds are drawn
+_WORLDS_PER_RESET = 64  # if more than one in so many worlds ends in a step, all worlds are drawn
 
 
 class Episode(flax.struct.PyTreeNode):
@@ -86,7 +86,7 @@ def _where_needed(draw: Callable) -> Callable:
         if not all(batched):
             raise ValueError("AutoReset is mapped over worlds without a key of its own for each; split the key")
         every = jax.vmap(draw)
-        few = max(worlds // _FEW_SHARE, 1)
+        few = max(worlds // _WORLDS_PER_RESET, 1)
 
         def ended_ones():
             index = jnp.nonzero(ended, size=few, fill_value=worlds)[0]

@@ -1,4 +1,4 @@
-"""The contract of an environment, as a test that ships with the package."""
+"""A test of the contract of an environment, for environments of users too."""
 
 from __future__ import annotations
 

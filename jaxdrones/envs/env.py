@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.checks import check_callable, check_finite, check_key, check_shape
+from jaxdrones.control import for_team
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.arguments import check_randomizations, check_team, check_terms, delay_steps, episode_steps
@@ -21,7 +22,7 @@ from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed,
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import Vision
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors, init_sensors, measure_sensors
 from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World
@@ -203,16 +204,17 @@ class Env:
     def _start(self, key: jax.Array) -> World:
         """The world at the start of an episode, before the first measurement."""
         params = draw(self._randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
-        drones, variables = self.task.start(jax.random.fold_in(key, START), self.params)
+        scene = self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE))
+        drones, variables = self.task.begin(jax.random.fold_in(key, START), self.params, scene)
         return World(
             params=params,
             drones=self.physics.init(params, drones),
             variables=variables,
-            memory=self.action.init(self.drones),
+            memory=for_team(self.action.init(), self.drones),
             actions=jnp.zeros((self.drones, self._history, self.action_size), drones.pos.dtype),
             step=jnp.zeros((), jnp.int32),
             dt=self.dt,
-            scene=self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE)),
+            scene=scene,
         )
 
     def _first_observation(self, key: jax.Array, world: World, rate: State | None) -> tuple[Array, World]:
@@ -267,12 +269,8 @@ class Env:
         )
         terminated = _any(terminations.values())
         truncated = _any(truncations.values()) | (world.step >= self.steps)
-        info = {
-            "rewards": rewards,
-            "metrics": task.measure(world),
-            "terminations": terminations,
-            "truncations": truncations,
-        }
+        info = {"rewards": rewards, "metrics": task.measure(world)}
+        info |= {"terminations": terminations, "truncations": truncations}
         obs = self._noisy_observation(key, world)
         return obs, world, sum(rewards.values()), terminated, truncated, info
 

@@ -1,4 +1,4 @@
-"""Observation terms by name; an observation is their concatenation. Every term has finite bounds.
+"""Observation terms by name; an observation is their concatenation. Every term has a bound.
 
 `kinematics` is the paper's equation 7, `adjacency` its equation 8; images (equation 9) belong to the environment.
 """

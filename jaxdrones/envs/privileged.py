@@ -1,4 +1,4 @@
-"""What a critic may know in training, and no policy in flight."""
+"""Privileged observations: what a critic may know in training, but no policy in flight."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ from jaxdrones.envs.randomize import (
 from jaxdrones.envs.surroundings import DrawScene
 from jaxdrones.envs.vision import IMAGES, Vision
 from jaxdrones.params import Params, repeat
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
 from jaxdrones.tasks import gates, gym_pybullet_drones, hover, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task
@@ -164,7 +164,7 @@ def make(
     scene = task.scene if scene is None else scene
     step: Step
     if backend == "bullet":
-        from jaxdrones.engine import bullet  # an optional library behind it
+        from jaxdrones.engine import bullet  # needs an optional library
 
         if integrator != "semi_implicit_euler":
             raise ValueError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
@@ -177,7 +177,7 @@ def make(
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
     observation = task.observation if observation is None else observation
-    known = OBSERVATIONS | dict(task.observations) | {s.name: reading(s.name, s.bound) for s in sensors}
+    known = _known_terms(task, sensors)
     observation = check_sequence("observation", observation, "'position_error'")
     return Env(
         task,
@@ -249,6 +249,15 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
         )
     check_loop(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
     return kind.fitted(nominal)
+
+
+def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, ObservationTerm]:
+    """Observation terms by name: those of all tasks, of this task, and one for every sensor."""
+    terms = OBSERVATIONS | dict(task.observations)
+    for sensor in sensors:
+        if sensor.name in terms:
+            raise ValueError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
+    return terms | {sensor.name: reading(sensor.name, sensor.bound) for sensor in sensors}
 
 
 def _vision(step, backend: str, images: Sequence[str], hz: float | None, control_hz: float) -> Vision | None:

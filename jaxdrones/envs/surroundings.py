@@ -8,7 +8,7 @@ import jax
 
 from jaxdrones.checks import shown
 from jaxdrones.engine.step import HostStep, Step
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Task, World
 
 DrawScene = Callable[[jax.Array], Scene]
@@ -22,9 +22,10 @@ def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> None:
     elif callable(scene):
         example = jax.eval_shape(scene, jax.random.key(0))
     else:
-        raise ValueError(f"scene is {shown(scene)}; give a jaxdrones.sensing.scene.Scene, or a function of a key")
+        raise ValueError(f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
     if not isinstance(example, Scene):
-        raise ValueError(f"the function that draws the scene returned {shown(example)}; return a Scene")
+        returned = shown(scene(jax.random.key(0)))
+        raise ValueError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
     if isinstance(step, HostStep):
         if scene is not example:
             raise ValueError(

@@ -24,7 +24,7 @@ _VARIANTS = ("_2021", "_world_axes")  # suffixes of the names of other models of
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """A flight and its options; `None` stands for the flight's own and is filled in.
+    """A flight and its options; `None` is replaced by the default of the flight.
 
     Raises:
         ValueError: an unknown name or a number out of range; says what, what was given, what to do.
@@ -41,7 +41,7 @@ class Conditions:
     """A name of `CONTROLLERS`; the vehicle's own when left out."""
     control_hz: int | None = None
     duration: float | None = None
-    """s."""
+    """Duration of the flight, s."""
     rotors: str = "instant"
     """`instant` or `lagging`."""
     integrator: str = "semi_implicit_euler"

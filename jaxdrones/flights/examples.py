@@ -21,10 +21,10 @@ class Flight:
     """One of the examples and its defaults."""
 
     summary: str
-    start: Callable[[int], State]  # number of drones -> initial state
-    target: Callable[
-        [int, jax.Array, float], Setpoint | jax.Array
-    ]  # (drones, time, duration) -> setpoints or velocity commands
+    start: Callable[[int], State]
+    """Number of drones -> initial state."""
+    target: Callable[[int, jax.Array, float], Setpoint | jax.Array]
+    """(number of drones, time, duration), s -> setpoints, or actions of the velocity input."""
     drones: int
     duration: float  # s
     control_hz: int

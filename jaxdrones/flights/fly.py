@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
-from jaxdrones.control import CONTROLLERS, Setpoint, pid, velocity
+from jaxdrones.control import CONTROLLERS, Setpoint, for_team, pid, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.rollout import rollout
@@ -96,10 +96,10 @@ def _controller(conditions: Conditions) -> tuple[Callable, object]:
     """The controller of one drone, and the initial memory of all."""
     if conditions.flight == "velocity":
         control = functools.partial(velocity.control, pid.gains(conditions.vehicle), dt=conditions.dt)
-        return control, pid.init(conditions.drones)
+        return control, for_team(pid.init(), conditions.drones)
     module = CONTROLLERS[conditions.controller]
     gains = pid.gains(conditions.vehicle) if module is pid else module.gains()
-    return functools.partial(module.control, gains, dt=conditions.dt), module.init(conditions.drones)
+    return functools.partial(module.control, gains, dt=conditions.dt), for_team(module.init(), conditions.drones)
 
 
 def _start(flight: Flight, n: int, seed: int | None) -> State:

@@ -67,7 +67,7 @@ class Record:
         found = {}
         for i, label in enumerate(self.labels):
             if lost[i]:
-                found[label] = f"{label} is {error[self.last_quarter, i].max():.3g} {unit} off what was commanded"
+                found[label] = f"{label} is {error[self.last_quarter, i].max():.3g} {unit} off its command"
             elif upside_down[i]:
                 found[label] = f"{label} is upside down"
         return found | self.not_finite()
@@ -140,7 +140,9 @@ class Record:
 def check_pwm(vehicle: str) -> None:
     """Raise `ValueError` unless a vehicle has the motors of the Crazyflie, whose PWM is known."""
     if vehicle not in VEHICLES:
-        raise ValueError(f"PWM is asked for of {vehicle!r}; it is known of {' and '.join(VEHICLES)} only, leave it out")
+        raise ValueError(
+            f"PWM is asked for with {vehicle!r}; it is known for {' and '.join(VEHICLES)} only, leave it out"
+        )
 
 
 def divergence(record: Record, other: Record, rows: int = 12) -> list[dict[str, float]]:

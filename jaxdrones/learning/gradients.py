@@ -24,7 +24,7 @@ from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
 from jaxdrones.learning.settings import Scalar
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 

@@ -98,7 +98,9 @@ def check_scene(scene: Any, files: bool = False) -> None:
         files: whether meshes and URDF files are understood.
     """
     if not isinstance(scene, Scene):
-        raise ValueError(f"scene is {shown(scene)}; give a jaxdrones.Scene, for example jaxdrones.Scene.of(box)")
+        raise ValueError(
+            f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)"
+        )
     for name in KINDS:
         stack = getattr(scene, name)
         if stack is not None:

@@ -16,9 +16,9 @@ from jaxdrones.tasks.starts import standing_height, thrown
 from jaxdrones.tasks.task import MAX_SPIN, Task, World, out_of_control, upright
 
 SPACING = 3.0  # m between neighboring goals, more than the drones are thrown apart
-_ROOM = 5.0  # m from the outermost goal to where a drone is lost, at least
-_HIGHEST = 1000.0  # m; float32 resolves 0.1 mm there
-_FASTEST = 100.0  # m/s
+_MAX_REACH = 5.0  # m; a drone is lost 3 m or more beyond it
+_MAX_HEIGHT = 1000.0  # m; float32 resolves 0.1 mm there
+_MAX_SPEED = 100.0  # m/s
 
 
 @check_keywords
@@ -31,7 +31,7 @@ def hover(
     height: float = 2.0,
     duration: float = 5.0,
 ) -> Task:
-    """Fly to the goal and stay.
+    """Fly to the goal and hover there.
 
     Args:
         drones: number of drones; their goals are 3 m apart in x.
@@ -46,11 +46,11 @@ def hover(
         ValueError: a number out of range.
     """
     check_whole("number of drones of hover", drones)
-    check_number("reach", reach, "m", at_least=0, at_most=_ROOM)
-    check_number("speed", speed, "m/s", at_least=0, at_most=_FASTEST)
+    check_number("reach", reach, "m", at_least=0, at_most=_MAX_REACH)
+    check_number("speed", speed, "m/s", at_least=0, at_most=_MAX_SPEED)
     check_number("omega", omega, "rad/s", at_least=0, below=MAX_SPIN)
     check_number("tilt", tilt, "degrees", at_least=0, at_most=180)
-    check_number("height", height, "m", above=0, at_most=_HIGHEST)
+    check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:
         goal = _goals(params, height)
@@ -64,7 +64,7 @@ def hover(
         start=start,
         target=_stay,
         rewards=shaping.REACH_AND_STAY,
-        terminations=out_of_control(_ROOM + SPACING * drones),
+        terminations=out_of_control(_MAX_REACH + SPACING * drones),
         success=settled,
     )
 
@@ -73,7 +73,7 @@ def hover(
 def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Task:
     """Start upside down, thrown and tumbling: level out at once, then fly back. Reports the altitude lost."""
     check_whole("number of drones of recovery", drones)
-    check_number("height", height, "m", above=0, at_most=_HIGHEST)
+    check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         goal = _goals(params, height)
@@ -97,7 +97,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
         start=start,
         target=target,
         rewards=shaping.REACH_AND_STAY | {"upright": (0.1, upright)},
-        terminations=out_of_control(_ROOM + SPACING * drones),
+        terminations=out_of_control(_MAX_REACH + SPACING * drones),
         advance=advance,
         metrics={
             "altitude_lost": lambda task, world: world.variables["start"] - world.variables["lowest"],
@@ -111,7 +111,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
 def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task:
     """Land on the pad at the origin softly, and come to rest level."""
     check_whole("number of drones of landing", drones)
-    check_number("height", height, "m", above=0, at_most=_ROOM)
+    check_number("height", height, "m", above=0, at_most=_MAX_REACH)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:
         pad = _goals(params, 0.0).at[:, 2].set(standing_height(params))
@@ -132,7 +132,7 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         start=start,
         target=_stay,
         rewards=shaping.REACH_AND_STAY | {"descent": (-1.0, descent)},
-        terminations=out_of_control(_ROOM + SPACING * drones) | {"crashed": _upside_down},
+        terminations=out_of_control(_MAX_REACH + SPACING * drones) | {"crashed": _upside_down},
         metrics={"upright": upright},
         success=_landed,
         contact=("ground",),

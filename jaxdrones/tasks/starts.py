@@ -1,4 +1,4 @@
-"""How episodes start."""
+"""Initial states of episodes."""
 
 import jax
 import jax.numpy as jnp
@@ -46,12 +46,12 @@ def thrown(
 
     Args:
         key: random key.
-        params: of the team.
-        pos: (n, 3) centres, m.
-        reach: pos + U(-reach, reach) along each axis, m: a number or one per axis.
-        speed: vel U(-speed, speed) along each axis, m/s.
-        omega: U(-omega, omega) about each axis, rad/s.
-        tilt: attitude: about any axis by U(0, tilt), rad.
+        params: parameters of the team.
+        pos: (n, 3) positions about which the drones start, m.
+        reach: displacement from there, U(-reach, reach) along each axis, m: a number or one per axis.
+        speed: velocity, U(-speed, speed) along each axis, m/s.
+        omega: body rates, U(-omega, omega) about each axis, rad/s.
+        tilt: rotation about a random axis by U(0, tilt), rad.
     """
     n, dtype = len(pos), pos.dtype
     u = jax.random.uniform(key, (n, 12), dtype, -1, 1)

@@ -1,4 +1,4 @@
-"""A swarm in which drones change places without touching."""
+"""A swarm in which drones exchange places without touching."""
 
 import functools
 import math
@@ -17,8 +17,8 @@ from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Task, Term, World, norm, out_of_control
 
 HEIGHT = 2.0  # m
-_APART = 0.6  # m between neighboring places on the ring, at least
-_CLOSE = 0.4  # m: nearer costs
+_MIN_SPACING = 0.6  # m between neighboring places on the ring
+_CROWDED = 0.4  # m; distance of the nearest drone below which the reward falls
 
 
 @check_keywords
@@ -32,7 +32,7 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         duration: duration of an episode, s.
     """
     check_whole("number of drones of swap-goals", drones, 2)
-    radius = max(1.0, _APART * drones / (2 * math.pi))
+    radius = max(1.0, _MIN_SPACING * drones / (2 * math.pi))
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         start_key, order_key = jax.random.split(key)
@@ -52,11 +52,11 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
 
     def crowding(task: Task, world: World) -> Float[Array, " n"]:
         """Squared penetration of the 0.4 m around a drone by its nearest neighbor, as a share of 0.4 m."""
-        return jnp.maximum(1 - world.variables["nearest"] / _CLOSE, 0) ** 2
+        return jnp.maximum(1 - world.variables["nearest"] / _CROWDED, 0) ** 2
 
     return Task(
         name="swap-goals",
-        summary="a swarm changes places without touching",
+        summary="a swarm exchanges places without touching",
         drones=drones,
         duration=duration,
         start=start,

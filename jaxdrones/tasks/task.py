@@ -1,4 +1,4 @@
-"""What a task is: what to start from, where to be, what is rewarded, when it ends."""
+"""A task: how an episode starts, where drones should be, what is rewarded, and when the episode ends."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole
+from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole, takes_scene
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -80,7 +80,7 @@ class ObservationTerm:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What to start from, where to be, what is rewarded, when it ends; all functions of one world.
+    """How an episode starts, where drones should be, what is rewarded, and when it ends; all functions of one world.
 
     Rewards, conditions and metrics are functions `(task, world)`. The task is the one that the environment flies, so
     `task.target_now(world)` is its target, also where `dataclasses.replace` has given it another one.
@@ -93,8 +93,8 @@ class Task:
     drones: int
     duration: float
     """Time after which an episode is truncated, s."""
-    start: Callable[[jax.Array, Params], tuple[State, Any]]
-    """(key, params) -> the team at the start, and the task's variables."""
+    start: Callable[..., tuple[State, Any]]
+    """(key, params) or (key, params, scene) -> the team at the start, and the task's variables."""
     target: Callable[[Any, Array], Setpoint]
     """(variables, time in s) -> where every drone should be; the time may be later than now."""
     rewards: Mapping[str, tuple[float, Term]]
@@ -140,6 +140,10 @@ class Task:
             check_number(f"scale of the reward {name!r}", scale)
         for contact in check_sequence("contact", self.contact, "'ground'"):
             check_choice("contact", contact, CONTACTS)
+
+    def begin(self, key: jax.Array, params: Params, scene: Scene) -> tuple[State, Any]:
+        """The team at the start of an episode in a scene, and the task's variables."""
+        return self.start(key, params, scene) if takes_scene(self.start) else self.start(key, params)
 
     def measure(self, world: World) -> dict[str, Float[Array, " n"]]:
         """All metrics by name; the task's own metrics replace standard ones of the same name."""

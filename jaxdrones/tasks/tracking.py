@@ -1,4 +1,4 @@
-"""Follow a curve."""
+"""Track a curve."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jaxdrones.tasks.task import Task, out_of_control
 
 HEIGHT = 2.0  # m
 SPACING = 4.0  # m between the centres of neighboring curves
-_SHORTEST = 0.1  # s; a period in which a circle of 1 m radius is flown at 63 m/s
+_MIN_PERIOD = 0.1  # s; a period in which a circle of 1 m radius is flown at 63 m/s
 
 
 @check_keywords
@@ -30,7 +30,7 @@ def tracking(
     duration: float = 10.0,
     random_start: bool = True,
 ) -> Task:
-    """Follow a curve that repeats.
+    """Track a periodic curve.
 
     Args:
         drones: number of drones; the centres of their curves are 4 m apart in y.
@@ -41,7 +41,7 @@ def tracking(
     """
     check_whole("number of drones of tracking", drones)
     check_choice("curve", curve, SHAPES)
-    check_number("period", period, "s", at_least=_SHORTEST)
+    check_number("period", period, "s", at_least=_MIN_PERIOD)
     check_switch("random_start", random_start)
     shape = SHAPES[curve]
 

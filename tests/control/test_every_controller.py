@@ -14,7 +14,7 @@ from helpers import VEHICLES, assert_close, assert_finite, flying
 from jax.flatten_util import ravel_pytree
 
 from jaxdrones import rotation
-from jaxdrones.control import geometric, pid, rates, simple_pid, velocity
+from jaxdrones.control import for_team, geometric, pid, rates, simple_pid, velocity
 from jaxdrones.control.setpoint import Setpoint
 
 DT = 1 / 240
@@ -51,7 +51,7 @@ each_controller = pytest.mark.parametrize("loop", EVERY_CONTROLLER, ids=repr)
 @each_pair
 def test_a_drone_where_it_should_be_gets_hover_speed(loop):
     team = team_of(*N * [loop.vehicle])
-    _, rpm = call(loop.control, loop.gains(), team, loop.init(N), hovering(team), stay(loop, team))
+    _, rpm = call(loop.control, loop.gains(), team, for_team(loop.init(), N), hovering(team), stay(loop, team))
     np.testing.assert_allclose(rpm, np.broadcast_to(team.hover_rpm[:, None], (N, 4)), rtol=1e-12)
 
 
@@ -67,7 +67,7 @@ def test_rotor_speeds_are_within_what_the_motors_can_in_any_state(loop):
         offset = [jnp.array(size * x) for x in rng.normal(size=(4, N, 3))]
         target = Setpoint(state.pos + offset[0], offset[1], offset[2], offset[3][:, 0], offset[3])
         target = jnp.column_stack([offset[0], offset[1][:, 0]]) if loop in VELOCITY else target
-        memory = jax.tree.map(lambda x, size=size: jnp.array(size * rng.normal(size=x.shape)), loop.init(N))
+        memory = jax.tree.map(lambda x, size=size: jnp.array(size * rng.normal(size=x.shape)), for_team(loop.init(), N))
         _, rpm = call(loop.control, loop.gains(), team, memory, state, target)
         assert jnp.all((rpm >= 0) & (rpm <= team.max_rpm[:, None]))
 
@@ -108,7 +108,7 @@ def test_values_and_gradients_are_finite_where_directions_are_lost(loop):
     state = hovering(team, (0.0, 0.0, 0.0)).replace(quat=jnp.stack(quat))
     action = jnp.column_stack([jnp.stack(pos), jnp.ones(N)])
     target = action if loop in VELOCITY else Setpoint.at(jnp.stack(pos))
-    gradients, rpm = differentiate(loop.control, (loop.gains(), team, state, target), loop.init(N))
+    gradients, rpm = differentiate(loop.control, (loop.gains(), team, state, target), for_team(loop.init(), N))
     assert_finite(rpm)
     assert_finite(gradients)
 
@@ -141,7 +141,7 @@ def test_gradients_of_a_call_agree_with_differences(loop):
 def test_without_weight_and_error_there_is_nothing_to_do(loop):
     """No rotor turns, but for the idle speed of the PID's motors."""
     team = team_of(*N * [loop.vehicle]).replace(gravity=jnp.zeros(N))
-    _, rpm = call(loop.control, loop.gains(), team, loop.init(N), hovering(team), stay(loop, team))
+    _, rpm = call(loop.control, loop.gains(), team, for_team(loop.init(), N), hovering(team), stay(loop, team))
     np.testing.assert_allclose(rpm, 9440.3 if loop in (*PID, *VELOCITY) else 0, rtol=1e-12)
 
 
@@ -156,7 +156,9 @@ def test_gradients_of_a_closed_loop_in_the_gains_agree_with_differences(loop):
     @jax.jit
     @jax.value_and_grad
     def cost(change):
-        flown = fly(loop.control, unravel(gains * (1 + change)), team, start, loop.init(1), targets, control_hz=240)
+        flown = fly(
+            loop.control, unravel(gains * (1 + change)), team, start, for_team(loop.init(), 1), targets, control_hz=240
+        )
         off = flown.pos - jnp.array([[[0, 0, 1.0]]])
         return 1e4 * jnp.mean(jnp.sum(off**2 + 0.1 * flown.vel**2, axis=-1))
 
@@ -247,7 +249,7 @@ def in_flight(loop, size=1.0):
         target = Setpoint(
             pos=state.pos + offset[0], vel=offset[1], acc=offset[2], yaw=rpy[:, 2] + offset[3][:, 0], omega=offset[3]
         )
-    memory = loop.init(N)
+    memory = for_team(loop.init(), N)
     if loop in (*PID, *VELOCITY):
         memory = memory.replace(rpy=rpy - DT * state.omega)
     if loop in SIMPLE_PID:

@@ -14,7 +14,7 @@ from closed_loop import control_team, recorded_vehicle
 
 import jaxdrones
 from jaxdrones import State, rotation
-from jaxdrones.control import pid, simple_pid, velocity
+from jaxdrones.control import for_team, pid, simple_pid, velocity
 from jaxdrones.control.setpoint import Setpoint
 
 ATOL = 1e-6  # RPM; measured: 8e-11
@@ -44,7 +44,9 @@ def test_velocities_are_commanded_as_recorded(name):
     actions = np.concatenate([np.zeros_like(arrays["action"][:1]), arrays["action"][:-1]])
     team, dt = team_and_dt(case)
     np.testing.assert_allclose(team.max_speed[0] * velocity.SPEED_SHARE, arrays["speed_limit"], rtol=1e-12)
-    rpm = along(velocity.control, pid.gains(), team, pid.init(len(team.mass)), states, jnp.array(actions), dt)
+    rpm = along(
+        velocity.control, pid.gains(), team, for_team(pid.init(), len(team.mass)), states, jnp.array(actions), dt
+    )
     np.testing.assert_allclose(clipped(case, rpm), arrays["rpm_applied"], rtol=0, atol=ATOL)
 
 
@@ -55,7 +57,7 @@ def assert_commands(controller, case):
     vel = jnp.broadcast_to(jnp.array(arrays.get("target_vel", 0.0)), pos.shape)
     yaw = jnp.broadcast_to(jnp.array(arrays["target_rpy"][..., 2]), pos.shape[:-1])
     team, dt = team_and_dt(case)
-    memory = controller.init(len(team.mass))
+    memory = for_team(controller.init(), len(team.mass))
     targets = Setpoint.at(pos, vel=vel, yaw=yaw)
     rpm = along(controller.control, controller.gains(), team, memory, arrays["state"], targets, dt)
     expected = np.concatenate([arrays["rpm_applied"][1:], arrays["rpm_final"][None]])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation as scipy_rotation
 
 import jaxdrones
 from jaxdrones import State
-from jaxdrones.control import pid
+from jaxdrones.control import for_team, pid
 from jaxdrones.control.setpoint import Setpoint
 
 INPUTS = ("pos", "quat", "vel", "target_pos", "target_rpy", "target_vel", "target_rpy_rates", "dt")
@@ -66,7 +66,7 @@ def test_at_48_hz_it_is_in_a_limit_cycle_and_at_120_hz_it_is_not():
     start = hovering(team).replace(vel=jnp.full((2, 3), 0.1))
     for hz in (48, 120):
         targets = always(at(2, (0, 0, 1)), 12 * hz)
-        rpm = fly(pid.control, pid.gains(), team, start, pid.init(2), targets, control_hz=hz).rpm[-2 * hz :]
+        rpm = fly(pid.control, pid.gains(), team, start, for_team(pid.init(), 2), targets, control_hz=hz).rpm[-2 * hz :]
         ripple[hz] = jnp.max(jnp.std(rpm, axis=0), axis=-1)
         lowest[hz], highest[hz] = jnp.min(rpm), jnp.max(rpm)
     assert jnp.all((ripple[48] > 700) & (ripple[48] < 1600))  # RPM; measured: 1330 and 846
@@ -86,7 +86,7 @@ def test_it_never_leaves_the_range_of_its_motors():
 def test_its_integrals_stop_at_their_limits():
     params = jaxdrones.load_params("cf2x")
     state = one(hovering(team_of("cf2x"))).replace(quat=jnp.array([0.5, 0.5, 0.5, 0.5]))
-    memory = jax.tree.map(lambda x: x + 1e6, one(pid.init(1)))
+    memory = jax.tree.map(lambda x: x + 1e6, pid.init())
     memory, _ = jax.jit(call)(params, state, Setpoint.at(jnp.zeros(3)), memory)
     np.testing.assert_array_equal(memory.pos_integral, [2, 2, 0.15])
     np.testing.assert_array_equal(memory.rpy_integral, [1, 1, 1500])
@@ -100,11 +100,11 @@ def test_only_a_crazyflie_has_gains():
 @pytest.mark.parametrize("n", [0, 2.0])
 def test_memory_is_for_a_whole_number_of_drones(n):
     with pytest.raises(ValueError, match=r"number of drones is .*whole number of at least 1"):
-        pid.init(n)
+        for_team(pid.init(), n)
 
 
 def call(params, state, setpoint, memory=None):
-    memory = one(pid.init(1)) if memory is None else memory
+    memory = pid.init() if memory is None else memory
     return pid.control(pid.gains(), params, memory, state, setpoint, dt=1 / 240)
 
 
@@ -117,7 +117,7 @@ def inputs(case):
 def call_fresh(params, pos, quat, vel, target_pos, target_rpy, target_vel, target_rpy_rates, dt):
     state = State(pos, quat, vel, jnp.zeros(3), jnp.zeros(4))
     setpoint = Setpoint.at(target_pos, vel=target_vel, yaw=target_rpy[2], omega=target_rpy_rates)
-    fresh = one(pid.init(1))
+    fresh = pid.init()
     memory, rpm = pid.control(pid.gains(), params, fresh, state, setpoint, dt=dt)
     _, thrust, target = pid.position_loop(pid.gains(), params, fresh, state, setpoint, dt)
     return memory, rpm, (thrust, jnp.stack(target, axis=-1))
@@ -134,7 +134,7 @@ def call_in_sequence(params, dt, pos, quat, vel, target_pos, target_rpy, target_
         return memory, (memory, rpm)
 
     rows = pos, quat, vel, target_pos, target_rpy, target_vel
-    return jax.lax.scan(advance, one(pid.init(1)), rows)[1]
+    return jax.lax.scan(advance, pid.init(), rows)[1]
 
 
 def intrinsic_xyz(angles):

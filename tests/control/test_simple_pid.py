@@ -8,7 +8,7 @@ import pytest
 from closed_loop import hovering, one, reaches, recorded_vehicle, team_of
 
 from jaxdrones import State
-from jaxdrones.control import simple_pid
+from jaxdrones.control import for_team, simple_pid
 from jaxdrones.control.setpoint import Setpoint
 
 
@@ -42,7 +42,7 @@ def test_at_48_hz_a_hummingbird_with_its_own_inertia_is_not_stable():
 def test_the_first_call_kicks_and_the_second_does_not():
     """Derivatives are differences of errors, and the last error in a fresh memory is zero."""
     team = team_of("hb")
-    params, state, memory = one(team), one(hovering(team)), one(simple_pid.init(1))
+    params, state, memory = one(team), one(hovering(team)), simple_pid.init()
     error, dt = 0.01, 1 / 240
     forces = []
     for _ in range(2):
@@ -56,7 +56,7 @@ def test_the_first_call_kicks_and_the_second_does_not():
 
 def fly_30_cm(hz, seconds, **constants):
     """Distance from the target, m. The memory holds the first error, so there is no kick."""
-    memory = simple_pid.init(1).replace(pos_error=jnp.array([[0.3, -0.3, 0.3]]))
+    memory = for_team(simple_pid.init(), 1).replace(pos_error=jnp.array([[0.3, -0.3, 0.3]]))
     return reaches(simple_pid, ("hb",), (0.3, -0.3, 1.3), seconds, hz, memory=memory, **constants)
 
 
@@ -74,4 +74,4 @@ def call_in_sequence(params, dt, pos, quat, target_pos):
         memory, rpm = simple_pid.control(simple_pid.gains(), params, memory, state, Setpoint.at(target_pos), dt=dt)
         return memory, (memory, rpm)
 
-    return jax.lax.scan(advance, one(simple_pid.init(1)), (pos, quat, target_pos))[1]
+    return jax.lax.scan(advance, simple_pid.init(), (pos, quat, target_pos))[1]

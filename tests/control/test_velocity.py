@@ -8,7 +8,7 @@ import pytest
 from closed_loop import always, fly, hovering, one, recorded_vehicle, team_of
 
 from jaxdrones import State
-from jaxdrones.control import pid, velocity
+from jaxdrones.control import for_team, pid, velocity
 
 
 @pytest.mark.parametrize("name", golden_data.names("action", "rpm", speed_limit=float))
@@ -25,7 +25,15 @@ def test_the_speed_becomes_the_asked_share_of_the_limit(direction, share):
     """Crazyflies: 0.25 m/s, 3 % of 30 km/h. Any length of the direction and either sign of the share will do."""
     team = team_of("cf2x", "cf2p")
     action = np.tile([*direction, share], (2, 1))
-    flown = fly(velocity.control, pid.gains(), team, hovering(team), pid.init(2), always(action, 720), control_hz=120)
+    flown = fly(
+        velocity.control,
+        pid.gains(),
+        team,
+        hovering(team),
+        for_team(pid.init(), 2),
+        always(action, 720),
+        control_hz=120,
+    )
     expected = 0.25 * abs(share) * np.array(direction) / np.linalg.norm(direction)
     # After 6 s; the closed loop's time constant is m / D = 0.135 s.
     np.testing.assert_allclose(flown.vel[-1], np.broadcast_to(expected, (2, 3)), rtol=0, atol=1e-4)
@@ -35,7 +43,7 @@ def test_zero_stops_a_drone_and_keeps_its_heading():
     team = team_of("cf2x", "cf2p")
     start = hovering(team).replace(vel=jnp.broadcast_to(jnp.array([0.2, -0.1, 0.1]), (2, 3)))
     start = start.replace(quat=jnp.broadcast_to(jnp.array([0, 0, np.sin(0.3), np.cos(0.3)]), (2, 4)))
-    memory = pid.init(2).replace(
+    memory = for_team(pid.init(), 2).replace(
         rpy=jnp.broadcast_to(jnp.array([0, 0, 0.6]), (2, 3))
     )  # so the first rate is not a kick
     targets = always(np.zeros((2, 4)), 720)
@@ -48,9 +56,7 @@ def test_the_length_of_the_direction_and_the_sign_of_the_share_do_not_matter():
     team = team_of("cf2x")
     state = hovering(team)
     call = jax.jit(
-        lambda action: velocity.control(
-            pid.gains(), one(team), one(pid.init(1)), one(state), action, dt=jnp.array(1 / 48)
-        )[1]
+        lambda action: velocity.control(pid.gains(), one(team), pid.init(), one(state), action, dt=jnp.array(1 / 48))[1]
     )
     rpm = call(jnp.array([0.3, -0.4, 0.5, 0.7]))
     np.testing.assert_allclose(call(jnp.array([3.0, -4.0, 5.0, -0.7])), rpm, rtol=0, atol=1e-8)
@@ -60,7 +66,7 @@ def test_the_length_of_the_direction_and_the_sign_of_the_share_do_not_matter():
 @pytest.mark.parametrize("shape", [(3,), (1, 4), ()])
 def test_an_action_is_four_numbers(shape):
     team = team_of("cf2x")
-    memory, state = one(pid.init(1)), one(hovering(team))
+    memory, state = pid.init(), one(hovering(team))
     with pytest.raises(ValueError, match=r"action has shape .*expected \(4,\): direction \(3\) and magnitude"):
         velocity.control(pid.gains(), one(team), memory, state, jnp.zeros(shape), dt=1 / 48)
 
@@ -73,4 +79,4 @@ def call_in_sequence(params, dt, pos, quat, vel, action):
         state = State(pos, quat, vel, jnp.zeros(3), jnp.zeros(4))
         return velocity.control(pid.gains(), params, memory, state, action, dt=dt)
 
-    return jax.lax.scan(advance, one(pid.init(1)), (pos, quat, vel, action))[1]
+    return jax.lax.scan(advance, pid.init(), (pos, quat, vel, action))[1]

@@ -187,7 +187,7 @@ def test_a_controller_of_one_drone_refuses_a_quaternion_that_is_no_attitude():
     single, gains = jaxdrones.load_params("cf2x"), geometric.gains()
     with pytest.raises(ValueError, match=r"state\.quat has length 0: .*unit quaternion"):
         setpoint = Setpoint.at(one.pos)
-        geometric.control(gains, single, geometric.init(1), one.replace(quat=jnp.zeros(4)), setpoint, dt=0.01)
+        geometric.control(gains, single, geometric.init(), one.replace(quat=jnp.zeros(4)), setpoint, dt=0.01)
 
 
 CONSTANTS = [(name, value) for name in POSITIVE for value in (0, -1)] + [("km", -1), ("gravity", -9.8)]

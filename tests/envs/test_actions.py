@@ -8,7 +8,7 @@ from helpers import VEHICLES, make_step, mostly_slow
 
 import jaxdrones
 from jaxdrones import State, assets
-from jaxdrones.control import pid, velocity
+from jaxdrones.control import for_team, pid, velocity
 from jaxdrones.envs import ACTIONS, make
 
 HZ, SECONDS = 100, 6
@@ -44,7 +44,9 @@ def fly(team, name, act):
         return jax.vmap(of_one)(params, memory, state)
 
     step = make_step(dt=1 / HZ / 3, substeps=3)
-    rollout = jax.jit(lambda team, start: jaxdrones.rollout(step, control, team, start, action.init(n), SECONDS * HZ))
+    rollout = jax.jit(
+        lambda team, start: jaxdrones.rollout(step, control, team, start, for_team(action.init(), n), SECONDS * HZ)
+    )
     return np.asarray(rollout(team, start)[1].pos)
 
 

@@ -1,5 +1,7 @@
 """Models, effects on a team, sensors and scenes in an environment, on both backends."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -123,6 +125,11 @@ def test_readings_after_autoreset_are_those_of_the_new_episode():
 def test_an_unknown_reading_is_named():
     with pytest.raises(ValueError, match="unknown observation 'imi'; did you mean 'imu'"):
         make("hover", sensors=(IMU,), observation=("imi",))
+
+
+def test_a_sensor_with_the_name_of_an_observation_term_is_refused():
+    with pytest.raises(ValueError, match="a sensor is named 'position', like an observation term; give it another"):
+        make("hover", sensors=(dataclasses.replace(IMU, name="position"),))
 
 
 def test_without_models_sensors_and_obstacles_a_world_has_nothing_more_and_a_step_is_one_kernel():

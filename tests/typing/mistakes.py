@@ -30,5 +30,5 @@ env.step(key, start, jnp.zeros((1, 4)))  # mistake: a world, not a state
 bptt.train(key, env, ppo.Config())  # mistake: the other learner's
 bptt.Config(world=8)  # mistake: worlds
 evaluate(env, bptt.train(key, env, bptt.Config()), key)  # mistake: a result is not a policy
-jd.over_worlds(jd.drag, chunks=4)  # mistake: chunk
+jd.over_worlds(jd.drag, chunks=4)  # mistake: no such argument
 jd.make_steps()  # mistake: make_step

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxdrones as jd
-from jaxdrones.control import Setpoint, pid
+from jaxdrones.control import Setpoint, for_team, pid
 from jaxdrones.learning import bptt, evaluate
 
 
@@ -26,7 +26,7 @@ def control(params: jd.Params, memory: pid.Memory, state: jd.State, k: jax.Array
 
 
 def fly(start: jd.State) -> jd.State:
-    return jd.rollout(step, control, params, start, memory=pid.init(2), length=12)[0]
+    return jd.rollout(step, control, params, start, memory=for_team(pid.init(), 2), length=12)[0]
 
 
 def miss(start: jd.State) -> jax.Array:
@@ -34,7 +34,7 @@ def miss(start: jd.State) -> jax.Array:
 
 
 many = jax.tree.map(lambda x: jnp.stack([x, x]), start)
-last: jd.State = jax.jit(jd.over_worlds(fly))(many)
+last: jd.State = jd.over_worlds(fly)(many)
 slope: jd.State = jax.grad(miss)(start)
 
 env = jd.make("hover", action="rpm", drones=1, duration=0.1)

@@ -12,7 +12,7 @@ from jaxdrones.dynamics.rotors import limited, with_rotor_speed
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.team import Layout, pack
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 # The host sees a team as one array, a row per drone: pose and velocities in the world frame, rotor speeds, commands,

@@ -13,10 +13,11 @@ import jax
 import numpy as np
 
 from jaxdrones.checks import check_choice
+from jaxdrones.engine.bullet.shapes import shape_of
 from jaxdrones.engine.step import is_traced
-from jaxdrones.sensing.files import Mesh, Urdf
+from jaxdrones.sensing.files import Urdf
 from jaxdrones.sensing.scene import Scene, check_scene
-from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Obstacle, Sphere
+from jaxdrones.sensing.shapes import Obstacle
 
 BALLS, CYLINDER = "balls", "cylinder"
 TINY, EGL = "tiny", "egl"
@@ -257,20 +258,7 @@ class Client:
                 return p.loadURDF(
                     str(obstacle.path), obstacle.pos, obstacle.quat, useFixedBase=True, physicsClientId=self.id
                 )
-        shape: dict[str, Any]
-        match obstacle:
-            case Box(size=size):
-                shape = dict(shapeType=p.GEOM_BOX, halfExtents=[edge / 2 for edge in size])
-            case Sphere(radius=radius):
-                shape = dict(shapeType=p.GEOM_SPHERE, radius=radius)
-            case Cylinder(radius=radius, height=height):
-                shape = dict(shapeType=p.GEOM_CYLINDER, radius=radius, height=height)
-            case Capsule(radius=radius, height=height):
-                shape = dict(shapeType=p.GEOM_CAPSULE, radius=radius, height=height)
-            case Mesh(path=path, scale=scale):
-                shape = dict(shapeType=p.GEOM_MESH, fileName=str(path), meshScale=[scale] * 3)
-            case _:
-                raise ValueError(f"Bullet has no shape for a {type(obstacle).__name__}; leave it out of the scene")
+        shape = shape_of(p, obstacle)
         collision = p.createCollisionShape(**shape, physicsClientId=self.id)
         if "height" in shape:
             shape["length"] = shape.pop("height")  # Bullet has two words for it

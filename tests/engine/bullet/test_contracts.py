@@ -10,7 +10,7 @@ from helpers import assert_close
 
 import jaxdrones as jd
 from jaxdrones.engine import bullet
-from jaxdrones.sensing.scene import Box, Scene
+from jaxdrones.sensing import Box, Scene
 
 pytestmark = pytest.mark.needs("pybullet")
 

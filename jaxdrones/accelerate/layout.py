@@ -1,0 +1,149 @@
+"""Arrays of many worlds in two layouts, and what primitives compute where each number is an array of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxdrones.accelerate import compiler
+from jaxdrones.accelerate.fitting import ELEMENTWISE, REDUCTIONS
+
+_MAX_UNROLLED = 32
+"""Terms up to which a reduction is written out; of more it is a loop."""
+
+_OPERATIONS = {
+    "reduce_sum": operator.add,
+    "reduce_prod": operator.mul,
+    "reduce_max": jnp.maximum,
+    "reduce_min": jnp.minimum,
+    "reduce_and": operator.and_,
+    "reduce_or": operator.or_,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Whole:
+    """An array as JAX has it: (..., worlds), or without that axis if it is the same in all worlds."""
+
+    x: Array
+    varies: bool
+
+    def in_all_worlds(self, worlds: int) -> Array:
+        """The array with the axis over worlds, whether it varies or not."""
+        return self.x if self.varies else jnp.broadcast_to(self.x[..., None], (*self.x.shape, worlds))
+
+
+Apart = np.ndarray
+"""An array of objects, which are its numbers: (worlds,) each, or () if they are the same in all worlds."""
+
+Value = Whole | Apart
+
+
+def apart(value: Value) -> Apart:
+    """The value with its numbers apart."""
+    if not isinstance(value, Whole):
+        return value
+    shape = value.x.shape[:-1] if value.varies else value.x.shape
+    return of_numbers([value.x[i] for i in np.ndindex(shape)], shape)
+
+
+def whole(value: Value) -> Whole:
+    """The value as one array."""
+    if isinstance(value, Whole):
+        return value
+    x = jnp.stack(_alike(value.flat))
+    return Whole(x.reshape(*value.shape, *x.shape[1:]), x.ndim > 1)
+
+
+def of_numbers(numbers: Sequence, shape: tuple[int, ...]) -> Apart:
+    """An array of objects of a shape."""
+    array = np.empty(len(numbers), object)
+    for i, x in enumerate(numbers):
+        array[i] = x
+    return array.reshape(shape)
+
+
+def number_by_number(eqn: compiler.Equation, inputs: list[Apart]) -> list[Apart]:
+    """The results of an equation that is elementwise, of shapes, or a reduction."""
+    p, x = eqn.params, inputs[0] if inputs else None
+    match eqn.primitive.name:
+        case name if name in ELEMENTWISE:
+            return [_elementwise(eqn, inputs)]
+        case name if name in REDUCTIONS:
+            rows = np.moveaxis(x, p["axes"], range(len(p["axes"])))
+            rows = rows.reshape(-1, *rows.shape[len(p["axes"]) :])
+            totals = [functools.reduce(_OPERATIONS[name], _alike(rows[:, *i])) for i in np.ndindex(rows.shape[1:])]
+            return [of_numbers(totals, rows.shape[1:])]
+        case "broadcast_in_dim":
+            shape = np.ones(len(p["shape"]), int)
+            shape[list(p["broadcast_dimensions"])] = x.shape
+            return [np.broadcast_to(x.reshape(shape), p["shape"])]
+        case "reshape":
+            return [(x if p["dimensions"] is None else x.transpose(p["dimensions"])).reshape(p["new_sizes"])]
+        case "squeeze":
+            return [np.squeeze(x, p["dimensions"])]
+        case "transpose":
+            return [x.transpose(p["permutation"])]
+        case "rev":
+            return [np.flip(x, p["dimensions"])]
+        case "concatenate":
+            return [np.concatenate(inputs, p["dimension"])]
+        case "stack":
+            return [np.stack(inputs, p["axis"])]
+        case "tile":
+            return [np.tile(x, p["reps"])]
+        case "split":
+            return np.split(x, np.cumsum(p["sizes"])[:-1], p["axis"])
+        case "unstack":
+            return [np.squeeze(part, p["axis"]) for part in np.split(x, x.shape[p["axis"]], p["axis"])]
+        case "slice":
+            strides = p["strides"] or (1,) * x.ndim
+            return [x[tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]]
+        case "pad":
+            return [_padded(x, inputs[1].item(), eqn)]
+        case name:
+            raise compiler.UnknownError(name)
+
+
+def reduced(eqn: compiler.Equation, x: Array) -> list[Array]:
+    """A reduction, written out or by a loop. XLA may make it a call of a library, of which there is no kernel."""
+    axes, operation = eqn.params["axes"], _OPERATIONS[eqn.primitive.name]
+    rows = jnp.moveaxis(x, axes, range(len(axes)))
+    rows = rows.reshape(-1, *rows.shape[len(axes) :])
+    if len(rows) <= _MAX_UNROLLED:
+        return [functools.reduce(operation, jnp.unstack(rows))]
+    return [jax.lax.scan(lambda total, row: (operation(total, row), None), rows[0], rows[1:])[0]]
+
+
+def _elementwise(eqn: compiler.Equation, inputs: list[Apart]) -> Apart:
+    def result(*numbers):
+        if eqn.primitive.name == "div" and isinstance(numbers[1], np.generic) and numbers[1] == 1:
+            return numbers[0]  # `stored` in derivatives divides by one
+        return eqn.primitive.bind(*_alike(numbers), **eqn.params)
+
+    inputs = np.broadcast_arrays(*inputs)
+    return of_numbers([result(*numbers) for numbers in zip(*(x.flat for x in inputs), strict=True)], inputs[0].shape)
+
+
+def _padded(x: Apart, value: Array, eqn: compiler.Equation) -> Apart:
+    shape, config = eqn.outvars[0].aval.shape, eqn.params["padding_config"]
+    padded = of_numbers([value] * int(np.prod(shape)), shape)
+    for i in np.ndindex(x.shape):
+        to = tuple(low + k * (1 + between) for k, (low, _, between) in zip(i, config, strict=True))
+        if all(0 <= k < n for k, n in zip(to, shape, strict=True)):
+            padded[to] = x[i]
+    return padded
+
+
+def _alike(numbers: Iterable) -> list:
+    """The numbers, all of shape (worlds,) if one of them is."""
+    numbers = list(numbers)
+    shape = max(map(jnp.shape, numbers), key=len)
+    return [x if jnp.shape(x) == shape else jnp.broadcast_to(x, shape) for x in numbers]

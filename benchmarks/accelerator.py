@@ -195,7 +195,7 @@ def learning(quick: bool) -> Iterator[Row]:
     """Seconds of training to hover, full four motors from any motion, and what success that has."""
     import learning as benchmark
 
-    from jaxdrones.training.runs import Recipe
+    from jaxdrones.training.recipe import Recipe
 
     small = dict(updates=2, worlds=8, horizon=4) if quick else {}
     for algorithm in ("bptt",) if quick else ("bptt", "ppo"):

@@ -16,13 +16,13 @@ import numpy as np
 import jaxdrones as jd
 from jaxdrones.control import Setpoint, for_team, pid
 from jaxdrones.engine import bullet
-from jaxdrones.sensing.scene import Box, Cylinder, Scene, Sphere
+from jaxdrones.sensing import Box, Cylinder, Scene, Sphere
 
 EFFECTS = dict(effects=(jd.drag, jd.ground_effect), pairs=(jd.downwash,))
-PRIMITIVES = Scene(
-    tuple(Box(pos=(2.0 + 0.3 * i, 0.4 * i - 0.8, 0.5), size=(0.2, 0.2, 1.0)) for i in range(4))
-    + tuple(Sphere(pos=(3.0, 0.8 * i - 0.8, 1.2), radius=0.2) for i in range(3))
-    + tuple(Cylinder(pos=(4.0, 0.8 * i - 0.8, 0.5), radius=0.1, height=1.0) for i in range(3))
+PRIMITIVES = Scene.of(
+    *(Box(pos=(2.0 + 0.3 * i, 0.4 * i - 0.8, 0.5), size=(0.2, 0.2, 1.0)) for i in range(4)),
+    *(Sphere(pos=(3.0, 0.8 * i - 0.8, 1.2), radius=0.2) for i in range(3)),
+    *(Cylinder(pos=(4.0, 0.8 * i - 0.8, 0.5), radius=0.1, height=1.0) for i in range(3)),
 )
 
 

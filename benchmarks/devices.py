@@ -1,7 +1,7 @@
-"""How much faster does a learner's update get on several devices than on one?
+"""How much faster is a learner's update on several devices than on one?
 
-Both programs run in one process, call by call in turn; medians. A CPU is cut into devices (`--cpu-devices`);
-XLA spreads the work of one device over all cores too, so that a CPU's figure says more about what sharing costs.
+Both programs run in one process, in alternation; the times are medians. A CPU is divided into devices
+(`--cpu-devices`); since XLA uses all cores for one device too, the result on a CPU shows the cost of sharing.
 """
 
 import argparse
@@ -13,11 +13,9 @@ import time
 import jax
 from common import about, report
 
-from jaxdrones import learning
-from jaxdrones.learning import bptt, ppo, shac, sharding
+from jaxdrones.learning import sharding
 from jaxdrones.training import presets
-
-ALGORITHMS = {"bptt": bptt, "ppo": ppo, "shac": shac}
+from jaxdrones.training.algorithms import ALGORITHMS, learner
 
 
 def main() -> None:
@@ -47,21 +45,24 @@ def main() -> None:
 
 def measure(algorithm: str, changes: dict, repeats: int) -> dict[str, object]:
     """Seconds of an update of hover, on one device and on all."""
-    learner = ALGORITHMS[algorithm]
+    trained_by = learner(algorithm)
     env, config = presets.preset("hover", algorithm)
     config = dataclasses.replace(config, **changes)
 
     def flying(mesh):
-        placed = sharding.layout(mesh, jax.eval_shape(lambda key: learner.init(key, env, config), jax.random.key(0)))
+        def start(key):
+            return trained_by.init(key, env, config)
+
+        placed = sharding.state_sharding(mesh, jax.eval_shape(start, jax.random.key(0)))
         with jax.set_mesh(mesh):
-            init = jax.jit(lambda key: learner.init(key, env, config), out_shardings=placed)
-            update = jax.jit(lambda state: learner.update(env, config, state)[0], out_shardings=placed)
+            init = jax.jit(start, out_shardings=placed)
+            update = jax.jit(lambda state: trained_by.update(env, config, state)[0], out_shardings=placed)
             state = init(jax.random.key(0))
-            return update.lower(state).compile(learning.COMPILER_OPTIONS), state
+            return update.lower(state).compile(), state
 
     programs = {
-        "one": flying(sharding.devices(config.worlds, jax.devices()[:1])),
-        "all": flying(sharding.devices(config.worlds)),
+        "one": flying(sharding.make_mesh(config.worlds, jax.devices()[:1])),
+        "all": flying(sharding.make_mesh(config.worlds)),
     }
     times = {name: [] for name in programs}
     for _ in range(1 + repeats):

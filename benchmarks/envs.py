@@ -12,7 +12,7 @@ import numpy as np
 from common import about, compiled, report, seconds
 
 import jaxdrones.adapters.gymnasium  # noqa: F401 (registers the environments)
-from jaxdrones.envs import autoreset, make
+from jaxdrones.envs import AutoReset, make
 
 STEPS = 50  # of a compiled call
 
@@ -43,7 +43,7 @@ def main() -> None:
 
 def in_jit(env, options) -> float:
     """Environment steps per second with random actions and autoreset; episodes start out of step."""
-    env = autoreset(env)
+    env = AutoReset(env)
     keys = jax.random.split(jax.random.key(0), options.worlds)
     _, episodes = jax.jit(jax.vmap(env.reset))(keys)
     age = jax.random.randint(jax.random.key(1), (options.worlds,), 0, env.env.steps)

@@ -1,8 +1,8 @@
-"""How large is the gradient of a flight, and how noisy, against its length, by what it goes through?
+"""How large and how noisy is the gradient of a flight, as a function of its length and of how it is differentiated?
 
-The gradient of the mean reward of the first h control steps in the policy's parameters, world by world: the norm of
-its mean over worlds, and the root mean square distance from that mean (the noise of a single world). For a policy as
-it is at the start, and after training by BPTT.
+This is the gradient of the mean reward of the first h control steps with respect to the policy's parameters, for each
+world: the norm of its mean over worlds, and the root mean square distance from that mean (the noise of a single world),
+for a policy at the start of a training and for one that BPTT has trained.
 """
 
 import argparse
@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from common import about, report
 
 from jaxdrones.learning import bptt, collect
-from jaxdrones.learning.gradients import linked, with_gradient
+from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
+from jaxdrones.learning.returns import discounted_rewards
 from jaxdrones.training import presets
 
 HORIZONS = (8, 16, 32, 64, 128, 256)
@@ -36,12 +37,12 @@ def main() -> None:
         horizons, options.worlds = (2, 4), 4
         config = dataclasses.replace(config, updates=2, worlds=4, horizon=4)
 
-    result = jax.jit(lambda key: bptt.train(key, env, config))(jax.random.key(0))
+    result = bptt.train(jax.random.key(0), env, config)
     start = bptt.init(jax.random.key(0), env, config).policy
-    policies = {"at the start": start.replace(statistics=result.policy.statistics), "trained": result.policy}
+    policies = {"at the start": start.replace(obs_stats=result.policy.obs_stats), "trained": result.policy}
     rows = []
     for option in OPTIONS:
-        chosen = dataclasses.replace(config, gradient=option, decay=options.decay)
+        chosen = dataclasses.replace(config, gradient=option, gradient_decay=options.decay)
         measure = jax.jit(lambda policy, chosen=chosen: norms(env, chosen, policy, options.worlds, horizons))
         for name, policy in policies.items():
             mean, noise = (x.tolist() for x in measure(policy))
@@ -63,17 +64,17 @@ def norms(env, config, policy, worlds: int, horizons) -> tuple[jax.Array, jax.Ar
         """Mean rewards of one world, up to each horizon."""
         flown = policy.replace(params=params)
         start_key, fly_key = jax.random.split(key)
-        world = collect.restart(start_key, env, collect.idle(env, 1))
-        _, flight = collect.fly(
+        world = collect.restart(start_key, env, collect.empty_worlds(env, 1))
+        _, trajectory = collect.collect(
             fly_key,
-            with_gradient(env, config),
+            with_gradient(env, config.gradient, config.surrogate),
             lambda key, obs: (flown(obs), None),
             world,
             max(horizons),
             reset=False,
-            link=linked(config),
+            between_steps=gradient_between_steps(config.gradient, config.gradient_decay),
         )
-        sums = jnp.cumsum(jnp.mean(bptt.discounted(flight, 1.0), axis=(1, 2)))
+        sums = jnp.cumsum(jnp.mean(discounted_rewards(trajectory, 1.0), axis=(1, 2)))
         return jnp.stack([sums[h - 1] / h for h in horizons])
 
     def gradients(key):

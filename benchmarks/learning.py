@@ -1,7 +1,7 @@
-"""How fast does a learner get how good? Seconds with and without compilation, success and error, seed by seed.
+"""How long does a learner train, and how well does its policy fly? Times, success and error of each seed.
 
-The seconds of compilation are those of a cold start (compilation cache off) unless --cache is given, tracing included;
-all seeds share one program. Evaluation is not counted.
+Compilation is timed for a cold start (compilation cache off) unless --cache is given, and includes tracing; all seeds
+share one program. The time of evaluations is not counted.
 """
 
 import argparse
@@ -10,10 +10,11 @@ import time
 import jax
 from common import about, report
 
-from jaxdrones.cli.training import settings
-from jaxdrones.learning import COMPILER_OPTIONS, evaluate
-from jaxdrones.training.presets import ALGORITHMS
-from jaxdrones.training.runs import Recipe
+from jaxdrones.cli.training import parse_settings
+from jaxdrones.learning import evaluate
+from jaxdrones.learning.result import training_program
+from jaxdrones.training.algorithms import ALGORITHMS, learner
+from jaxdrones.training.recipe import Recipe
 
 
 def main() -> None:
@@ -29,7 +30,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="two updates of few worlds: does it run?")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     options = parser.parse_args()
-    changes = settings(options.set)
+    changes = parse_settings(options.set)
     if options.quick:
         changes |= dict(updates=2, worlds=8, horizon=4)
         options.seeds, options.episodes = 1, 10
@@ -53,11 +54,11 @@ def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
         jax.config.update("jax_enable_compilation_cache", False)
     else:
         jax.config.update("jax_compilation_cache_dir", options.cache)
-    algorithm, config = ALGORITHMS[recipe.algorithm], recipe.config
+    algorithm, config = learner(recipe.algorithm), recipe.config
     env, practice = recipe.env(), recipe.env(practice=True)
     start, start_cpu = time.perf_counter(), time.process_time()
-    train = jax.jit(lambda key: algorithm.train(key, practice, config))
-    train = train.lower(jax.random.key(0)).compile(COMPILER_OPTIONS)
+    program = training_program(algorithm.init, algorithm.update, practice, config)
+    train = program.lower(jax.random.key(0)).compile()
     spent = {"compile s": time.perf_counter() - start, "compile CPU s": time.process_time() - start_cpu}
 
     rows = []
@@ -73,11 +74,11 @@ def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
                 "run": run,
                 "run CPU": run_cpu,
                 "success": came.success,
-                "interval": came.interval,
-                "error p50": came.error_percentiles[50],
-                "error p99": came.error_percentiles[99],
+                "interval": came.success_interval,
+                "error p50": came.final_error_percentiles[50],
+                "error p99": came.final_error_percentiles[99],
                 "rms": came.rms_error,
-                "metrics": {name: round(x, 4) for name, x in came.metrics.items()} | came.ends,
+                "metrics": {name: round(x, 4) for name, x in came.final_metrics.items()} | came.end_rates,
             }
         )
     return rows, spent

@@ -111,7 +111,7 @@ def placed(
     """The inputs with an equal share of the worlds on each device."""
     if len(devices) < 2:
         return start, commands
-    mesh = sharding.devices(len(start.pos), devices)
+    mesh = sharding.make_mesh(len(start.pos), devices)
     shares = (jax.NamedSharding(mesh, jax.P(*[None] * along, *sharding.WORLDS)) for along in (0, axis))
     start, commands = map(jax.device_put, (start, commands), shares)
     return start, commands

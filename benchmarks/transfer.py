@@ -1,9 +1,9 @@
 """Does a policy trained with the realistic preset fly a plant that it has not seen?
 
 Hover policies are trained on our plant and flown, with their weights frozen, on
-  own        our plant with all that the preset has: lag, drag, delay, noise, parameters drawn per episode;
-  bullet     the same with Bullet as integrator, contacts and the reference's damping, 0.04 1/s; 25 drones, 3 m apart,
-             share a world;
+  own        our plant with the realistic preset: lag, drag, delay, noise, parameters drawn per episode;
+  bullet     the same with Bullet as integrator, with contacts and the damping of gym-pybullet-drones (2021), 0.04 1/s;
+             25 drones, 3 m apart, share a world;
   crazyflow  crazyflow 0.4.0: its airframes, thrust curves, rotors and drag, at its rate and by its integrator, in an
              environment of its own (rivals_venv.py). Delay and noise are the preset's. An action asks for the same
              share of the hover speed as in training: mass and hover speed are all that is told of the airframe.
@@ -28,14 +28,15 @@ from common import about, report
 import jaxdrones as jd
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
-from jaxdrones.learning import COMPILER_OPTIONS, evaluate
-from jaxdrones.learning.evaluation import wilson
+from jaxdrones.learning import evaluate
+from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.training.algorithms import ALGORITHMS, learner
 from jaxdrones.training.episode import fly_episode
-from jaxdrones.training.presets import ALGORITHMS
-from jaxdrones.training.runs import Recipe, Run
+from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.run import Run
 
 PLANTS = ("own", "bullet", "crazyflow")
-DAMPING = 0.04  # 1/s, of the reference
+DAMPING = 0.04  # 1/s, of gym-pybullet-drones (2021)
 TEAM = 25  # drones of a Bullet world
 SEED = 1_000_000  # of the episodes: the same for every policy
 AGREED = 1e-9  # m, m/s, rad/s, RPM: largest difference that is rounding
@@ -77,14 +78,12 @@ def main() -> None:
 
 def trained(options, changes: dict, folder: Path) -> Iterator[Path]:
     """Train one policy per seed."""
-    check_choice("algorithm", options.algo, ALGORITHMS)
     recipe = Recipe.of("hover", options.algo, realistic=True, **changes)
     env = recipe.env(practice=True)
-    algorithm = ALGORITHMS[options.algo]
-    train = jax.jit(lambda key: algorithm.train(key, env, recipe.config).policy, compiler_options=COMPILER_OPTIONS)
     for seed in range(options.seeds):
         run = Run(folder / f"seed {seed}")
-        run.save_policy("best", train(jax.random.key(seed)), recipe=recipe.as_dict())
+        policy = learner(options.algo).train(jax.random.key(seed), env, recipe.config).policy
+        run.save_policy("best", policy, recipe=recipe.as_dict())
         yield run.folder
 
 
@@ -125,7 +124,7 @@ def on_crazyflow(recipe: Recipe, runs: list[Run], options) -> list[dict]:
     nominal = jax.tree.map(lambda x: x[0], recipe.env().params)
     for airframe in options.airframes or crazyflow.AIRFRAMES:
         sim = crazyflow.make_sim(airframe)
-        env = recipe.env(vehicle=crazyflow.calibrated(airframe, nominal), laws=())
+        env = recipe.env(vehicle=crazyflow.calibrated(airframe, nominal), randomize=())
         env = with_physics(env, crazyflow.make_step(sim, substeps=round(env.dt * sim.freq)))
         rows += [flown(f"crazyflow {airframe}", run, env, options.episodes) for run in runs]
     return rows
@@ -137,8 +136,8 @@ FLOWN = {"own": on_own, "bullet": on_bullet, "crazyflow": on_crazyflow}
 def flown(plant: str, run: Run, env: Env, episodes: int) -> dict:
     """How a policy flies many worlds at once."""
     came = evaluate(env, run.policy(env=env), jax.random.key(SEED), episodes)
-    p50, p99 = came.error_percentiles[50], came.error_percentiles[99]
-    return row(plant, run, episodes, came.success, came.interval, p50, p99)
+    p50, p99 = came.final_error_percentiles[50], came.final_error_percentiles[99]
+    return row(plant, run, episodes, came.success, came.success_interval, p50, p99)
 
 
 def flown_in_teams(plant: str, run: Run, env: Env, episodes: int) -> dict:
@@ -150,7 +149,7 @@ def flown_in_teams(plant: str, run: Run, env: Env, episodes: int) -> dict:
         success += list(whole & env.task.success(flight.metrics, env.dt))
         error += list(flight.metrics["error"][-1])
     n = len(success)
-    interval = wilson(int(sum(success)), n)
+    interval = wilson_interval(int(sum(success)), n)
     p50, p99 = (float(np.percentile(error, q)) for q in (50, 99))
     return row(plant, run, n, float(np.mean(success)), interval, p50, p99)
 

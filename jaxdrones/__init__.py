@@ -27,6 +27,7 @@ from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
+from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
@@ -37,6 +38,7 @@ __all__ = [
     "NeighborGrid",
     "Pair",
     "Params",
+    "Sensor",
     "State",
     "Step",
     "TeamEffect",

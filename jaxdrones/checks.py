@@ -171,6 +171,15 @@ def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], h
         raise ValueError(f"{name}: {called} takes {signature}; {wanted}{hint}") from None
 
 
+def takes_scene(function: Callable) -> bool:
+    """Whether a function has three arguments, the third of which is called `scene`."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    return len(parameters) == 3 and parameters[2].name == "scene"
+
+
 def check_keywords(function: Function) -> Function:
     """The same function or class; a keyword that it does not have is an error that names the closest one."""
     called: Any = function.__dict__["__init__"] if isinstance(function, type) else function

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # First flight
-# Four Crazyflies on the paper's circle, flown by its PID. These notebooks are plain Python in cells: open them in
-# Jupyter with jupytext, or in an editor that knows `# %%`.
+# Four Crazyflies on the circle of gym-pybullet-drones (2021), flown by its PID. These notebooks are plain Python in
+# cells: open them in Jupyter with jupytext, or in an editor that knows `# %%`.
 
 # %%
 import functools
@@ -55,4 +55,4 @@ for i in range(4):
 left.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
 right.set(xlabel="t (s)", ylabel="distance from the target (cm)")
 left.legend()
-assert error[4 * HZ :].mean() < 0.12  # the PID lags some 10 cm behind, as in the paper
+assert error[4 * HZ :].mean() < 0.12  # the PID lags some 10 cm behind, as in gym-pybullet-drones

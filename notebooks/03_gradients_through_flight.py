@@ -41,17 +41,17 @@ def cost(log_gains):
 
 # %%
 gains = jax.tree.map(jnp.log, rates.gains())
-optimiser = optax.adam(0.05)
+optimizer = optax.adam(0.05)
 
 
 @jax.jit
 def update(gains, memory):
     value, slope = jax.value_and_grad(cost)(gains)
-    change, memory = optimiser.update(slope, memory)
+    change, memory = optimizer.update(slope, memory)
     return optax.apply_updates(gains, change), memory, value
 
 
-memory, costs, tuned = optimiser.init(gains), [], gains
+memory, costs, tuned = optimizer.init(gains), [], gains
 for _ in range(60):
     tuned, memory, value = update(tuned, memory)
     costs.append(float(value))

@@ -15,9 +15,8 @@ from jaxdrones.learning import bptt, evaluate
 
 # %%
 env = jd.make("hover")
-train = jax.jit(lambda key: bptt.train(key, env, bptt.Config()))
 began = time.perf_counter()
-result = jax.block_until_ready(train(jax.random.key(0)))
+result = bptt.train(jax.random.key(0), env, bptt.Config())
 print(f"trained in {time.perf_counter() - began:.1f} s, compilation included")
 
 # %% [markdown]

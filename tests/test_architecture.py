@@ -17,7 +17,9 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("dynamics",), ("control",), ("sensing",), ("accelerate",)),
     (("engine",), ("tasks",)),
     (("envs",), ("flights",)),
-    (("adapters", "learning", "render", "training", "cli"),),
+    (("adapters",), ("learning",), ("render",)),
+    (("training",),),
+    (("cli",),),
     (("",),),  # the package itself, which re-exports
 )
 PLACE = {
@@ -34,23 +36,33 @@ def top(file: Path) -> str:
     return "" if first == "__init__" else first
 
 
-def imports(file: Path) -> set[str]:
-    """Top-level names of the package that a file imports, wherever in the file it does."""
+def paths(file: Path) -> set[str]:
+    """Dotted names of the package that a file imports, wherever in the file it does: modules, or what is in them."""
     found = set()
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
-            paths = [alias.name for alias in node.names]
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{file}: relative import; write the full name"
-            paths = [f"{node.module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        for path in paths:
-            package, _, rest = path.partition(".")
-            if package == "jaxdrones":
-                module = rest.partition(".")[0]
-                found.add(module if module in PLACE else "")
-    return found
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {path for path in found if path.partition(".")[0] == "jaxdrones"}
+
+
+def imports(file: Path) -> set[str]:
+    """Top-level names of the package that a file imports."""
+    tops = {path.split(".")[1] for path in paths(file)}
+    return {name if name in PLACE else "" for name in tops}
+
+
+def imported_files(file: Path) -> set[Path]:
+    """Files of the package that a file imports: of `jaxdrones.a.b.c` that of b if c is a name in it."""
+    found = set()
+    for path in paths(file):
+        parts = path.split(".")[1:]
+        candidates = [PACKAGE.joinpath(*parts[:end]) for end in range(len(parts), 0, -1)]
+        named = (f for c in candidates for f in (c.with_suffix(".py"), c / "__init__.py") if f.is_file())
+        found.add(next(named, PACKAGE / "__init__.py"))
+    return found - {file}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
@@ -61,6 +73,28 @@ def test_imports_point_to_lower_layers(file):
         other_layer, other_peer = PLACE[module]
         allowed = other_layer < layer or (other_layer, other_peer) == (layer, peer)
         assert allowed, f"{file.name} imports jaxdrones.{module or '__init__'}, which is not below it"
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    graph = {file: imported_files(file) for file in FILES}
+    cycles = []
+
+    def visit(file: Path, way: tuple[Path, ...]) -> None:
+        if file in way:
+            cycles.append(" -> ".join(str(f.relative_to(PACKAGE)) for f in (*way[way.index(file) :], file)))
+        elif file not in done:
+            for other in sorted(graph[file]):
+                visit(other, (*way, file))
+            done.add(file)
+
+    done: set[Path] = set()
+    for file in FILES:
+        visit(file, ())
+    assert cycles == []
+
+
+def test_every_file_is_short_enough_to_be_read_at_once():
+    assert [str(f.relative_to(PACKAGE)) for f in FILES if len(f.read_text().splitlines()) > 300] == []
 
 
 def test_what_jax_does_not_promise_to_keep_is_touched_in_one_file():

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from helpers import mostly_slow
 
-from jaxdrones import flights
 from jaxdrones.cli import main
 from jaxdrones.flights.conditions import Conditions
-from jaxdrones.training import presets
+from jaxdrones.flights.fly import fly
+from jaxdrones.training import algorithms
 
 FILMS = pytest.mark.needs("pybullet", "imageio_ffmpeg")
 SHORT = ["--duration", "0.25", "--drones", "2"]
@@ -48,10 +48,10 @@ def test_csv_and_pwm_come_on_request(tmp_path):
 
 
 def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypatch):
-    record = flights.fly("circle", drones=2, duration=0.25)
+    record = fly("circle", drones=2, duration=0.25)
     pos = np.array(record.pos)
     pos[12:, 1] = np.nan
-    monkeypatch.setattr("jaxdrones.cli.conditions.fly", lambda *_, **__: dataclasses.replace(record, pos=pos))
+    monkeypatch.setattr("jaxdrones.cli.flight_options.fly", lambda *_, **__: dataclasses.replace(record, pos=pos))
     assert main(["fly", "circle", "--no-figure", "--json", "--output", str(tmp_path)]) == 1
     captured = capsys.readouterr()
     assert "the state of drone 1 is not finite from t = 0.108 s on" in captured.err
@@ -100,7 +100,7 @@ def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
         (["fly", "circle", "--effects", "drag,drag_world_axes"], "'drag_world_axes' is given beside 'drag'"),
         (["fly", "circle", "--effects", "downwash_2021,downwash"], "'downwash' is given beside 'downwash_2021'"),
         (["fly", "circle", "--effects", "drag,"], "unknown effect ''"),
-        (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for of 'racer'"),
+        (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for with 'racer'"),
         pytest.param(
             ["fly", "circle", "--video", "folder.mp4"],
             "--video folder.mp4 cannot be written: Is a directory",
@@ -138,7 +138,7 @@ def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
 )
 def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("jaxdrones.cli.conditions.fly", flies_only_to_complain)
+    monkeypatch.setattr("jaxdrones.cli.flight_options.fly", refused_flight)
     monkeypatch.setattr("jaxdrones.limits.memory", lambda: 10**10)
     (tmp_path / "file").touch()
     (tmp_path / "folder.mp4").mkdir()
@@ -151,18 +151,18 @@ def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(arguments, message, cap
     assert message in captured.err and captured.err.count("\n") == 1 and len(captured.err) < 1200
 
 
-def flies_only_to_complain(flight, gui=False, progress=None, **options):
+def refused_flight(flight, gui=False, progress=None, **options):
     """In place of `fly`, which would take long where a mistake is not seen at once."""
     Conditions(flight, **options)
     if not gui:
         raise AssertionError("flown")
-    return flights.fly(flight, gui, progress, **options)
+    return fly(flight, gui, progress, **options)
 
 
 @pytest.mark.needs("pybullet")
 @pytest.mark.parametrize("name", ["", "log.npz", "log.csv", "flight.png", "cameras"])
 def test_an_output_that_cannot_be_written_is_refused_before_the_flight(name, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxdrones.cli.conditions.fly", flies_only_to_complain)
+    monkeypatch.setattr("jaxdrones.cli.flight_options.fly", refused_flight)
     output = tmp_path / "output"
     if name in ("", "cameras"):
         (output / name).parent.mkdir(exist_ok=True)
@@ -179,7 +179,7 @@ def test_list_names_what_can_be_chosen(capsys):
     names = json.loads(capsys.readouterr().out)
     assert {"cf2x", "cf2p", "hb", "racer"} == set(names["vehicles"])
     assert {"drag", "ground_effect", "downwash", "downwash_2021"} <= set(names["effects"])
-    assert names["algorithms"] == list(presets.ALGORITHMS)
+    assert names["algorithms"] == list(algorithms.ALGORITHMS)
     assert main(["list"]) == 0
     assert "integrators" in capsys.readouterr().out
 

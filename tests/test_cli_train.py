@@ -13,13 +13,13 @@ import pytest
 from jaxdrones.cli import main
 from jaxdrones.cli.evaluate import percent, success
 from jaxdrones.learning import checkpoint
-from jaxdrones.learning.evaluation import wilson
-from jaxdrones.training import loop
-from jaxdrones.training.runs import Run
+from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.training import trainer
+from jaxdrones.training.run import Run
 
 pytestmark = pytest.mark.float32
 
-SMALL = ["--set", "worlds=4", "--set", "horizon=4", "--set", "sizes=8,", "--set", "duration=0.2"]
+SMALL = ["--set", "worlds=4", "--set", "horizon=4", "--set", "hidden_sizes=8,", "--set", "duration=0.2"]
 TRAIN = ["train", "hover", *SMALL, "--budget", "4", "--episodes", "8"]
 HOSTS = ["train", "hover", "--hosts", "2", "--host", "0", "--coordinator"]
 
@@ -37,7 +37,7 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
     folder, printed = trained
     run = Run(folder)
     assert run.policy("best")(np.zeros((1, 22), np.float32)).shape == (1, 4)
-    assert run.policy("last").network.sizes == (8,)
+    assert run.policy("last").network.hidden_sizes == (8,)
     assert run.recipe().config.worlds == 4 and run.recipe().options == {"duration": 0.2}
     rows = run.history()
     assert [row["update"] for row in rows] == [1, 2, 3, 4]
@@ -46,12 +46,12 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
     assert len(list(folder.glob("events.out.tfevents.*"))) == 1
     (report,) = printed["seeds"]
     assert report == json.loads((folder / "report.json").read_text())
-    assert report["evaluation"]["episodes"] == 8 and len(report["evaluation"]["interval"]) == 2
+    assert report["evaluation"]["episodes"] == 8 and len(report["evaluation"]["success_interval"]) == 2
     assert report["seconds"]["training"] > 0 and report["seconds"]["compiling"] > 0
 
 
 def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained, tmp_path, capsys, monkeypatch):
-    advance, calls = loop.Trainer.advance, []
+    advance, calls = trainer.Trainer.advance, []
 
     def interrupted(self, state, updates):
         calls.append(updates)
@@ -59,7 +59,7 @@ def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained,
             raise KeyboardInterrupt
         return advance(self, state, updates)
 
-    monkeypatch.setattr(loop.Trainer, "advance", interrupted)
+    monkeypatch.setattr(trainer.Trainer, "advance", interrupted)
     folder = tmp_path / "hover"
     assert main([*TRAIN, "--output", str(folder)]) == 130
     said = capsys.readouterr().err
@@ -68,9 +68,9 @@ def test_an_interrupted_training_keeps_the_best_and_goes_on_bit_for_bit(trained,
     Run(folder).policy("best")
 
     assert main([*TRAIN, "--output", str(folder)]) == 2
-    assert "go on with --resume" in capsys.readouterr().err
+    assert "continue it with --resume" in capsys.readouterr().err
     assert main(["train", "hover", "--output", str(folder), "--resume", "--algo", "ppo"]) == 2
-    assert "began with algo bptt, not ppo" in capsys.readouterr().err
+    assert "was started with algo bptt, not ppo" in capsys.readouterr().err
 
     assert main(["train", "hover", "--output", str(folder), "--resume"]) == 0
     whole, _ = trained
@@ -92,7 +92,7 @@ def nothing_compiles(monkeypatch):
     def compile(self):
         raise AssertionError("compiled")
 
-    monkeypatch.setattr(loop.Trainer, "compile", compile)
+    monkeypatch.setattr(trainer.Trainer, "compile", compile)
 
 
 @pytest.mark.parametrize("more", [[], ["--seed", "3"], ["--seeds", "2"], ["--algo", "shac"], ["--budget", "1s"]])
@@ -115,7 +115,7 @@ def test_the_default_folder_and_those_of_seeds_are_not_replaced_unasked(
     assert main(["train", "hover", "--seeds", "2"]) == 2
     assert "seed-1 holds a finished training" in capsys.readouterr().err
     assert main(["train", "hover", "--resume"]) == 2
-    assert "holds no training to go on with; give --seeds N, or leave out --resume" in capsys.readouterr().err
+    assert "holds no training to continue; give --seeds N, or leave out --resume" in capsys.readouterr().err
     shutil.move("runs/hover/seed-1", "runs/moved")
     shutil.rmtree("runs/hover")
     shutil.move("runs/moved", "runs/hover")
@@ -146,7 +146,7 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop.Trainer, "compile", interrupted)
+        patch.setattr(trainer.Trainer, "compile", interrupted)
         assert main(overwrite) == 130
     for wrong in (["--set", "horizon=0"], ["--set", "gradient=steep"], ["--resume"]):
         assert main([*overwrite, *wrong]) == 2
@@ -154,7 +154,7 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
     assert main([*overwrite, "--seed", "5"]) == 0
     after = contents(folder)
     assert after["notes.txt"] == b"of other people" and after["best.msgpack"] != before["best.msgpack"]
-    assert Run(folder).told("state", "seed") == 5 and Run(folder).report()["updates"] == 4
+    assert Run(folder).sidecar_entry("state", "seed") == 5 and Run(folder).report()["updates"] == 4
     assert [row["update"] for row in Run(folder).history()] == [1, 2, 3, 4]
 
 
@@ -162,15 +162,15 @@ def test_overwrite_loses_nothing_until_there_is_something_in_its_place(trained, 
 def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, tmp_path, capsys, monkeypatch):
     folder = shutil.copytree(trained[0], tmp_path / "hover")
     resume = ["train", "hover", "--output", str(folder), "--resume", "--no-figure"]
-    before, best = contents(folder), tuple(Run(folder).told("best", "score"))
+    before, best = contents(folder), tuple(Run(folder).sidecar_entry("best", "score"))
     for wrong, message in [
-        ([], "trained to the end, 4 updates; train longer with --budget N more or 60s"),
+        ([], "trained to the end, 4 updates; train it longer with --budget N or 60s"),
         (["--set", "updates=4"], "trained to the end"),
-        (["--set", "updates=3"], "began with updates 4, not 3"),
+        (["--set", "updates=3"], "was started with updates 4, not 3"),
         (["--budget", "2147483647"], "updates is 2147483651; give at most"),
-        (["--budget", "2", "--episodes", "9"], "began with episodes 8, not 9"),
-        (["--budget", "2", "--set", "worlds=8"], "began with worlds 4, not 8"),
-        (["--budget", "2", "--seed", "1"], "began with seed 0, not 1"),
+        (["--budget", "2", "--episodes", "9"], "was started with episodes 8, not 9"),
+        (["--budget", "2", "--set", "worlds=8"], "was started with worlds 4, not 8"),
+        (["--budget", "2", "--seed", "1"], "was started with seed 0, not 1"),
     ]:
         assert main([*resume, *wrong]) == 2
         assert message in capsys.readouterr().err
@@ -178,11 +178,11 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
 
     assert main([*resume, "--budget", "2"]) == 0
     assert "updates: 6, 4 of them made" in capsys.readouterr().out
-    assert Run(folder).report()["updates"] == 6 == Run(folder).told("state", "update")
+    assert Run(folder).report()["updates"] == 6 == Run(folder).sidecar_entry("state", "update")
     assert rewards(folder)[:4] == rewards(trained[0]) and len(rewards(folder)) == 6
-    assert at_least(Run(folder).told("best", "score"), best)
+    assert at_least(Run(folder).sidecar_entry("best", "score"), best)
 
-    advance, calls = loop.Trainer.advance, []
+    advance, calls = trainer.Trainer.advance, []
 
     def interrupted(self, state, updates):
         calls.append(updates)
@@ -191,16 +191,16 @@ def test_a_finished_training_goes_on_with_a_budget_and_keeps_its_best(trained, t
         return advance(self, state, updates)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop.Trainer, "advance", interrupted)
+        patch.setattr(trainer.Trainer, "advance", interrupted)
         assert main([*resume, "--set", "updates=12"]) == 130
     assert Run(folder).report() is None
-    made = Run(folder).told("state", "update")
+    made = Run(folder).sidecar_entry("state", "update")
     assert 6 < made < 12
     assert main([*resume, "--budget", "5"]) == 2
-    assert "began with updates 12, not 5" in capsys.readouterr().err
+    assert "was started with updates 12, not 5" in capsys.readouterr().err
     assert main([*resume, "--budget", "0.001s"]) == 0
     assert made < Run(folder).report()["updates"] == len(rewards(folder))
-    assert at_least(Run(folder).told("best", "score"), best)
+    assert at_least(Run(folder).sidecar_entry("best", "score"), best)
 
 
 def rewards(folder):
@@ -224,6 +224,17 @@ def test_numbers_that_are_not_finite_stop_training_and_the_best_policy_stays(tmp
     assert "training diverged" in said and "best.msgpack is the best policy" in said and "learning_rate" in said
     for leaf in jax.tree.leaves(Run(tmp_path).policy()):
         assert np.isfinite(leaf).all()
+
+
+@pytest.mark.slow
+def test_gradients_that_are_not_finite_stop_training_though_nothing_else_shows_them(tmp_path, capsys):
+    steep = ["--algo", "ppo", "--set", "minibatches=2", "--set", "value_coef=1e38", "--no-figure"]
+    assert main([*TRAIN, *steep, "--output", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert "training diverged: gradients were not finite in 4 updates in a row" in said and said.count("\n") == 1
+    assert "best.msgpack is the best policy" in said
+    assert main([*TRAIN, "--no-figure", "--overwrite", "--output", str(tmp_path)]) == 0
+    assert all(row["nonfinite_gradients"] == 0 for row in Run(tmp_path).history())
 
 
 @pytest.mark.slow
@@ -251,10 +262,10 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
         (["train", "hover", "--set", "worlds=2.5"], "worlds is 2.5; give something like 256"),
         (["train", "hover", "--set", "worlds=0"], "worlds is 0"),
         (["train", "hover", "--set", "worlds"], "give NAME=VALUE"),
-        (["train", "hover", "--algo", "ppo", "--set", "worlds=6"], "give a multiple of batches, 8"),
+        (["train", "hover", "--algo", "ppo", "--set", "worlds=6"], "give a multiple of minibatches, 8"),
         (["train", "hover", "--budget", "long"], "--budget is 'long'; give updates"),
         (["train", "hover", "--seeds", "0"], "seeds is 0"),
-        (["train", "hover", "--resume"], "holds no training to go on with"),
+        (["train", "hover", "--resume"], "holds no training to continue"),
         (["train", "hover", "--resume", "--overwrite"], "--resume and --overwrite are given"),
         (["train", "hover", "--algo", ""], "unknown algorithm ''"),
         (["train", "hover", "--seed", "-1"], "seed is -1"),
@@ -268,21 +279,21 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
             ["train", "hover", "--set", "worlds=2000000000"],
             "2000000000 worlds x 64 control steps x 1 drones needs about",
         ),
-        (["train", "hover", "--set", "sizes=1000000000,"], "smaller networks"),
+        (["train", "hover", "--set", "hidden_sizes=1000000000,"], "smaller networks"),
         (["train", "hover", "--set", "drones=1000000000000"], "a team of 1,000,000,000,000 drones needs about"),
         (["train", "hover", "--set", "updates=3000000000"], "updates is 3000000000; give at most"),
         (["train", "hover", "--set", "surrogate=3"], "unknown setting 'surrogate'"),
-        (["train", "hover", "--set", "task=x"], "--set task is no setting"),
+        (["train", "hover", "--set", "task=x"], "--set task is not a setting"),
         (["train", "hover", "--set", "updates=3", "--budget", "4"], "--set updates=3 is given beside --budget"),
-        (["train", "hover", "--set", "disturb=3"], "disturb"),
+        (["train", "hover", "--set", "disturbance=3"], "disturbance"),
         (["train", "hover", "--set", "worlds=" + "9" * 5000], "worlds is"),
-        (["train", "hover", "--budget", "1e30s"], "or time up to 1000h"),
+        (["train", "hover", "--budget", "1e30s"], "or a time up to 1000h"),
         (["train", "hover", "--budget", "99999999999"], "--budget is '99999999999'; give updates"),
         (["train", "hover", "--output", ""], "the path is empty"),
         (["train", "hover", "--hosts", "2"], "give all of --hosts, --host and --coordinator"),
         ([*HOSTS, "127.0.0.1:99999"], "coordinator is '127.0.0.1:99999'; give ADDRESS:PORT"),
         ([*HOSTS, "127.0.0.1:0"], "coordinator is '127.0.0.1:0'; give ADDRESS:PORT"),
-        ([*HOSTS, "x" * 300 + ":80"], "did not meet all others"),
+        ([*HOSTS, "x" * 300 + ":80"], "did not reach all others"),
         (["eval", ""], "the path is empty"),
         (["eval", "file"], "file/best.json cannot be read: Not a directory"),
         (["eval", "nowhere", "--seed", "-1"], "seed is -1"),
@@ -320,7 +331,13 @@ def test_a_mistake_is_one_line_before_anything_is_trained(arguments, message, ca
 )
 def test_eval_counts_the_successes(successes, episodes, text):
     assert (
-        success({"success": successes / episodes, "episodes": episodes, "interval": wilson(successes, episodes)})
+        success(
+            {
+                "success": successes / episodes,
+                "episodes": episodes,
+                "success_interval": wilson_interval(successes, episodes),
+            }
+        )
         == text
     )
 
@@ -337,7 +354,7 @@ def test_eval_prints_one_object(trained, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["evaluation"]["episodes"] == 8 and printed["recipe"]["task"] == "hover"
     assert printed["evaluation"]["successes"] == 0
-    assert set(printed["evaluation"]["error_percentiles"]) == {"50", "95", "99"}
+    assert set(printed["evaluation"]["final_error_percentiles"]) == {"50", "95", "99"}
 
 
 @pytest.mark.slow

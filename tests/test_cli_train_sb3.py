@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxdrones.adapters
-import jaxdrones.learning
+import jaxdrones.training
 from jaxdrones.cli import main
 
 pytestmark = pytest.mark.float32
@@ -24,9 +24,9 @@ def without_sb3(monkeypatch):
         if name.partition(".")[0] == "stable_baselines3":
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-    for package in (jaxdrones.adapters, jaxdrones.learning):
-        monkeypatch.delitem(sys.modules, f"{package.__name__}.sb3", raising=False)
-        monkeypatch.delattr(package, "sb3", raising=False)
+    for package, name in ((jaxdrones.adapters, "sb3"), (jaxdrones.training, "stable_baselines")):
+        monkeypatch.delitem(sys.modules, f"{package.__name__}.{name}", raising=False)
+        monkeypatch.delattr(package, name, raising=False)
 
 
 @pytest.mark.parametrize(
@@ -79,6 +79,20 @@ def test_a_setting_that_sb3_or_the_environment_lacks_is_one_line(arguments, mess
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("task", ["hover", "hover-2021", "leader-follower"])
+def test_the_task_that_is_named_is_the_one_that_is_trained(task, capsys, tmp_path, monkeypatch):
+    pytest.importorskip("stable_baselines3")
+    from jaxdrones.training import stable_baselines_trainer
+
+    def interrupted(self, recipe, *_):
+        assert recipe.env().task.name == task
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stable_baselines_trainer.SB3Trainer, "__init__", interrupted)
+    assert main(["train", task, "--library", "sb3", "--no-figure", "--output", str(tmp_path)]) == 130
+    assert capsys.readouterr().out.startswith(f"{task} by sb3 ppo: ")
+
+
 @pytest.mark.needs("pybullet", "stable_baselines3")
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -91,13 +105,12 @@ def test_a_setting_that_sb3_or_the_environment_lacks_is_one_line(arguments, mess
 )
 def test_the_papers_learners_climb_to_the_goal_and_fly_there_on_both_backends(algorithm, settings, tmp_path, capsys):
     small = ["--set", "net_arch=64,64", "--episodes", "2", "--json", "--output", str(tmp_path)]
-    assert main([*SB3, "--algo", algorithm, *settings, *small]) == 0
+    assert main(["train", "hover-2021", "--library", "sb3", "--algo", algorithm, *settings, *small]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert printed["task"] == "hover-2021"
     for name in ("best.zip", "last.zip", "progress.csv", "curve.png", "report.json"):
         assert (tmp_path / name).stat().st_size > 0
     first = next(csv.DictReader((tmp_path / "progress.csv").read_text().splitlines()))
-    returned = printed["seeds"][0]["evaluation"]["returned"]
+    returned = printed["seeds"][0]["evaluation"]["mean_return"]
     assert returned > float(first["evaluated_return"]) + 30  # to stay on the ground gives -191, an optimal climb -27
     for backend in ("explicit", "bullet"):
         flight = ["fly", "--policy", str(tmp_path), "--backend", backend, "--json"]
@@ -112,13 +125,13 @@ def test_the_papers_learners_climb_to_the_goal_and_fly_there_on_both_backends(al
 @pytest.mark.slow
 def test_an_interrupted_training_keeps_the_best_and_is_not_replaced_unasked(tmp_path, capsys, monkeypatch):
     pytest.importorskip("stable_baselines3")
-    from jaxdrones.training import sb3_training
+    from jaxdrones.training import stable_baselines_trainer
 
     def interrupted(self):
         raise KeyboardInterrupt
 
     train = [*SB3, *SMALL, "--set", "batch_size=32", "--budget", "64", "--no-figure", "--output", str(tmp_path)]
-    monkeypatch.setattr(sb3_training._Course, "_on_rollout_end", interrupted)
+    monkeypatch.setattr(stable_baselines_trainer._Callback, "_on_rollout_end", interrupted)
     assert main(train) == 130
     assert "best.zip is the best policy, of update 0" in capsys.readouterr().err
     monkeypatch.undo()

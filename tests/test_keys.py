@@ -10,25 +10,36 @@ import numpy as np
 import pytest
 from helpers import mostly_slow
 
-from jaxdrones.envs import autoreset, make
-from jaxdrones.envs.randomize import pushes, scaled, sensor_noise, shifted
+import jaxdrones as jd
+from jaxdrones.envs import AutoReset, make
+from jaxdrones.envs.randomize import random_pushes, scaled, sensor_noise, shifted
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
-from jaxdrones.training import loop
+from jaxdrones.sensing import Scene, Sensor, Sphere
+from jaxdrones.training import selection
 
 DRAWS = ("uniform", "normal", "bernoulli", "randint")
 KEY = jax.random.key(3)
 EVERYTHING = dict(
-    laws=(scaled("mass", 0.9, 1.1), scaled("kf", 0.9, 1.1), shifted("wind", -1, 1)),
+    randomize=(scaled("mass", 0.9, 1.1), scaled("kf", 0.9, 1.1), shifted("wind", -1, 1)),
     noise=sensor_noise(),
-    disturb=pushes(0.3),
+    disturbance=random_pushes(0.3),
+    sensors=(
+        Sensor(
+            "noisy",
+            lambda key, params, state, rate, scene, memory: (memory, memory + jax.random.normal(key)),
+            lambda key, params: jax.random.normal(key),
+        ),
+    ),
+    scene=lambda key: Scene.of(Sphere(pos=jax.random.uniform(key, (3,)) + 50.0, radius=0.1)),
+    effects=(lambda params, state, scene: jd.Wrench.of_force(0 * scene.spheres.pos[0]),),
 )
-SMALL = dict(updates=2, worlds=3, horizon=2, sizes=(2,))
+SMALL = dict(updates=2, worlds=3, horizon=2, hidden_sizes=(2,))
 CRITIC = dict(critic_hidden_sizes=(2,))
 LEARNERS = {
     "bptt": (bptt, bptt.Config(**SMALL)),
     "shac": (shac, shac.Config(**SMALL, **CRITIC, critic_steps=2)),
-    "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, batches=3)),
+    "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, minibatches=3)),
 }
 
 
@@ -86,16 +97,16 @@ def keys(monkeypatch):
 
 @pytest.mark.parametrize("task", mostly_slow(["hover", "tracking", "swap-goals"], ["hover"]))
 def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
-    """Start, parameters, noise, pushes, and those of the next episode: in one step that ends one."""
+    """Start, parameters, scene, sensors, noise, pushes, and those of the next episode: in one step that ends one."""
     env = make(task, **EVERYTHING)
-    _, episode = autoreset(env).reset(jax.random.key(2))
+    _, episode = AutoReset(env).reset(jax.random.key(2))
     episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
-    autoreset(env).step(KEY, episode, jnp.zeros((env.drones, 4)))
-    keys.check(least=2 * 5 + 2)
+    AutoReset(env).step(KEY, episode, jnp.zeros((env.drones, 4)))
+    keys.check(least=2 * 8 + 3)
 
 
 def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatch):
-    """Fake noise, pushes, laws, starts and resets tell which key they saw, also where all are given the same one."""
+    """Fake noise, pushes, randomizations, starts and resets record the key they saw, even if all get the same one."""
     seen = {}
 
     def tell(stream, key):
@@ -108,12 +119,12 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
         tell("noise", key)
         return state
 
-    def disturb(key, params, dt):
+    def disturbance(key, params, dt):
         tell("disturbance", key)
         return params
 
-    def law_keys(laws, key, params):
-        tell("laws", key)
+    def draw(randomize, key, params):
+        tell("randomize", key)
         return params
 
     plain = make("hover").task
@@ -122,15 +133,15 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
         tell("start", key)
         return plain.start(key, params)
 
-    monkeypatch.setattr("jaxdrones.envs.env.draw", law_keys)
-    env = make(dataclasses.replace(plain, start=start), noise=noise, disturb=disturb)
+    monkeypatch.setattr("jaxdrones.envs.env.draw", draw)
+    env = make(dataclasses.replace(plain, start=start), noise=noise, disturbance=disturbance)
     reset, env.reset = env.reset, lambda key: (tell("reset", key), reset(key))[1]
-    _, episode = autoreset(env).reset(KEY)
+    _, episode = AutoReset(env).reset(KEY)
     episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
-    autoreset(env).step(KEY, episode, jnp.zeros((1, 4)))
+    AutoReset(env).step(KEY, episode, jnp.zeros((1, 4)))
     jax.effects_barrier()
     counts = {stream: len(found) for stream, found in seen.items()}
-    assert counts == dict(reset=2, laws=2, start=2, noise=2, disturbance=1)
+    assert counts == dict(reset=2, randomize=2, start=2, noise=2, disturbance=1)
     assert len(set().union(*seen.values())) == sum(counts.values())
 
 
@@ -140,10 +151,10 @@ def test_noise_and_pushes_of_a_step_are_independent():
     def noise(key, state):
         return state.replace(vel=jax.random.normal(key, state.vel.shape))
 
-    def disturb(key, params, dt):
+    def disturbance(key, params, dt):
         return params.replace(external_force=jax.random.normal(key, params.external_force.shape))
 
-    env = make("hover", observation=("velocity",), noise=noise, disturb=disturb, drones=200)
+    env = make("hover", observation=("velocity",), noise=noise, disturbance=disturbance, drones=200)
     _, world = env.reset(KEY)
     obs, world, *_ = env.step(jax.random.key(1), world, jnp.zeros((200, 4)))
     assert abs(np.corrcoef(obs.ravel(), world.params.external_force.ravel())[0, 1]) < 0.15
@@ -152,7 +163,7 @@ def test_noise_and_pushes_of_a_step_are_independent():
 class Toss:
     """A world that draws in every step; all that a learner needs."""
 
-    drones, action_size, observation_size, dt, steps, kept = 1, 1, 2, 0.1, 2, ()
+    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 2, ()
 
     def reset(self, key):
         x = jax.random.uniform(jax.random.fold_in(key, 0), (1, 2))
@@ -188,6 +199,6 @@ def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(ke
         patched.setattr(learner, "Policy", type("Policy", (), {"init": staticmethod(init)}))
         state = learner.init(KEY, env, config)
     jax.jit(lambda state: learner.update(env, config, state))(state)
-    for purpose in (loop.CHOICE, loop.REPORT):
+    for purpose in (selection.SELECTION_STREAM, selection.REPORT_STREAM):
         jax.random.split(jax.random.fold_in(KEY, purpose))
     keys.check(least=10)

@@ -9,7 +9,7 @@ import pytest
 from documents import ROOT, blocks, run_python
 
 from jaxdrones.cli import main
-from jaxdrones.training.loop import Trainer
+from jaxdrones.training.trainer import Trainer
 
 README = ROOT / "README.md"
 BLOCKS = blocks(README, "sh")
@@ -74,10 +74,10 @@ TRAININGS = {
     "fly --policy runs/hover --backend bullet --video hover.mp4": Short(
         "hover by bptt, policy of runs/hover, on Bullet ... wrote .*hover.mp4", needs=FILM
     ),
-    "train hover --library sb3 --algo ppo": Short(
+    "train hover-2021 --library sb3 --algo ppo": Short(
         "trained in ", "--budget 64 --set n_steps=8 --set batch_size=32 --episodes 2", SB3
     ),
-    "fly --policy runs/hover-sb3-ppo": Short(LOGGED, needs=SB3),
+    "fly --policy runs/hover-2021-sb3-ppo": Short(LOGGED, needs=SB3),
 }
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxdrones as jd
-from jaxdrones.envs import autoreset, make
+from jaxdrones.envs import AutoReset, make
 from jaxdrones.learning import Result
 from jaxdrones.learning.networks import Policy
 
@@ -20,7 +20,7 @@ def two_gusts(params, state):
 LINES = {
     "environment": (HOVER, "<Env hover: 2 x hb, dt 0.01 s, 500 steps, 4 actions and 22 observations a drone, explicit"),
     "own vehicle": (make("hover", vehicle=jd.load_params("hb")), "<Env hover: 1 x drones of own parameters, dt 0.01"),
-    "autoreset": (autoreset(HOVER), "<AutoReset of <Env hover: 2 x hb, "),
+    "autoreset": (AutoReset(HOVER), "<AutoReset of <Env hover: 2 x hb, "),
     "policy": (POLICY, "<Policy 22 -> 32 -> 16 -> 4, tanh, 1,332 parameters, statistics of 0 observations>"),
     "policies": (
         Policy.init(jax.random.key(0), HOVER, (8,), True),

@@ -157,3 +157,48 @@ def evaluated(equation: Equation, inputs: Sequence) -> list:
     """The results of an equation."""
     variables = {v: x for v, x in zip(equation.invars, inputs, strict=True) if not is_literal(v)}
     return alone(equation, variables, equation.outvars)(*variables.values())
+
+
+def depends(function: Callable, *arguments: Any) -> Any:
+    """Which numbers of a function's result depend on its first argument: a pytree of booleans like the result.
+
+    It is read off the traced program, so it holds for all values of the arguments. Where the program is not transparent
+    (a loop, a derivative rule of its own) everything that goes in may change everything that comes out.
+    """
+    program, _, shape = trace(function, *arguments)
+    first = len(jax.tree.leaves(arguments[0]))
+    given = [i < first for i in range(len(program.invars))]
+    return jax.tree.unflatten(jax.tree.structure(shape), _dependent(program, given))
+
+
+def _dependent(program: Any, given: Sequence[bool]) -> list[bool]:
+    """Which results of a program depend on the inputs that are given as true."""
+    known = dict(zip(program.invars, given, strict=True))
+
+    def depends(variable: Variable) -> bool:
+        return not is_literal(variable) and known.get(variable, False)
+
+    for eqn in program.eqns:
+        inputs = [depends(v) for v in eqn.invars]
+        if eqn.primitive.name in PLAIN_CALLS:
+            found = _dependent(called(eqn)[0], inputs)
+        elif eqn.primitive.name == "cond":
+            branches = [opened(branch)[0] for branch in eqn.params["branches"]]
+            found = [inputs[0] and not same for same in map(_is_forwarded, *(_sources(b) for b in branches))]
+            for branch in branches:
+                found = [a or b for a, b in zip(found, _dependent(branch, inputs[1:]), strict=True)]
+        else:
+            found = [any(inputs)] * len(eqn.outvars)
+        known |= dict(zip(eqn.outvars, found, strict=True))
+    return [depends(v) for v in program.outvars]
+
+
+def _sources(program: Any) -> list[int | None]:
+    """For every result of a program the index of the input that it is, or nothing."""
+    inputs = {v: i for i, v in enumerate(program.invars)}
+    return [None if is_literal(v) else inputs.get(v) for v in program.outvars]
+
+
+def _is_forwarded(*sources: int | None) -> bool:
+    """Whether a result is the same input in all branches."""
+    return sources[0] is not None and len(set(sources)) == 1

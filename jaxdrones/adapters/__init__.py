@@ -1,1 +1,1 @@
-"""The environments as other libraries want them, one file per library, each imported only when asked for."""
+"""Environments with the interfaces of other libraries, one file per library, imported only when asked for."""

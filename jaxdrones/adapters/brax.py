@@ -11,6 +11,7 @@ with brax.trainers():
 from __future__ import annotations
 
 import contextlib
+import functools
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -32,43 +33,43 @@ except ImportError as error:
 _NEXT = np.uint32(2**32 - 1)  # what the key is folded with for the next episode: no episode has that many steps
 
 
-def wrap(env: envs.Env) -> Env:
-    """An environment as brax wants it."""
-    return Env(env)
+def wrap(env: envs.Env) -> BraxEnv:
+    """An environment for brax's trainers."""
+    return BraxEnv(env)
 
 
-class Env(base.Env):
-    """One world; a team acts and sees as one, side by side, and its reward is the mean over the drones.
+class BraxEnv(base.Env):
+    """One world with one agent: actions and observations of the drones are concatenated, the reward is their mean.
 
-    As for all of brax's environments, the time limit is the trainer's `episode_length`; take `env.steps`.
-    `info["time_out"]` is 1 where the task cut the episode, though it could go on.
+    As in all of brax's environments, the time limit is the trainer's `episode_length`; take `env.steps`.
+    `info["time_out"]` is 1 where the task truncated the episode.
     """
 
     def __init__(self, env: envs.Env):
         """Wrap an environment.
 
         Raises:
-            ValueError: it has cameras.
+            ValueError: the environment has cameras.
         """
         if env.vision is not None:
             raise ValueError(
-                "the environment has cameras, which brax's trainers have no use for; make it without vision"
+                "the environment has cameras, whose images brax's trainers do not take; make it without vision"
             )
         self.env = env
 
     @property
     def observation_size(self) -> int:
-        """Of all drones together."""
+        """Length of the concatenated observation of all drones."""
         return self.env.drones * self.env.observation_size
 
     @property
     def action_size(self) -> int:
-        """Of all drones together."""
+        """Length of the concatenated action of all drones."""
         return self.env.drones * self.env.action_size
 
     @property
     def backend(self) -> str:
-        """Not one of brax's."""
+        """Name of the simulator, which is none of brax's."""
         return "jaxdrones"
 
     def reset(self, rng: jax.Array) -> base.State:
@@ -85,9 +86,7 @@ class Env(base.Env):
         world, key = state.pipeline_state
         action = jnp.reshape(action, (self.env.drones, self.env.action_size))
         obs, world, reward, terminated, _, info = self.env.step(jax.random.fold_in(key, world.step), world, action)
-        cut = jnp.zeros((), bool)
-        for name in self.env.task.limits:
-            cut |= info["ends"][name]
+        cut = functools.reduce(jnp.logical_or, info["truncations"].values(), jnp.zeros((), bool))
         return state.replace(
             pipeline_state=(world, key),
             obs=self._flat(obs),
@@ -106,9 +105,9 @@ class Env(base.Env):
 
 
 class _Training(base.Wrapper):
-    """Many worlds; where an episode ends, a new one begins, from a start that was not seen before."""
+    """Many worlds; where an episode ends, a new one begins from a newly drawn start."""
 
-    def __init__(self, env: Env, episode_length: int):
+    def __init__(self, env: BraxEnv, episode_length: int):
         super().__init__(env)
         self.episode_length = episode_length
 
@@ -152,18 +151,18 @@ class _Training(base.Wrapper):
 
 
 def wrap_for_training(
-    env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
+    env: BraxEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
 ) -> base.Wrapper:
-    """The trainers' `wrap_env_fn`: many worlds, each episode from a fresh start, time limits told from ends.
+    """The trainers' `wrap_env_fn`: many worlds, each episode from a newly drawn start.
 
-    Brax's own starts every episode of a world from the same cached state. `info["truncation"]` and
-    `info["time_out"]` are 1 where an episode was cut, by `episode_length` or by the task.
+    Brax's own wrapper starts every episode of a world from the same cached state. `info["truncation"]` and
+    `info["time_out"]` are 1 where an episode was truncated, by `episode_length` or by the task.
 
     Args:
-        env: from `wrap`.
-        episode_length: control steps.
-        action_repeat: 1; make the environment with a lower `control_hz` to hold actions longer.
-        randomization_fn: none; make the environment with `laws` to draw parameters in every episode.
+        env: environment that `wrap` returned.
+        episode_length: control steps of an episode.
+        action_repeat: must be 1; make the environment with a lower `control_hz` to hold actions longer.
+        randomization_fn: must be `None`; make the environment with `randomize` to draw parameters in every episode.
 
     Raises:
         ValueError: an argument that is not of that kind.
@@ -174,16 +173,16 @@ def wrap_for_training(
             f"action_repeat is {action_repeat}; leave it at 1 and make the environment with a lower control_hz"
         )
     if randomization_fn is not None:
-        raise ValueError("randomization_fn is given; leave it out and make the environment with laws")
+        raise ValueError("randomization_fn is given; leave it out and make the environment with randomize")
     return _Training(env, episode_length)
 
 
 @contextlib.contextmanager
 def trainers() -> Iterator[None]:
-    """Within this, brax 0.14.2's trainers run on jax 0.10 and later, and print nothing to stdout when imported.
+    """A context in which brax 0.14.2's trainers run on jax 0.10 and later.
 
-    They call `jax.device_put_replicated`, which jax 0.10 took away (google/brax issue 671). It is put back, and taken
-    away again at the end.
+    They call `jax.device_put_replicated`, which jax 0.10 removed (google/brax issue 671). The context adds it, and
+    removes it again at the end.
     """
     missing = not hasattr(jax, "device_put_replicated")
     if missing:
@@ -196,7 +195,7 @@ def trainers() -> Iterator[None]:
 
 
 def _device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
-    """A copy of every array on every device, along a new leading axis; laid out as what a `pmap` over "i" returns."""
+    """A copy of every array on every device, along a new leading axis, with the sharding of a `pmap` over "i"."""
     sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
 
     def put(leaf):

@@ -6,6 +6,7 @@ compiled step; the options are those of `jaxdrones.make`.
 
 from __future__ import annotations
 
+import copy
 import functools
 from typing import Any
 
@@ -16,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from jaxdrones import envs
-from jaxdrones.adapters.session import SEEDS, Session, begin, made
+from jaxdrones.adapters.session import SEEDS, Session, as_env, begin
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.checks import check_whole
 from jaxdrones.tasks.task import Task
@@ -24,8 +25,8 @@ from jaxdrones.tasks.task import Task
 NAMESPACE = "jaxdrones"
 
 
-class Env(gymnasium.Env):
-    """One world. A team's reward is the sum over its drones; `info["rewards"]` has every drone's by term."""
+class GymnasiumEnv(gymnasium.Env):
+    """One world. A team's reward is the sum over its drones; `info["rewards"]` has the terms of every drone by name."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
 
@@ -36,17 +37,17 @@ class Env(gymnasium.Env):
 
         Args:
             task: a name, a task, or an environment.
-            dict_spaces: observe and act by drone, "0", "1", ..., as in the paper; else a team has Box spaces (n, d)
-                and (n, a), and a lone drone (d,) and (a,).
-            render_mode: `rgb_array` or nothing; pictures are taken by pybullet, on both backends.
-            **options: of `jaxdrones.make`.
+            dict_spaces: observations and actions are dicts by drone, "0", "1", ..., as in gym-pybullet-drones (2021);
+                else a team has Box spaces (n, d) and (n, a), and a single drone (d,) and (a,).
+            render_mode: `rgb_array` or nothing; pybullet renders the pictures, on both backends.
+            **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: as of `jaxdrones.make`.
+            ValueError: an argument that `jaxdrones.make` refuses.
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
-        self.env, self.render_mode = made(task, options), render_mode
+        self.env, self.render_mode = as_env(task, options), render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / self.env.dt)}
         self._layout = _layout(self.env, dict_spaces)
         self.observation_space, self.action_space = self._layout.observation, self._layout.action
@@ -90,16 +91,17 @@ class Env(gymnasium.Env):
         return self._session.photo()
 
     def close(self) -> None:
-        """End what is connected to Bullet."""
+        """End the connection to Bullet, if there is one."""
         self._session.close()
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
     """Many worlds in one compiled step; where an episode ends, the next one begins in the same step.
 
-    `infos` has `rewards`, `metrics` and `ends` by name. If an episode ended, it has `final_obs` (of all; those that
-    count are in `_final_obs`) and `final_info`, with what came last and `episode`: return `r` and length `l`.
-    World i, reset with `seed`, starts as an `Env` does that is reset with `seed + i`.
+    `infos` has `rewards`, `metrics`, `terminations` and `truncations` by name. If an episode ended, it has `final_obs`
+    (of all worlds; `_final_obs` says of which it is valid) and `final_info`, with the last infos of the episode and
+    `episode`: return `r` and length `l`. World i, reset with `seed`, starts like a `GymnasiumEnv` that is reset with
+    `seed + i`.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -118,30 +120,27 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
             task: a name, a task, or an environment.
-            num_envs: how many worlds.
-            dict_spaces: as of `Env`.
-            numpy: give NumPy arrays of one's own; else JAX's, not copied and not waited for, with `final_obs` and
+            num_envs: number of worlds.
+            dict_spaces: as for `GymnasiumEnv`.
+            numpy: return new NumPy arrays; else JAX arrays, not copied and not waited for, with `final_obs` and
                 `final_info` in every step.
-            max_episode_steps: cut episodes after so many steps, not after the task's duration.
-            **options: of `jaxdrones.make`.
+            max_episode_steps: truncate episodes after so many steps, not after the task's duration.
+            **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: as of `jaxdrones.make`.
+            ValueError: an argument that `jaxdrones.make` refuses.
         """
         check_whole("num_envs", num_envs)
-        self.env, self.num_envs, self._numpy = made(task, options), num_envs, numpy
+        self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
         if max_episode_steps is not None:
             check_whole("max_episode_steps", max_episode_steps)
-            if self.env is task:
-                raise ValueError(
-                    "max_episode_steps is given beside an environment; set its `steps` before its first step"
-                )
+            self.env = copy.copy(self.env)
             self.env.steps = max_episode_steps
         self._layout = _layout(self.env, dict_spaces)
         self.single_observation_space, self.single_action_space = self._layout.observation, self._layout.action
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._auto = envs.autoreset(self.env)
+        self._episodes = envs.AutoReset(self.env)
         self._compiled_reset = jax.jit(self._reset)
         self._compiled_step = jax.jit(self._step, donate_argnums=1)
         self._worlds = None
@@ -159,7 +158,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """One control step in every world.
 
         Raises:
-            ValueError: actions of wrong shape or with NaN (which a JAX array is not looked at for).
+            ValueError: actions of wrong shape or with NaN (JAX arrays are not searched for NaN).
             gymnasium.error.ResetNeeded: no episode has begun.
         """
         if self._worlds is None:
@@ -170,24 +169,24 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End what is connected to Bullet."""
+        """End the connection to Bullet, if there is one."""
         self.env.close()
 
     def _reset(self, seeds: jax.Array):
-        keys, episodes, obs = jax.vmap(functools.partial(begin, self._auto))(seeds)
+        keys, episodes, obs = jax.vmap(functools.partial(begin, self._episodes))(seeds)
         return keys, (np.uint32(0), episodes), self._layout.arrange(obs, 1)
 
     def _step(self, keys: jax.Array, worlds: tuple, actions: jax.Array):
         count, episodes = worlds
 
         def step(key, episode, action):
-            return self._auto.step(jax.random.fold_in(key, count), episode, action)
+            return self._episodes.step(jax.random.fold_in(key, count), episode, action)
 
         obs, episodes, reward, terminated, truncated, info = jax.vmap(step)(keys, episodes, actions)
         last = {"rewards": info["rewards"], "metrics": info["metrics"]}
         if self.env.drones == 1:
             last = jax.tree.map(lambda x: x[:, 0], last)
-        last |= {"ends": info["ends"]}
+        last |= {name: info[name] for name in ("terminations", "truncations")}
         episode = {"r": info["episode"]["return"].sum(-1), "l": info["episode"]["length"]}
         info = {"last": last, "episode": episode, "final_obs": self._layout.arrange(info["final_obs"], 1)}
         return (count + 1, episodes), (self._layout.arrange(obs, 1), reward.sum(-1), terminated, truncated, info)
@@ -198,7 +197,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return jax.tree.map(lambda x: np.array(x, np.float32 if x.dtype == np.float64 else None), tree)
 
     def _infos(self, info: dict[str, Any], ended: Any) -> dict[str, Any]:
-        """As gymnasium masks them: what is in `name` holds for the worlds of `_name`."""
+        """The infos with gymnasium's masks: `_name` says of which worlds `name` is valid."""
         last, goes_on = info["last"], ~ended
         infos = _masked({name: _masked(group, goes_on) for name, group in last.items()}, goes_on)
         if not self._numpy or ended.any():
@@ -231,4 +230,6 @@ def _masked(values: dict[str, Any], mask: Any) -> dict[str, Any]:
 
 for _task, _id in ids().items():
     if _id not in gymnasium.registry:
-        gymnasium.register(_id, f"{__name__}:Env", vector_entry_point=f"{__name__}:VectorEnv", kwargs={"task": _task})
+        gymnasium.register(
+            _id, f"{__name__}:GymnasiumEnv", vector_entry_point=f"{__name__}:VectorEnv", kwargs={"task": _task}
+        )

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from jaxdrones.adapters.session import SEEDS, Session, made
+from jaxdrones.adapters.session import SEEDS, Session, as_env
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import Env
 from jaxdrones.tasks.task import Task
@@ -19,7 +19,7 @@ except ImportError as error:
 
 
 def parallel_env(task: str | Task | Env, **options: Any) -> ParallelEnv:
-    """A team whose agents are `drone_0`, `drone_1`, ...; the options are those of `jaxdrones.make`."""
+    """A team whose agents are `drone_0`, `drone_1`, ...; it takes the options of `jaxdrones.make`."""
     return ParallelEnv(task, **options)
 
 
@@ -31,15 +31,15 @@ class ParallelEnv(pettingzoo.ParallelEnv):
 
         Args:
             task: a name, a task, or an environment.
-            render_mode: `rgb_array` or nothing; pictures are taken by pybullet, on both backends.
-            **options: of `jaxdrones.make`.
+            render_mode: `rgb_array` or nothing; pybullet renders the pictures, on both backends.
+            **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: as of `jaxdrones.make`.
+            ValueError: an argument that `jaxdrones.make` refuses.
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
-        self.env = made(task, options)
+        self.env = as_env(task, options)
         self.render_mode = render_mode
         self.metadata = {
             "name": f"jaxdrones/{self.env.task.name}",
@@ -58,11 +58,11 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         self._seeds = np.random.default_rng()
 
     def observation_space(self, agent: str) -> gymnasium.Space:
-        """What an agent sees."""
+        """The observation space of an agent."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> gymnasium.Space:
-        """What an agent does."""
+        """The action space of an agent."""
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
@@ -94,7 +94,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """What all agents see, one after the other (without pictures): for critics that see everything.
+        """The concatenated observations of all agents without pictures, for centralized critics.
 
         Raises:
             ValueError: no episode has begun.
@@ -118,7 +118,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         return self._session.photo()
 
     def close(self) -> None:
-        """End what is connected to Bullet."""
+        """End the connection to Bullet, if there is one."""
         self._session.close()
 
     def _observed(self, obs: Any) -> dict[str, Any]:
@@ -128,4 +128,8 @@ class ParallelEnv(pettingzoo.ParallelEnv):
 
 def _of_drone(info: dict[str, Any], i: int) -> dict[str, Any]:
     rewards, metrics = ({name: x[i].item() for name, x in info[group].items()} for group in ("rewards", "metrics"))
-    return {"rewards": rewards, "metrics": metrics, "ends": dict(info["ends"])}
+    return {
+        "rewards": rewards,
+        "metrics": metrics,
+        **{name: dict(info[name]) for name in ("terminations", "truncations")},
+    }

@@ -18,9 +18,9 @@ except ImportError as error:
 
 
 class VecEnv(vec_env.VecEnv):
-    """Many worlds; `infos[i]` of an episode's last step has what SB3 looks for, the others are empty.
+    """Many worlds; `infos[i]` is empty but in the last step of an episode.
 
-    That is `terminal_observation`, `TimeLimit.truncated`, and `episode` (return `r`, length `l`) for its log.
+    There it has `terminal_observation`, `TimeLimit.truncated`, and `episode` (return `r`, length `l`) for SB3's log.
     """
 
     def __init__(self, task: str | Task | Env, num_envs: int, *, seed: int | None = None, **options: Any):
@@ -28,12 +28,12 @@ class VecEnv(vec_env.VecEnv):
 
         Args:
             task: a name, a task, or an environment.
-            num_envs: how many.
-            seed: of the first reset; SB3's algorithms set it too.
-            **options: of `jaxdrones.make`.
+            num_envs: number of worlds.
+            seed: seed of the first reset; SB3's algorithms set it too.
+            **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: as of `jaxdrones.make`.
+            ValueError: an argument that `jaxdrones.make` refuses.
         """
         self.envs = gymnasium.VectorEnv(task, num_envs, **options)
         self.render_mode = None
@@ -72,7 +72,7 @@ class VecEnv(vec_env.VecEnv):
         return obs, reward, done, infos
 
     def close(self) -> None:
-        """End what is connected to Bullet."""
+        """End the connection to Bullet, if there is one."""
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
@@ -80,7 +80,7 @@ class VecEnv(vec_env.VecEnv):
         return [getattr(self.envs, attr_name) for _ in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """The worlds are one; they cannot be set apart.
+        """Always raises: all worlds are one compiled step and cannot be set apart.
 
         Raises:
             ValueError: always.
@@ -88,7 +88,7 @@ class VecEnv(vec_env.VecEnv):
         raise ValueError(f"attribute {attr_name} cannot be set in a compiled environment; give it as an option")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """The worlds are one; they have no methods of their own.
+        """Always raises: all worlds are one compiled step and have no methods of their own.
 
         Raises:
             ValueError: always.
@@ -96,7 +96,7 @@ class VecEnv(vec_env.VecEnv):
         raise ValueError(f"method {method_name} cannot be called: the environments are one compiled step")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """No world is wrapped."""
+        """False for every world."""
         return [False for _ in self._chosen(indices)]
 
     def _chosen(self, indices: int | Iterable[int] | None) -> Iterable[int]:

@@ -12,28 +12,29 @@ from jax.typing import ArrayLike
 
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
+from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Task, World
 
-SEEDS = 2**32  # a seed counts modulo this
+SEEDS = 2**32  # seeds are taken modulo this
 
 
 class Session:
-    """A world that stays on the device; what is seen of it comes in fresh arrays."""
+    """A world that stays on the device, whose observations are returned as new NumPy arrays."""
 
     def __init__(self, env: Env):
         self.env = env
         self.world: World | None = None
         self.running = False
         """Whether an episode has begun and not ended."""
-        on_host = isinstance(env.physics, HostStep)  # is called as it is, and compiles what is around it by itself
-        self._begin: Callable[..., Any]
-        self._advance: Callable[..., Any]
-        self._begin, self._advance = (begin, _advance) if on_host else (_begin_compiled, _advance_compiled)
+        on_host = isinstance(env.physics, HostStep)  # the environment compiles what is around such a step by itself
+        self._compiled: Callable[..., Any] = _partial if on_host else Env.compiled
 
     def reset(self, seed: int) -> Any:
         """Start an episode; returns the observation."""
-        self._key, self.world, obs = self._begin(self.env, np.uint32(seed % SEEDS))
+        self._key, self.world, obs = self._compiled(self.env, begin)(np.uint32(seed % SEEDS))
         self.running = True
+        if not isinstance(self.env.scene, Scene):
+            self._close_renderer()  # of the scene of the last episode
         return _numpy(obs)
 
     def step(self, action: np.ndarray) -> tuple[Any, np.ndarray, bool, bool, dict[str, Any]]:
@@ -45,15 +46,16 @@ class Session:
         Returns:
             Observation, reward (n,), terminated, truncated and info, as the environment gives them.
         """
-        self.world, outcome = self._advance(self.env, self._key, self.world, action)
+        self.world, outcome = self._compiled(self.env, _advance)(self._key, self.world, action)
         obs, reward, terminated, truncated, info = _numpy(outcome)
         terminated, truncated = bool(terminated), bool(truncated)
         self.running = not (terminated or truncated)
-        info["ends"] = {name: bool(end) for name, end in info["ends"].items()}
+        for group in ("terminations", "truncations"):
+            info[group] = {name: bool(condition) for name, condition in info[group].items()}
         return obs, reward, terminated, truncated, info
 
     def photo(self) -> np.ndarray:
-        """A picture of the team from the side: RGB (height, width, 3) uint8; taken by Bullet, whatever the backend.
+        """A picture of the team from the side, RGB (height, width, 3) uint8; Bullet renders it, whatever the backend.
 
         Raises:
             ImportError: pybullet is not installed; says which extra to install.
@@ -63,29 +65,33 @@ class Session:
         center = pos.mean(axis=0)
         reach = 1.0 + np.abs(pos - center).max()  # m
         eye = center + reach * np.array([0.9, -1.2, 0.6])
-        return self._photographer.photo(self.world.params, self.world.drones, eye, center)
+        return self._renderer.photo(self.world.params, self.world.drones, eye, center)
 
     def close(self) -> None:
-        """End what is connected to Bullet; the session cannot go on."""
+        """End the connections to Bullet; the session cannot go on."""
         self.running = False
         self.env.close()
-        if "_photographer" in vars(self):
-            self._photographer.close()
+        self._close_renderer()
+
+    def _close_renderer(self) -> None:
+        if "_renderer" in vars(self):
+            self._renderer.close()
+            del self._renderer
 
     @functools.cached_property
-    def _photographer(self):
+    def _renderer(self):
         if isinstance(self.env.physics, HostStep):
             return self.env.physics
         from jaxdrones.engine import bullet  # an optional library behind it
 
-        return bullet.make_step(scene=self.env.task.scene)
+        return bullet.make_step(scene=self.world.scene)
 
 
-def made(task: str | Task | Env, options: dict[str, Any]) -> Env:
-    """The environment that is meant by a name, a task, or an environment.
+def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
+    """The environment for a name, a task, or an environment.
 
     Raises:
-        ValueError: as of `jaxdrones.make`, or options beside an environment.
+        ValueError: an argument that `jaxdrones.make` refuses, or options beside an environment.
     """
     if not isinstance(task, Env):
         return make(task, **options)
@@ -95,7 +101,7 @@ def made(task: str | Task | Env, options: dict[str, Any]) -> Env:
 
 
 def begin(env: Env | AutoReset, seed: ArrayLike) -> tuple[jax.Array, Any, Any]:
-    """The key of an episode's steps, the world at its start, and what is seen of it."""
+    """The key of an episode's steps, the world at its start, and the first observation."""
     key, start = jax.random.split(jax.random.PRNGKey(seed))
     obs, world = env.reset(start)
     return key, world, obs
@@ -106,10 +112,10 @@ def _advance(env: Env, key: jax.Array, world: World, action: np.ndarray) -> tupl
     return world, (obs, *rest)
 
 
-_begin_compiled = jax.jit(begin, static_argnums=0)  # once for an environment, however many sessions it has
-_advance_compiled = jax.jit(_advance, static_argnums=0)
+def _partial(env: Env, function: Callable) -> Callable:
+    return functools.partial(function, env)
 
 
 def _numpy(tree: Any) -> Any:
-    """Arrays of one's own, in single precision where they are real."""
+    """New NumPy arrays, real ones in single precision."""
     return jax.tree.map(lambda x: np.array(x, np.float32 if x.dtype == np.float64 else None), tree)

@@ -12,12 +12,13 @@ from gymnasium import spaces
 
 from jaxdrones.checks import check_shape
 from jaxdrones.envs import Env
+from jaxdrones.sensing import Scene
 
-_FAR = 1001.0  # m; the cameras see 1000 m far, give or take rounding
+_MAX_DEPTH = 1001.0  # m; the farthest visible distance of the cameras, 1000 m, and rounding
 
 
 def observation_of_drone(env: Env) -> spaces.Space:
-    """What one drone sees."""
+    """The observation space of one drone."""
     state = spaces.Box(-env.observation_bound, env.observation_bound, dtype=np.float32)
     if env.vision is None:
         return state
@@ -25,21 +26,21 @@ def observation_of_drone(env: Env) -> spaces.Space:
 
 
 def action_of_drone(env: Env) -> spaces.Box:
-    """What one drone is told."""
+    """The action space of one drone."""
     return spaces.Box(-1, 1, (env.action_size,), np.float32)
 
 
 def stacked(space: spaces.Space, n: int) -> spaces.Space:
-    """The space of n side by side, with a leading axis."""
+    """The space of n of them, with a leading axis."""
     if isinstance(space, spaces.Dict):
-        return spaces.Dict({name: stacked(part, n) for name, part in space.items()})
+        return spaces.Dict({name: stacked(entry, n) for name, entry in space.items()})
     assert isinstance(space, spaces.Box)
     low, high = (np.broadcast_to(x, (n, *space.shape)) for x in (space.low, space.high))
     return spaces.Box(low, high, dtype=space.low.dtype.type)
 
 
 class Layout:
-    """A lone drone without its axis; a team with it, or as a dict by drone."""
+    """Layout of observations and actions: one drone without the drone axis; a team with it, or as a dict by drone."""
 
     def __init__(self, env: Env, names: Sequence[str] | None):
         n = env.drones
@@ -56,13 +57,13 @@ class Layout:
             self.action = stacked(action_of_drone(env), n)
 
     def arrange(self, tree: Any, axis: int = 0) -> Any:
-        """Arrays with all drones along `axis`, laid out."""
+        """Arrays with all drones along `axis`, in this layout."""
         if self.names:
             return {name: _pick(tree, i, axis) for i, name in enumerate(self.names)}
         return _pick(tree, 0, axis) if self.drones == 1 else tree
 
     def gather(self, action: Any, batch: tuple[int, ...] = ()) -> Any:
-        """The array (*batch, n, a) of an action that is laid out.
+        """The array (*batch, n, a) of an action in this layout.
 
         Raises:
             ValueError: a drone without an action, a wrong shape, or not a number (in a NumPy array).
@@ -75,13 +76,13 @@ class Layout:
             return action[..., None, :] if alone else action
         if not isinstance(action, Mapping) or set(action) != set(self.names):
             given = ", ".join(map(str, action)) if isinstance(action, Mapping) else repr(action)
-            raise ValueError(f"action is for {given or 'no drone'}; give a dict with one each for {self._who}")
-        parts = [_check(action[name], f"action of {name}", (*batch, self.size), "") for name in self.names]
-        stack = np.stack if isinstance(parts[0], np.ndarray) else jnp.stack
-        return stack(parts, axis=len(batch))
+            raise ValueError(f"action is for {given or 'no drone'}; give a dict with one each for {self._agents}")
+        rows = [_check(action[name], f"action of {name}", (*batch, self.size), "") for name in self.names]
+        stack = np.stack if isinstance(rows[0], np.ndarray) else jnp.stack
+        return stack(rows, axis=len(batch))
 
     @property
-    def _who(self) -> str:
+    def _agents(self) -> str:
         return ", ".join(self.names)
 
 
@@ -108,5 +109,6 @@ def _image(env: Env, name: str) -> spaces.Box:
     if name == "rgb":
         return spaces.Box(0, 255, (48, 64, 4), np.uint8)
     if name == "depth":
-        return spaces.Box(0, _FAR, (48, 64), np.float32)
-    return spaces.Box(-1, env.drones + len(env.task.scene.obstacles), (48, 64), np.int32)
+        return spaces.Box(0, _MAX_DEPTH, (48, 64), np.float32)
+    assert isinstance(env.scene, Scene), "Bullet, which takes the pictures, has refused others"
+    return spaces.Box(-1, env.drones + len(env.scene.obstacles), (48, 64), np.int32)

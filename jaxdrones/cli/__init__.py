@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdrones.cli import compare, evaluate, fly, names, train
-from jaxdrones.cli.common import INTERRUPTED, Parser, complain
+from jaxdrones.cli.common import INTERRUPTED, Parser, print_error
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -17,12 +17,12 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return options.run(options)
     except KeyboardInterrupt:
-        return complain("interrupted", INTERRUPTED)
+        return print_error("interrupted", INTERRUPTED)
     except OSError as error:
         unwritable = f"{error.filename}: {error.strerror}; choose another --output"
-        return complain(unwritable if error.filename else str(error))
+        return print_error(unwritable if error.filename else str(error))
     except (ValueError, ImportError) as error:
-        return complain(str(error))
+        return print_error(str(error))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""What the commands share: how they take arguments, complain, show progress and tables."""
+"""What the commands share: arguments, error messages, progress bars and tables."""
 
 import argparse
 import contextlib
@@ -12,7 +12,7 @@ from typing import Any
 
 INTERRUPTED = 130  # exit code
 
-_LONGEST = 1000  # characters of a complaint
+_MAX_MESSAGE = 1000  # characters
 
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
@@ -38,31 +38,31 @@ _COLUMNS = {  # result: (heading, format)
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose complaints are one line."""
+    """A parser whose error messages are one line."""
 
     def error(self, message):  # noqa: D102
-        self.exit(complain(f"{shortened(message)}; see {self.prog} --help"))
+        self.exit(print_error(f"{shortened(message)}; see {self.prog} --help"))
 
 
-def complain(message: str, code: int = 2) -> int:
-    """One line on stderr; returns the exit code."""
+def print_error(message: str, code: int = 2) -> int:
+    """Write an error message of one line to stderr; returns the exit code."""
     print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{shortened(message)}", file=sys.stderr)
     return code
 
 
-def note(message: str) -> None:
-    """One line on stderr about what is done, but maybe not as it was meant."""
+def print_warning(message: str) -> None:
+    """Write a warning of one line to stderr."""
     print(f"jaxdrones: warning: {shortened(message)}", file=sys.stderr)
 
 
 def shortened(message: str) -> str:
-    """A message on one line, without the middle of what a user gave at great length."""
+    """A message on one line; the middle of a very long one is left out."""
     line = " ".join(message.split("\n"))
-    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
+    return line if len(line) <= _MAX_MESSAGE else f"{line[: _MAX_MESSAGE // 2]} ... {line[-_MAX_MESSAGE // 2 :]}"
 
 
 def folder(text: str) -> Path:
-    """A path as an option names it; an empty one, as of a variable that is not set, would be the current folder."""
+    """The path that an option gives; an empty one, for example from an unset variable, is refused."""
     if not text:
         raise argparse.ArgumentTypeError("the path is empty; name one, or leave the option out")
     return Path(text)
@@ -82,10 +82,10 @@ def _finite(x):
 
 
 def check_writable(file: Path) -> None:
-    """See that a file can be written, and make its folder; an old file stays until it is replaced.
+    """Raise unless a file can be written; its folder is made, an old file stays until it is replaced.
 
     Raises:
-        OSError: it cannot; names it.
+        OSError: the file cannot be written; names it.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.is_dir():
@@ -99,7 +99,7 @@ def check_writable(file: Path) -> None:
 
 
 def bar(total: int | None, what: str, unit: str, initial: int = 0):
-    """A progress bar on stderr; nothing without a terminal, `None` without tqdm."""
+    """A context with a progress bar on stderr, which is silent without a terminal; with `None` without tqdm."""
     try:
         from tqdm import tqdm
     except ImportError:
@@ -109,7 +109,7 @@ def bar(total: int | None, what: str, unit: str, initial: int = 0):
 
 
 def table(results: list[dict]) -> str:
-    """Columns aligned under their headings, one line per drone."""
+    """Results as text: columns aligned under their headings, one line per drone."""
     names = list(results[0])
     rows = [[_COLUMNS[name][0] for name in names]]
     rows += [

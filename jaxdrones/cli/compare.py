@@ -4,7 +4,7 @@ import argparse
 
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, table
-from jaxdrones.cli.conditions import add_conditions, flown, warn
+from jaxdrones.cli.flight_options import add_conditions, fly_options, warn
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.record import divergence
@@ -14,7 +14,7 @@ def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "compare",
-        help="fly an example on both backends and print how they part",
+        help="fly an example on both backends and print how they diverge",
         description="Fly an example on two backends from the same start and print their divergence over time.",
         allow_abbrev=False,
     )
@@ -31,7 +31,7 @@ def _compare(options: argparse.Namespace) -> int:
         raise ValueError(f"--backends is {options.backends!r}; give two different ones, for example explicit,bullet")
     for name in names:
         check_choice("backend", name, BACKENDS)
-    first, second = records = [flown(options, backend=name) for name in names]
+    first, second = records = [fly_options(options, backend=name) for name in names]
     rows = divergence(first, second)
     diverged = {name: record.diverged() for name, record in zip(names, records, strict=True)}
     if options.json:

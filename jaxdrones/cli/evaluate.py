@@ -5,21 +5,24 @@ import math
 
 from jaxdrones.cli.common import as_json, folder
 
+_FIRST_SEED = 1_000_000  # so that episodes differ from those of the training
+
 
 def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "eval",
         help="evaluate a trained policy over many episodes",
-        description="Fly the best policy of a run for many episodes: success with its 95 % interval, errors, ends.",
+        description="Fly many episodes with the best policy of a run. Prints the success rate with its 95 % interval, "
+        "errors, and how episodes ended.",
         allow_abbrev=False,
     )
     parser.add_argument(
         "policy", type=folder, metavar="RUN", help="folder of `jaxdrones train`, for example runs/hover"
     )
-    parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="(1000)")
-    parser.add_argument("--seed", type=int, default=0, metavar="K", help="of starts and noise (0)")
-    parser.add_argument("--last", action="store_true", help="the newest policy in place of the best")
+    parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
+    parser.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
+    parser.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=_evaluate)
 
@@ -29,17 +32,19 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     from jaxdrones.learning import evaluate
     from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
-    from jaxdrones.training.runs import as_dict, run_in
+    from jaxdrones.training.open_run import open_run
+    from jaxdrones.training.run import report_as_dict
 
     check_at_most("episodes", options.episodes, LARGEST_COUNT)
     check_seed("seed", options.seed)
-    run, name = run_in(options.policy), "last" if options.last else "best"
-    recipe, update = run.recipe(name), run.told(name, "update")
+    run, name = open_run(options.policy), "last" if options.last else "best"
+    recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
     env = recipe.env()
-    report = as_dict(evaluate(env, run.policy(name, env), jax.random.key(1_000_000 + options.seed), options.episodes))
+    key = jax.random.key(_FIRST_SEED + options.seed)
+    report = report_as_dict(evaluate(env, run.policy(name, env), key, options.episodes))
     if options.json:
-        kept = {"run": str(options.policy), "policy": name, "update": update, "seed": options.seed}
-        print(as_json(kept | {"recipe": recipe.as_dict(), "evaluation": report}))
+        about = {"run": str(options.policy), "policy": name, "update": update, "seed": options.seed}
+        print(as_json(about | {"recipe": recipe.as_dict(), "evaluation": report}))
     else:
         print(f"{described(recipe)}: policy of update {update}")
         print(evaluation_table(report))
@@ -47,48 +52,48 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def described(recipe) -> str:
-    """`hover by bptt`, with what was changed."""
+    """The task, the learner and the options that differ from their defaults, such as `hover by bptt`."""
     options = "".join(f", {name} {x}" for name, x in recipe.options.items())
-    return f"{recipe.task} by {recipe.learner}{', realistic' * recipe.realistic}{options}"
+    return f"{recipe.task} by {recipe.trained_by}{', realistic' * recipe.realistic}{options}"
 
 
 def evaluation_table(report: dict) -> str:
-    """What `runs.as_dict` made of an evaluation, in lines."""
-    episodes, error = report["episodes"], report["error_percentiles"]
-    ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["ends"].items()) or "none"
-    others = ", ".join(f"{name} {x:.3g}" for name, x in report["metrics"].items() if name not in ("error",))
+    """The entries of `report_as_dict` as lines of text."""
+    episodes, error = report["episodes"], report["final_error_percentiles"]
+    ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["end_rates"].items()) or "none"
+    others = ", ".join(f"{name} {x:.3g}" for name, x in report["final_metrics"].items() if name not in ("error",))
     rows = [
-        ["episodes", f"{episodes:,}, {report['length']:.2f} s long on average"],
+        ["episodes", f"{episodes:,}, {report['mean_length']:.2f} s long on average"],
         ["success", success(report)],
         [
-            "error in the end",
+            "final error",
             f"median {_length(error['50'])}, 95 % {_length(error['95'])}, 99 % {_length(error['99'])}",
         ],
         ["rms error", f"{_length(report['rms_error'])} over the last four fifths"],
-        ["return", f"{report['returned']:.2f}"],
+        ["return", f"{report['mean_return']:.2f}"],
         ["ended early", ends],
-        ["in the end", others],
+        ["final metrics", others],
     ]
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"  {name.ljust(width)}  {text}" for name, text in rows if text)
 
 
 def success(report: dict) -> str:
-    """Share, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
+    """Success rate, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
     episodes = report["episodes"]
-    low, high = (100 * x for x in report["interval"])
+    low, high = (100 * x for x in report["success_interval"])
     digits = _digits(episodes) + 1
     count = f"{round(report['success'] * episodes):,} of {episodes:,}"
     return f"{percent(report['success'], episodes)}, {count}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"
 
 
 def percent(share: float, episodes: int) -> str:
-    """A share of the episodes, with so many digits that all but one of them do not read as all."""
+    """A fraction of the episodes in percent, with enough digits to tell all of them from all but one."""
     return f"{100 * share:.{_digits(episodes)}f} %"
 
 
 def _digits(episodes: int) -> int:
-    """After the point of a percentage: one episode is at least one unit of the last digit."""
+    """Decimals of a percentage with which one episode is at least one unit of the last digit."""
     return max(1, math.ceil(math.log10(episodes)) - 2)
 
 

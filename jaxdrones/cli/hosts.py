@@ -1,4 +1,4 @@
-"""What `jaxdrones train` does to train on several hosts."""
+"""Options of `jaxdrones train` for a training on several hosts."""
 
 import argparse
 import contextlib
@@ -10,26 +10,28 @@ from collections.abc import Callable
 from pathlib import Path
 
 HELP = (
-    "All devices share the worlds. A CPU counts as N with XLA_FLAGS=--xla_force_host_platform_device_count=N.\n"
-    "On several hosts start the same command on each, with another --host; host 0 writes the files, and a folder to\n"
-    "--resume must be there for all:\n"
+    "All devices share the worlds. A CPU counts as N devices with\n"
+    "XLA_FLAGS=--xla_force_host_platform_device_count=N. On several hosts, start the same command on each, with a\n"
+    "different --host. Host 0 writes the files; to --resume, each host needs a copy of the folder:\n"
     "  jaxdrones train hover --hosts 2 --host 0 --coordinator 127.0.0.1:9911"
 )
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Who the hosts are."""
-    parser.add_argument("--hosts", type=int, metavar="N", help="processes that train together (1)")
-    parser.add_argument("--host", type=int, metavar="I", help="which of them this is, from 0")
-    parser.add_argument("--coordinator", metavar="ADDRESS:PORT", help="of host 0, a port that is free there")
+    """Add the options to the parser."""
+    parser.add_argument("--hosts", type=int, metavar="N", help="number of processes that train together (1)")
+    parser.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
+    parser.add_argument(
+        "--coordinator", metavar="ADDRESS:PORT", help="address of host 0, and a port that is free there"
+    )
 
 
-def together(train: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
-    """The command on one host or several; all but the first write to a folder that is thrown away, and say nothing."""
-    return functools.partial(_together, train)
+def on_hosts(train: Callable[[argparse.Namespace], int]) -> Callable[[argparse.Namespace], int]:
+    """The command on one host or several; all but the first print nothing and write to a temporary folder."""
+    return functools.partial(_on_hosts, train)
 
 
-def _together(train: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
+def _on_hosts(train: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
     asked = (options.hosts, options.host, options.coordinator)
     if asked == (None, None, None):
         return train(options)
@@ -37,10 +39,10 @@ def _together(train: Callable[[argparse.Namespace], int], options: argparse.Name
         raise ValueError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
     if options.library == "sb3":
         raise ValueError("--library sb3 trains on one host; leave out --hosts, --host and --coordinator")
-    from jaxdrones.training import hosts
+    from jaxdrones.training import distributed
 
     with contextlib.ExitStack() as stack:
-        stack.enter_context(hosts.together(*asked))
+        stack.enter_context(distributed.join_hosts(*asked))
         if options.host > 0:
             stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
             copy = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
@@ -48,5 +50,5 @@ def _together(train: Callable[[argparse.Namespace], int], options: argparse.Name
             if options.resume and output.is_dir():
                 shutil.copytree(output, copy)
             options.output, options.no_figure = copy, True
-        hosts.meet("copied")
+        distributed.wait_for_hosts("copied")
         return train(options)

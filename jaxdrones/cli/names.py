@@ -9,9 +9,8 @@ from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
+from jaxdrones.training.algorithms import ALGORITHMS, SB3_ALGORITHMS
 
-ALGORITHMS = ("bptt", "ppo", "shac")  # of jaxdrones.learning, which takes long to import
-SB3_ALGORITHMS = ("ppo", "a2c", "sac")  # of jaxdrones.training.sb3, which may not be installed
 LIBRARIES = ("jaxdrones", "sb3")
 
 

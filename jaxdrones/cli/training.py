@@ -1,4 +1,4 @@
-"""What a training at the shell takes, shows and leaves behind, whichever library trains."""
+"""Arguments, progress and results of a training at the shell, for every library."""
 
 import argparse
 import ast
@@ -12,46 +12,46 @@ from jaxdrones.cli.evaluate import evaluation_table, percent
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.render import plots
 
-_ARGUMENTS = ("cls", "task", "algorithm", "realistic")  # of `Recipe.of`, which other options of the command say
-_LONGEST = 3.6e6  # s
+_NO_SETTINGS = ("cls", "task", "algorithm", "realistic")  # arguments of `Recipe.of` that are options of the command
+_MAX_SECONDS = 3.6e6
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
-def budget(text: str | None, unit: str, example: int) -> tuple[int | None, float | None]:
-    """A number of `unit`, or seconds."""
+def parse_budget(text: str | None, unit: str, example: int) -> tuple[int | None, float | None]:
+    """The number of `unit`, or the seconds, that --budget gives; the other is `None`."""
     if text is None:
         return None, None
     try:
         if text[-1:] in _UNITS:
             seconds = float(text[:-1]) * _UNITS[text[-1]]
-            if 0 < seconds <= _LONGEST:
+            if 0 < seconds <= _MAX_SECONDS:
                 return None, seconds
         elif 0 < int(text) <= LARGEST_COUNT:
             return int(text), None
     except ValueError:
         pass
     raise ValueError(
-        f"--budget is {text!r}; give {unit}, for example {example}, or time up to 1000h, for example 60s, 5m or 2h"
+        f"--budget is {text!r}; give {unit}, for example {example}, or a time up to 1000h, for example 60s, 5m or 2h"
     )
 
 
-def settings(texts: list[str]) -> dict[str, Any]:
-    """Name -> value of every --set; of a name that is given twice, the last."""
+def parse_settings(texts: list[str]) -> dict[str, Any]:
+    """The name and value of every --set; of a name that is given twice, the last value."""
     changes: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
-        if name in _ARGUMENTS:
+        if name in _NO_SETTINGS:
             raise ValueError(
-                f"--set {name} is no setting of a learner or of an environment; see jaxdrones train --help"
+                f"--set {name} is not a setting of a learner or of an environment; see jaxdrones train --help"
             )
         changes[name] = _value(value)
     return changes
 
 
 def _value(text: str) -> Any:
-    """A Python literal, or else a name; `nan` and `inf` are numbers."""
+    """A Python literal, or else a string; `nan` and `inf` are numbers."""
     try:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError, RecursionError, MemoryError):
@@ -59,11 +59,11 @@ def _value(text: str) -> Any:
 
 
 @contextlib.contextmanager
-def fitting(changes: dict[str, Any], task: str):
-    """Settings that break what is built with them are a mistake in what was asked.
+def user_mistakes(changes: dict[str, Any], task: str):
+    """Turn errors that settings of a user cause into errors that name the settings.
 
     Raises:
-        ValueError: in place of what Python or JAX said of them.
+        ValueError: in place of an error of Python or JAX.
     """
     try:
         yield
@@ -74,11 +74,11 @@ def fitting(changes: dict[str, Any], task: str):
         raise ValueError(f"--set {given} does not fit {task}: {error}") from error
 
 
-def once(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:
-    """The changes, and the number that --budget gave for one of them.
+def merge_budget(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:
+    """The settings together with the number that --budget gives for one of them.
 
     Raises:
-        ValueError: that one is changed by --set too.
+        ValueError: --set gives that one too.
     """
     if name in changes and (number is not None or seconds is not None):
         raise ValueError(f"--set {name}={changes[name]} is given beside --budget; give one of them")
@@ -86,99 +86,101 @@ def once(name: str, changes: dict[str, Any], number: int | None, seconds: float 
 
 
 def check_free(run, overwrite: bool) -> None:
-    """Raise if files of a run would be lost."""
+    """Raise if files of another run would be replaced without --overwrite."""
     if overwrite or not run.files:
         return
     if run.finished:
         what, again = "a finished training", "train it longer with --resume --budget N, " if run.started else ""
     else:
-        what, again = "a training that did not finish", "go on with --resume, " if run.started else ""
+        what, again = "a training that did not finish", "continue it with --resume, " if run.started else ""
     raise ValueError(f"{run.folder} holds {what}; {again}replace it with --overwrite, or choose another --output")
 
 
-class Shown(contextlib.ExitStack):
-    """A live bar from the first news on, and a line for every evaluation."""
+class ProgressDisplay(contextlib.ExitStack):
+    """A progress bar, and a line for every evaluation."""
 
-    def __init__(self, total: int | None, what: str, episodes: int, say, unit: str = "update"):
-        """Show nothing yet.
+    def __init__(self, total: int | None, what: str, episodes: int, print_line, unit: str = "update"):
+        """Prepare; the bar appears with the first call of `update`.
 
         Args:
-            total: number of `unit` to come, if that is known.
-            what: is trained.
-            episodes: of an evaluation.
-            say: prints a line.
+            total: number of `unit` of the whole training; `None` if it is not known.
+            what: label, such as the seed.
+            episodes: number of episodes of an evaluation.
+            print_line: function that prints a line.
             unit: what is counted.
         """
         super().__init__()
-        self._total, self._what, self._episodes, self._say, self._unit = total, what, episodes, say, unit
+        self._total, self._what, self._episodes, self._print_line, self._unit = total, what, episodes, print_line, unit
         self._bar: Any = None
-        self._evaluated, self._begun = "", False
+        self._evaluated, self._started = "", False
 
-    def tell(self, count: int, now: dict[str, float]) -> None:
-        """Move the bar; say what an evaluation came to."""
-        if not self._begun:
-            self._begun = True
+    def update(self, count: int, now: dict[str, float]) -> None:
+        """Move the bar, and print the results of an evaluation."""
+        if not self._started:
+            self._started = True
             self._bar = self.enter_context(bar(self._total, self._what, self._unit, initial=count))
-        pace = _pace(now["steps_per_s"])
+        speed = _speed(now["steps_per_s"])
         if "success" in now:
             success = percent(now["success"], self._episodes)
             self._evaluated = f"return {now['evaluated_return']:.1f}, success {success}"
             of = "" if self._total is None else f"/{self._total}"
             line = f"{self._what}: {self._unit} {count:4}{of}  {self._evaluated}, "
-            line += f"median error {now['evaluated_error']:.3f} m, {pace}, {now['seconds']:.1f} s"
+            line += f"median error {now['evaluated_error']:.3f} m, {speed}, {now['seconds']:.1f} s"
             if self._bar is None or self._bar.disable:
-                self._say(line)
+                self._print_line(line)
             else:
-                self._bar.write(line, file=sys.stderr if self._say is quiet else sys.stdout)
+                self._bar.write(line, file=sys.stderr if self._print_line is quiet else sys.stdout)
         if self._bar is not None:
             self._bar.update(count - self._bar.n)
-            self._bar.set_postfix_str(", ".join(filter(None, (self._evaluated, f"reward {now['reward']:.3f}", pace))))
+            self._bar.set_postfix_str(", ".join(filter(None, (self._evaluated, f"reward {now['reward']:.3f}", speed))))
 
 
-def _pace(steps_per_s: float) -> str:
+def _speed(steps_per_s: float) -> str:
     return f"{steps_per_s / 1e6:.2f} M steps/s" if steps_per_s >= 1e5 else f"{steps_per_s:.0f} steps/s"
 
 
 def quiet(_: str) -> None:
-    """With --json, stdout is for the object."""
+    """Print nothing: with --json, stdout is for the JSON object."""
 
 
-def kept(run) -> str:
-    """Which policy an unfinished training leaves."""
-    return f"{run.folder / 'best'}.{run.policy_suffix} is the best policy, of update {run.told('best', 'update')}"
+def remaining_best(run) -> str:
+    """A phrase that names the best policy that an unfinished training leaves."""
+    return (
+        f"{run.folder / 'best'}.{run.policy_suffix} is the best policy, of update {run.sidecar_entry('best', 'update')}"
+    )
 
 
-def draw(options: argparse.Namespace, runs: dict, folder: Path) -> list[Path]:
-    """The learning curve, if it is wanted."""
+def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[Path]:
+    """Draw the learning curves, unless --no-figure is given."""
     if options.no_figure:
         return []
     histories = {f"seed {seed}": run.history() for seed, run in runs.items()}
     recipe = next(iter(runs.values())).recipe()
-    plots.save_curves(histories, folder / "curve.png", f"training {recipe.task} by {recipe.learner}")
+    plots.save_curves(histories, folder / "curve.png", f"training {recipe.task} by {recipe.trained_by}")
     return [folder / "curve.png"]
 
 
-def finish(options: argparse.Namespace, runs: dict, output: Path) -> int:
-    """Draw, choose the best seed, print.
+def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
+    """Draw learning curves, choose the best seed, and print the results.
 
     Args:
-        options: of the command line.
-        runs: seed -> run.
-        output: where the figure goes and, of several seeds, the best.
+        options: options of the command line.
+        runs: run of each seed.
+        output: folder for the figure and, with several seeds, for the best policy.
     """
-    from jaxdrones.training.loop import best_of, score_of
-    from jaxdrones.training.runs import Run
+    from jaxdrones.training.run import Run
+    from jaxdrones.training.selection import best_of, score_of
 
     reports = {seed: run.report() for seed, run in runs.items()}
     evaluations = [report["evaluation"] for report in reports.values()]
-    scores = [score_of(evaluation["success"], evaluation["returned"]) for evaluation in evaluations]
+    scores = [score_of(evaluation["success"], evaluation["mean_return"]) for evaluation in evaluations]
     best = list(runs)[best_of(scores, min(evaluation["episodes"] for evaluation in evaluations))]
     run = runs[best]
     if len(runs) > 1:
-        about = {entry: run.told("best", entry) for entry in ("recipe", "seed", "update")}
+        about = {entry: run.sidecar_entry("best", entry) for entry in ("recipe", "seed", "update")}
         Run(output).save_policy("best", run.policy(), **about)
         Run(output).save_report({"best_seed": best, "seeds": list(reports.values())})
-    files = [output / f"best.{run.policy_suffix}", output / "report.json", *draw(options, runs, output)]
+    files = [output / f"best.{run.policy_suffix}", output / "report.json", *draw_curves(options, runs, output)]
     if options.json:
         result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
         print(as_json(result | {"files": list(map(str, files))}))
@@ -189,7 +191,7 @@ def finish(options: argparse.Namespace, runs: dict, output: Path) -> int:
             print(f"seed {seed}:")
         print(
             f"trained in {spent['training']:.1f} s, {spent['training'] + spent['compiling']:.1f} s with compiling; "
-            f"{spent['evaluating']:.1f} s for evaluations. Best of update {report['best_update']}:"
+            f"{spent['evaluating']:.1f} s for evaluations. The best policy is that of update {report['best_update']}:"
         )
         print(evaluation_table(report["evaluation"]))
     print("wrote " + ", ".join(map(str, files)))

@@ -20,7 +20,7 @@ from jaxdrones.engine.step import Step, is_traced
 from jaxdrones.engine.team import check_command, check_values
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 Derivative = Callable[..., State]
@@ -184,7 +184,7 @@ class ExplicitStep(Step):
 
     def _check_scene(self, scene: Scene) -> None:
         if not isinstance(scene, Scene):
-            raise ValueError(f"scene is {scene!r}; give a jaxdrones.sensing.scene.Scene")
+            raise ValueError(f"scene is {scene!r}; give a jaxdrones.sensing.Scene")
         if scene.has_obstacles and not self.physics.takes_scene:
             raise ValueError(
                 "the scene has obstacles and no effect takes it, so drones would fly through them; give an effect "

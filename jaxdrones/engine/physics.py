@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arguments, check_sequence
+from jaxdrones.checks import check_arguments, check_sequence, takes_scene
 from jaxdrones.dynamics import Model, drone_contact, instant_rotors
 from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
@@ -89,7 +88,7 @@ class Physics:
     @functools.cached_property
     def takes_scene(self) -> bool:
         """Whether an effect depends on what stands around."""
-        return any(_takes_scene(effect) for effect in self.effects)
+        return any(takes_scene(effect) for effect in self.effects)
 
     def contains(self, function: Callable) -> bool:
         """Whether a function is among the effects or pairs, also with arguments bound by `functools.partial`."""
@@ -132,7 +131,7 @@ class Physics:
 
         def alone(params: Params, state: State) -> Wrench:
             def acting(effect):
-                return effect(params, state, scene) if _takes_scene(effect) else effect(params, state)
+                return effect(params, state, scene) if takes_scene(effect) else effect(params, state)
 
             own = (check_wrench("effects", effect, acting(effect)) for effect in self.effects)
             return sum(own, rotor_wrench(params, state))
@@ -157,18 +156,9 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
     for function in functions:
         if not callable(function):
             raise ValueError(f"{name}: {function!r} is not a function; give for example {example}")
-        if not (name == "effects" and _takes_scene(function)):
+        if not (name == "effects" and takes_scene(function)):
             check_arguments(name, function, _ARGUMENTS[name], _ELSEWHERE.get(name, ""))
     return functions
-
-
-def _takes_scene(effect: Callable) -> bool:
-    """Whether the third argument of an effect is called `scene`."""
-    try:
-        parameters = list(inspect.signature(effect).parameters.values())
-    except (TypeError, ValueError):
-        return False
-    return len(parameters) == 3 and parameters[2].name == "scene"
 
 
 def _unbound(function: Callable) -> Callable:

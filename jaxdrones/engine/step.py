@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 
 from jaxdrones.engine.physics import Physics
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 

@@ -1,6 +1,6 @@
-"""Action types: what four, three or one number in [-1, 1] ask of a drone.
+"""Action types: functions from a few numbers in [-1, 1] to rotor speeds.
 
-All are scaled from the nominal parameters of the vehicle, so that 0 hovers whatever its mass.
+All are scaled with the nominal parameters of the vehicle, so that an action of 0 hovers, whatever the mass.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
-Rpm = Callable[[Params, Any, State, Array, Setpoint, float], tuple[Any, Float[Array, "4"]]]
+Command = Callable[[Params, Any, State, Array, Setpoint, float], tuple[Any, Float[Array, "4"]]]
 
 
 def _no_memory() -> None:
@@ -32,19 +32,19 @@ class Action:
     """An action type: functions of one drone."""
 
     size: int
-    """Numbers per drone."""
-    rpm: Rpm
+    """How many numbers an action of one drone has."""
+    rpm: Command
     """(params, memory, state, action (size,), setpoint of the task, control period) -> (memory, rotor speeds, RPM)."""
     init: Callable[[], Any] = _no_memory
     """() -> memory of one drone at the start of an episode."""
     for_vehicle: Callable[[Params], Action] | None = None
-    """Nominal parameters of the team -> the action type as they need it; `None` where it is the same for all."""
+    """Nominal parameters of the team -> the action type for this vehicle; `None` where it is the same for all."""
 
     def fitted(self, params: Params) -> Action:
-        """The action type as a vehicle needs it.
+        """The action type for this vehicle.
 
         Raises:
-            ValueError: it does not fit the vehicle.
+            ValueError: the action type does not suit the vehicle.
         """
         return self if self.for_vehicle is None else self.for_vehicle(params)
 
@@ -55,7 +55,7 @@ class Action:
 
 
 def rpm(near_hover: float | None = None) -> Action:
-    """Four rotor speeds: -1 stands still, 0 hovers, 1 is full speed; or hover speed times 1 +- `near_hover`."""
+    """Four rotor speeds: -1 is standstill, 0 hover speed, 1 full speed; or hover speed times 1 +- `near_hover`."""
     _check_share("near_hover", near_hover)
 
     def command(params, memory, state, action, setpoint, dt):
@@ -65,7 +65,7 @@ def rpm(near_hover: float | None = None) -> Action:
 
 
 def one_d_rpm(near_hover: float | None = 0.05) -> Action:
-    """One speed for all rotors; the paper's range is 5 % about hover."""
+    """One speed for all rotors; the default range of 5 % about hover is that of gym-pybullet-drones (2021)."""
     _check_share("near_hover", near_hover)
 
     def command(params, memory, state, action, setpoint, dt):
@@ -77,7 +77,7 @@ def one_d_rpm(near_hover: float | None = 0.05) -> Action:
 def thrust_and_torques(torque_share: float = 0.05) -> Action:
     """Collective thrust from zero to twice the weight, and torques up to a share of the largest.
 
-    Allocated as by the paper, which knows no limit but that no rotor turns backwards, and then limited.
+    As in gym-pybullet-drones (2021), they are allocated to rotors without an upper limit, and then limited.
     """
     _check_share("torque_share", torque_share)
 
@@ -102,12 +102,12 @@ def one_d_thrust(share: float = 0.05) -> Action:
 
 
 def velocity_input() -> Action:
-    """The paper's velocity input (equation 8): a direction and a share of the speed limit."""
+    """Velocity command of gym-pybullet-drones (2021): a direction and a share of the speed limit."""
     return _setpoint(4, velocity.setpoint)
 
 
 def one_d_velocity() -> Action:
-    """The velocity input along z alone."""
+    """The velocity command along z alone."""
 
     def target(params, state, action):
         vertical = jnp.stack([0 * action[0], 0 * action[0], jnp.sign(action[0]), jnp.abs(action[0])])
@@ -117,13 +117,13 @@ def one_d_velocity() -> Action:
 
 
 def position(step: float = 0.1) -> Action:
-    """A place up to `step` (m) away along each axis."""
+    """A position up to `step` (m) away along each axis."""
     check_number("step", step, "m", above=0)
     return _setpoint(3, lambda params, state, action: Setpoint.at(state.pos + step * action))
 
 
 def one_d_position(step: float = 0.1) -> Action:
-    """A place up to `step` (m) above or below."""
+    """A position up to `step` (m) above or below."""
     check_number("step", step, "m", above=0)
 
     def target(params, state, action):
@@ -132,17 +132,17 @@ def one_d_position(step: float = 0.1) -> Action:
     return _setpoint(1, target)
 
 
-def destination(stride: float = 1.0) -> Action:
-    """A place in the world (m, within 1 m of the origin along each axis), approached at most `stride` (m) ahead.
+def destination(max_step: float = 1.0) -> Action:
+    """A position in the world within 1 m of the origin along each axis, m: the `pid` action of (2.x).
 
-    The `pid` action of today's version of the paper's simulator.
+    The setpoint is on the straight line there, at most `max_step` (m) ahead of the drone.
     """
-    check_number("stride", stride, "m", above=0)
+    check_number("max_step", max_step, "m", above=0)
 
     def target(params, state, action):
-        way = action - state.pos
-        length = jnp.maximum(vector.dot(way, vector.unit(way)), stride)
-        return Setpoint.at(state.pos + way * stride / length)
+        away = action - state.pos
+        distance = jnp.maximum(vector.dot(away, vector.unit(away)), max_step)
+        return Setpoint.at(state.pos + away * max_step / distance)
 
     return _setpoint(3, target)
 
@@ -167,7 +167,7 @@ def pid_gains() -> Action:
 
 
 def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
-    """Collective thrust (-1 none, 0 the weight, 1 all there is) and body rates up to `max_rate` (rad/s)."""
+    """Collective thrust (-1 none, 0 the weight, 1 the largest) and body rates up to `max_rate` (rad/s)."""
     check_shape("max_rate", max_rate, (3,), "about x, y and z, rad/s")
     for rate in max_rate:
         check_number("an entry of max_rate", rate, "rad/s", above=0)
@@ -193,14 +193,14 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
     return Action(4, command)
 
 
-_LONGEST_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie, at 15 Hz the geometric controller holds any vehicle
-_SLOWEST_ROTORS = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
+_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
+_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
 
 
 def _setpoint(size: int, target: Callable[[Params, State, Array], Setpoint]) -> Action:
-    """An action type that asks for a setpoint, whatever the task.
+    """An action type that commands a setpoint, whatever the task.
 
-    The PID flies there with vehicles that its gains suit, the geometric controller with all others.
+    The PID follows it with vehicles that its gains suit, the geometric controller with all others.
     """
 
     def flown_by(controller) -> Action:
@@ -217,24 +217,24 @@ def check_loop(name: str, action: Action, params: Params, lagging: bool, dt: flo
     """Raise `ValueError` if the controller of an action type would be called too seldom, or its rotors lag too much.
 
     Args:
-        name: of the action type.
+        name: name of the action type.
         action: the action type.
-        params: nominal ones of the vehicle.
+        params: nominal parameters of the vehicle.
         lagging: whether the rotors lag.
         dt: control period, s.
     """
     if action.for_vehicle is None:
         return
-    if dt > _LONGEST_PERIOD * (1 + 1e-6):
+    if dt > _MAX_PERIOD * (1 + 1e-6):
         raise ValueError(
             f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
-            f"{1 / _LONGEST_PERIOD:g} or more"
+            f"{1 / _MAX_PERIOD:g} or more"
         )
     time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
-    if lagging and time > _SLOWEST_ROTORS * (1 + 1e-6):
+    if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
         raise ValueError(
             f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
-            f"{_SLOWEST_ROTORS} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
+            f"{_MAX_ROTOR_TIME} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
             "action type that commands rotors, thrust and torques, or rates"
         )
 
@@ -251,12 +251,12 @@ def _rotor_speed(params: Params, action: Array, near_hover: float | None) -> Arr
 
 
 def _collective(params: Params, action: Array) -> Array:
-    """Thrust per mass, m/s^2."""
+    """Collective thrust per mass, m/s^2."""
     return _from_hover(action, params.weight, params.max_thrust) / params.mass
 
 
 def _from_hover(action: Array, hover: Array, highest: Array) -> Array:
-    """-1 -> 0, 0 -> hover, 1 -> highest, straight in between."""
+    """Piecewise linear: -1 -> 0, 0 -> hover, 1 -> highest."""
     return hover + action * jnp.where(action > 0, highest - hover, hover)
 
 

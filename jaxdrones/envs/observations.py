@@ -1,56 +1,58 @@
-"""What a policy sees: named parts that are put side by side, each with finite bounds.
+"""Observation terms by name; an observation is their concatenation. Every term has a bound.
 
-`kinematics` is the paper's equation 7, `adjacency` its equation 8; images (equation 9) are the environment's.
+`kinematics` is the paper's equation 7, `adjacency` its equation 8; images (equation 9) belong to the environment.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.tasks.task import Part, Task, World, norm
+from jaxdrones.tasks.task import ObservationTerm, Task, World, norm
 
-_FAR, _FAST, _SPINNING = 20.0, 30.0, 100.0  # m, m/s, rad/s: the bounds of what is seen
-_RPM = 1e5
+_MAX_DISTANCE, _MAX_SPEED, _MAX_RATE = 20.0, 30.0, 100.0  # m, m/s, rad/s: bounds of the observations
+_MAX_RPM = 1e5
 _UNIT = 1.0 + 1e-6
 
 
 def position(task: Task, world: World) -> Array:
-    """m, world."""
+    """Position, m, world."""
     return world.drones.pos
 
 
 def position_error(task: Task, world: World) -> Array:
-    """From the drone to its target, m, world axes."""
+    """Vector from the drone to its target, m, world axes."""
     return task.target_now(world).pos - world.drones.pos
 
 
 def position_error_body(task: Task, world: World) -> Array:
-    """From the drone to its target, m, body axes."""
+    """Vector from the drone to its target, m, body axes."""
     return _to_body(world, position_error(task, world))
 
 
 def velocity(task: Task, world: World) -> Array:
-    """m/s, world."""
+    """Velocity, m/s, world."""
     return world.drones.vel
 
 
 def velocity_body(task: Task, world: World) -> Array:
-    """m/s, body axes."""
+    """Velocity, m/s, body axes."""
     return _to_body(world, world.drones.vel)
 
 
 def velocity_error(task: Task, world: World) -> Array:
-    """Of the target relative to the drone, m/s, world axes."""
+    """Velocity of the target relative to the drone, m/s, world axes."""
     return task.target_now(world).vel - world.drones.vel
 
 
 def quaternion(task: Task, world: World) -> Array:
-    """(x, y, z, w) with w >= 0: of the two that are the same attitude, one."""
+    """Attitude (x, y, z, w); of the two quaternions that are the same attitude the one with w >= 0."""
     quat = world.drones.quat
     return jnp.where(quat[:, 3:] < 0, -quat, quat)
 
@@ -61,22 +63,22 @@ def rpy(task: Task, world: World) -> Array:
 
 
 def rotation_matrix(task: Task, world: World) -> Array:
-    """Row by row."""
+    """Attitude as a matrix, body to world, row by row."""
     return jnp.reshape(jax.vmap(rotation.to_matrix)(world.drones.quat), (-1, 9))
 
 
 def omega(task: Task, world: World) -> Array:
-    """rad/s, body."""
+    """Angular velocity, rad/s, body."""
     return world.drones.omega
 
 
 def omega_world(task: Task, world: World) -> Array:
-    """rad/s, world axes, as the paper has it."""
+    """Angular velocity, rad/s, world axes, as in the paper."""
     return jax.vmap(rotation.rotate)(world.drones.quat, world.drones.omega)
 
 
 def rotor_speed(task: Task, world: World) -> Array:
-    """Share of the highest."""
+    """Rotor speeds as shares of the highest."""
     return world.drones.rpm / world.params.max_rpm[:, None]
 
 
@@ -89,16 +91,15 @@ def kinematics(task: Task, world: World) -> Array:
 
 
 def kinematics_2x(task: Task, world: World) -> Array:
-    """Position, roll-pitch-yaw, velocity, angular velocity (world): today's version of the paper's simulator."""
+    """Position, roll-pitch-yaw, velocity, angular velocity (world): observation of gym-pybullet-drones (2.x)."""
     drones = world.drones
     return jnp.concatenate([drones.pos, rpy(task, world), drones.vel, omega_world(task, world)], -1)
 
 
 def normalized_kinematics(task: Task, world: World) -> Array:
-    """The paper's twelve numbers in [-1, 1].
+    """Twelve numbers in [-1, 1]: observation of gym-pybullet-drones (2021).
 
-    That vz is cut at 1 m/s and divided by 3, and that only the direction of the angular velocity is seen, is the
-    reference's.
+    As there, vz is clipped at 1 m/s but divided by 3, and of the angular velocity only the direction is observed.
     """
     x, y, z = world.drones.pos.T
     vx, vy, vz = world.drones.vel.T
@@ -113,23 +114,23 @@ def normalized_kinematics(task: Task, world: World) -> Array:
 
 
 def adjacency(task: Task, world: World, radius: float = 10.0) -> Array:
-    """Equation 8: 1 for every drone nearer than `radius` (m) and for itself, else 0."""
+    """Equation 8: 1 for every drone nearer than `radius` (m) and for the drone itself, else 0."""
     return (_distances(world) < radius).astype(world.drones.pos.dtype)
 
 
-def last_actions(count: int) -> Part:
-    """The last actions, oldest first."""
+def last_actions(count: int) -> ObservationTerm:
+    """A term of the last actions, oldest first."""
 
     def observe(task: Task, world: World) -> Array:
         return jnp.reshape(world.actions[:, -count:], (len(world.actions), -1))
 
-    return Part(observe, _UNIT, history=count)
+    return ObservationTerm(observe, _UNIT, history=count)
 
 
-def neighbours(count: int) -> Part:
-    """Position (m) and velocity (m/s) of the nearest drones relative to one's own, world axes, nearest first.
+def neighbors(count: int) -> ObservationTerm:
+    """A term of the nearest drones, nearest first: relative position (m) and velocity (m/s), world axes.
 
-    In a team with fewer others the rest is zero.
+    It is padded with zeros where the team has fewer other drones.
     """
 
     def observe(task: Task, world: World) -> Array:
@@ -143,17 +144,43 @@ def neighbours(count: int) -> Part:
             away = jnp.where(jnp.arange(n)[None] == nearest[:, None], jnp.inf, away)
         return jnp.pad(jnp.concatenate(relative, -1), ((0, 0), (0, 6 * max(count - n + 1, 0))))
 
-    return Part(observe, _FAR)
+    return ObservationTerm(observe, _MAX_DISTANCE)
 
 
-def preview(*ahead: float) -> Part:
-    """Where the target will be (s ahead), relative to the drone, m, world axes."""
+def reading(sensor: str, bound: float = math.inf) -> ObservationTerm:
+    """A term of the latest reading of a sensor of this name, flattened."""
+
+    def observe(task: Task, world: World) -> Array:
+        n = len(world.drones.pos)
+        return jnp.concatenate([jnp.reshape(x, (n, -1)) for x in jax.tree.leaves(world.readings[sensor])], axis=-1)
+
+    return ObservationTerm(observe, bound)
+
+
+def preview(*ahead: float) -> ObservationTerm:
+    """A term of the future positions of the target, `ahead` (s) from now, relative to the drone, m, world axes."""
 
     def observe(task: Task, world: World) -> Array:
         later = [task.target(world.variables, world.time + t).pos - world.drones.pos for t in ahead]
         return jnp.concatenate(later, axis=-1)
 
-    return Part(observe, _FAR)
+    return ObservationTerm(observe, _MAX_DISTANCE)
+
+
+def observe(terms: Sequence[ObservationTerm], task: Task, world: World) -> Float[Array, "n d"]:
+    """The observation: all terms side by side, clipped at their bounds."""
+    return jnp.concatenate([_clip(term.observe(task, world), term.bound) for term in terms], axis=-1)
+
+
+def bounds(terms: Sequence[ObservationTerm], widths: Sequence[int]) -> np.ndarray:
+    """(d,) largest magnitude of every entry of an observation, whose terms have so many entries."""
+    columns = [np.broadcast_to(term.bound, (width,)) for term, width in zip(terms, widths, strict=True)]
+    return np.concatenate(columns).astype(np.float32)
+
+
+def _clip(x: Array, bound: float | tuple[float, ...]) -> Array:
+    limit = jnp.broadcast_to(jnp.asarray(bound, x.dtype), x.shape[-1:])[None]
+    return jnp.clip(x, -limit, limit)
 
 
 def _to_body(world: World, v: Array) -> Array:
@@ -166,28 +193,30 @@ def _distances(world: World) -> Float[Array, "n n"]:
 
 
 _TURN = math.pi + 1e-6
-_KINEMATICS = (_FAR,) * 3 + (_UNIT,) * 4 + (_TURN,) * 3 + (_FAST,) * 3 + (_SPINNING,) * 3 + (_RPM,) * 4
-_KINEMATICS_V2 = (_FAR,) * 3 + (_TURN,) * 3 + (_FAST,) * 3 + (_SPINNING,) * 3
+_KINEMATICS = (
+    (_MAX_DISTANCE,) * 3 + (_UNIT,) * 4 + (_TURN,) * 3 + (_MAX_SPEED,) * 3 + (_MAX_RATE,) * 3 + (_MAX_RPM,) * 4
+)
+_KINEMATICS_2X = (_MAX_DISTANCE,) * 3 + (_TURN,) * 3 + (_MAX_SPEED,) * 3 + (_MAX_RATE,) * 3
 
-OBSERVATIONS: dict[str, Part] = {
-    "position": Part(position, _FAR),
-    "position_error": Part(position_error, _FAR),
-    "position_error_body": Part(position_error_body, _FAR * 2),
-    "velocity": Part(velocity, _FAST),
-    "velocity_body": Part(velocity_body, _FAST),
-    "velocity_error": Part(velocity_error, _FAST),
-    "quaternion": Part(quaternion, _UNIT),
-    "rpy": Part(rpy, _TURN),
-    "rotation_matrix": Part(rotation_matrix, _UNIT),
-    "omega": Part(omega, _SPINNING),
-    "omega_world": Part(omega_world, _SPINNING),
-    "rotor_speed": Part(rotor_speed, 10.0),
-    "kinematics": Part(kinematics, _KINEMATICS),
-    "kinematics_2x": Part(kinematics_2x, _KINEMATICS_V2),
-    "normalized_kinematics": Part(normalized_kinematics, _UNIT),
-    "adjacency": Part(adjacency, 1.0),
+OBSERVATIONS: dict[str, ObservationTerm] = {
+    "position": ObservationTerm(position, _MAX_DISTANCE),
+    "position_error": ObservationTerm(position_error, _MAX_DISTANCE),
+    "position_error_body": ObservationTerm(position_error_body, _MAX_DISTANCE * 2),
+    "velocity": ObservationTerm(velocity, _MAX_SPEED),
+    "velocity_body": ObservationTerm(velocity_body, _MAX_SPEED),
+    "velocity_error": ObservationTerm(velocity_error, _MAX_SPEED),
+    "quaternion": ObservationTerm(quaternion, _UNIT),
+    "rpy": ObservationTerm(rpy, _TURN),
+    "rotation_matrix": ObservationTerm(rotation_matrix, _UNIT),
+    "omega": ObservationTerm(omega, _MAX_RATE),
+    "omega_world": ObservationTerm(omega_world, _MAX_RATE),
+    "rotor_speed": ObservationTerm(rotor_speed, 10.0),
+    "kinematics": ObservationTerm(kinematics, _KINEMATICS),
+    "kinematics_2x": ObservationTerm(kinematics_2x, _KINEMATICS_2X),
+    "normalized_kinematics": ObservationTerm(normalized_kinematics, _UNIT),
+    "adjacency": ObservationTerm(adjacency, 1.0),
     "last_action": last_actions(1),
     "last_actions_2x": last_actions(15),
-    "neighbours": neighbours(2),
+    "neighbors": neighbors(2),
     "preview": preview(0.1, 0.2, 0.3),
 }

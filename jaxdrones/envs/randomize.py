@@ -1,4 +1,4 @@
-"""What makes training robust: parameters drawn per episode, sensor noise, wind and pushes. All compose."""
+"""Domain randomization: parameters drawn per episode, sensor noise, wind and random pushes. All compose."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
+from jaxdrones.accelerate import compiler
 from jaxdrones.checks import POSITIVE, check_choice, check_number
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -14,12 +15,12 @@ from jaxdrones.state import State
 Randomization = Callable[[jax.Array, Params], Params]
 """(key, params) of one drone -> its parameters in this episode."""
 Noise = Callable[[jax.Array, State], State]
-"""(key, state) of a team -> what its sensors show."""
+"""(key, state) of a team -> the state as its sensors show it."""
 Disturbance = Callable[[jax.Array, Params, float], Params]
-"""(key, params, control period) of a team -> the surroundings in the next control step."""
+"""(key, params, control period) of a team -> its parameters with the surroundings of the next control step."""
 
 
-def _check_law(field: str, low: float, high: float) -> None:
+def _check_range(field: str, low: float, high: float) -> None:
     check_choice("parameter", field, Params.__dataclass_fields__)
     check_number(f"lower bound of {field}", low)
     check_number(f"upper bound of {field}", high)
@@ -33,15 +34,15 @@ def scaled(field: str, low: float, high: float) -> Randomization:
     Raises:
         ValueError: unknown field, `low` above `high`, or a factor that makes something positive negative or zero.
     """
-    _check_law(field, low, high)
+    _check_range(field, low, high)
     if field in POSITIVE:
         check_number(f"lower bound of {field}", low, "a factor", above=0)
 
-    def law(key: jax.Array, params: Params) -> Params:
+    def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
         return params.replace(**{field: value * jax.random.uniform(key, (), value.dtype, low, high)})
 
-    return law
+    return randomize
 
 
 def shifted(field: str, low: float, high: float) -> Randomization:
@@ -50,43 +51,50 @@ def shifted(field: str, low: float, high: float) -> Randomization:
     Raises:
         ValueError: unknown field, or `low` above `high`.
     """
-    _check_law(field, low, high)
+    _check_range(field, low, high)
 
-    def law(key: jax.Array, params: Params) -> Params:
+    def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
         return params.replace(**{field: value + jax.random.uniform(key, value.shape, value.dtype, low, high)})
 
-    return law
+    return randomize
 
 
 def constant_wind(speed: float) -> Randomization:
-    """Wind U(-speed, speed) (m/s) along x and y, a quarter of that along z, the whole episode through.
+    """Wind U(-speed, speed) (m/s) along x and y and a quarter of that along z, constant in an episode.
 
     Raises:
         ValueError: a negative speed.
     """
     check_number("speed of the wind", speed, "m/s", at_least=0)
 
-    def law(key: jax.Array, params: Params) -> Params:
+    def randomize(key: jax.Array, params: Params) -> Params:
         wind = jax.random.uniform(key, (3,), params.wind.dtype, -speed, speed)
         return params.replace(wind=wind * jnp.array([1, 1, 0.25], wind.dtype))
 
-    return law
+    return randomize
 
 
-def draw(laws: Sequence[Randomization], key: jax.Array, params: Params) -> Params:
-    """Apply all laws to every drone of a team, each with a key of its own."""
+def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> Params:
+    """The parameters of a team after all randomizations, each with a key of its own for every drone."""
     n = len(params.mass)
-    for law, law_key in zip(laws, jax.random.split(key, max(len(laws), 1)), strict=False):
-        params = jax.vmap(law)(jax.random.split(law_key, n), params)
+    for one, one_key in zip(randomize, jax.random.split(key, max(len(randomize), 1)), strict=False):
+        params = jax.vmap(one)(jax.random.split(one_key, n), params)
     return params
 
 
-def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, omega: float = 0.02) -> Noise:
-    """White noise: standard deviations in m, m/s, rad and rad/s.
+def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[bool]:
+    """Which leaves of the parameters of a team differ from episode to episode, however rarely."""
+    one = jax.tree.map(lambda x: x[0], params)
+    found = [jax.tree.leaves(compiler.depends(each, jax.random.key(0), one)) for each in randomize]
+    return [any(flags) for flags in zip(*found, strict=True)] if found else [False] * len(jax.tree.leaves(params))
 
-    The defaults for position and velocity are those of Huang et al.'s swarm simulator; angle and rates of an
-    attitude filter on the Crazyflie are of this size (L2F: 1 mrad and 2 mrad/s; DiffAero: 2.4e-2 rad/s).
+
+def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, omega: float = 0.02) -> Noise:
+    """White noise on the state with these standard deviations, m, m/s, rad and rad/s.
+
+    The defaults for position and velocity are those of Huang et al.'s swarm simulator. Those for angle and rates are of
+    the size that attitude filters on the Crazyflie have (L2F: 1 mrad and 2 mrad/s; DiffAero: 2.4e-2 rad/s).
 
     Raises:
         ValueError: a negative standard deviation.
@@ -108,32 +116,32 @@ def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, om
     return noise
 
 
-def pushes(force: float, every: float = 1.0, lasting: float = 0.1) -> Disturbance:
-    """Pushes of random direction and up to `force` (share of the weight), one in `every` seconds on average.
+def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) -> Disturbance:
+    """External forces of U(-force, force) (share of the weight) along each axis, at random times.
 
-    Each lasts `lasting` seconds on average: a push comes and goes by chance, whatever came before.
+    One begins every `interval` seconds and lasts `duration` seconds on average, both with exponential distributions.
 
     Raises:
         ValueError: a negative force, or times that are not positive.
     """
     check_number("force of a push", force, "share of the weight", at_least=0)
-    check_number("every", every, "s", above=0, infinite=True)
-    check_number("lasting", lasting, "s", above=0, infinite=True)
+    check_number("interval", interval, "s", above=0, infinite=True)
+    check_number("duration", duration, "s", above=0, infinite=True)
 
-    def disturb(key: jax.Array, params: Params, dt: float) -> Params:
+    def disturbance(key: jax.Array, params: Params, dt: float) -> Params:
         n = len(params.mass)
         u = jax.random.uniform(key, (n, 4), params.external_force.dtype)
         fresh = force * params.weight[:, None] * (2 * u[:, 1:] - 1)
-        begins, ends = u[:, :1] < dt / every, u[:, :1] > 1 - dt / lasting
+        begins, ends = u[:, :1] < dt / interval, u[:, :1] > 1 - dt / duration
         return params.replace(external_force=jnp.where(begins, fresh, jnp.where(ends, 0, params.external_force)))
 
-    return disturb
+    return disturbance
 
 
 def delayed(actions: Array, steps: float) -> Array:
-    """The command that arrives when the newest of (n, h, a) actions was given, `steps` control steps late.
+    """The action (n, a) that is in force `steps` control steps after it was given, out of the last h actions (n, h, a).
 
-    A fraction mixes two neighbours: the mean of what is in force during the control step.
+    For a fraction it is the mean over the control step, in which one action is followed by the next.
     """
     whole = int(steps)
     share = steps - whole
@@ -151,6 +159,9 @@ REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
     scaled("rotor_rise_time", 0.8, 1.2),
     scaled("rotor_fall_time", 0.2, 1.2),
 )
-"""10 or 20 % either way, but where those who identified a Crazyflie differ by more: its drag torque is a fifth of ours
-to some, and its rotors slow down five times as slowly as they speed up, or as fast."""
+"""Ranges of 10 or 20 % either way, wider where published identifications of the Crazyflie differ by more.
+
+Some find a fifth of our torque coefficient; some find that rotors slow down as fast as they speed up, others five times
+as slowly.
+"""
 REALISTIC_DELAY = 0.02  # s

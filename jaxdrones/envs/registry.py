@@ -23,6 +23,7 @@ from jaxdrones.dynamics import (
     INTEGRATORS,
     PAIRS,
     ROTORS,
+    Model,
     drone_contact,
     external_force,
     ground_contact,
@@ -30,9 +31,11 @@ from jaxdrones.dynamics import (
 )
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
+from jaxdrones.engine.wrenches import TeamEffect
 from jaxdrones.envs.actions import ACTIONS, Action, check_loop
+from jaxdrones.envs.arguments import check_randomizations
 from jaxdrones.envs.env import Env
-from jaxdrones.envs.observations import OBSERVATIONS
+from jaxdrones.envs.observations import OBSERVATIONS, reading
 from jaxdrones.envs.randomize import (
     REALISTIC_DELAY,
     REALISTIC_RANDOMIZATION,
@@ -41,10 +44,13 @@ from jaxdrones.envs.randomize import (
     Randomization,
     sensor_noise,
 )
+from jaxdrones.envs.surroundings import DrawScene
 from jaxdrones.envs.vision import IMAGES, Vision
 from jaxdrones.params import Params, repeat
-from jaxdrones.tasks import gates, hover, paper, swap, tracking
-from jaxdrones.tasks.task import Part, Task
+from jaxdrones.sensing import Scene
+from jaxdrones.sensing.sensor import Sensor, check_sensors
+from jaxdrones.tasks import gates, gym_pybullet_drones, hover, swap, tracking
+from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
 
 TASKS: dict[str, Callable[..., Task]] = {
@@ -54,15 +60,15 @@ TASKS: dict[str, Callable[..., Task]] = {
     "tracking": tracking.tracking,
     "gates": gates.gates,
     "swap-goals": swap.swap_goals,
-    "hover-2021": paper.hover,
-    "takeoff": paper.takeoff,
-    "fly-through-gate": paper.fly_through_gate,
-    "tune": paper.tune,
-    "leader-follower": paper.leader_follower,
-    "flock": paper.flock,
-    "meetup": paper.meetup,
-    "hover-2x": paper.hover_2x,
-    "multi-hover": paper.multi_hover,
+    "hover-2021": gym_pybullet_drones.hover,
+    "takeoff": gym_pybullet_drones.takeoff,
+    "fly-through-gate": gym_pybullet_drones.fly_through_gate,
+    "tune": gym_pybullet_drones.tune,
+    "leader-follower": gym_pybullet_drones.leader_follower,
+    "flock": gym_pybullet_drones.flock,
+    "meetup": gym_pybullet_drones.meetup,
+    "hover-2x": gym_pybullet_drones.hover_2x,
+    "multi-hover": gym_pybullet_drones.multi_hover,
 }
 BACKENDS = ("explicit", "bullet")
 
@@ -73,20 +79,24 @@ def make(
     backend: str = "explicit",
     vehicle: str | os.PathLike | Params = "cf2x",
     action: str | Action | None = None,
-    observation: Sequence[str | Part] | None = None,
+    observation: Sequence[str | ObservationTerm] | None = None,
     vision: Sequence[str] = (),
     vision_hz: float | None = None,
     realistic: bool = False,
     effects: Sequence[str | Callable] | None = None,
     pairs: Sequence[str | Callable] = (),
+    team_effects: Sequence[TeamEffect] = (),
+    models: Sequence[Model] = (),
     rotors: str | None = None,
     integrator: str = "semi_implicit_euler",
     control_hz: float | None = None,
     substeps: int | None = None,
-    laws: Sequence[Randomization] | None = None,
+    randomize: Sequence[Randomization] | None = None,
     noise: Noise | None = None,
-    disturb: Disturbance | None = None,
+    disturbance: Disturbance | None = None,
     delay: float | None = None,
+    sensors: Sequence[Sensor] = (),
+    scene: Scene | DrawScene | None = None,
     **options: Any,
 ) -> Env:
     """Make an environment.
@@ -96,21 +106,27 @@ def make(
         backend: `explicit` or `bullet`, which must be closed: use the environment in a `with` block.
         vehicle: a bundled vehicle, the path of a URDF, or the parameters of one drone.
         action: a name of `ACTIONS` or an action type; the task's own when left out.
-        observation: names of `OBSERVATIONS` or parts, put side by side; the task's own when left out.
-        vision: which of `rgb`, `depth`, `segmentation` to see beside the rest; with the Bullet backend.
+        observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
+            out.
+        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest; with the Bullet backend.
         vision_hz: pictures per second; one per control step when left out.
-        realistic: lagging rotors, drag, 20 ms of delay, sensor noise and parameter ranges, where not given here.
+        realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
+        team_effects: functions `(params, state) -> Wrench` of the whole team.
+        models: differential equations that are integrated along, such as a battery.
         rotors: `instant` or `lagging`.
         integrator: a name of `INTEGRATORS`; Bullet has its own.
         control_hz: control steps per second; the task's own when left out.
         substeps: physics steps per control step; the task's own when left out.
-        laws: draw each episode's parameters from the nominal ones.
-        noise: of the sensors.
-        disturb: pushes.
-        delay: between action and command, s.
-        **options: of the task, for example `drones`.
+        randomize: randomizations that draw each episode's parameters from the nominal ones.
+        noise: noise of the observed state.
+        disturbance: sets the surroundings before every control step, for example `random_pushes`.
+        delay: delay between action and command, s.
+        sensors: sensors of every drone; their names are observations too.
+        scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's own
+            when left out. On the explicit backend an effect must take it if it has obstacles.
+        **options: options of the task, for example `drones`.
 
     Raises:
         ValueError: an unknown name, a number out of range, an option that the task does not have, an action type that
@@ -131,18 +147,28 @@ def make(
     preset = _REALISTIC if realistic else _PLAIN
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
-    if disturb is not None:
+    if disturbance is not None:
         effects = [*effects, external_force]
     pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
     action = _action(task.action if action is None else action, nominal, rotors is lagging_rotors, dt)
-    physics: dict[str, Any] = dict(effects=effects, pairs=pairs, rotors=rotors, dt=dt / substeps, substeps=substeps)
+    sensors = check_sensors(sensors)
+    physics: dict[str, Any] = dict(
+        effects=effects,
+        pairs=pairs,
+        team_effects=team_effects,
+        models=models,
+        rotors=rotors,
+        dt=dt / substeps,
+        substeps=substeps,
+    )
+    scene = task.scene if scene is None else scene
     step: Step
     if backend == "bullet":
-        from jaxdrones.engine import bullet  # an optional library behind it
+        from jaxdrones.engine import bullet  # needs an optional library
 
         if integrator != "semi_implicit_euler":
             raise ValueError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
-        step = bullet.make_step(**physics, scene=task.scene)
+        step = bullet.make_step(**physics, scene=scene if isinstance(scene, Scene) else None)
     else:
         if "ground" in task.contact:
             physics["effects"] = [*effects, ground_contact]
@@ -151,29 +177,32 @@ def make(
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
     observation = task.observation if observation is None else observation
-    parts = [_part(name, task) for name in check_sequence("observation", observation, "'position_error'")]
+    known = _known_terms(task, sensors)
+    observation = check_sequence("observation", observation, "'position_error'")
     return Env(
         task,
         nominal,
         step,
         dt=dt,
         action=action,
-        observation=parts,
-        laws=(
-            *task.laws,
-            *check_sequence("laws", preset["laws"] if laws is None else laws, "scaled('mass', 0.9, 1.1)"),
+        observation=[_named("observation", term, known) for term in observation],
+        randomize=(
+            *task.randomize,
+            *check_randomizations(preset["randomize"] if randomize is None else randomize),
         ),
         noise=preset["noise"] if noise is None else noise,
-        disturb=disturb,
+        disturbance=disturbance,
         delay=preset["delay"] if delay is None else delay,
         vision=_vision(step, backend, vision, vision_hz, control_hz),
+        sensors=sensors,
+        scene=scene,
         vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
     )
 
 
-_PLAIN: dict[str, Any] = dict(rotors="instant", effects=(), laws=(), noise=None, delay=0.0)
+_PLAIN: dict[str, Any] = dict(rotors="instant", effects=(), randomize=(), noise=None, delay=0.0)
 _REALISTIC: dict[str, Any] = dict(
-    rotors="lagging", effects=("drag",), laws=REALISTIC_RANDOMIZATION, noise=sensor_noise(), delay=REALISTIC_DELAY
+    rotors="lagging", effects=("drag",), randomize=REALISTIC_RANDOMIZATION, noise=sensor_noise(), delay=REALISTIC_DELAY
 )
 
 
@@ -194,7 +223,7 @@ _OWN_OPTIONS = {name for name in inspect.signature(make).parameters if name not 
 
 
 def _all_named(kind: str, values, table: dict, others: dict) -> list:
-    """Functions by name, of a table; what is in the table of others instead is given to another argument."""
+    """Functions by name, from a table; a name that is in the table of others belongs to another argument."""
     values = check_sequence(kind, values, repr(next(iter(table))))
     for value in values:
         if isinstance(value, str) and value not in table and value in others:
@@ -211,7 +240,7 @@ def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
 
 
 def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> Action:
-    """The action type as the vehicle needs it, and an error if its controller cannot fly that."""
+    """The action type for the vehicle, or an error if its controller cannot fly that."""
     kind = _named("action", action, ACTIONS)
     kind = kind() if callable(kind) else kind
     if not isinstance(kind, Action):
@@ -222,8 +251,13 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
     return kind.fitted(nominal)
 
 
-def _part(name: str | Part, task: Task) -> Part:
-    return _named("observation", name, OBSERVATIONS | dict(task.senses))
+def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, ObservationTerm]:
+    """Observation terms by name: those of all tasks, of this task, and one for every sensor."""
+    terms = OBSERVATIONS | dict(task.observations)
+    for sensor in sensors:
+        if sensor.name in terms:
+            raise ValueError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
+    return terms | {sensor.name: reading(sensor.name, sensor.bound) for sensor in sensors}
 
 
 def _vision(step, backend: str, images: Sequence[str], hz: float | None, control_hz: float) -> Vision | None:

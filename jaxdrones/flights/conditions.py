@@ -1,4 +1,4 @@
-"""What is to be flown, and under which conditions."""
+"""Conditions of a flight: what is flown, with which vehicle, physics and controller."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.limits import check_at_most, check_memory, check_seed
 
 BACKENDS = ("explicit", "bullet")
-PHYSICS_HZ = 240  # at least; raised to a multiple of the control rate
+PHYSICS_HZ = 240  # lowest rate; raised to a multiple of the control rate
 
-_HIGHEST_HZ = 20_000  # above it a float32 position of 1 m loses what 1 mm/s adds in a step
-_LONGEST = 1e5  # s; later float32 times are further apart than control steps at 120 Hz
-_LOG_BYTES = 400  # of a drone and a control step: trajectory, log, figure
-_PAIR_BYTES = 32  # of two drones, while the effects between them are summed
-_VARIANTS = ("_paper", "_world_axes")  # endings of the names of other models of the same effect
+_MAX_HZ = 20_000  # above it the step of 1 mm/s is lost in the rounding of a float32 position of 1 m
+_MAX_DURATION = 1e5  # s; from there on float32 times are further apart than control steps at 120 Hz
+_LOG_BYTES = 400  # per drone and control step: trajectory, log, figure
+_PAIR_BYTES = 32  # per pair of drones, while the effects between them are summed
+_VARIANTS = ("_2021", "_world_axes")  # suffixes of the names of other models of the same effect
 
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """A flight and its options; `None` stands for the flight's own and is filled in.
+    """A flight and its options; `None` is replaced by the default of the flight.
 
     Raises:
         ValueError: an unknown name or a number out of range; says what, what was given, what to do.
@@ -41,7 +41,7 @@ class Conditions:
     """A name of `CONTROLLERS`; the vehicle's own when left out."""
     control_hz: int | None = None
     duration: float | None = None
-    """s."""
+    """Duration of the flight, s."""
     rotors: str = "instant"
     """`instant` or `lagging`."""
     integrator: str = "semi_implicit_euler"
@@ -49,16 +49,18 @@ class Conditions:
     backend: str = "explicit"
     """`explicit` or `bullet`."""
     obstacles: bool = False
-    """Whether the paper's obstacles stand around; in Bullet only."""
+    """Whether the obstacles of gym-pybullet-drones (2021) are there; in Bullet only."""
     seed: int | None = None
-    """Of a random start, 1 cm about the flight's own; no disturbance when left out."""
+    """Seed of a random displacement of the start, 1 cm standard deviation; none when left out."""
 
     def __post_init__(self):
         check_choice("flight", self.flight, FLIGHTS)
         flight = FLIGHTS[self.flight]
-        own = dict(drones=flight.drones, effects=flight.effects, control_hz=flight.control_hz, duration=flight.duration)
-        own["controller"] = "pid" if self.flight == "velocity" or self.vehicle in pid.VEHICLES else "geometric"
-        for name, value in own.items():
+        default = dict(
+            drones=flight.drones, effects=flight.effects, control_hz=flight.control_hz, duration=flight.duration
+        )
+        default["controller"] = "pid" if self.flight == "velocity" or self.vehicle in pid.VEHICLES else "geometric"
+        for name, value in default.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
         object.__setattr__(self, "effects", tuple(self.effects))
@@ -68,10 +70,10 @@ class Conditions:
     def _check(self) -> None:
         flight = FLIGHTS[self.flight]
         check_whole("drones", self.drones)
-        check_at_most("control rate (Hz)", self.control_hz, _HIGHEST_HZ)
+        check_at_most("control rate (Hz)", self.control_hz, _MAX_HZ)
         check_positive("duration", self.duration, "s")
-        if self.duration > _LONGEST:
-            raise ValueError(f"duration is {self.duration} s; give at most {_LONGEST:g} s")
+        if self.duration > _MAX_DURATION:
+            raise ValueError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
         if self.seed is not None:
             check_seed("seed", self.seed)
         check_choice("controller", self.controller, CONTROLLERS)
@@ -81,7 +83,7 @@ class Conditions:
         for effect in self.effects:
             check_choice("effect", effect, EFFECTS | PAIRS)
         _check_once(self.effects)
-        if self.drones != flight.drones and not flight.any_number:
+        if flight.labels and self.drones != len(flight.labels):
             who = ", ".join(flight.labels)
             raise ValueError(f"drones is {self.drones}; the {self.flight} flight takes {flight.drones}: {who}")
         if self.flight == "velocity" and self.controller != "pid":
@@ -128,7 +130,7 @@ class Conditions:
         return self.control_hz * self.substeps
 
     def as_dict(self) -> dict[str, object]:
-        """For JSON."""
+        """The conditions as entries of a JSON object."""
         return dataclasses.asdict(self) | {"physics_hz": self.physics_hz}
 
     def __str__(self) -> str:
@@ -145,8 +147,8 @@ def _check_once(effects: tuple[str, ...]) -> None:
     seen: dict[str, str] = {}
     for effect in effects:
         kind = effect
-        for ending in _VARIANTS:
-            kind = kind.removesuffix(ending)
+        for suffix in _VARIANTS:
+            kind = kind.removesuffix(suffix)
         if kind in seen:
             both = "twice" if seen[kind] == effect else f"beside {seen[kind]!r}, another model of the same effect"
             raise ValueError(f"effect {effect!r} is given {both}; give one of them, once")

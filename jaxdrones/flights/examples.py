@@ -1,4 +1,4 @@
-"""The paper's four control examples (its figures 6 to 9)."""
+"""The four control examples of gym-pybullet-drones (2021), figures 6 to 9 of its paper."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,20 +18,21 @@ _HEADINGS = np.array([0, np.pi / 3, np.pi / 4, np.pi / 2])  # rad
 
 @dataclasses.dataclass(frozen=True)
 class Flight:
-    """One of the paper's flights and its defaults."""
+    """One of the examples and its defaults."""
 
     summary: str
-    start: Callable[[int], State]  # number of drones -> state
-    target: Callable[[int, jax.Array, float], Setpoint | jax.Array]  # (drones, time, duration) -> set points or actions
+    start: Callable[[int], State]
+    """Number of drones -> initial state."""
+    target: Callable[[int, jax.Array, float], Setpoint | jax.Array]
+    """(number of drones, time, duration), s -> setpoints, or actions of the velocity input."""
     drones: int
     duration: float  # s
     control_hz: int
     effects: tuple[str, ...] = ()
-    settled: float = 2.0  # s; results are taken from here on
-    panels: tuple[str, ...] = ()  # of the figure; all when empty
-    labels: tuple[str, ...] = ()
-    adapt: Callable[[Params], Params] = lambda team: team
-    any_number: bool = True
+    settling_time: float = 2.0  # s; results are taken from here on
+    panels: tuple[str, ...] = ()  # panels of the figure; all when empty
+    labels: tuple[str, ...] = ()  # names of the drones, for a team of fixed size
+    change_params: Callable[[Params], Params] = lambda team: team
 
 
 def _circle() -> Flight:
@@ -69,7 +70,7 @@ def _velocity() -> Flight:
         drones=4,
         duration=12.0,
         control_hz=120,
-        settled=10.0,
+        settling_time=10.0,
     )
 
 
@@ -83,11 +84,10 @@ def _ground_effect() -> Flight:
         duration=0.5,
         control_hz=240,
         effects=("ground_effect_2021",),
-        settled=0.0,
+        settling_time=0.0,
         panels=("z", "vz", "rpm0"),
         labels=("with ground effect", "without"),
-        adapt=lambda team: team.replace(ground_effect_coeff=team.ground_effect_coeff.at[1].set(0)),
-        any_number=False,
+        change_params=lambda team: team.replace(ground_effect_coeff=team.ground_effect_coeff.at[1].set(0)),
     )
 
 
@@ -103,7 +103,7 @@ def _downwash() -> Flight:
         duration=12.0,
         control_hz=120,
         effects=("downwash_2021",),
-        settled=3.0,
+        settling_time=3.0,
         panels=("x", "vx", "z", "vz", "pitch", "omega_y", "rpm0", "rpm1"),
     )
 

@@ -1,4 +1,4 @@
-"""Flying the paper's control examples on either backend."""
+"""Flying the control examples on either backend."""
 
 import functools
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.examples import FLIGHTS, Flight
 from jaxdrones.flights.record import Record
 from jaxdrones.params import Params, repeat
-from jaxdrones.sensing.scene import Scene, paper_obstacles
+from jaxdrones.sensing import Scene, obstacles_2021
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
@@ -28,8 +28,8 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
 
     Args:
         flight: `circle`, `velocity`, `ground-effect` or `downwash`.
-        gui: watch it in Bullet's window, in real time.
-        progress: is told now and then which share of the flight is flown.
+        gui: show the flight in Bullet's window, in real time.
+        progress: function that is called with the share of the flight that is done, at most a hundred times.
         options: the other fields of `Conditions`.
 
     Raises:
@@ -37,16 +37,16 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
     """
     conditions = Conditions(flight, **options)
     example, n, dt, steps = FLIGHTS[flight], conditions.drones, conditions.dt, conditions.steps
-    pilot, memory = _pilot(conditions)
+    controller, memory = _controller(conditions)
 
     def control(params, memory, state, k):
         if progress is not None:
             _report(k, steps, progress)
-        return jax.vmap(pilot)(params, memory, state, example.target(n, k * dt, conditions.duration))
+        return jax.vmap(controller)(params, memory, state, example.target(n, k * dt, conditions.duration))
 
     @jax.jit
     def prepare(params: Params) -> tuple[Params, State]:
-        return example.adapt(repeat(params, n)), _start(example, n, conditions.seed)
+        return example.change_params(repeat(params, n)), _start(example, n, conditions.seed)
 
     @jax.jit
     def finish(params: Params, trajectory: State) -> dict[str, jax.Array]:
@@ -54,7 +54,8 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
         target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
         target_pos, target_vel = _targets(target, params)
         rpy = jax.vmap(jax.vmap(rotation.to_rpy))(trajectory.quat)
-        return dict(vars(trajectory), t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
+        motion = {name: getattr(trajectory, name) for name in ("pos", "quat", "vel", "omega", "rpm")}
+        return dict(motion, t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
 
     params, start = prepare(load_params(conditions.vehicle))
     trajectory = _rollout(conditions, gui, control, params, start, memory)
@@ -64,12 +65,12 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
 
 
 def scene_of(conditions: Conditions) -> Scene:
-    """What stands around the drones of a flight."""
-    return paper_obstacles() if conditions.obstacles else Scene()
+    """Obstacles and ground of a flight."""
+    return obstacles_2021() if conditions.obstacles else Scene()
 
 
 def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: State, memory) -> State:
-    """The trajectory, on the backend that was chosen."""
+    """The trajectory on the chosen backend."""
     common: dict[str, Any] = dict(
         effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
         pairs=[PAIRS[effect] for effect in conditions.effects if effect in PAIRS],
@@ -86,13 +87,13 @@ def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: 
 
     from jaxdrones.engine import bullet  # optional
 
-    with bullet.make_step(**common, scene=scene_of(conditions), gui=gui) as step:
-        step = bullet.Window(step, params, conditions.dt) if gui else step
-        return rollout(step, control, params, start, memory, conditions.steps)[1]
+    with bullet.make_step(**common, scene=scene_of(conditions), gui=gui) as simulated:
+        watched = bullet.Window(simulated, params, conditions.dt) if gui else simulated
+        return rollout(watched, control, params, start, memory, conditions.steps)[1]
 
 
-def _pilot(conditions: Conditions) -> tuple[Callable, object]:
-    """The controller of one drone, and fresh memory for all."""
+def _controller(conditions: Conditions) -> tuple[Callable, object]:
+    """The controller of one drone, and the initial memory of all."""
     if conditions.flight == "velocity":
         control = functools.partial(velocity.control, pid.gains(conditions.vehicle), dt=conditions.dt)
         return control, for_team(pid.init(), conditions.drones)
@@ -109,17 +110,17 @@ def _start(flight: Flight, n: int, seed: int | None) -> State:
 
 
 def _report(k: jax.Array, steps: int, progress: Callable[[float], None]) -> None:
-    """Tell the host, at every hundredth of the flight, which share of it is flown."""
+    """Report the share of the flight that is done to the host, at every hundredth of it."""
     every = max(1, steps // 100)
 
-    def tell():
+    def report():
         jax.debug.callback(lambda k: progress(float(k + 1) / steps), k)
 
-    jax.lax.cond((k + 1) % every == 0, tell, lambda: None)
+    jax.lax.cond((k + 1) % every == 0, report, lambda: None)
 
 
 def _targets(target: Setpoint | jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
-    """Commanded positions and velocities over time; NaN for the one that is not commanded."""
+    """Commanded positions and velocities over time; the one that is not commanded is NaN."""
     if isinstance(target, Setpoint):
         return target.pos, jnp.full_like(target.pos, jnp.nan)
     vel = jax.vmap(jax.vmap(velocity.commanded), (None, 0))(params, target)

@@ -1,9 +1,8 @@
-"""Backpropagation through time: the gradient of the flown rewards, through physics and policy."""
+"""Backpropagation through time: the gradient of the rewards through physics and policy (analytic policy gradient)."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import flax.struct
 import jax
@@ -14,61 +13,77 @@ from jaxtyping import Array
 from jaxdrones.checks import check_key, check_keywords
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect
-from jaxdrones.learning.gradients import linked, with_gradient
+from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.normalize import vector
-from jaxdrones.learning.result import Result, descent, scan_updates
-from jaxdrones.learning.settings import check_config, check_settings
+from jaxdrones.learning.normalize import state_vector
+from jaxdrones.learning.result import Result, cosine_adam, count_nonfinite, run_training
+from jaxdrones.learning.returns import discounted_rewards
+from jaxdrones.learning.settings import (
+    BelowOne,
+    Count,
+    Fraction,
+    Gradient,
+    HiddenSizes,
+    Positive,
+    PositiveOrInfinite,
+    Surrogate,
+    Switch,
+    TracedCount,
+    check_config,
+    check_settings,
+)
 
 
 @check_keywords
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
+    """Settings; the numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
 
-    updates: int = 180
-    worlds: int = 256
-    horizon: int = 64
-    """Control steps that a gradient goes back through."""
-    sizes: tuple[int, ...] = (32, 32)
-    memory: float = 1e9
-    """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
-    settle: float = 0.2
-    """Share of the updates after which the statistics stay as they are."""
-    per_agent: bool = False
-    learning_rate: float = 2e-2
-    """At the start; falls to zero along a cosine."""
-    discount: float = 1.0
-    b2: float = 0.95
-    """How long Adam remembers the squares of gradients; those of a flight shrink by orders of magnitude."""
-    clip: float = 0.3
-    """Largest norm of the gradient."""
-    restart: float = 0.2
-    """Share of the worlds that start afresh before an update; the others fly on."""
-    gradient: str = "exact"
-    """A name of `GRADIENTS`."""
-    decay: float = 0.98
-    """Of the gradient, per control step, with `gradient="decay"`."""
-    surrogate: Any = None
-    """Step of the backward pass with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+    updates: TracedCount = 180
+    worlds: Count = 256
+    horizon: Count = 64
+    """Control steps that the gradient goes back through."""
+    hidden_sizes: HiddenSizes = (32, 32)
+    obs_stats_window: PositiveOrInfinite = 1e9
+    """Number of trajectories whose observations the statistics remember."""
+    obs_stats_freeze: Fraction = 0.2
+    """Fraction of the updates after which the statistics of observations no longer change."""
+    per_agent: Switch = False
+    """Whether every drone has a policy of its own; otherwise all drones share one."""
+    learning_rate: Positive = 2e-2
+    """Learning rate at the start; it falls to zero along a cosine."""
+    gamma: Fraction = 1.0
+    """Discount factor."""
+    adam_b2: BelowOne = 0.95
+    """Decay rate of Adam's mean of squared gradients. It is low because gradients shrink by orders of magnitude while
+    the policy learns."""
+    max_grad_norm: PositiveOrInfinite = 0.3
+    restart_fraction: Fraction = 0.2
+    """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
+    gradient: Gradient = "exact"
+    """How the flight is differentiated; see `learning.gradients`."""
+    gradient_decay: Fraction = 0.98
+    """Factor on the gradient per control step with `gradient="decay"`."""
+    surrogate: Surrogate = None
+    """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
 
     def __post_init__(self):
         check_settings(self)
 
 
 class TrainState(flax.struct.PyTreeNode):
-    """All that training needs to go on."""
+    """Everything that training needs to continue."""
 
     step: Array
     """() updates made."""
     key: Array
     policy: Policy
-    optimiser: optax.OptState
+    opt_state: optax.OptState
     worlds: collect.Worlds
 
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
-    """Before the first update.
+    """The state before the first update.
 
     Raises:
         ValueError: no random key, or settings of another learner.
@@ -76,46 +91,49 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key = jax.random.split(key)
-    policy = Policy.init(policy_key, env, config.sizes, config.per_agent)
+    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent)
     return TrainState(
-        jnp.zeros((), jnp.int32), key, policy, _optimiser(config).init(policy.params), collect.idle(env, config.worlds)
+        step=jnp.zeros((), jnp.int32),
+        key=key,
+        policy=policy,
+        opt_state=_optimizer(config).init(policy.params),
+        worlds=collect.empty_worlds(env, config.worlds),
     )
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
-    """One flight of all worlds and one step along its gradient."""
+    """Simulate a trajectory of all worlds and make one step along the gradient of its rewards."""
     check_config(config, Config)
-    key, restart_key, fly_key = jax.random.split(state.key, 3)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart)
-    env = with_gradient(env, config)
+    key, restart_key, collect_key = jax.random.split(state.key, 3)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
+    env = with_gradient(env, config.gradient, config.surrogate)
+    between_steps = gradient_between_steps(config.gradient, config.gradient_decay)
 
     def loss(params):
-        policy = state.policy.replace(params=params)
-        after, flight = collect.fly(
-            fly_key, env, collect.piloted(policy), worlds, config.horizon, reset=False, link=linked(config)
+        act = collect.deterministic(state.policy.replace(params=params))
+        after, trajectory = collect.collect(
+            collect_key, env, act, worlds, config.horizon, reset=False, between_steps=between_steps
         )
-        return -jnp.mean(discounted(flight, config.discount)), (after, flight)
+        return -jnp.mean(discounted_rewards(trajectory, config.gamma)), (after, trajectory)
 
-    (_, (worlds, flight)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
-    step, optimiser = _optimiser(config).update(gradient, state.optimiser)
+    (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
+    step, opt_state = _optimizer(config).update(gradient, state.opt_state)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
-        statistics=collect.remember(state.policy.statistics, vector(flight.obs), config, state.step),
+        obs_stats=collect.update_obs_stats(state.policy.obs_stats, state_vector(trajectory.obs), config, state.step),
     )
-    metrics = collect.progress(flight) | {"gradient_norm": optax.tree.norm(gradient)}
-    return TrainState(state.step + 1, key, policy, optimiser, worlds), metrics
+    norm = optax.tree.norm(gradient)
+    metrics = {"gradient_norm": norm, "nonfinite_gradients": count_nonfinite(norm)}
+    metrics |= collect.trajectory_metrics(trajectory)
+    return TrainState(state.step + 1, key, policy, opt_state, worlds), metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
-    """All updates as one program."""
-    return scan_updates(update, env, config, init(key, env, config))
+    """Make all updates in one compiled program; see `learning.result.run_training`."""
+    check_key("key", key)
+    check_config(config, Config)
+    return run_training(init, update, key, env, config)
 
 
-def discounted(flight: collect.Flight, discount: float) -> Array:
-    """(t, w, n) rewards until the episode ends, discounted from the start of the flight."""
-    weight = discount ** jnp.arange(len(flight.reward), dtype=flight.reward.dtype)
-    return jnp.where(flight.over[..., None], 0, weight[:, None, None] * flight.reward)
-
-
-def _optimiser(config: Config) -> optax.GradientTransformation:
-    return descent(config.learning_rate, config.updates, config.clip, b2=config.b2)
+def _optimizer(config: Config) -> optax.GradientTransformation:
+    return cosine_adam(config.learning_rate, config.updates, config.max_grad_norm, config.adam_b2)

@@ -1,4 +1,4 @@
-"""Flights of many worlds at once, whose episodes follow one another."""
+"""Trajectories of many worlds at once, whose episodes follow one another."""
 
 from __future__ import annotations
 
@@ -11,190 +11,205 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.envs import AutoReset, Env, autoreset
+from jaxdrones.envs import AutoReset, Env
 from jaxdrones.envs.autoreset import Episode
-from jaxdrones.envs.env import Obs, PrivilegedObservation
+from jaxdrones.envs.env import Obs
+from jaxdrones.envs.privileged import PrivilegedObservation
 from jaxdrones.learning import sharding
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.normalize import Statistics
+from jaxdrones.learning.normalize import RunningStatistics
+from jaxdrones.learning.settings import Scalar
 
 Act = Callable[[jax.Array, Obs], tuple[Array, Any]]
-"""(a key for each world (w,), observations (w, n, d)) -> actions (w, n, a), and what is to be kept of the decision."""
+"""(a key for each world (w,), observations (w, n, d)) -> actions (w, n, a), and extras for the learner, such as log
+probabilities."""
 
 
 class Worlds(flax.struct.PyTreeNode):
-    """w worlds in flight."""
+    """w worlds, each in the middle of an episode."""
 
     episodes: Episode
     obs: Obs
-    """(w, n, d) what is seen now; here and below, with cameras, a dictionary of that and of images."""
-    ended: Array
-    """(w,) whether the episode is over, and a new one has to be started."""
+    """(w, n, d) current observations; here and below, with cameras, a dictionary of such an array and of images."""
+    done: Array
+    """(w,) whether the episode has ended and a new one has to be started."""
 
 
-class Flight(flax.struct.PyTreeNode):
+class Trajectory(flax.struct.PyTreeNode):
     """t control steps of w worlds."""
 
     obs: Obs
-    """(t, w, n, d) what was seen before the step."""
+    """(t, w, n, d) observations before the step."""
     action: Array
     """(t, w, n, a)"""
-    kept: Any
-    """What `act` wanted to be kept."""
+    extras: Any
+    """Extras that `act` returned."""
     reward: Array
     """(t, w, n)"""
     terminated: Array
-    """(t, w) what follows has no value."""
+    """(t, w) whether the episode ended for good, so that the state after it has no value."""
     truncated: Array
-    """(t, w) the episode was cut, though it could go on."""
+    """(t, w) whether the episode was cut, though it could have gone on."""
     final_obs: Obs
-    """(t, w, n, d) what was seen after the step, before a new episode started."""
-    returned: Array
-    """(t, w, n) sum of rewards of the episode so far."""
+    """(t, w, n, d) observations after the step, before a new episode starts."""
+    episode_return: Array
+    """(t, w, n) sum of the rewards of the episode so far."""
     error: Array
     """(t, w, n) distance from the target, m."""
-    truth: PrivilegedObservation | None
-    """(t, w, n, ...) before the step, where it was asked for."""
-    final_truth: PrivilegedObservation | None
-    """(t, w, n, ...) after the step, before a new episode started."""
-    over: Array
-    """(t, w) the episode was over before the step, which does not count; never so where episodes are reset."""
+    privileged: PrivilegedObservation | None
+    """(t, w, n, ...) privileged observations before the step; `None` unless they were asked for."""
+    final_privileged: PrivilegedObservation | None
+    """(t, w, n, ...) privileged observations after the step, before a new episode starts."""
+    was_done: Array
+    """(t, w) whether the episode had ended before the step; such a step does not count. Always false with `reset`."""
 
     @property
-    def ended(self) -> Array:
-        """(t, w)."""
+    def done(self) -> Array:
+        """(t, w) whether the step ended the episode."""
         return self.terminated | self.truncated
 
 
-def idle(env: Env, worlds: int) -> Worlds:
-    """Worlds in which nothing has begun yet."""
-    obs, episodes = jax.eval_shape(jax.vmap(autoreset(env).reset), jax.random.split(jax.random.key(0), worlds))
+def empty_worlds(env: Env, count: int) -> Worlds:
+    """Worlds in which no episode has begun; `restart` starts one in each."""
+    obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), count))
     episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
-    return Worlds(episodes, obs, ended=jnp.ones(worlds, bool))
+    return Worlds(episodes, obs, done=jnp.ones(count, bool))
 
 
-def restart(key: jax.Array, env: Env, worlds: Worlds, share: float = 0.0) -> Worlds:
-    """A fresh episode where one is over, and with probability `share` elsewhere: so that not all are of an age."""
+def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) -> Worlds:
+    """Start a new episode in every world whose episode has ended, and in the others with a given probability.
+
+    Args:
+        key: random key.
+        env: environment.
+        worlds: worlds.
+        fraction: probability of a new episode in a world whose episode has not ended; above zero, the worlds do not
+            all reach the same time of their episodes together.
+    """
     start_key, choice_key = jax.random.split(key)
-    w = len(worlds.ended)
-    chosen = worlds.ended | jax.random.bernoulli(choice_key, share, (w,))
-    obs, episodes = jax.vmap(autoreset(env).reset)(jax.random.split(start_key, w))
-    fresh = Worlds(episodes, obs, jnp.zeros_like(chosen))
-    return _where(chosen, fresh, worlds)
+    count = len(worlds.done)
+    chosen = worlds.done | jax.random.bernoulli(choice_key, fraction, (count,))
+    obs, episodes = jax.vmap(AutoReset(env).reset)(jax.random.split(start_key, count))
+    return _select(chosen, Worlds(episodes, obs, jnp.zeros_like(chosen)), worlds)
 
 
-def fly(
+def collect(
     key: jax.Array,
     env: Env,
     act: Act,
     worlds: Worlds,
     length: int,
     reset: bool = True,
-    link: Callable = lambda worlds: worlds,
-    informed: bool = False,
-) -> tuple[Worlds, Flight]:
-    """Fly on; each device its share of the worlds, where `jax.set_mesh` was given several.
+    between_steps: Callable[[Worlds], Worlds] = lambda worlds: worlds,
+    privileged: bool = False,
+) -> tuple[Worlds, Trajectory]:
+    """Simulate all worlds for some control steps; with `jax.set_mesh` each device simulates its share of them.
 
     Args:
         key: random key.
         env: environment.
-        act: the pilot of all worlds; where several devices fly, it is differentiated by the arguments of a
-            `jax.tree_util.Partial` alone.
-        worlds: in flight.
+        act: chooses the actions in all worlds. On several devices it is differentiated only with respect to the
+            arguments of a `jax.tree_util.Partial`.
+        worlds: worlds at the start of the trajectory.
         length: control steps.
-        reset: start a new episode in the step in which one ends; else that is left to `restart`, the drones stay as
-            they are, and everything from there on is marked as over.
-        link: applied to the worlds between steps; changes their gradients, not their values.
-        informed: keep the truth beside what is seen.
+        reset: whether a new episode starts in the step in which one ends. Otherwise the drones stay as they are, and
+            all later steps are marked by `was_done`, until `restart` starts a new episode.
+        between_steps: function that is applied to the worlds between steps, to change their gradient.
+        privileged: whether to record privileged observations.
     """
-    truth = jax.vmap(env.truth) if informed else lambda worlds: None
-    step = jax.vmap((autoreset(env) if reset else _Endless(env)).step)
+    privileged_of = jax.vmap(env.privileged_observation) if privileged else lambda worlds: None
+    step = jax.vmap((AutoReset(env) if reset else _NoReset(env)).step)
 
-    def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Flight]:
+    def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Trajectory]:
         act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
-        worlds = link(worlds)
-        action, kept = act(act_keys, worlds.obs)
+        worlds = between_steps(worlds)
+        action, extras = act(act_keys, worlds.obs)
         obs, episodes, reward, terminated, truncated, info = step(step_keys, worlds.episodes, action)
-        flown = Flight(
+        recorded = Trajectory(
             obs=worlds.obs,
             action=action,
-            kept=kept,
+            extras=extras,
             reward=reward,
             terminated=terminated,
             truncated=truncated & ~terminated,
             final_obs=info["final_obs"],
-            returned=info["episode"]["return"],
+            episode_return=info["episode"]["return"],
             error=info["metrics"]["error"],
-            truth=truth(worlds.episodes.world),
-            final_truth=truth(info["final_world"]),
-            over=worlds.ended,
+            privileged=privileged_of(worlds.episodes.world),
+            final_privileged=privileged_of(info["final_world"]),
+            was_done=worlds.done,
         )
         if reset:
-            return Worlds(episodes, obs, worlds.ended), flown
-        after = Worlds(episodes, obs, worlds.ended | terminated | truncated)
-        return _where(worlds.ended, worlds, after), flown  # a drone that is left to spin flies to infinity
+            return Worlds(episodes, obs, worlds.done), recorded
+        after = Worlds(episodes, obs, worlds.done | terminated | truncated)
+        return _select(worlds.done, worlds, after), recorded  # without this, a lost drone would fly on to infinity
 
-    def flown(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Flight]:
+    def control_steps(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Trajectory]:
         return jax.lax.scan(functools.partial(control_step, act, index), worlds, keys)
 
-    flown = sharding.each_device(
-        flown, (sharding.SAME, sharding.SAME, sharding.WORLDS, sharding.WORLDS), (sharding.WORLDS, sharding.STEPS)
+    control_steps = sharding.map_worlds(
+        control_steps,
+        (sharding.REPLICATED, sharding.REPLICATED, sharding.WORLDS, sharding.WORLDS),
+        (sharding.WORLDS, sharding.STEPS),
     )
     act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
-    return flown(act, jax.random.split(key, length), jnp.arange(len(worlds.ended)), worlds)
+    return control_steps(act, jax.random.split(key, length), jnp.arange(len(worlds.done)), worlds)
 
 
-def piloted(policy: Policy) -> Act:
-    """The policy's own actions; nothing is kept."""
+def deterministic(policy: Policy) -> Act:
+    """Actions of the policy without exploration noise, and no extras."""
     return jax.tree_util.Partial(lambda policy, keys, obs: (policy(obs), None), policy)
 
 
-class _Endless(AutoReset):
-    """Episodes that are not reset."""
+class _NoReset(AutoReset):
+    """Episodes after which no new one starts."""
 
     def step(self, key: jax.Array, episode: Episode, action: Array):
         obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
-        episode = Episode(world, episode.returned + reward, episode.length + 1)
-        last = {"final_obs": obs, "final_world": world}
-        info = info | last | {"episode": {"return": episode.returned, "length": episode.length}}
+        episode = Episode(world, episode.episode_return + reward, episode.length + 1)
+        final = {"final_obs": obs, "final_world": world}
+        info = info | final | {"episode": {"return": episode.episode_return, "length": episode.length}}
         return obs, episode, reward, terminated, truncated, info
 
 
-def progress(flight: Flight) -> dict[str, Array]:
-    """What a learner reports of a flight, over the steps that count.
+def trajectory_metrics(trajectory: Trajectory) -> dict[str, Array]:
+    """Metrics over the steps that count.
 
-    Reward per step, error (m), share of steps in which a drone crashed, and the return of the episodes that ended.
+    These are the mean reward of a step, the mean error (m), the fraction of steps that terminated an episode, and the
+    mean return of the episodes that ended.
     """
-    counts = ~flight.over
-    ended = flight.ended & counts
+    counts = ~trajectory.was_done
+    done = trajectory.done & counts
     return {
-        "reward": jnp.mean(flight.reward, where=counts[..., None]),
-        "error": jnp.mean(flight.error, where=counts[..., None]),
-        "crashes": jnp.mean(flight.terminated.astype(flight.reward.dtype), where=counts),
-        "return": jnp.sum(flight.returned, where=ended[..., None])
-        / jnp.maximum(jnp.sum(ended), 1)
-        / flight.reward.shape[2],
+        "reward": jnp.mean(trajectory.reward, where=counts[..., None]),
+        "error": jnp.mean(trajectory.error, where=counts[..., None]),
+        "termination_rate": jnp.mean(trajectory.terminated.astype(trajectory.reward.dtype), where=counts),
+        "return": jnp.sum(trajectory.episode_return, where=done[..., None])
+        / jnp.maximum(jnp.sum(done), 1)
+        / trajectory.reward.shape[2],
     }
 
 
-def remember(statistics: Statistics, seen: Float[Array, "t w n d"], config: Any, step: Array) -> Statistics:
-    """The statistics of what was seen so far with those of a flight, until they are settled.
+def update_obs_stats(
+    statistics: RunningStatistics, obs: Float[Array, "t w n d"], config: Any, step: Array
+) -> RunningStatistics:
+    """The statistics with the observations of a trajectory added, until they are frozen.
 
     Args:
-        statistics: so far.
-        seen: in the flight.
-        config: settings: `memory` in flights, `settle` as a share of `updates`.
+        statistics: statistics so far.
+        obs: observations of the trajectory.
+        config: settings of a learner, of which `obs_stats_window`, `obs_stats_freeze` and `updates` count.
         step: () updates made.
     """
-    new = statistics.update(seen, memory=config.memory * seen[..., 0].size)
-    settling = step < config.settle * config.updates
-    return jax.tree.map(lambda new, old: jnp.where(settling, new, old), new, statistics)
+    new = statistics.update(obs, window=config.obs_stats_window * obs[..., 0].size)
+    frozen = step >= config.obs_stats_freeze * config.updates
+    return jax.tree.map(lambda new, old: jnp.where(frozen, old, new), new, statistics)
 
 
-def _where(chosen: Array, these: Worlds, others: Worlds) -> Worlds:
-    """These worlds where chosen (w,), else the others."""
+def _select(condition: Array, worlds: Worlds, others: Worlds) -> Worlds:
+    """Worlds where the condition (w,) holds, else the others."""
 
-    def pick(this: Array, other: Array) -> Array:
-        return jnp.where(chosen.reshape(chosen.shape + (1,) * (this.ndim - 1)), this, other)
+    def select(x: Array, other: Array) -> Array:
+        return jnp.where(condition.reshape(condition.shape + (1,) * (x.ndim - 1)), x, other)
 
-    return jax.tree.map(pick, these, others)
+    return jax.tree.map(select, worlds, others)

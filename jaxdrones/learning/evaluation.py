@@ -1,4 +1,4 @@
-"""How well a policy flies: many episodes at once, and how sure that is."""
+"""Evaluation of a policy over many episodes, with the confidence interval of its success rate."""
 
 from __future__ import annotations
 
@@ -10,124 +10,135 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.accelerate.compiler import training_options
 from jaxdrones.checks import check_key
 from jaxdrones.envs import Env
+from jaxdrones.learning import compilation
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 
-_CHUNK = 1000  # episodes flown at a time
-_EPISODE_BYTES = 64  # of a drone, that an evaluation keeps until its end
+_CHUNK = 1000  # episodes simulated at a time
+_EPISODE_BYTES = 64  # memory that the results of an episode take per drone until the evaluation ends
 
 
 class Report(flax.struct.PyTreeNode):
-    """What came of the episodes."""
+    """Results of an evaluation."""
 
     episodes: int
     success: float
-    """Share of the episodes in which every drone did what it should."""
-    interval: tuple[float, float]
-    """95 % confidence interval of it (Wilson)."""
-    error: float
-    """Mean distance from the target in the end, m."""
-    error_percentiles: dict[int, float]
-    """50, 95, 99 % of the drones end nearer than this, m."""
+    """Fraction of the episodes in which every drone met the task's criterion of success."""
+    success_interval: tuple[float, float]
+    """95 % confidence interval of `success` (Wilson)."""
+    final_error: float
+    """Mean distance from the target at the end of an episode, m."""
+    final_error_percentiles: dict[int, float]
+    """50th, 95th and 99th percentile of that distance over all drones, m."""
     rms_error: float
-    """Root mean square over the last four fifths of all episodes, m."""
-    returned: float
-    """Mean sum of a drone's rewards."""
-    length: float
+    """Root mean square distance from the target over the last four fifths of all episodes, m."""
+    mean_return: float
+    """Mean over drones and episodes of the sum of rewards."""
+    mean_length: float
     """Mean length of an episode, s."""
-    ends: dict[str, float]
-    """Share of the episodes that each end or limit of the task stopped."""
-    metrics: dict[str, float]
-    """Mean over drones of each of the task's metrics in the end."""
+    end_rates: dict[str, float]
+    """Fraction of the episodes that ended by each termination or truncation of the task."""
+    final_metrics: dict[str, float]
+    """Mean over drones of each of the task's metrics at the end of an episode."""
 
 
 def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -> Report:
-    """Fly episodes from start to end; what a drone's metrics are when its episode ends, they stay.
+    """Simulate whole episodes; after an episode has ended, its metrics keep their last values.
 
     Args:
         env: environment of either backend.
         policy: observations (n, d), or a dictionary with images, -> actions (n, a); a pytree, or any function.
         key: random key.
-        episodes: number of them.
+        episodes: number of episodes.
 
     Raises:
-        ValueError: no random key, or so many episodes cannot be flown.
+        ValueError: no random key, or more episodes than the memory holds.
     """
     check_key("key", key)
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, flax.struct.PyTreeNode):
-        flown = _fly_policy()(env, policy, keys)
+        outcomes = _compiled_outcomes()(compilation.Static(env), policy, keys)
     else:
-        flown = jax.jit(functools.partial(_fly, env, policy))(keys)
-    return _report(env, jax.tree.map(np.asarray, flown))
+        outcomes = jax.jit(functools.partial(_outcomes, env, policy))(keys)
+    return _report(env, jax.tree.map(np.asarray, outcomes))
 
 
 def check_episodes(env: Env, episodes: int) -> None:
-    """Raise unless so many episodes can be flown at once."""
+    """Raise if an evaluation of so many episodes needs more memory than there is."""
     check_at_most("episodes", episodes, LARGEST_COUNT)
     check_memory(f"an evaluation of {episodes:,} episodes", episodes * env.drones * _EPISODE_BYTES, "give fewer")
 
 
 @functools.cache
-def _fly_policy() -> Callable:
-    return jax.jit(_fly, static_argnums=0, compiler_options=training_options())
+def _compiled_outcomes() -> Callable:
+    return compilation.jit(lambda env, policy, keys: _outcomes(env.value, policy, keys), static_argnums=0)
 
 
-def _fly(env: Env, policy: Callable, keys: jax.Array):
-    return jax.lax.map(functools.partial(_episode, env, policy), keys, batch_size=min(_CHUNK, len(keys)))
+def _outcomes(env: Env, policy: Callable, keys: jax.Array) -> dict:
+    """Outcomes of one episode per key, along a leading axis."""
+    return jax.lax.map(functools.partial(_outcome, env, policy), keys, batch_size=min(_CHUNK, len(keys)))
 
 
-def _episode(env: Env, policy: Callable, key: jax.Array) -> dict:
-    """One episode, frozen where it ended; positions that are not numbers at any time are no success."""
+def _outcome(env: Env, policy: Callable, key: jax.Array) -> dict:
+    """The outcome of one episode; an episode in which a position is ever not finite is no success."""
     start_key, key = jax.random.split(key)
     obs, world = env.reset(start_key)
-    first = jax.eval_shape(env.step, key, world, jnp.zeros((env.drones, env.action_size)))[-1]
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (first["metrics"], first["ends"]))
+    info = jax.eval_shape(env.step, key, world, jnp.zeros((env.drones, env.action_size)))[-1]
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), _metrics_and_ends(info))
 
     def control_step(carry, key):
-        obs, world, lost, done, outcome, returned, length = carry
+        obs, world, diverged, done, last, episode_return, length = carry
         obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
-        now = (info["metrics"], info["ends"])
-        outcome = jax.tree.map(lambda new, old: jnp.where(done, old, new), now, outcome)
-        returned = returned + jnp.where(done, 0, reward)
+        last = jax.tree.map(lambda new, old: jnp.where(done, old, new), _metrics_and_ends(info), last)
+        episode_return = episode_return + jnp.where(done, 0, reward)
         length = length + ~done
-        lost = lost | ~jnp.all(jnp.isfinite(world.drones.pos))
-        return (obs, world, lost, done | terminated | truncated, outcome, returned, length), outcome[0]
+        diverged = diverged | ~jnp.all(jnp.isfinite(world.drones.pos))
+        return (obs, world, diverged, done | terminated | truncated, last, episode_return, length), last[0]
 
     zero = jnp.zeros(env.drones, world.drones.pos.dtype)
-    no = jnp.zeros((), bool)
-    carry = (obs, world, no, no, nothing, zero, jnp.zeros((), jnp.int32))
+    false = jnp.zeros((), bool)
+    carry = (obs, world, false, false, zeros, zero, jnp.zeros((), jnp.int32))
     carry, metrics = jax.lax.scan(control_step, carry, jax.random.split(key, env.steps))
-    _, _, lost, _, (final, ends), returned, length = carry
-    success = no if env.task.success is None else jnp.all(env.task.success(metrics, env.dt)) & ~lost
-    rms = jnp.sqrt(jnp.mean(metrics["error"][env.steps // 5 :] ** 2, axis=0))
-    return dict(success=success, final=final, ends=ends, returned=returned, length=length, rms=rms)
+    _, _, diverged, _, (final_metrics, ends), episode_return, length = carry
+    success = false if env.task.success is None else jnp.all(env.task.success(metrics, env.dt)) & ~diverged
+    rms_error = jnp.sqrt(jnp.mean(metrics["error"][env.steps // 5 :] ** 2, axis=0))
+    return {
+        "success": success,
+        "final_metrics": final_metrics,
+        "ends": ends,
+        "return": episode_return,
+        "length": length,
+        "rms_error": rms_error,
+    }
 
 
-def _report(env: Env, flown: dict) -> Report:
-    episodes = len(flown["success"])
-    error = flown["final"]["error"]
+def _metrics_and_ends(info: dict) -> tuple[dict, dict]:
+    return info["metrics"], info["terminations"] | info["truncations"]
+
+
+def _report(env: Env, outcomes: dict) -> Report:
+    episodes = len(outcomes["success"])
+    error = outcomes["final_metrics"]["error"]
     return Report(
         episodes=episodes,
-        success=float(np.mean(flown["success"])),
-        interval=wilson(int(np.sum(flown["success"])), episodes),
-        error=float(np.mean(error)),
-        error_percentiles={q: float(np.percentile(error, q)) for q in (50, 95, 99)},
-        rms_error=float(np.sqrt(np.mean(flown["rms"] ** 2))),
-        returned=float(np.mean(flown["returned"])),
-        length=float(np.mean(flown["length"]) * env.dt),
-        ends={name: float(np.mean(ended)) for name, ended in flown["ends"].items()},
-        metrics={name: float(np.mean(x)) for name, x in flown["final"].items()},
+        success=float(np.mean(outcomes["success"])),
+        success_interval=wilson_interval(int(np.sum(outcomes["success"])), episodes),
+        final_error=float(np.mean(error)),
+        final_error_percentiles={q: float(np.percentile(error, q)) for q in (50, 95, 99)},
+        rms_error=float(np.sqrt(np.mean(outcomes["rms_error"] ** 2))),
+        mean_return=float(np.mean(outcomes["return"])),
+        mean_length=float(np.mean(outcomes["length"]) * env.dt),
+        end_rates={name: float(np.mean(ended)) for name, ended in outcomes["ends"].items()},
+        final_metrics={name: float(np.mean(x)) for name, x in outcomes["final_metrics"].items()},
     )
 
 
-def wilson(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's score interval of a share, 95 % by default."""
+def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's score interval of a proportion, of 95 % confidence by default."""
     p, n = successes / trials, trials
-    centre = p + z**2 / (2 * n)
+    center = p + z**2 / (2 * n)
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    low, high = (centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)
+    low, high = (center - half) / (1 + z**2 / n), (center + half) / (1 + z**2 / n)
     return max(0.0, float(low)), min(1.0, float(high))

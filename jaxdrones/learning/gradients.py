@@ -1,11 +1,12 @@
-"""What a gradient goes through, and how long.
+"""Three ways to differentiate a simulated flight.
 
-A long flight of an unstable drone has gradients that grow or shrink with every control step. Three ways:
+The gradients of a long flight of an unstable vehicle grow or shrink with every control step.
 
-- `exact`: the derivative of what was simulated.
-- `decay`: every control step back multiplies it by a factor below one, which bounds how far back an error is blamed.
-- `surrogate`: physics is simulated as it is, but differentiated as a simpler step, one rigid body step per control
-  period by default: cheaper, and smooth where the simulated physics is not. The gradient is biased.
+- `exact`: the derivative of the simulated physics.
+- `decay`: the gradient is multiplied by a factor below one at every control step backward, so that distant steps
+  contribute little.
+- `surrogate`: the physics is simulated as it is, but differentiated as a simpler step, by default one rigid body step
+  per control period. This is cheaper, and smooth where the simulated physics is not; the gradient is biased.
 """
 
 from __future__ import annotations
@@ -16,32 +17,41 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
+from jaxdrones.learning.settings import Scalar
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.state import State
 
-GRADIENTS = ("exact", "decay", "surrogate")
 
+def with_gradient(env: Env, gradient: str, surrogate: Step | None = None) -> Env:
+    """The environment whose physics is differentiated in the way that `gradient` names.
 
-def with_gradient(env: Env, config: Any) -> Env:
-    """The environment, differentiated as the settings say."""
-    if config.gradient != "surrogate":
+    Args:
+        env: environment.
+        gradient: exact, decay or surrogate.
+        surrogate: step whose derivatives are taken with `surrogate`; a rigid body with instant rotors when left out.
+    """
+    if gradient != "surrogate":
         return env
     changed = copy.copy(env)
-    changed.physics = differentiated_as(env.physics, config.surrogate or make_step(dt=env.dt))
+    changed.physics = SurrogateStep(env.physics, surrogate or make_step(dt=env.dt))
     return changed
 
 
-def linked(config: Any) -> Callable:
-    """What happens to the gradient of worlds between two control steps."""
-    if config.gradient == "decay":
-        return lambda worlds: scale_gradient(worlds, config.decay)
+def gradient_between_steps(gradient: str, factor: Scalar) -> Callable[[Any], Any]:
+    """A function that is applied to the worlds between control steps; it changes their gradient, not their values."""
+    if gradient == "decay":
+        return lambda worlds: scale_gradient(worlds, factor)
     return lambda worlds: worlds
 
 
-def scale_gradient(tree: Any, factor: float) -> Any:
-    """The same numbers, with a gradient multiplied by `factor`."""
+def scale_gradient(tree: Any, factor: Scalar) -> Any:
+    """The same numbers, with their gradient multiplied by `factor`."""
 
     def scale(x):
         if not jnp.issubdtype(x.dtype, jnp.floating):
@@ -51,18 +61,30 @@ def scale_gradient(tree: Any, factor: float) -> Any:
     return jax.tree.map(scale, tree)
 
 
-def differentiated_as(step: Step, simple: Step) -> Step:
-    """A step with the values of one and the derivatives of another, at the same state."""
+class SurrogateStep(Step):
+    """A step with the values of `step` and the derivatives of `surrogate` at the same state."""
 
-    @jax.custom_vjp
-    def mixed(params, state, rpm):
-        return step(params, state, rpm)
+    def __init__(self, step: Step, surrogate: Step):
+        self.physics, self._step = step.physics, step
 
-    def forward(params, state, rpm):
-        return step(params, state, rpm), (params, state, rpm)
+        @jax.custom_vjp
+        def mixed(scene, *arguments):
+            return step(*arguments, scene)
 
-    def backward(saved, cotangent):
-        return jax.vjp(simple, *saved)[1](cotangent)
+        def forward(scene, *arguments):
+            return step(*arguments, scene), (scene, arguments)
 
-    mixed.defvjp(forward, backward)
-    return mixed
+        def backward(saved, cotangent):
+            scene, arguments = saved
+            return jax.tree.map(jnp.zeros_like, scene), *jax.vjp(surrogate, *arguments)[1](cotangent)
+
+        mixed.defvjp(forward, backward)
+        self._mixed = mixed
+
+    def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """Advance a team by one control step."""
+        return self._mixed(scene, params, state, rpm)
+
+    def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
+        """The time derivative of the step that gives the values."""
+        return self._step.rate(params, state, rpm, scene)

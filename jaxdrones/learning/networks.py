@@ -1,4 +1,4 @@
-"""Policies and value functions: multilayer perceptrons of normalised observations, which see images through a CNN."""
+"""Policies and value functions: multilayer perceptrons of normalized observations, with a CNN for images."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_choice, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
-from jaxdrones.learning.normalize import Statistics, on_vector, vector
+from jaxdrones.learning.normalize import RunningStatistics, map_state_vector, state_vector
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
-_FAR = 5.0  # m; beyond, all depths look the same
+_MAX_DEPTH = 5.0  # m; larger depths are clipped
 
 
 class MLP(nn.Module):
-    """Layers of the given sizes, and a linear one that starts near zero where `scale` is small."""
+    """A multilayer perceptron with a linear output layer, whose initial outputs are near zero if `output_scale` is."""
 
-    sizes: Sequence[int]
-    outputs: int
-    scale: float = 1.0
+    hidden_sizes: Sequence[int]
+    output_size: int
+    output_scale: float = 1.0
     activation: str = "tanh"
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch d"]) -> Array:
-        """(*batch, outputs)."""
-        for size in self.sizes:
-            x = ACTIVATIONS[self.activation](nn.Dense(size, kernel_init=_init(1.0))(x))
-        return nn.Dense(self.outputs, kernel_init=_init(self.scale))(x)
+        """(*batch, output_size)."""
+        for size in self.hidden_sizes:
+            x = ACTIVATIONS[self.activation](nn.Dense(size, kernel_init=_kernel_init(1.0))(x))
+        return nn.Dense(self.output_size, kernel_init=_kernel_init(self.output_scale))(x)
 
 
 class CNN(nn.Module):
-    """What is in a picture: convolutions, and a layer over all that they find.
+    """Features of an image: convolutions, and a dense layer over all their outputs.
 
-    Kernels are as wide as their strides, so that a convolution is a product of matrices. For the gradient of 3x3
-    kernels of stride 2, XLA takes 80 times as long on a CPU.
+    Kernels are as wide as their strides, so that a convolution is a product of matrices, which is far faster on a CPU
+    than overlapping kernels are.
     """
 
     channels: Sequence[int]
@@ -50,26 +50,26 @@ class CNN(nn.Module):
     features: int
 
     @nn.compact
-    def __call__(self, picture: Float[Array, "*batch h w c"]) -> Float[Array, "*batch features"]:
-        """Of numbers in [0, 1]; h and w are multiples of the product of the strides."""
+    def __call__(self, image: Float[Array, "*batch h w c"]) -> Float[Array, "*batch features"]:
+        """Features of numbers in [0, 1]; h and w are multiples of the product of the strides."""
         for channels, stride in zip(self.channels, self.strides, strict=True):
-            picture = nn.relu(nn.Dense(channels)(_patches(picture, stride)))
-        return nn.relu(nn.Dense(self.features)(picture.reshape(*picture.shape[:-3], -1)))
+            image = nn.relu(nn.Dense(channels)(_patches(image, stride)))
+        return nn.relu(nn.Dense(self.features)(image.reshape(*image.shape[:-3], -1)))
 
 
-def _patches(picture: Float[Array, "*batch h w c"], stride: int) -> Array:
-    """(*batch, h / stride, w / stride, stride^2 c): side by side, what was in a square."""
-    *batch, h, w, c = picture.shape
-    squares = picture.reshape(*batch, h // stride, stride, w // stride, stride, c)
+def _patches(image: Float[Array, "*batch h w c"], stride: int) -> Array:
+    """(*batch, h / stride, w / stride, stride^2 c): the image cut into squares, each a vector."""
+    *batch, h, w, c = image.shape
+    squares = image.reshape(*batch, h // stride, stride, w // stride, stride, c)
     return jnp.moveaxis(squares, -4, -3).reshape(*batch, h // stride, w // stride, -1)
 
 
 class VisionMLP(nn.Module):
-    """An MLP of the vector of an observation and, beside it, of what a CNN finds in its images."""
+    """An MLP of the vector of an observation and of the features that a CNN extracts from its images."""
 
-    sizes: Sequence[int]
-    outputs: int
-    scale: float = 1.0
+    hidden_sizes: Sequence[int]
+    output_size: int
+    output_scale: float = 1.0
     activation: str = "tanh"
     channels: Sequence[int] = (16, 32, 32)
     strides: Sequence[int] = (4, 2, 2)
@@ -77,75 +77,76 @@ class VisionMLP(nn.Module):
 
     @nn.compact
     def __call__(self, obs: dict[str, Array]) -> Array:
-        """(*batch, outputs)."""
-        pictures = [SCALES[name](obs[name]) for name in sorted(obs.keys() - {"state"})]
-        found = CNN(self.channels, self.strides, self.features)(jnp.concatenate(pictures, axis=-1))
-        mlp = MLP(self.sizes, self.outputs, self.scale, self.activation)
-        return mlp(jnp.concatenate([obs["state"], found], axis=-1))
+        """(*batch, output_size)."""
+        images = [IMAGE_CHANNELS[name](obs[name]) for name in sorted(obs.keys() - {"state"})]
+        features = CNN(self.channels, self.strides, self.features)(jnp.concatenate(images, axis=-1))
+        mlp = MLP(self.hidden_sizes, self.output_size, self.output_scale, self.activation)
+        return mlp(jnp.concatenate([obs["state"], features], axis=-1))
 
 
-def network_for(obs: Obs, sizes: Sequence[int], outputs: int, scale: float) -> MLP | VisionMLP:
-    """The kind of network that such observations need.
+def make_network(obs: Obs, hidden_sizes: Sequence[int], output_size: int, output_scale: float) -> MLP | VisionMLP:
+    """A network of the kind that such observations need.
 
     Raises:
-        ValueError: they have images that no network takes.
+        ValueError: the observations have images that no network takes.
     """
     if not isinstance(obs, dict):
-        return MLP(tuple(sizes), outputs, scale)
+        return MLP(tuple(hidden_sizes), output_size, output_scale)
     for name in obs.keys() - {"state"}:
-        check_choice("image for a policy", name, SCALES)
-    return VisionMLP(tuple(sizes), outputs, scale)
+        check_choice("image for a policy", name, IMAGE_CHANNELS)
+    return VisionMLP(tuple(hidden_sizes), output_size, output_scale)
 
 
-def _colours(rgb: Array) -> Float[Array, "*batch h w 3"]:
-    """Red, green, blue of (*batch, h, w, 4) bytes, in [0, 1]."""
+def _normalize_rgb(rgb: Array) -> Float[Array, "*batch h w 3"]:
+    """Red, green and blue in [0, 1] of an image (*batch, h, w, 4) of bytes; the opacity is dropped."""
     return rgb[..., :3].astype(jnp.float32) / 255
 
 
-def _nearness(depth: Array) -> Float[Array, "*batch h w 1"]:
-    """Of (*batch, h, w) m: 1 at the eye, 0 far away."""
-    return 1 - jnp.clip(depth, 0, _FAR)[..., None] / _FAR
+def _normalize_depth(depth: Array) -> Float[Array, "*batch h w 1"]:
+    """1 at the camera, 0 at the largest depth and beyond, of depths (*batch, h, w) in m."""
+    return 1 - jnp.clip(depth, 0, _MAX_DEPTH)[..., None] / _MAX_DEPTH
 
 
-SCALES: dict[str, Callable[[Array], Array]] = {"rgb": _colours, "depth": _nearness}
-"""Images that policies take, to channels in [0, 1]."""
+IMAGE_CHANNELS: dict[str, Callable[[Array], Array]] = {"rgb": _normalize_rgb, "depth": _normalize_depth}
+"""The images that policies take, each with the function that makes channels in [0, 1] of it."""
 
 
-def _init(scale: float):
-    """Normally distributed, so that outputs have the inputs' variance times `scale`^2; compiles fast."""
+def _kernel_init(scale: float):
+    """Normally distributed weights, with which the variance of the outputs is `scale`^2 times that of the inputs."""
     return nn.initializers.variance_scaling(scale**2, "fan_in", "normal")
 
 
 class Policy(flax.struct.PyTreeNode):
-    """What flies: observations of a team to its actions. A pytree, so it can be saved, mapped and differentiated."""
+    """A function from a team's observations to its actions; a pytree, which can be saved, mapped and differentiated."""
 
     params: Any
-    """Of the network; with `per_agent` one set per drone, along a leading axis."""
-    statistics: Statistics
+    """Parameters of the network; with `per_agent` one set for each drone, along a leading axis."""
+    obs_stats: RunningStatistics
+    """Statistics that normalize the observations."""
     network: MLP | VisionMLP = flax.struct.field(pytree_node=False)
     per_agent: bool = flax.struct.field(pytree_node=False, default=False)
 
     @classmethod
-    def init(cls, key: jax.Array, env: Env, sizes: Sequence[int], per_agent: bool = False) -> Policy:
-        """A policy whose actions are nearly zero, which with most action types is to hover.
+    def init(cls, key: jax.Array, env: Env, hidden_sizes: Sequence[int], per_agent: bool = False) -> Policy:
+        """A policy whose actions are nearly zero, with which drones hover in most action types.
 
         Args:
             key: random key.
-            env: what it is to fly.
-            sizes: of the hidden layers.
-            per_agent: a network for every drone, else one for all.
+            env: environment that the policy is for.
+            hidden_sizes: sizes of the hidden layers.
+            per_agent: whether every drone has a network of its own; otherwise all drones share one.
         """
-        obs = seen_by_one(env)
-        network = network_for(obs, sizes, env.action_size, scale=0.01)
+        obs = example_observation(env)
+        network = make_network(obs, hidden_sizes, env.action_size, output_scale=0.01)
         params = init_params(key, network, obs, env.drones if per_agent else None)
-        return cls(params, Statistics.none(env.observation_size), network, per_agent)
+        return cls(params, RunningStatistics.empty(env.observation_size), network, per_agent)
 
     def __repr__(self) -> str:
-        layers = (*np.shape(self.statistics.mean)[-1:], *self.network.sizes, self.network.outputs)
+        layers = (*np.shape(self.obs_stats.mean)[-1:], *self.network.hidden_sizes, self.network.output_size)
         numbers = sum(math.prod(np.shape(x)) for x in jax.tree.leaves(self.params))
-        seen = self.statistics.count
-        known = isinstance(seen, jax.Array | np.ndarray) and is_known(seen) and seen.ndim == 0
-        counted = f", statistics of {float(seen):,.0f} observations" if known else ""
+        count = self.obs_stats.count
+        known = isinstance(count, jax.Array | np.ndarray) and is_known(count) and count.ndim == 0
+        counted = f", statistics of {float(count):,.0f} observations" if known else ""
         images = f" and images by {self.network.channels}" if isinstance(self.network, VisionMLP) else ""
         whose = ", one network per drone" if self.per_agent else ""
         return (
@@ -154,36 +155,38 @@ class Policy(flax.struct.PyTreeNode):
         )
 
     def __call__(self, obs: Obs) -> Float[Array, "*batch n a"]:
-        """The action, in (-1, 1), of observations (*batch, n, d), or of a dictionary of such arrays with images."""
-        x = on_vector(self.statistics.normalize, obs)
+        """Actions in (-1, 1) for observations (*batch, n, d), or for a dictionary of such an array and of images."""
+        x = map_state_vector(self.obs_stats.normalize, obs)
         return jnp.tanh(apply(self.network, self.params, x, self.per_agent))
 
 
-def seen_by_one(env: Env) -> Obs:
+def example_observation(env: Env) -> Obs:
     """An observation of one drone, all zero."""
     obs, _ = jax.eval_shape(env.reset, jax.random.key(0))
     return jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), obs)
 
 
-def init_params(key: jax.Array, network: MLP | VisionMLP, example: Obs, roles: int | None = None) -> Any:
-    """Parameters of a network for inputs like the example, or one set per role along a leading axis."""
-    if roles is None:
+def init_params(key: jax.Array, network: MLP | VisionMLP, example: Obs, agents: int | None = None) -> Any:
+    """Parameters of a network for inputs like the example; with `agents` one set for each, along a leading axis."""
+    if agents is None:
         return network.init(key, example)
-    return jax.vmap(network.init, in_axes=(0, None))(jax.random.split(key, roles), example)
+    return jax.vmap(network.init, in_axes=(0, None))(jax.random.split(key, agents), example)
 
 
 def apply(network: MLP | VisionMLP, params: Any, x: Obs, per_agent: bool) -> Array:
-    """The network of every drone, or the one for all."""
+    """Outputs of the network that all drones share, or of the network of each drone."""
     if not per_agent:
         return cast(Array, network.apply(params, x))
-    drones = vector(x).ndim - 2
-    return cast(Array, jax.vmap(network.apply, in_axes=(0, drones), out_axes=drones)(params, x))
+    agent_axis = state_vector(x).ndim - 2
+    return cast(Array, jax.vmap(network.apply, in_axes=(0, agent_axis), out_axes=agent_axis)(params, x))
 
 
-def central(obs: Float[Array, "*batch n d"], action: Float[Array, "*batch n a"]) -> Float[Array, "*batch n e"]:
-    """What a central critic sees of every drone: all observations, its own first, then the actions of the others.
+def centralized_input(
+    obs: Float[Array, "*batch n d"], action: Float[Array, "*batch n a"]
+) -> Float[Array, "*batch n e"]:
+    """Input of a centralized critic for each drone: all observations, its own first, then the others' actions.
 
-    Two drones of the paper's leader-follower: 12 + 12 + 1 = 25 numbers.
+    For two drones of the paper's leader-follower task these are 12 + 12 + 1 = 25 numbers.
     """
     n = obs.shape[-2]
     own_first = [jnp.roll(obs, -i, axis=-2).reshape(*obs.shape[:-2], -1) for i in range(n)]

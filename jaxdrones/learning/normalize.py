@@ -1,4 +1,4 @@
-"""Running mean and variance of what is observed."""
+"""Running mean and variance of observations."""
 
 from __future__ import annotations
 
@@ -9,60 +9,61 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.envs.env import Obs
+from jaxdrones.learning.settings import Scalar
 
-_LARGEST = 10.0  # standard deviations
-_SMALLEST = 1e-2  # standard deviation; an entry that hardly moves is not blown up
+_CLIP = 10.0  # standard deviations
+_MIN_STD = 1e-2  # so that an entry that hardly changes is not amplified
 
 
-class Statistics(flax.struct.PyTreeNode):
-    """Of all vectors seen so far."""
+class RunningStatistics(flax.struct.PyTreeNode):
+    """Mean and variance of all observation vectors seen so far."""
 
     mean: Array
     """(d,)"""
     var: Array
     """(d,)"""
     count: Array
-    """() vectors seen."""
+    """() number of vectors."""
 
     @classmethod
-    def none(cls, size: int) -> Statistics:
-        """Before anything was seen: mean 0, variance 1, which the first vectors replace."""
+    def empty(cls, size: int) -> RunningStatistics:
+        """Statistics before the first vector: mean 0 and variance 1, which the first vectors replace."""
         return cls(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
 
     @classmethod
-    def of(cls, obs: Float[Array, "*batch d"]) -> Statistics:
-        """Of the vectors along the last axis."""
-        vectors = tuple(range(obs.ndim - 1))
-        mean = jnp.mean(obs, axis=vectors, keepdims=True)
-        var = jnp.mean((obs - mean) ** 2, axis=vectors)
+    def of(cls, obs: Float[Array, "*batch d"]) -> RunningStatistics:
+        """Statistics of the vectors along the last axis."""
+        batch_axes = tuple(range(obs.ndim - 1))
+        mean = jnp.mean(obs, axis=batch_axes, keepdims=True)
+        var = jnp.mean((obs - mean) ** 2, axis=batch_axes)
         return cls(mean.reshape(-1), var, jnp.asarray(obs.size // obs.shape[-1], obs.dtype))
 
-    def update(self, obs: Float[Array, "*batch d"], memory: float = jnp.inf) -> Statistics:
-        """With more vectors, joined as by Chan et al. (1983).
+    def update(self, obs: Float[Array, "*batch d"], window: Scalar = jnp.inf) -> RunningStatistics:
+        """Statistics of the old and the new vectors together (Chan et al. 1983).
 
         Args:
             obs: new vectors along the last axis.
-            memory: largest weight of the old ones, in vectors; so that early ones are forgotten.
+            window: the old vectors weigh at most as much as this number of vectors, so that early ones are forgotten.
         """
-        new = Statistics.of(obs)
-        old = jnp.minimum(self.count, memory)
-        count = old + new.count
-        step = new.mean - self.mean
-        var = (old * self.var + new.count * new.var) / count + step**2 * (old * new.count / count**2)
-        return Statistics(self.mean + step * (new.count / count), var, count)
+        new = RunningStatistics.of(obs)
+        old_count = jnp.minimum(self.count, window)
+        count = old_count + new.count
+        shift = new.mean - self.mean
+        var = (old_count * self.var + new.count * new.var) / count + shift**2 * (old_count * new.count / count**2)
+        return RunningStatistics(self.mean + shift * (new.count / count), var, count)
 
     def normalize(self, obs: Float[Array, "*batch d"]) -> Array:
-        """In standard deviations from the mean, cut at ten."""
-        scale = 1 / jnp.maximum(jnp.sqrt(self.var), _SMALLEST)
+        """Observations in standard deviations from the mean, clipped at ten."""
+        scale = 1 / jnp.maximum(jnp.sqrt(self.var), _MIN_STD)
         shape = (1,) * (obs.ndim - 1) + self.mean.shape
-        return jnp.clip((obs - self.mean.reshape(shape)) * scale.reshape(shape), -_LARGEST, _LARGEST)
+        return jnp.clip((obs - self.mean.reshape(shape)) * scale.reshape(shape), -_CLIP, _CLIP)
 
 
-def vector(obs: Obs) -> Float[Array, "*batch d"]:
-    """What of an observation is not an image."""
+def state_vector(obs: Obs) -> Float[Array, "*batch d"]:
+    """The observation without its images."""
     return obs["state"] if isinstance(obs, dict) else obs
 
 
-def on_vector(function: Callable[[Array], Array], obs: Obs) -> Obs:
-    """The observation with a function of its vector in place of it; images stay as they are."""
+def map_state_vector(function: Callable[[Array], Array], obs: Obs) -> Obs:
+    """The observation with a function applied to its vector; images stay as they are."""
     return obs | {"state": function(obs["state"])} if isinstance(obs, dict) else function(obs)

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al. 2017), for teams and many worlds."""
+"""Proximal policy optimization (Schulman et al. 2017), for teams and many worlds."""
 
 from __future__ import annotations
 
@@ -15,114 +15,126 @@ from jaxtyping import Array
 from jaxdrones.checks import check_key, check_keywords, check_number, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
-from jaxdrones.learning import collect
-from jaxdrones.learning.networks import MLP, Policy, VisionMLP, apply, central, init_params, network_for, seen_by_one
-from jaxdrones.learning.normalize import on_vector, vector
-from jaxdrones.learning.result import Result, bounded, scan_updates
-from jaxdrones.learning.returns import advantages
-from jaxdrones.learning.settings import check_config, check_settings
+from jaxdrones.learning import collect, networks
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import map_state_vector, state_vector
+from jaxdrones.learning.result import Result, clip_gradient, count_nonfinite, run_training
+from jaxdrones.learning.returns import trajectory_advantages
+from jaxdrones.learning.settings import (
+    BelowOne,
+    Count,
+    Fraction,
+    HiddenSizes,
+    NotNegative,
+    Positive,
+    PositiveOrInfinite,
+    Scalar,
+    Switch,
+    TracedCount,
+    check_config,
+    check_settings,
+)
 
 _HALF_LOG_2_PI = math.log(2 * math.pi) / 2
-_PACE = 1.2  # the learning rate grows or falls by
-_LARGEST_CHANGE = 10.0  # of a logarithm, far beyond what is rewarded; its exponential stays finite
+_RATE_FACTOR = 1.2  # by which the learning rate is raised or lowered
+_MAX_LOG_RATIO = 10.0  # far beyond what is rewarded; its exponential is finite
 
 
 @check_keywords
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
+    """Settings; the numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
 
-    updates: int = 400
-    worlds: int = 256
-    horizon: int = 96
-    """Control steps of an update; about a second, in which a rotor's speed comes to show in the position."""
-    epochs: int = 4
-    """Times that every step is learnt from."""
-    batches: int = 8
-    """Parts of the flown steps, each of which makes one gradient step; cut out of the worlds."""
-    sizes: tuple[int, ...] = (32, 32)
-    critic_hidden_sizes: tuple[int, ...] = (32, 32)
-    memory: float = 1e9
-    """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
-    settle: float = 0.1
-    """Share of the updates after which the statistics stay as they are."""
-    per_agent: bool = False
-    """A policy and a value function for every drone, else one of each for all."""
-    centralized_critic: bool = False
-    """Values are of all drones' observations and of the others' actions, else of a drone's own observation."""
-    privileged_critic: bool = False
-    """Values are of what a policy never sees: observations without noise, and drawn parameters (`Env.truth`)."""
-    learning_rate: float = 2e-3
-    """At the start; follows how much the policy changes in a gradient step."""
-    change: float = 0.02
-    """That is aimed at: divergence (KL) of the policy from the one that flew. The rate falls above twice of it and
-    grows below half of it, within `min_learning_rate` and `max_learning_rate`."""
-    min_learning_rate: float = 1e-5
-    max_learning_rate: float = 5e-3
-    cool: float = 0.3
-    """Share of the updates, the last ones, in which the largest rate falls to the min_learning_rate, and the spread to `calm`."""
-    discount: float = 0.99
-    trace: float = 0.99
-    """Lambda of the advantages."""
-    clip_epsilon: float = 0.2
-    """Largest change of an action's probability that is rewarded."""
-    entropy: float = 0.0
-    """Reward for the spread of actions."""
-    value_coef: float = 0.5
-    spread: float = 0.4
-    """Standard deviation of actions at the start."""
-    min_std: float = 0.1
-    """The least it may become before the last updates; what is tried next to the mean is what a policy learns from."""
-    calm: float = 0.02
-    """What it falls to in the last updates: rotors that are shaken lift more, so the mean is off without shaking."""
-    restart: float = 0.05
-    """Share of the worlds that start afresh before an update, so that not all are of an age."""
-    clip: float = 0.5
-    """Largest norm of the gradient."""
+    updates: TracedCount = 400
+    worlds: Count = 256
+    horizon: Count = 96
+    """Control steps of a trajectory. About one second is enough for a rotor's speed to change the position."""
+    epochs: Count = 4
+    """Passes over each trajectory."""
+    minibatches: Count = 8
+    """Minibatches of an epoch, each with all steps of some of the worlds."""
+    hidden_sizes: HiddenSizes = (32, 32)
+    critic_hidden_sizes: HiddenSizes = (32, 32)
+    obs_stats_window: PositiveOrInfinite = 1e9
+    """Number of trajectories whose observations the statistics remember."""
+    obs_stats_freeze: Fraction = 0.1
+    """Fraction of the updates after which the statistics of observations no longer change."""
+    per_agent: Switch = False
+    """Whether every drone has a policy and a critic of its own; otherwise all drones share them."""
+    centralized_critic: Switch = False
+    """Whether the critic takes all drones' observations and the others' actions, or a drone's own observation."""
+    privileged_critic: Switch = False
+    """Whether the critic takes what the policy does not observe: observations without noise, and drawn parameters."""
+    learning_rate: Positive = 2e-3
+    """Learning rate at the start; it then adapts to `target_kl`."""
+    target_kl: Positive = 0.02
+    """Divergence of the updated policy from the one that acted. The learning rate falls when the divergence is above
+    twice this value and rises when it is below half of it, between `min_learning_rate` and `max_learning_rate`."""
+    min_learning_rate: Positive = 1e-5
+    max_learning_rate: Positive = 5e-3
+    anneal_fraction: Fraction = 0.3
+    """Fraction of the updates, the last ones, in which the upper bound of the learning rate falls to
+    `min_learning_rate`, and that of the standard deviation of actions to `final_std`."""
+    gamma: BelowOne = 0.99
+    """Discount factor."""
+    gae_lambda: Fraction = 0.99
+    """Lambda of the generalized advantage estimation."""
+    clip_epsilon: Positive = 0.2
+    """Largest change of an action's probability ratio that the loss rewards."""
+    entropy_coef: NotNegative = 0.0
+    value_coef: NotNegative = 0.5
+    init_std: Positive = 0.4
+    """Standard deviation of actions at the start, and its upper bound before it is annealed."""
+    min_std: Positive = 0.1
+    """Lower bound of the standard deviation of actions until the upper bound is annealed below it; with less
+    exploration a policy stops learning."""
+    final_std: Positive = 0.02
+    """Upper bound of the standard deviation after the last update. It is small because rotors whose speed fluctuates
+    produce more thrust, so that the mean action alone, which flies after training, would produce too little."""
+    restart_fraction: Fraction = 0.05
+    """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
+    max_grad_norm: PositiveOrInfinite = 0.5
 
     def __post_init__(self):
-        check_settings(self, valued=True)
+        check_settings(self)
         if is_known(self.min_learning_rate):
-            check_number(
-                "max_learning_rate",
-                self.max_learning_rate,
-                "not slower than min_learning_rate",
-                at_least=self.min_learning_rate,
-            )
-        if self.worlds % self.batches:
-            raise ValueError(f"worlds is {self.worlds}; give a multiple of batches, {self.batches}")
+            low = float(self.min_learning_rate)
+            check_number("max_learning_rate", self.max_learning_rate, "not below min_learning_rate", at_least=low)
+        if self.worlds % self.minibatches:
+            raise ValueError(f"worlds is {self.worlds}; give a multiple of minibatches, {self.minibatches}")
 
 
 class TrainState(flax.struct.PyTreeNode):
-    """All that training needs to go on."""
+    """Everything that training needs to continue."""
 
     step: Array
     """() updates made."""
     key: Array
     policy: Policy
     log_std: Array
-    """(a,), or (n, a) with `per_agent`: logarithm of the spread of actions."""
+    """(a,), or (n, a) with `per_agent`: logarithm of the standard deviation of actions."""
     critic: Any
     """Parameters of the value function."""
-    optimiser: optax.OptState
-    rate: Array
-    """() learning rate."""
+    opt_state: optax.OptState
+    learning_rate: Array
+    """()"""
     worlds: collect.Worlds
 
 
-class Sample(flax.struct.PyTreeNode):
-    """What is learnt from; leading axes (t, w, n)."""
+class Batch(flax.struct.PyTreeNode):
+    """Transitions to learn from; leading axes (t, w, n)."""
 
     obs: Obs
     action: Array
     log_prob: Array
+    """Logarithm of the probability density of the action when it was chosen."""
     critic_obs: Obs
     advantage: Array
-    target: Array
+    value_target: Array
 
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
-    """Before the first update.
+    """The state before the first update.
 
     Raises:
         ValueError: no random key, or settings of another learner.
@@ -130,24 +142,31 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.sizes, config.per_agent)
+    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent)
     n, a = env.drones, env.action_size
     d = env.observation_size + (env.privileged_size if config.privileged_critic else 0)
-    log_std = jnp.full((n, a) if config.per_agent else (a,), jnp.log(config.spread))
-    inputs = n * d + (n - 1) * a if config.centralized_critic else d
-    obs = on_vector(lambda _: jnp.zeros(inputs), seen_by_one(env))
-    critic = init_params(critic_key, _critic(config, obs), obs, n if config.per_agent else None)
-    optimiser = _descent(config).init((policy.params, log_std, critic))
-    rate = jnp.asarray(config.learning_rate, log_std.dtype)
-    worlds = collect.idle(env, config.worlds)
-    return TrainState(jnp.zeros((), jnp.int32), key, policy, log_std, critic, optimiser, rate, worlds)
+    log_std = jnp.full((n, a) if config.per_agent else (a,), jnp.log(config.init_std))
+    critic_inputs = n * d + (n - 1) * a if config.centralized_critic else d
+    critic_obs = map_state_vector(lambda _: jnp.zeros(critic_inputs), networks.example_observation(env))
+    agents = n if config.per_agent else None
+    critic = networks.init_params(critic_key, _critic_network(config, critic_obs), critic_obs, agents)
+    return TrainState(
+        step=jnp.zeros((), jnp.int32),
+        key=key,
+        policy=policy,
+        log_std=log_std,
+        critic=critic,
+        opt_state=_optimizer(config).init((policy.params, log_std, critic)),
+        learning_rate=jnp.asarray(config.learning_rate, log_std.dtype),
+        worlds=collect.empty_worlds(env, config.worlds),
+    )
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
-    """Fly, then learn from what was flown."""
+    """Collect a trajectory of all worlds, then make some epochs of gradient steps on it."""
     check_config(config, Config)
-    key, restart_key, fly_key, learn_key = jax.random.split(state.key, 4)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart)
+    key, restart_key, collect_key, optimize_key = jax.random.split(state.key, 4)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
 
     def act(policy, log_std, keys, obs):
         mean = policy(obs)
@@ -156,122 +175,126 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         action = mean + std * noise
         return action, log_prob(action, mean, log_std)
 
-    pilot = jax.tree_util.Partial(act, state.policy, state.log_std)
-    worlds, flight = collect.fly(fly_key, env, pilot, worlds, config.horizon, informed=config.privileged_critic)
-    sample = _judged(config, state, flight)
-    learnt, optimiser, rate, losses = _learn(learn_key, config, state, sample)
-    params, log_std, critic = learnt
-    widest = _falling(config, state.step, config.spread, config.calm)
-    log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.min_std, widest)), jnp.log(widest))
-    statistics = collect.remember(state.policy.statistics, vector(flight.obs), config, state.step)
-    policy = state.policy.replace(params=params, statistics=statistics)
-    metrics = collect.progress(flight) | losses | {"spread": jnp.mean(jnp.exp(log_std)), "rate": rate}
-    return TrainState(state.step + 1, key, policy, log_std, critic, optimiser, rate, worlds), metrics
+    explore = jax.tree_util.Partial(act, state.policy, state.log_std)
+    worlds, trajectory = collect.collect(
+        collect_key, env, explore, worlds, config.horizon, privileged=config.privileged_critic
+    )
+    batch = _batch(config, state, trajectory)
+    (params, log_std, critic), opt_state, learning_rate, metrics = _optimize(optimize_key, config, state, batch)
+    max_std = _annealed(config, state.step, config.init_std, config.final_std)
+    log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.min_std, max_std)), jnp.log(max_std))
+    obs_stats = collect.update_obs_stats(state.policy.obs_stats, state_vector(trajectory.obs), config, state.step)
+    policy = state.policy.replace(params=params, obs_stats=obs_stats)
+    metrics |= collect.trajectory_metrics(trajectory)
+    metrics |= {"action_std": jnp.mean(jnp.exp(log_std)), "learning_rate": learning_rate}
+    return TrainState(state.step + 1, key, policy, log_std, critic, opt_state, learning_rate, worlds), metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
-    """All updates as one program."""
-    return scan_updates(update, env, config, init(key, env, config))
+    """Make all updates in one compiled program; see `learning.result.run_training`."""
+    check_key("key", key)
+    check_config(config, Config)
+    return run_training(init, update, key, env, config)
 
 
 def log_prob(action: Array, mean: Array, log_std: Array) -> Array:
-    """(*batch, n) logarithm of the density of (*batch, n, a) actions, normally distributed about their means."""
+    """(*batch, n) logarithm of the density of actions (*batch, n, a) that are normally distributed about their mean."""
     log_std = jnp.broadcast_to(log_std, mean.shape)
     terms = -(((action - mean) * jnp.exp(-log_std)) ** 2) / 2 - log_std - _HALF_LOG_2_PI
     return jnp.sum(terms, axis=-1)
 
 
-def loss(config: Config, policy: Policy, log_std: Array, critic: Any, sample: Sample) -> tuple[Array, dict[str, Array]]:
-    """What PPO descends: the clipped surrogate of the return, the error of the values, minus entropy."""
-    change = log_prob(sample.action, policy(sample.obs), log_std) - sample.log_prob
-    ratio = jnp.exp(jnp.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE))
+def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
+    """The clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy."""
+    log_ratio = log_prob(batch.action, policy(batch.obs), log_std) - batch.log_prob
+    ratio = jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
     clipped = jnp.clip(ratio, 1 - config.clip_epsilon, 1 + config.clip_epsilon)
-    gain = jnp.mean(jnp.minimum(ratio * sample.advantage, clipped * sample.advantage))
-    miss = (1 - config.discount) * (_value(config, critic, sample.critic_obs) - sample.target)
-    value_loss = jnp.mean(miss**2)
+    surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    value_error = (1 - config.gamma) * (_value(config, critic, batch.critic_obs) - batch.value_target)
+    value_loss = jnp.mean(value_error**2)
     entropy = jnp.mean(jnp.sum(log_std + 0.5 + _HALF_LOG_2_PI, axis=-1))
-    total = -gain + config.value_coef * value_loss - config.entropy * entropy
-    kl = jnp.mean(ratio - 1 - change)
+    total = -surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
+    kl = jnp.mean(ratio - 1 - log_ratio)
     return total, {"value_loss": value_loss, "kl": kl}
 
 
-def _judged(config: Config, state: TrainState, flight: collect.Flight) -> Sample:
-    """The flown steps with their advantages."""
+def _batch(config: Config, state: TrainState, trajectory: collect.Trajectory) -> Batch:
+    """The transitions of a trajectory with their advantages, normalized, and the targets of their values."""
     policy = state.policy
 
-    def seen(obs, truth, action):
-        """What the critic sees, where the policy sees `obs`."""
+    def critic_input(obs, privileged, action):
+        """Observations of the critic where the policy observes `obs`."""
         if config.privileged_critic:
-            obs = on_vector(lambda _: truth.obs, obs)
-        obs = on_vector(policy.statistics.normalize, obs)
+            obs = map_state_vector(lambda _: privileged.obs, obs)
+        obs = map_state_vector(policy.obs_stats.normalize, obs)
         if config.privileged_critic:
-            obs = on_vector(lambda x: jnp.concatenate([x, truth.secrets], axis=-1), obs)
-        return on_vector(lambda x: central(x, action), obs) if config.centralized_critic else obs
+            obs = map_state_vector(lambda x: jnp.concatenate([x, privileged.params], axis=-1), obs)
+        return (
+            map_state_vector(lambda x: networks.centralized_input(x, action), obs) if config.centralized_critic else obs
+        )
 
-    critic_obs = seen(flight.obs, flight.truth, flight.action)
-    final_action = policy(flight.final_obs) if config.centralized_critic else None
-    final_obs = seen(flight.final_obs, flight.final_truth, final_action)
+    critic_obs = critic_input(trajectory.obs, trajectory.privileged, trajectory.action)
+    final_action = policy(trajectory.final_obs) if config.centralized_critic else None
+    final_obs = critic_input(trajectory.final_obs, trajectory.final_privileged, final_action)
     value = _value(config, state.critic, critic_obs)
     next_value = _value(config, state.critic, final_obs)
-    terminated, truncated = (jnp.broadcast_to(x[..., None], value.shape) for x in (flight.terminated, flight.truncated))
-    advantage = advantages(flight.reward, value, next_value, terminated, truncated, config.discount, config.trace)
-    target = value + advantage
+    advantage = trajectory_advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
+    value_target = value + advantage
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
-    return Sample(flight.obs, flight.action, flight.kept, critic_obs, advantage, target)
+    return Batch(trajectory.obs, trajectory.action, trajectory.extras, critic_obs, advantage, value_target)
 
 
-def _learn(key: jax.Array, config: Config, state: TrainState, sample: Sample):
-    """Some epochs of gradient steps, each on the steps of some of the worlds."""
-    t, w = sample.advantage.shape[:2]
+def _optimize(key: jax.Array, config: Config, state: TrainState, batch: Batch):
+    """Some epochs of gradient steps: (policy parameters, log_std, critic), optimizer state, learning rate, metrics."""
+    t, w = batch.advantage.shape[:2]
 
-    def cost(learnt, batch):
-        params, log_std, critic = learnt
-        return loss(config, state.policy.replace(params=params), log_std, critic, batch)
+    def cost(variables, minibatch):
+        params, log_std, critic = variables
+        return loss(config, state.policy.replace(params=params), log_std, critic, minibatch)
 
-    max_learning_rate = _falling(config, state.step, config.max_learning_rate, config.min_learning_rate)
+    max_learning_rate = _annealed(config, state.step, config.max_learning_rate, config.min_learning_rate)
 
-    def step(carry, batch):
-        learnt, optimiser, rate = carry
-        (_, losses), gradient = jax.value_and_grad(cost, has_aux=True)(learnt, batch)
-        step, optimiser = _descent(config).update(gradient, optimiser)
-        slower, faster = losses["kl"] > 2 * config.change, losses["kl"] < config.change / 2
-        rate = jnp.clip(
-            rate * jnp.where(slower, 1 / _PACE, jnp.where(faster, _PACE, 1)),
-            config.min_learning_rate,
-            max_learning_rate,
-        )
-        learnt = jax.tree.map(lambda x, s: x - rate.astype(x.dtype) * s, learnt, step)
-        return (learnt, optimiser, rate), losses
+    def step(carry, minibatch):
+        variables, opt_state, learning_rate = carry
+        (_, metrics), gradient = jax.value_and_grad(cost, has_aux=True)(variables, minibatch)
+        step, opt_state = _optimizer(config).update(gradient, opt_state)
+        lower, raise_ = metrics["kl"] > 2 * config.target_kl, metrics["kl"] < config.target_kl / 2
+        factor = jnp.where(lower, 1 / _RATE_FACTOR, jnp.where(raise_, _RATE_FACTOR, 1))
+        learning_rate = jnp.clip(learning_rate * factor, config.min_learning_rate, max_learning_rate)
+        variables = jax.tree.map(lambda x, s: x - learning_rate.astype(x.dtype) * s, variables, step)
+        return (variables, opt_state, learning_rate), (metrics, optax.tree.norm(gradient))
 
     def epoch(carry, key):
-        # One world of every group goes into each batch: neighbours change places, so that no device needs another's.
-        order = jnp.argsort(jax.random.uniform(key, (w // config.batches, config.batches)), axis=1)
+        # The worlds are cut into groups of neighbors, and each minibatch takes one world of every group: on several
+        # devices, whose shares are neighbors too, no device needs the worlds of another.
+        order = jnp.argsort(jax.random.uniform(key, (w // config.minibatches, config.minibatches)), axis=1)
 
-        def batches(x):
+        def minibatches(x):
             x = x.reshape(t, *order.shape, *x.shape[2:])
             return jax.vmap(lambda group, order: group[:, order], (1, 0), 2)(x, order).swapaxes(0, 1)
 
-        return jax.lax.scan(step, carry, jax.tree.map(batches, sample))
+        return jax.lax.scan(step, carry, jax.tree.map(minibatches, batch))
 
-    carry = ((state.policy.params, state.log_std, state.critic), state.optimiser, state.rate)
-    (learnt, optimiser, rate), losses = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
-    return learnt, optimiser, rate, jax.tree.map(jnp.mean, losses)
-
-
-def _falling(config: Config, step: Array, high: float, low: float) -> Array:
-    """`high`, but from there to `low` in the last updates, by the same factor in each."""
-    left = jnp.clip((1 - step / config.updates) / config.cool, 0, 1)
-    return low * (high / low) ** left
+    carry = ((state.policy.params, state.log_std, state.critic), state.opt_state, state.learning_rate)
+    carry, (metrics, norms) = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
+    return *carry, jax.tree.map(jnp.mean, metrics) | {"nonfinite_gradients": count_nonfinite(norms)}
 
 
-def _critic(config: Config, critic_obs: Obs) -> MLP | VisionMLP:
-    return network_for(critic_obs, config.critic_hidden_sizes, 1, scale=0.01)
+def _annealed(config: Config, step: Array, high: Scalar, low: Scalar) -> Array:
+    """`high` until the last updates, in which it falls to `low` by the same factor in each."""
+    remaining = jnp.clip((1 - step / config.updates) / config.anneal_fraction, 0, 1)
+    return low * (high / low) ** remaining
+
+
+def _critic_network(config: Config, critic_obs: Obs) -> networks.MLP | networks.VisionMLP:
+    return networks.make_network(critic_obs, config.critic_hidden_sizes, 1, output_scale=0.01)
 
 
 def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
-    """(*batch, n) discounted sum of rewards to come; the network's output is a mean reward."""
-    return apply(_critic(config, critic_obs), critic, critic_obs, config.per_agent)[..., 0] / (1 - config.discount)
+    """(*batch, n) discounted sum of future rewards; the network's output is that sum times one minus gamma."""
+    output = networks.apply(_critic_network(config, critic_obs), critic, critic_obs, config.per_agent)[..., 0]
+    return output / (1 - config.gamma)
 
 
-def _descent(config: Config) -> optax.GradientTransformation:
-    return optax.flatten(optax.chain(bounded(config.clip), optax.scale_by_adam()))
+def _optimizer(config: Config) -> optax.GradientTransformation:
+    return optax.flatten(optax.chain(clip_gradient(config.max_grad_norm), optax.scale_by_adam()))

@@ -1,10 +1,32 @@
-"""What follows a step is worth: advantages and targets from rewards and values."""
+"""Discounted rewards, advantages and TD(lambda) targets of trajectories."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from jaxdrones.learning.collect import Trajectory
+from jaxdrones.learning.settings import Scalar
+
+
+def discounted_rewards(trajectory: Trajectory, gamma: Scalar) -> Float[Array, "t w n"]:
+    """Rewards up to the end of each episode, discounted from the start of the trajectory."""
+    weight = gamma ** jnp.arange(len(trajectory.reward), dtype=trajectory.reward.dtype)
+    return jnp.where(trajectory.was_done[..., None], 0, weight[:, None, None] * trajectory.reward)
+
+
+def trajectory_advantages(
+    trajectory: Trajectory,
+    value: Float[Array, "t w n"],
+    next_value: Float[Array, "t w n"],
+    gamma: Scalar,
+    gae_lambda: Scalar,
+) -> Float[Array, "t w n"]:
+    """Advantages of every drone in a trajectory; the episodes of a team end together. See `advantages`."""
+    terminated = jnp.broadcast_to(trajectory.terminated[..., None], value.shape)
+    truncated = jnp.broadcast_to(trajectory.truncated[..., None], value.shape)
+    return advantages(trajectory.reward, value, next_value, terminated, truncated, gamma, gae_lambda)
 
 
 def advantages(
@@ -13,33 +35,33 @@ def advantages(
     next_value: Float[Array, "t *w"],
     terminated: Bool[Array, "t *w"],
     truncated: Bool[Array, "t *w"],
-    discount: float,
-    trace: float,
+    gamma: Scalar,
+    gae_lambda: Scalar,
 ) -> Float[Array, "t *w"]:
-    """Generalised advantage estimation (Schulman et al. 2016), exact at time limits.
+    """Generalized advantage estimation (Schulman et al. 2016), exact at time limits.
 
-    Termination stops the sum and what follows is worth nothing; a cut episode stops it too, but what would have
-    followed is worth the value of what was seen last.
+    A termination ends the sum, and the state after it has no value. A truncation ends the sum too, but the value of the
+    last observation stands for the rewards that would have followed.
 
     Args:
-        reward: of every step.
-        value: of what was seen before it.
-        next_value: of what was seen after it, before a new episode started.
+        reward: reward of every step.
+        value: value of the observation before the step.
+        next_value: value of the observation after the step, before a new episode starts.
         terminated: whether the step ended the episode for good.
-        truncated: whether it was cut there.
-        discount: gamma.
-        trace: lambda; 0 for one step, 1 for all to the end.
+        truncated: whether the episode was cut after the step.
+        gamma: discount factor.
+        gae_lambda: 0 sums one step, 1 all steps to the end of the episode.
 
     Returns:
-        Advantages; with the values added they are the targets of TD(lambda).
+        The advantages; the sums of advantage and value are the TD(lambda) targets of the value.
     """
-    surprise = reward + discount * jnp.where(terminated, 0, next_value) - value
-    carry_on = jnp.where(terminated | truncated, 0, discount * trace)
+    td_error = reward + gamma * jnp.where(terminated, 0, next_value) - value
+    decay = jnp.where(terminated | truncated, 0, gamma * gae_lambda)
 
-    def backwards(later, x):
-        surprise, carry_on = x
-        now = surprise + carry_on * later
-        return now, now
+    def backward(later, step):
+        td_error, decay = step
+        advantage = td_error + decay * later
+        return advantage, advantage
 
-    _, result = jax.lax.scan(backwards, jnp.zeros_like(reward[0]), (surprise, carry_on), reverse=True)
+    _, result = jax.lax.scan(backward, jnp.zeros_like(reward[0]), (td_error, decay), reverse=True)
     return result

@@ -1,102 +1,91 @@
-"""What the settings of every learner must be to make sense. Those that are not shapes may be traced."""
+"""Types of the settings of learners, each with the check of its values.
+
+A learner's `Config` annotates each field with one of these types, and `check_settings` applies the checks. Numbers that
+are not shapes may be traced by JAX; what is traced has no value yet and passes.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import typing
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import jax
 
 from jaxdrones.checks import check_callable, check_choice, check_number, check_switch, check_whole, is_known, shown
-from jaxdrones.learning.gradients import GRADIENTS
+from jaxdrones.engine.step import Step
 
-Check = Callable[[str, Any], None]
+GRADIENTS = ("exact", "decay", "surrogate")
+"""Names of the gradients that `learning.gradients` explains."""
 
-_share = partial(check_number, at_least=0, at_most=1)
-_positive_share = partial(check_number, above=0, at_most=1)
-_below_one = partial(check_number, at_least=0, below=1)
-_positive = partial(check_number, above=0)
-_positive_or_infinite = partial(check_number, above=0, infinite=True)
-_not_negative = partial(check_number, at_least=0)
+Scalar = float | jax.Array
+"""A number that may be traced, so that `jax.vmap` trains with many values of it at once."""
 
 
-def _whole_or_traced(name: str, value: Any) -> None:
+def _check_whole_if_known(name: str, value: Any) -> None:
     if is_known(value):
         check_whole(name, value)
 
 
-def _layers(name: str, sizes) -> None:
+def _check_layers(name: str, sizes: Any) -> None:
     if not isinstance(sizes, tuple | list) or not sizes:
         raise ValueError(f"{name} is {shown(sizes)}; give the sizes of the hidden layers, for example (32, 32)")
     for size in sizes:
         check_whole(f"an entry of {name}", size)
 
 
-def _gradient(name: str, value: Any) -> None:
+def _check_gradient(name: str, value: Any) -> None:
     check_choice(name, value, GRADIENTS)
 
 
-def _surrogate(name: str, step) -> None:
+def _check_surrogate(name: str, step: Any) -> None:
     if step is not None:
         check_callable(name, step, "jaxdrones.make_step()")
 
 
-_CHECKS: dict[str, Check] = {
-    "updates": _whole_or_traced,
-    "worlds": check_whole,
-    "horizon": check_whole,
-    "epochs": check_whole,
-    "batches": check_whole,
-    "critic_steps": check_whole,
-    "sizes": _layers,
-    "critic_hidden_sizes": _layers,
-    "memory": _positive_or_infinite,
-    "settle": _share,
-    "per_agent": check_switch,
-    "centralized_critic": check_switch,
-    "privileged_critic": check_switch,
-    "learning_rate": _positive,
-    "critic_rate": _positive,
-    "min_learning_rate": _positive,
-    "max_learning_rate": _positive,
-    "change": _positive,
-    "cool": _share,
-    "trust": _positive_share,
-    "discount": _share,
-    "trace": _share,
-    "target_speed": _positive_share,
-    "b2": _below_one,
-    "clip_epsilon": _positive,
-    "entropy": _not_negative,
-    "value_coef": _not_negative,
-    "spread": _positive,
-    "min_std": _positive,
-    "calm": _positive,
-    "restart": _share,
-    "clip": _positive_or_infinite,
-    "gradient": _gradient,
-    "decay": _share,
-    "surrogate": _surrogate,
-}
+Positive = Annotated[Scalar, partial(check_number, above=0)]
+PositiveOrInfinite = Annotated[Scalar, partial(check_number, above=0, infinite=True)]
+NotNegative = Annotated[Scalar, partial(check_number, at_least=0)]
+Fraction = Annotated[Scalar, partial(check_number, at_least=0, at_most=1)]
+PositiveFraction = Annotated[Scalar, partial(check_number, above=0, at_most=1)]
+BelowOne = Annotated[Scalar, partial(check_number, at_least=0, below=1)]
+"""At least 0 and below 1, such as the discount of an infinite sum."""
+Count = Annotated[int, check_whole]
+TracedCount = Annotated[int | jax.Array, _check_whole_if_known]
+"""A whole number that may be traced."""
+Switch = Annotated[bool, check_switch]
+HiddenSizes = Annotated[tuple[int, ...], _check_layers]
+"""Sizes of the hidden layers of a network."""
+Gradient = Annotated[Literal["exact", "decay", "surrogate"], _check_gradient]
+Surrogate = Annotated[Step | None, _check_surrogate]
 
 
-def check_settings(config: Any, valued: bool = False) -> None:
-    """Raise unless every setting makes sense.
+def check_settings(config: Any) -> None:
+    """Raise unless every setting is one that its type allows.
 
     Args:
-        config: dataclass of settings.
-        valued: whether a critic learns the value of all that is to come, which is finite with a discount below one.
+        config: dataclass whose fields are annotated with types of this module; fields of other types are not checked.
 
     Raises:
         ValueError: names the setting, what was given, and what to give.
     """
-    checks = _CHECKS | ({"discount": _below_one} if valued else {})
-    for field in dataclasses.fields(config):
-        checks[field.name](field.name, getattr(config, field.name))
+    for name, check in _checks(config.__class__).items():
+        check(name, getattr(config, name))
+
+
+@functools.cache
+def _checks(kind: type) -> dict[str, Callable[[str, Any], None]]:
+    """The check of each field of a dataclass that has one."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    annotated = {field.name: getattr(hints[field.name], "__metadata__", ()) for field in dataclasses.fields(kind)}
+    return {name: metadata[0] for name, metadata in annotated.items() if metadata}
 
 
 def check_config(config: Any, kind: type) -> None:
-    """Raise unless the settings are those of this learner."""
+    """Raise unless the settings are those of the learner whose `Config` is `kind`."""
     if isinstance(config, kind):
         return
     learner = _learner(kind)

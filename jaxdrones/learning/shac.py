@@ -1,4 +1,4 @@
-"""Short-horizon actor-critic (Xu et al. 2022): backpropagation through short flights, a value at the end."""
+"""Short-horizon actor-critic (Xu et al. 2022): backpropagation through short trajectories, with a terminal value."""
 
 from __future__ import annotations
 
@@ -14,81 +14,96 @@ from jaxtyping import Array
 from jaxdrones.checks import check_key, check_keywords
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect
-from jaxdrones.learning.bptt import discounted
-from jaxdrones.learning.gradients import linked, with_gradient
+from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
 from jaxdrones.learning.networks import MLP, Policy, init_params
-from jaxdrones.learning.normalize import vector
-from jaxdrones.learning.result import Result, descent, scan_updates
-from jaxdrones.learning.returns import advantages
-from jaxdrones.learning.settings import check_config, check_settings
+from jaxdrones.learning.normalize import state_vector
+from jaxdrones.learning.result import Result, cosine_adam, count_nonfinite, run_training
+from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
+from jaxdrones.learning.settings import (
+    BelowOne,
+    Count,
+    Fraction,
+    Gradient,
+    HiddenSizes,
+    Positive,
+    PositiveFraction,
+    PositiveOrInfinite,
+    Surrogate,
+    Switch,
+    TracedCount,
+    check_config,
+    check_settings,
+)
 
-_STEPS = 4  # control steps that a gradient step of the critic is taken on
+_CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 
 
 @check_keywords
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings; the numbers that are not shapes may be traced, so that `vmap` tries many."""
+    """Settings; the numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
 
-    updates: int = 220
-    worlds: int = 256
-    horizon: int = 64
-    """Control steps that a gradient goes back through."""
-    sizes: tuple[int, ...] = (32, 32)
-    critic_hidden_sizes: tuple[int, ...] = (32, 32)
-    memory: float = 1e9
-    """Flights that the statistics of observations go back; early ones, far away, would blur what is near."""
-    settle: float = 0.2
-    """Share of the updates after which the statistics stay as they are."""
-    per_agent: bool = False
-    learning_rate: float = 2e-2
-    """Of the policy, at the start; falls to zero along a cosine."""
-    critic_rate: float = 5e-3
-    """The same of the critic."""
-    critic_steps: int = 8
-    """Gradient steps of the critic in an update, each with four successive control steps of all worlds."""
-    trust: float = 0.9
-    """Share of the updates in which the value of the end grows from nothing to its full weight."""
-    discount: float = 0.98
-    trace: float = 0.95
-    """Lambda of the critic's targets."""
-    target_speed: float = 0.2
-    """Share of the way that the target critic moves towards the critic in an update."""
-    b2: float = 0.95
-    """How long Adam remembers the squares of gradients; those of a flight shrink by orders of magnitude."""
-    clip: float = 0.3
-    """Largest norm of a gradient."""
-    restart: float = 0.2
-    """Share of the worlds that start afresh before an update; the others fly on."""
-    gradient: str = "exact"
-    """A name of `GRADIENTS`."""
-    decay: float = 0.98
-    """Of the gradient, per control step, with `gradient="decay"`."""
-    surrogate: Any = None
-    """Step of the backward pass with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+    updates: TracedCount = 220
+    worlds: Count = 256
+    horizon: Count = 64
+    """Control steps that the gradient goes back through."""
+    hidden_sizes: HiddenSizes = (32, 32)
+    critic_hidden_sizes: HiddenSizes = (32, 32)
+    obs_stats_window: PositiveOrInfinite = 1e9
+    """Number of trajectories whose observations the statistics remember."""
+    obs_stats_freeze: Fraction = 0.2
+    """Fraction of the updates after which the statistics of observations no longer change."""
+    per_agent: Switch = False
+    """Whether every drone has a policy of its own; otherwise all drones share one."""
+    learning_rate: Positive = 2e-2
+    """Learning rate of the policy at the start; it falls to zero along a cosine."""
+    critic_learning_rate: Positive = 5e-3
+    """Learning rate of the critic at the start; it falls to zero along a cosine."""
+    critic_steps: Count = 8
+    """Gradient steps of the critic in an update, each on four successive control steps of all worlds."""
+    terminal_value_warmup: PositiveFraction = 0.9
+    """Fraction of the updates during which the weight of the terminal value rises linearly from 0 to 1."""
+    gamma: BelowOne = 0.98
+    """Discount factor."""
+    gae_lambda: Fraction = 0.95
+    """Lambda of the critic's TD(lambda) targets."""
+    target_update_rate: PositiveFraction = 0.2
+    """Fraction by which the target critic approaches the critic in an update."""
+    adam_b2: BelowOne = 0.95
+    """Decay rate of Adam's mean of squared gradients, of the policy. It is low because gradients shrink by orders of
+    magnitude while the policy learns."""
+    max_grad_norm: PositiveOrInfinite = 0.3
+    restart_fraction: Fraction = 0.2
+    """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
+    gradient: Gradient = "exact"
+    """How the flight is differentiated; see `learning.gradients`."""
+    gradient_decay: Fraction = 0.98
+    """Factor on the gradient per control step with `gradient="decay"`."""
+    surrogate: Surrogate = None
+    """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
 
     def __post_init__(self):
-        check_settings(self, valued=True)
+        check_settings(self)
 
 
 class TrainState(flax.struct.PyTreeNode):
-    """All that training needs to go on."""
+    """Everything that training needs to continue."""
 
     step: Array
     """() updates made."""
     key: Array
     policy: Policy
-    optimiser: optax.OptState
+    opt_state: optax.OptState
     critic: Any
     """Parameters of the value function."""
-    target: Any
-    """The same, some updates behind."""
-    critic_optimiser: optax.OptState
+    target_critic: Any
+    """Parameters of the target value function, which follows the critic slowly."""
+    critic_opt_state: optax.OptState
     worlds: collect.Worlds
 
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
-    """Before the first update.
+    """The state before the first update.
 
     Raises:
         ValueError: no random key, or settings of another learner.
@@ -96,97 +111,103 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.sizes, config.per_agent)
-    critic = init_params(critic_key, _critic(config), jnp.zeros(env.observation_size))
+    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent)
+    critic = init_params(critic_key, _critic_network(config), jnp.zeros(env.observation_size))
     return TrainState(
-        jnp.zeros((), jnp.int32),
-        key,
-        policy,
-        _actor_descent(config).init(policy.params),
-        critic,
-        critic,
-        _critic_descent(config).init(critic),
-        collect.idle(env, config.worlds),
+        step=jnp.zeros((), jnp.int32),
+        key=key,
+        policy=policy,
+        opt_state=_policy_optimizer(config).init(policy.params),
+        critic=critic,
+        target_critic=critic,
+        critic_opt_state=_critic_optimizer(config).init(critic),
+        worlds=collect.empty_worlds(env, config.worlds),
     )
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
-    """One flight of all worlds, one step of the policy along its gradient, some of the critic towards its returns."""
+    """Simulate a trajectory of all worlds, make one step of the policy along its gradient, then fit the critic."""
     check_config(config, Config)
-    key, restart_key, fly_key, critic_key = jax.random.split(state.key, 4)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart)
-    env = with_gradient(env, config)
-
-    trust = jnp.minimum(state.step / (config.trust * config.updates), 1)
+    key, restart_key, collect_key, critic_key = jax.random.split(state.key, 4)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
+    env = with_gradient(env, config.gradient, config.surrogate)
+    between_steps = gradient_between_steps(config.gradient, config.gradient_decay)
+    weight = jnp.minimum(state.step / (config.terminal_value_warmup * config.updates), 1)
 
     def value(params, obs):
-        """In mean rewards: the sum times one minus the discount."""
-        return _critic(config).apply(params, state.policy.statistics.normalize(obs))[..., 0] / (1 - config.discount)
+        """Discounted sum of future rewards; the network's output is that sum times one minus gamma."""
+        normalized = state.policy.obs_stats.normalize(obs)
+        return _critic_network(config).apply(params, normalized)[..., 0] / (1 - config.gamma)
 
     def loss(params):
-        policy = state.policy.replace(params=params)
-        after, flight = collect.fly(
-            fly_key, env, collect.piloted(policy), worlds, config.horizon, False, linked(config)
+        act = collect.deterministic(state.policy.replace(params=params))
+        after, trajectory = collect.collect(
+            collect_key, env, act, worlds, config.horizon, reset=False, between_steps=between_steps
         )
-        ahead = trust * config.discount * value(state.target, flight.final_obs)
-        last = flight.truncated.at[-1].set(~flight.terminated[-1])
-        reward = flight.reward + jnp.where(last[..., None], ahead, 0)
-        worth = jnp.mean(jnp.sum(discounted(flight.replace(reward=reward), config.discount), axis=0))
-        return -worth / config.horizon, (after, flight)
+        terminal_value = weight * config.gamma * value(state.target_critic, trajectory.final_obs)
+        bootstrap = trajectory.truncated.at[-1].set(~trajectory.terminated[-1])
+        reward = trajectory.reward + jnp.where(bootstrap[..., None], terminal_value, 0)
+        returns = jnp.sum(discounted_rewards(trajectory.replace(reward=reward), config.gamma), axis=0)
+        return -jnp.mean(returns) / config.horizon, (after, trajectory)
 
-    (_, (worlds, flight)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
-    step, optimiser = _actor_descent(config).update(gradient, state.optimiser)
-    critic, critic_optimiser, critic_loss = _fit(critic_key, config, state, value, flight)
-    target = optax.incremental_update(critic, state.target, config.target_speed)
+    (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
+    step, opt_state = _policy_optimizer(config).update(gradient, state.opt_state)
+    critic, critic_opt_state, critic_metrics = _fit_critic(critic_key, config, state, value, trajectory)
+    target_critic = optax.incremental_update(critic, state.target_critic, config.target_update_rate)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
-        statistics=collect.remember(state.policy.statistics, vector(flight.obs), config, state.step),
+        obs_stats=collect.update_obs_stats(state.policy.obs_stats, state_vector(trajectory.obs), config, state.step),
     )
-    metrics = collect.progress(flight) | {"gradient_norm": optax.tree.norm(gradient), "critic_loss": critic_loss}
-    return TrainState(state.step + 1, key, policy, optimiser, critic, target, critic_optimiser, worlds), metrics
+    norm = optax.tree.norm(gradient)
+    metrics = {
+        "gradient_norm": norm,
+        "critic_loss": critic_metrics["loss"],
+        "nonfinite_gradients": count_nonfinite(norm) + critic_metrics["nonfinite_gradients"],
+    }
+    metrics |= collect.trajectory_metrics(trajectory)
+    state = TrainState(state.step + 1, key, policy, opt_state, critic, target_critic, critic_opt_state, worlds)
+    return state, metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
-    """All updates as one program."""
-    return scan_updates(update, env, config, init(key, env, config))
+    """Make all updates in one compiled program; see `learning.result.run_training`."""
+    check_key("key", key)
+    check_config(config, Config)
+    return run_training(init, update, key, env, config)
 
 
-def _fit(key, config: Config, state: TrainState, value, flight: collect.Flight):
-    """The critic after some steps towards the TD(lambda) returns of the flight."""
-    now, later = value(state.target, flight.obs), value(state.target, flight.final_obs)
-    team = (
-        jnp.broadcast_to(flight.terminated[..., None], now.shape),
-        jnp.broadcast_to(flight.truncated[..., None], now.shape),
-    )
-    goal = now + advantages(flight.reward, now, later, *team, config.discount, config.trace)
-    counts = jnp.broadcast_to(~flight.over[..., None], now.shape)
-    flown = jax.lax.stop_gradient((flight.obs, goal, counts.astype(goal.dtype)))
-    length = min(_STEPS, config.horizon)
+def _fit_critic(key: jax.Array, config: Config, state: TrainState, value, trajectory: collect.Trajectory):
+    """Parameters, optimizer state and metrics of the critic after some steps towards the TD(lambda) returns."""
+    now, later = value(state.target_critic, trajectory.obs), value(state.target_critic, trajectory.final_obs)
+    target = now + trajectory_advantages(trajectory, now, later, config.gamma, config.gae_lambda)
+    mask = jnp.broadcast_to(~trajectory.was_done[..., None], now.shape)
+    data = jax.lax.stop_gradient((trajectory.obs, target, mask.astype(target.dtype)))
+    length = min(_CRITIC_BATCH, config.horizon)
 
-    def loss(params, obs, goal, counts):
-        miss = (1 - config.discount) * (value(params, obs) - goal)
-        return jnp.mean(counts * miss**2)
+    def loss(params, obs, target, mask):
+        error = (1 - config.gamma) * (value(params, obs) - target)
+        return jnp.mean(mask * error**2)
 
     def step(carry, key):
-        params, optimiser = carry
+        params, opt_state = carry
         start = jax.random.randint(key, (), 0, config.horizon - length + 1)
-        batch = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, length), flown)
+        batch = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, length), data)
         cost, gradient = jax.value_and_grad(loss)(params, *batch)
-        change, optimiser = _critic_descent(config).update(gradient, optimiser)
-        return (optax.apply_updates(params, change), optimiser), cost
+        step, opt_state = _critic_optimizer(config).update(gradient, opt_state)
+        return (optax.apply_updates(params, step), opt_state), (cost, optax.tree.norm(gradient))
 
-    carry = (state.critic, state.critic_optimiser)
-    (critic, optimiser), cost = jax.lax.scan(step, carry, jax.random.split(key, config.critic_steps))
-    return critic, optimiser, jnp.mean(cost)
-
-
-def _critic(config: Config) -> MLP:
-    return MLP(config.critic_hidden_sizes, 1, scale=0.01)
+    carry = (state.critic, state.critic_opt_state)
+    (critic, opt_state), (costs, norms) = jax.lax.scan(step, carry, jax.random.split(key, config.critic_steps))
+    return critic, opt_state, {"loss": jnp.mean(costs), "nonfinite_gradients": count_nonfinite(norms)}
 
 
-def _actor_descent(config: Config) -> optax.GradientTransformation:
-    return descent(config.learning_rate, config.updates, config.clip, b2=config.b2)
+def _critic_network(config: Config) -> MLP:
+    return MLP(config.critic_hidden_sizes, 1, output_scale=0.01)
 
 
-def _critic_descent(config: Config) -> optax.GradientTransformation:
-    return descent(config.critic_rate, config.updates * config.critic_steps, config.clip)
+def _policy_optimizer(config: Config) -> optax.GradientTransformation:
+    return cosine_adam(config.learning_rate, config.updates, config.max_grad_norm, config.adam_b2)
+
+
+def _critic_optimizer(config: Config) -> optax.GradientTransformation:
+    return cosine_adam(config.critic_learning_rate, config.updates * config.critic_steps, config.max_grad_norm)

@@ -1,11 +1,11 @@
-"""Worlds spread over the devices of one host or of several.
+"""Training on several devices, of one host or of several: each device simulates its share of the worlds.
 
-A training state is the same on every device but for its `worlds`, of which each flies a share. A world's random numbers
-are its own whoever flies it, so the result is that of one device, to rounding. Devices exchange gradients and
-statistics, and nothing while they fly: a flight is a `shard_map` (`each_device`), what surrounds it is left to the
-compiler. To use it without `training.Trainer`:
+A training state is replicated on all devices but for its `worlds`, which are divided among them. A world draws the same
+random numbers on whichever device it is, so the result equals that of one device up to rounding. Devices exchange
+gradients and statistics; while trajectories are collected, which is a `shard_map` (`map_worlds`), they exchange
+nothing. To use several devices without `jaxdrones.training`:
 
-    with jax.set_mesh(sharding.devices(config.worlds)):
+    with jax.set_mesh(sharding.make_mesh(config.worlds)):
         result = jax.jit(lambda key: bptt.train(key, env, config))(key)
 
 A CPU is one device, unless JAX is told before its first use: `jax.config.update("jax_num_cpu_devices", 2)`, or
@@ -23,66 +23,67 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 _AXIS = "worlds"
 
 WORLDS = PartitionSpec(_AXIS)
-"""Of arrays (w, ...)."""
+"""Arrays (w, ...), divided by worlds."""
 STEPS = PartitionSpec(None, _AXIS)
-"""Of arrays (t, w, ...)."""
-SAME = PartitionSpec()
-"""On every device."""
+"""Arrays (t, w, ...), divided by worlds."""
+REPLICATED = PartitionSpec()
+"""Arrays of which every device has a copy."""
 
 
-def devices(worlds: int, chosen: Sequence[jax.Device] | None = None) -> Mesh:
-    """Devices, each with an equal share of the worlds.
+def make_mesh(worlds: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """A mesh of devices, each with an equal share of the worlds.
 
     Args:
-        worlds: number of them.
-        chosen: devices; all of all hosts when left out.
+        worlds: number of worlds.
+        devices: devices to use; all devices of all hosts when left out.
 
     Raises:
-        ValueError: worlds is no multiple of the number of devices.
+        ValueError: worlds is not a multiple of the number of devices.
     """
-    chosen = jax.devices() if chosen is None else chosen
-    count = len(chosen)
+    devices = jax.devices() if devices is None else devices
+    count = len(devices)
     if worlds % count:
         raise ValueError(
             f"worlds is {worlds}, to be shared by {count} devices; give a multiple of {count}, "
             "or hide devices (CUDA_VISIBLE_DEVICES=0 leaves one)"
         )
-    return jax.make_mesh((count,), (_AXIS,), axis_types=(AxisType.Auto,), devices=chosen)
+    return jax.make_mesh((count,), (_AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 
-def everywhere(mesh: Mesh) -> NamedSharding:
-    """Where arrays are that every device has all of."""
-    return NamedSharding(mesh, SAME)
+def replicated(mesh: Mesh) -> NamedSharding:
+    """The sharding of arrays of which every device has a copy."""
+    return NamedSharding(mesh, REPLICATED)
 
 
-def layout(mesh: Mesh, state: Any) -> Any:
-    """Where the arrays of a training state are to be: a tree of shardings of its structure."""
-    placed = jax.tree.map(lambda _: everywhere(mesh), state)
-    return placed.replace(worlds=jax.tree.map(lambda _: NamedSharding(mesh, WORLDS), state.worlds))
+def state_sharding(mesh: Mesh, state: Any) -> Any:
+    """The shardings of the arrays of a training state, as a tree of its structure."""
+    shardings = jax.tree.map(lambda _: replicated(mesh), state)
+    return shardings.replace(worlds=jax.tree.map(lambda _: NamedSharding(mesh, WORLDS), state.worlds))
 
 
-def placed(mesh: Mesh, state: Any) -> Any:
-    """A training state that every host has all of, spread over the devices."""
-    return jax.jit(lambda x: x, out_shardings=layout(mesh, state))(state)
+def shard_state(mesh: Mesh, state: Any) -> Any:
+    """A training state of which every host has a copy, distributed over the devices."""
+    return jax.jit(lambda x: x, out_shardings=state_sharding(mesh, state))(state)
 
 
-def each_device(function: Callable, inputs: Any, outputs: Any) -> Callable:
-    """The function, run by each device of `jax.set_mesh` on its own share; the function itself where there is one.
+def map_worlds(function: Callable, in_specs: Any, out_specs: Any) -> Callable:
+    """The function, applied by each device of `jax.set_mesh` to its own worlds; with one device the function itself.
 
-    The gradient by an argument that is the `SAME` everywhere is the sum over devices, right for a loss that is taken of
-    all worlds outside; `check_vma=False` forms it once, at the end, not in every step of a scan.
+    The gradient with respect to a `REPLICATED` argument is summed over the devices, which is right for a loss that is
+    computed outside from all worlds. With `check_vma=False` this sum is formed once, at the end, and not in every step
+    of a scan.
 
     Args:
-        function: of arrays; what it closes over must not be differentiated.
-        inputs: `WORLDS`, `STEPS` or `SAME` for each argument.
-        outputs: the same for each result.
+        function: function of arrays; the values that it closes over must not be differentiated.
+        in_specs: `WORLDS`, `STEPS` or `REPLICATED` for each argument.
+        out_specs: the same for each result.
     """
     if jax.sharding.get_abstract_mesh().shape.get(_AXIS, 1) == 1:
         return function
-    return jax.shard_map(function, in_specs=inputs, out_specs=outputs, check_vma=False)
+    return jax.shard_map(function, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
 
-def whole(mesh: Mesh, tree: Any) -> Any:
-    """A copy of all of it on one device of each host; every host has to ask."""
-    same = jax.jit(lambda x: x, out_shardings=everywhere(mesh))(tree)
-    return jax.tree.map(lambda x: x.addressable_data(0), same)
+def gather(mesh: Mesh, tree: Any) -> Any:
+    """A copy of the whole tree on one device of each host; every host has to call this."""
+    copies = jax.jit(lambda x: x, out_shardings=replicated(mesh))(tree)
+    return jax.tree.map(lambda x: x.addressable_data(0), copies)

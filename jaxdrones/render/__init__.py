@@ -1,1 +1,1 @@
-"""Pictures of flights."""
+"""Figures and films of flights."""

@@ -1,4 +1,4 @@
-"""Figures of flights, laid out like the paper's. Needs matplotlib (extra `cli`)."""
+"""Figures of flights, in the layout of the gym-pybullet-drones paper. They need matplotlib (extra `cli`)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxdrones.flights.record import Record
 
-# panel: (array of the record, column, label), in the order of the paper's figures, left and right in turn
+# panel: (array of the record, column, label); the order alternates between left and right column
 PANELS = {
     "x": ("pos", 0, "x (m)"),
     "vx": ("vel", 0, "vx (m/s)"),
@@ -31,7 +31,7 @@ POLICY_PANELS = ("x", "rpm0", "y", "rpm1", "z", "rpm2", "vz", "rpm3", "error", "
 
 
 def check_matplotlib() -> None:
-    """Raise if no figure can be drawn.
+    """Raise `ValueError` if no figure can be drawn.
 
     Raises:
         ValueError: matplotlib is not installed; says how to get it.
@@ -49,11 +49,11 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
 
     Args:
         record: the flight.
-        path: of the picture; its suffix chooses the format.
-        title: above the figure.
+        path: path of the picture; its suffix chooses the format.
+        title: title of the figure.
         panels: names of `PANELS`, or `error`; all `PANELS` when empty.
     """
-    from matplotlib.figure import Figure  # the one import of matplotlib; it takes half a second
+    from matplotlib.figure import Figure  # importing it takes half a second
 
     panels = panels or list(PANELS)
     columns = 1 if len(panels) < 4 else 2
@@ -79,12 +79,12 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
 
 
 def save_curves(histories: dict[str, list[dict[str, float]]], path: Path, title: str) -> None:
-    """Draw how training went: one line per run, over the control steps flown.
+    """Draw learning curves: one line per run, over the number of control steps.
 
     Args:
-        histories: label -> lines of progress.csv, as `learning.runs.Run.history` returns them.
-        path: of the picture.
-        title: above the figure.
+        histories: label -> rows of progress.csv, as `training.run.Run.history` returns them.
+        path: path of the picture.
+        title: title of the figure.
     """
     from matplotlib.figure import Figure
 

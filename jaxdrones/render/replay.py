@@ -1,4 +1,4 @@
-"""Recorded flights of either backend, seen from outside or from on board. Needs the extra `bullet`."""
+"""Films of recorded flights of either backend, from outside or from on board. They need the extra `bullet`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,32 +9,32 @@ from jaxdrones.engine import bullet
 from jaxdrones.flights.record import Record
 from jaxdrones.params import repeat
 from jaxdrones.render import video
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
-FPS = 24  # frames per simulated second; the paper's camera rate
+FPS = 24  # frames per simulated second; the camera rate of gym-pybullet-drones (2021)
 
 _DIRECTION = np.array([-0.6, -0.7, 0.4])  # from the middle of the flight to the camera
 _DISTANCE = 1.6  # of the camera, over the extent of the flight
-_LEAST_EXTENT = 0.6  # m
-_FAR = 1e6  # m; a drone that diverged is not followed further
+_MIN_EXTENT = 0.6  # m
+_FAR = 1e6  # m; states beyond are not shown
 
 
 def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS) -> int:
-    """Write a film of a flight from a camera that sees all of it; one frame per 1/fps of simulated time.
+    """Write a film of a flight from a camera that shows all of it; one frame per 1/fps of simulated time.
 
     Args:
         record: the flight.
-        path: .mp4 or .gif.
-        scene: what to show around the drones; a bare ground plane when left out.
+        path: path of the film, .mp4 or .gif.
+        scene: obstacles and ground; a bare ground plane when left out.
         fps: frames per second.
 
     Returns:
         The number of frames.
 
     Raises:
-        ValueError: there is nothing to film, as the flight broke at once.
+        ValueError: no state of the flight is finite.
     """
     video.check_video(path)
     if not len(_finite(record)):
@@ -42,7 +42,7 @@ def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS)
     pos = record.pos[_finite(record)]
     low, high = pos.min(axis=(0, 1)), pos.max(axis=(0, 1))
     middle = (low + high) / 2
-    eye = middle + _DIRECTION * _DISTANCE * max(_LEAST_EXTENT, float(np.linalg.norm(high - low)))
+    eye = middle + _DIRECTION * _DISTANCE * max(_MIN_EXTENT, float(np.linalg.norm(high - low)))
     with bullet.make_step(scene=scene) as step:
         params = _params(record)
         frames = (step.photo(params, state, eye, middle) for state in _states(record, fps))
@@ -50,7 +50,7 @@ def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS)
 
 
 def save_cameras(record: Record, folder: Path, scene: Scene | None = None, fps: int = FPS) -> int:
-    """Write what every drone saw as PNG, `drone 0/00000.png` and so on; returns the number of pictures."""
+    """Write the pictures of every drone's camera as `drone 0/00000.png` and so on; returns their number."""
     from matplotlib.image import imsave
 
     count = 0
@@ -75,7 +75,7 @@ def _finite(record: Record) -> np.ndarray:
 
 
 def _states(record: Record, fps: int) -> Iterator[State]:
-    """The recorded state nearest to every frame's time, one at least; of those that can be shown."""
+    """The recorded state nearest to every frame's time, out of those that can be shown; at least one."""
     rows = _finite(record)
     for time in np.arange(max(1, round(record.t[-1] * fps))) / fps:
         k = rows[np.abs(record.t[rows] - time).argmin()]

@@ -1,4 +1,4 @@
-"""Frames -> MP4 (extra `video`) or GIF."""
+"""Writes frames as MP4 (extra `video`) or GIF."""
 
 import warnings
 from collections.abc import Iterable
@@ -11,10 +11,10 @@ SUFFIXES = (".mp4", ".gif")
 
 
 def check_video(path: Path) -> None:
-    """Raise if no film can be written to `path`.
+    """Raise `ValueError` if no film can be written to `path`.
 
     Raises:
-        ValueError: a suffix that is not known, or a package that is not installed; says which extra it is in.
+        ValueError: an unknown suffix, or a package that is not installed; says which extra to install.
     """
     try:
         if path.suffix == ".mp4":
@@ -30,10 +30,10 @@ def check_video(path: Path) -> None:
 
 
 def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
-    """Write RGB frames (height, width, 3) uint8, at least one, as a film; returns how many there were.
+    """Write RGB frames (height, width, 3) uint8, at least one, as a film; returns their number.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     check_video(path)
     return (_write_mp4 if path.suffix == ".mp4" else _write_gif)(frames, path, fps)

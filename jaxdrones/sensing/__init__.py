@@ -1,1 +1,27 @@
-"""What there is to see and how it is seen."""
+"""What stands around, who touches it, and what the drones measure."""
+
+from jaxdrones.sensing.collisions import Collisions, collisions
+from jaxdrones.sensing.distances import contains, distance
+from jaxdrones.sensing.files import Mesh, Urdf
+from jaxdrones.sensing.rays import ray
+from jaxdrones.sensing.scene import Scene, gate, obstacles_2021
+from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
+
+__all__ = [
+    "Box",
+    "Capsule",
+    "Collisions",
+    "Cylinder",
+    "Mesh",
+    "Scene",
+    "Sensor",
+    "Sphere",
+    "Urdf",
+    "collisions",
+    "contains",
+    "distance",
+    "gate",
+    "obstacles_2021",
+    "ray",
+]

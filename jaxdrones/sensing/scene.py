@@ -1,182 +1,190 @@
-"""The surroundings as data: a ground plane and obstacles that do not move, for every backend and every camera."""
+"""The surroundings as data: a ground plane and obstacles that do not move, for every backend, sensor and camera."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from pathlib import Path
+from typing import Any
 
+import flax.struct
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array
+from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_finite, check_positive, check_quaternion
+from jaxdrones.checks import check_finite, check_positive, check_quaternion, check_shape, check_switch, is_known, shown
+from jaxdrones.sensing.files import File, Mesh, Urdf
+from jaxdrones.sensing.shapes import LENGTHS, Box, Capsule, Cylinder, Obstacle, Sphere, single
+from jaxdrones.vector import sin_cos
 
-Vector = tuple[float, float, float]
-Color = tuple[float, float, float, float]
+__all__ = ["Box", "Capsule", "Cylinder", "Mesh", "Scene", "Sphere", "Urdf", "gate", "obstacles_2021"]
 
-_GREY = (0.6, 0.6, 0.6, 1.0)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Obstacle:
-    """Something solid at a place."""
-
-    pos: Vector
-    """m, world."""
-    quat: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Attitude (x, y, z, w), obstacle to world."""
-    color: Color = _GREY
-    """Red, green, blue, opacity; 0 to 1."""
-
-    def __post_init__(self):
-        for name, length in ("pos", 3), ("quat", 4), ("color", 4):
-            value = getattr(self, name)
-            if np.shape(value) != (length,):
-                raise ValueError(f"{name} of {type(self).__name__} is {value!r}; give {length} numbers")
-            check_finite(f"{name} of {type(self).__name__}", value)
-        check_quaternion(f"quat of {type(self).__name__}", self.quat)
+KINDS: dict[str, type[Obstacle]] = {"boxes": Box, "spheres": Sphere, "cylinders": Cylinder, "capsules": Capsule}
+"""The fields of a scene that hold arrays."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Box(Obstacle):
-    """A cuboid about `pos`."""
+class Scene(flax.struct.PyTreeNode, kw_only=True):
+    """Obstacles, and a ground plane at z = 0 unless left out. `Scene.of` builds one.
 
-    size: Vector
-    """Edge lengths, m."""
+    Obstacles are numbered kind by kind: boxes, spheres, cylinders, capsules, meshes, URDF files; within a kind as they
+    were given.
+    """
 
-    def __post_init__(self):
-        super().__post_init__()
-        for edge in self.size:
-            check_positive("size of Box", edge, "m")
+    boxes: Box | None = None
+    """(k, ...) arrays of all k boxes; nothing where there are none."""
+    spheres: Sphere | None = None
+    """(k, ...) arrays of all k spheres; nothing where there are none."""
+    cylinders: Cylinder | None = None
+    """(k, ...) arrays of all k cylinders; nothing where there are none."""
+    capsules: Capsule | None = None
+    """(k, ...) arrays of all k capsules; nothing where there are none."""
+    meshes: tuple[Mesh, ...] = flax.struct.field(pytree_node=False, default=())
+    """What only Bullet can show."""
+    urdfs: tuple[Urdf, ...] = flax.struct.field(pytree_node=False, default=())
+    """What only Bullet can show."""
+    ground: bool = flax.struct.field(pytree_node=False, default=True)
+    """Whether there is a ground plane."""
 
+    @classmethod
+    def of(cls, *obstacles: Obstacle | File, ground: bool = True) -> Scene:
+        """A scene of obstacles of any kind.
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Sphere(Obstacle):
-    """A ball about `pos`."""
+        Args:
+            obstacles: `Box`, `Sphere`, `Cylinder`, `Capsule`, each one obstacle or many: what has leading axes is an
+                array of obstacles, and what has none is shared by all of them. Their numbers may be traced.
+                `Mesh` and `Urdf` are for Bullet alone.
+            ground: whether there is a ground plane at z = 0.
 
-    radius: float
-    """m."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_positive("radius of Sphere", self.radius, "m")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Cylinder(Obstacle):
-    """A cylinder about `pos`, its axis along its z."""
-
-    radius: float
-    """m."""
-    height: float
-    """m."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_positive("radius of Cylinder", self.radius, "m")
-        check_positive("height of Cylinder", self.height, "m")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Mesh(Obstacle):
-    """A triangle mesh from a file (.obj, .stl, .dae)."""
-
-    path: str | Path
-    scale: float = 1.0
-    """Length of the file's unit, m."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_positive("scale of Mesh", self.scale, "m")
-        _check_file(self.path)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Urdf(Obstacle):
-    """A body from a URDF, fixed at `pos`; keeps its own colours."""
-
-    path: str | Path
-
-    def __post_init__(self):
-        super().__post_init__()
-        _check_file(self.path)
-
-
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """Obstacles, and a ground plane at z = 0 unless left out."""
-
-    obstacles: tuple[Obstacle, ...] = ()
-    ground: bool = True
+        Raises:
+            ValueError: something else than an obstacle, or one of a wrong shape or size.
+        """
+        check_switch("ground", ground)
+        for obstacle in obstacles:
+            if not isinstance(obstacle, Obstacle | File):
+                known = ", ".join(kind.__name__ for kind in (*KINDS.values(), Mesh, Urdf))
+                raise ValueError(f"{shown(obstacle)} is not an obstacle; give each as an argument of its own: {known}")
+        arrays: dict[str, Any] = {}
+        for name, kind in KINDS.items():
+            rows = [_rows(obstacle) for obstacle in obstacles if isinstance(obstacle, kind)]
+            if sum(len(row.pos) for row in rows):  # an array without entries stands for nothing
+                arrays[name] = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
+        meshes = tuple(obstacle for obstacle in obstacles if isinstance(obstacle, Mesh))
+        urdfs = tuple(obstacle for obstacle in obstacles if isinstance(obstacle, Urdf))
+        return cls(**arrays, meshes=meshes, urdfs=urdfs, ground=ground)
 
     @property
     def has_obstacles(self) -> bool:
-        """Whether something stands around."""
-        return bool(self.obstacles)
+        """Whether there is anything but the ground; known before the program runs."""
+        return any(getattr(self, name) is not None for name in KINDS) or bool(self.meshes or self.urdfs)
 
-    def __post_init__(self):
-        for obstacle in self.obstacles:
-            if not isinstance(obstacle, Obstacle):
-                raise ValueError(f"{obstacle!r} is not an obstacle; give Box, Sphere, Cylinder, Mesh or Urdf")
+    @property
+    def obstacles(self) -> tuple[Any, ...]:
+        """Single obstacles, in the order of their numbers."""
+        stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
+        return (*(single(stack, i) for stack in stacks for i in range(len(stack.pos))), *self.meshes, *self.urdfs)
+
+    def shapes(self, dtype: DTypeLike) -> list[Obstacle]:
+        """The kinds that there are, in this precision; each with a leading axis over its obstacles."""
+        stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
+        return [jax.tree.map(lambda x: jnp.asarray(x, dtype), stack) for stack in stacks]
 
 
-def gate(
-    pos: Vector, yaw: float = 0.0, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05
-) -> tuple[Box, ...]:
-    """Four boxes around a square opening that is centred on `pos` and crossed along the heading `yaw` (rad); m.
+def check_scene(scene: Any, files: bool = False) -> None:
+    """Raise unless this is the scene of one world, and if it is read for its geometry, one without files.
 
-    The default size is that of the gates of lsy_drone_racing: 0.4 m inside, 0.72 m outside.
+    Args:
+        scene: what was given.
+        files: whether meshes and URDF files are understood.
     """
-    quat = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    if not isinstance(scene, Scene):
+        raise ValueError(
+            f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)"
+        )
+    for name in KINDS:
+        stack = getattr(scene, name)
+        if stack is not None:
+            check_shape(f"scene.{name}.pos", stack.pos, ("k", 3), "of one world; for many worlds use jax.vmap")
+    if not files and (scene.meshes or scene.urdfs):
+        kind = type((*scene.meshes, *scene.urdfs)[0]).__name__
+        known = ", ".join(kind.__name__ for kind in KINDS.values())
+        raise ValueError(
+            f"the scene has a {kind}, which only Bullet reads; give {known}, or ask the Bullet backend, for example "
+            "step.contacts(params, state)"
+        )
+
+
+def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Box:
+    """The four beams of a gate: a square opening in a square frame.
+
+    The default size is that of the gates of lsy_drone_racing: 0.4 m inside, 0.72 m outside. For many gates use
+    `jax.vmap`.
+
+    Args:
+        pos: (3,) center of the opening, m, world.
+        yaw: () heading in which the gate is crossed, rad.
+        opening: edge of the opening, m.
+        frame: width of the beams, m.
+        depth: of the beams along the heading, m.
+    """
+    for name, value in ("opening", opening), ("frame", frame), ("depth", depth):
+        check_positive(f"{name} of a gate", value, "m")
+    pos, yaw = jnp.asarray(pos, float), jnp.asarray(yaw, float)
+    check_shape("pos of a gate", pos, (3,), "one gate; for many use jax.vmap")
+    check_shape("yaw of a gate", yaw, (), "one gate; for many use jax.vmap")
     outer, offset = opening + 2 * frame, (opening + frame) / 2
-    color = (0.9, 0.35, 0.1, 1.0)
-
-    def beam(left: float, up: float, width: float, height: float) -> Box:
-        x, y, z = pos
-        place = (x - left * math.sin(yaw), y + left * math.cos(yaw), z + up)
-        return Box(pos=place, quat=quat, size=(depth, width, height), color=color)
-
-    return (
-        beam(0.0, offset, outer, frame),
-        beam(0.0, -offset, outer, frame),
-        beam(offset, 0.0, frame, opening),
-        beam(-offset, 0.0, frame, opening),
+    sin, cos = sin_cos(yaw)
+    half_sin, half_cos = sin_cos(yaw / 2)
+    left = jnp.array([0.0, 0.0, offset, -offset], pos.dtype)
+    up = jnp.array([offset, -offset, 0.0, 0.0], pos.dtype)
+    lying, standing = (depth, outer, frame), (depth, frame, opening)
+    return Box(
+        pos=pos[None] + jnp.stack([-sin * left, cos * left, up], axis=-1),
+        quat=jnp.tile(jnp.stack([0 * yaw, 0 * yaw, half_sin, half_cos])[None], (4, 1)),
+        size=jnp.array([lying, lying, standing, standing], pos.dtype),
+        color=jnp.tile(jnp.array([[0.9, 0.35, 0.1, 1.0]], pos.dtype), (4, 1)),
     )
 
 
-def contains(obstacle: Obstacle, point: np.ndarray) -> bool:
-    """Whether a point (3,) (m, world) is inside a box, sphere or cylinder; False for meshes and URDFs."""
-    x, y, z, w = obstacle.quat
-    offset = np.asarray(point) - obstacle.pos
-    t = 2 * np.cross(offset, [x, y, z])  # R^T offset, with the conjugate quaternion
-    local = offset + w * t + np.cross(t, [x, y, z])
-    match obstacle:
-        case Box(size=size):
-            return bool(np.all(np.abs(local) < np.asarray(size) / 2))
-        case Sphere(radius=radius):
-            return bool(local @ local < radius**2)
-        case Cylinder(radius=radius, height=height):
-            return bool(local[:2] @ local[:2] < radius**2 and abs(local[2]) < height / 2)
-    return False
+def obstacles_2021() -> Scene:
+    """Counterparts of the default obstacles of gym-pybullet-drones (2021), at their places and of their size.
 
-
-def paper_obstacles() -> Scene:
-    """Counterparts of the paper's default obstacles: at their places, of their size, made of primitives.
-
-    The walls of a courtyard around the origin, a duck at (-0.5, -0.5), a cube of 1 m at (-0.5, -2.5), a ball of 1 m
-    at (0, 2).
+    They are the walls of a courtyard around the origin, a duck at (-0.5, -0.5), a cube of 1 m at (-0.5, -2.5) and a
+    ball of 1 m at (0, 2), all made of boxes and spheres.
     """
     wall = (0.55, 0.3, 0.25, 1.0)
-    return Scene(
-        (
-            Box(pos=(6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
-            Box(pos=(-6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
-            Sphere(pos=(-0.5, -0.5, 0.05), radius=0.05, color=(1.0, 0.85, 0.0, 1.0)),
-            Box(pos=(-0.5, -2.5, 0.5), size=(1.0, 1.0, 1.0), color=(0.4, 0.6, 0.9, 1.0)),
-            Sphere(pos=(0.0, 2.0, 0.5), radius=0.5, color=(0.95, 0.95, 0.95, 1.0)),
-        )
+    return Scene.of(
+        Box(pos=(6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
+        Box(pos=(-6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
+        Sphere(pos=(-0.5, -0.5, 0.05), radius=0.05, color=(1.0, 0.85, 0.0, 1.0)),
+        Box(pos=(-0.5, -2.5, 0.5), size=(1.0, 1.0, 1.0), color=(0.4, 0.6, 0.9, 1.0)),
+        Sphere(pos=(0.0, 2.0, 0.5), radius=0.5, color=(0.95, 0.95, 0.95, 1.0)),
     )
 
 
-def _check_file(path: str | Path) -> None:
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: there is no such file; give the path of a mesh or URDF that exists")
+def _rows(obstacle: Obstacle) -> Obstacle:
+    """One obstacle or many as arrays with one leading axis, checked where they have values."""
+    kind = type(obstacle).__name__
+    arrays: dict[str, Array] = {}
+    for name, value in vars(obstacle).items():
+        arrays[name] = array = jnp.asarray(value, float)
+        length = LENGTHS.get(name)
+        if length and array.shape[-1:] != (length,):
+            raise ValueError(f"{name} of {kind} is {shown(value)}; give {length} numbers")
+        check_finite(f"{name} of {kind}", value)
+        if name not in ("pos", "quat", "color") and is_known(value) and not (np.asarray(value) > 0).all():
+            raise ValueError(f"{name} of {kind} is {shown(value)}; give positive numbers (m)")
+    check_quaternion(f"quat of {kind}", obstacle.quat)
+    arrays["quat"] = arrays["quat"] / jnp.linalg.norm(arrays["quat"], axis=-1, keepdims=True)
+    axes = {name: array.shape[: array.ndim - (name in LENGTHS)] for name, array in arrays.items()}
+    try:
+        leading = np.broadcast_shapes(*axes.values())
+    except ValueError:
+        given = ", ".join(f"{name} {arrays[name].shape}" for name in arrays)
+        raise ValueError(f"the arrays of {kind} do not fit together: {given}; give as many of each, or one") from None
+
+    def rows(name: str, array: Array) -> Array:
+        one = array.shape[array.ndim - (name in LENGTHS) :]
+        return jnp.broadcast_to(array, leading + one).reshape(math.prod(leading), *one)
+
+    return obstacle.replace(**{name: rows(name, array) for name, array in arrays.items()})

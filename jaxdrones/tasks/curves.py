@@ -1,4 +1,4 @@
-"""Curves to follow: where drone i of a team should be at time t."""
+"""Curves to follow: shapes of one period, and where drone i of a team should be at time t."""
 
 from __future__ import annotations
 
@@ -12,14 +12,62 @@ from jaxtyping import Array, Float, Int
 from jaxdrones.checks import check_finite, check_positive, check_whole
 from jaxdrones.control.setpoint import Setpoint
 
+WAYPOINTS = 8
+RANDOM_NUMBERS = 3 * WAYPOINTS + 3
+"""How many random numbers a shape is given."""
+Shape = Callable[[Float[Array, " k"], Float[Array, ""]], Float[Array, "3"]]
+"""(random numbers (27,) in [-1, 1], time in periods) -> place relative to the centre, m; repeats after every period."""
 Point = Callable[[Int[Array, ""], Float[Array, ""]], Float[Array, "3"]]
+"""(drone, time in s) -> place, m, world."""
+
+
+def setpoint_on(point: Callable[[Float[Array, ""]], Float[Array, "3"]], t: Float[Array, ""]) -> Setpoint:
+    """Position, velocity and acceleration at time t (s) of a point that moves, by differentiating its position."""
+
+    def velocity(t):
+        return jax.jvp(point, (t,), (jnp.ones_like(t),))[1]
+
+    acc = jax.jvp(velocity, (t,), (jnp.ones_like(t),))[1]
+    return Setpoint.at(point(t), vel=velocity(t), acc=acc)
+
+
+def unit_circle(u: Array, s: Array) -> Array:
+    """A level circle of 1 m radius, counter-clockwise from x = 1 m."""
+    return jnp.stack([jnp.cos(_angle(s)), jnp.sin(_angle(s)), jnp.zeros_like(s)])
+
+
+def figure_eight(u: Array, s: Array) -> Array:
+    """An upright eight, as in crazyflow's benchmark: x is the sine, z half the sine of the double angle, m."""
+    return jnp.stack([jnp.sin(_angle(s)), jnp.zeros_like(s), jnp.sin(2 * _angle(s)) / 2])
+
+
+def lissajous(u: Array, s: Array) -> Array:
+    """Sines of one, two and three periods in x, y and z: amplitudes U(0.5, 1) m, half of that in z, and any phases."""
+    amplitude, phase = 0.75 + 0.25 * u[:3], u[3:6] / 2
+    return amplitude * jnp.sin(_angle(jnp.array([1, 2, 3], s.dtype) * s + phase)) * jnp.array([1, 1, 0.5], s.dtype)
+
+
+def polynomial(u: Array, s: Array) -> Array:
+    """Eight random waypoints within 1 m, from rest to rest along polynomials of fifth degree."""
+    waypoints = jnp.reshape(u[: 3 * WAYPOINTS], (WAYPOINTS, 3)) * jnp.array([[1, 1, 0.5]], s.dtype)
+    k = jnp.floor(s * WAYPOINTS).astype(jnp.int32)
+    x = s * WAYPOINTS - k
+    here, there = waypoints[k % WAYPOINTS], waypoints[(k + 1) % WAYPOINTS]
+    return here + (there - here) * x**3 * (10 - 15 * x + 6 * x**2)
+
+
+SHAPES: dict[str, Shape] = {
+    "circle": unit_circle,
+    "figure-eight": figure_eight,
+    "lissajous": lissajous,
+    "polynomial": polynomial,
+}
 
 
 class Curve(flax.struct.PyTreeNode):
     """A place for every drone at every time."""
 
     point: Point = flax.struct.field(pytree_node=False)
-    """(drone, time in s) -> (3,) m, world."""
 
     def positions(self, n: int, t: float | Array = 0.0) -> Float[Array, "n 3"]:
         """Where the n drones of a team should be at time t (s)."""
@@ -27,51 +75,48 @@ class Curve(flax.struct.PyTreeNode):
         return jax.vmap(self.point, (0, None))(jnp.arange(n), jnp.asarray(t, float))
 
     def setpoints(self, n: int, t: float | Array = 0.0) -> Setpoint:
-        """Position, velocity and acceleration of the n drones at time t (s), by differentiating the curve."""
+        """Position, velocity and acceleration of the n drones at time t (s)."""
         check_whole("number of drones", n)
         t = jnp.asarray(t, float)
-
-        def one(i):
-            def velocity(t):
-                return jax.jvp(lambda t: self.point(i, t), (t,), (jnp.ones_like(t),))[1]
-
-            acc = jax.jvp(velocity, (t,), (jnp.ones_like(t),))[1]
-            return Setpoint.at(self.point(i, t), vel=velocity(t), acc=acc)
-
-        return jax.vmap(one)(jnp.arange(n))
+        return jax.vmap(lambda i: setpoint_on(lambda t: self.point(i, t), t))(jnp.arange(n))
 
 
 def circle(radius: float = 0.3, period: float = 10.0, height: float = 0.1, spacing: float = 0.05) -> Curve:
-    """The paper's circle about (0, -radius): drones 60 degrees apart, each `spacing` above the one before, m and s."""
+    """A circle about (0, -radius): drones 60 degrees apart, each `spacing` above the one before, m and s."""
     check_positive("period", period, "s")
     check_finite("circle", dict(radius=radius, height=height, spacing=spacing))
 
     def point(i, t):
-        angle = 2 * jnp.pi * (t / period + i / 6) + jnp.pi / 2
-        return jnp.stack([radius * jnp.cos(angle), radius * (jnp.sin(angle) - 1), height + i * spacing])
+        center = jnp.stack([0 * t, 0 * t - radius, height + i * spacing])
+        return center + radius * unit_circle(jnp.zeros(0), t / period + i / 6 + 1 / 4)
 
     return Curve(point)
 
 
-def crossing(n: int, reach: float = 0.5, period: float = 5.0, spacing: float = 0.5) -> Curve:
-    """The paper's downwash flight: drones swing in x, neighbours in height against each other, the last one lowest."""
+def crossing(n: int, amplitude: float = 0.5, period: float = 5.0, spacing: float = 0.5) -> Curve:
+    """Drones above each other oscillate along x, those of neighboring heights in opposition; the last one is lowest."""
     check_positive("period", period, "s")
-    check_finite("crossing", dict(reach=reach, spacing=spacing))
+    check_finite("crossing", dict(amplitude=amplitude, spacing=spacing))
 
     def point(i, t):
-        x = reach * jnp.cos(2 * jnp.pi * t / period + i * jnp.pi)
+        x = amplitude * jnp.cos(_angle(t / period + i / 2))
         return jnp.stack([x, jnp.zeros_like(x), (n - i) * spacing])
 
     return Curve(point)
 
 
 def hop(height: float = 0.014, amplitude: float = 0.15, period: float = 4.0, spacing: float = 1.0) -> Curve:
-    """The paper's take-off: a step to `height + amplitude`, from where z swings; drones `spacing` (m) apart in x."""
+    """A step to `height + amplitude`, about which z then oscillates; drones `spacing` (m) apart in x."""
     check_positive("period", period, "s")
     check_finite("hop", dict(height=height, amplitude=amplitude, spacing=spacing))
 
     def point(i, t):
-        z = height + amplitude * (jnp.sin(2 * jnp.pi * t / period) + 1)
+        z = height + amplitude * (jnp.sin(_angle(t / period)) + 1)
         return jnp.stack([i * spacing, jnp.zeros_like(z), z])
 
     return Curve(point)
+
+
+def _angle(s: Array) -> Array:
+    """The angle after some periods, rad."""
+    return 2 * jnp.pi * s

@@ -1,4 +1,4 @@
-"""Race through gates: the track of lsy_drone_racing, nominal, randomised or drawn anew."""
+"""Race through gates: the track of lsy_drone_racing, nominal, randomised or drawn at random."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_keywords, check_number, check_switch, check_whole, shown
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Cylinder, Scene, gate
+from jaxdrones.sensing import Cylinder, Scene, gate
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import hovering, standing_height
-from jaxdrones.tasks.task import Part, Task, World, norm, out_of_control, square
+from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control, square
 
 # x, y, z (m) and heading (rad) in which each gate is crossed, in this order
 GATES = np.array([(0.5, 0.25, 0.7, -0.78), (1.05, 0.75, 1.2, 2.35), (-1.0, -0.25, 0.7, 3.14), (0.0, -0.75, 1.2, 0.0)])
@@ -23,33 +23,33 @@ START = np.array([-1.5, 0.75])
 OPENING, OUTER = 0.40, 0.72  # m, edges of the square hole and of the frame
 POLE_RADIUS, POLE_HEIGHT = 0.015, 1.52  # m
 LEVELS = (0, 1, 2, 3)
-_APART = 0.5  # m in y between drones at the start
-_ROOM = 3.0  # m from the middle of the track, beyond which a drone is lost
-_MOST_DRONES = 5  # as many as start within that room
+_START_SPACING = 0.5  # m in y between drones at the start
+_ARENA = 3.0  # m from the middle of the track along every axis, beyond which a drone is lost
+_MAX_DRONES = 5  # so that all start inside the arena
 
 _GATE_RANGE = np.array([0.15, 0.15, 0.1, 0.2])  # m, m, m, rad: level 2 moves gates by U(-range, range)
 _POLE_RANGE = 0.15  # m
-_IN_SIGHT = 3.0  # m, up to which poles are seen
+_SIGHT = 3.0  # m, at which the observed positions of poles are clipped
 _INERTIA_RANGE = 0.2  # share: level 1 on
 
 
 @check_keywords
-def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: bool = False) -> Task:
+def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start: bool = False) -> Task:
     """One lap through four gates.
 
-    In Bullet gates and poles stand where levels 0 and 1 have them; where they are moved, hits are seen by geometry.
+    In Bullet gates and poles are solid on levels 0 and 1; on the others hits are found by geometry alone.
 
     Args:
-        drones: number of drones, up to 5; they start 0.5 m apart in y, and do not see each other.
-        level: 0 nominal; 1 inertia randomised; 2 also gates and poles; 3 random tracks without poles.
-        duration: of an episode, s.
-        anywhere: start in the air before any of the gates, or one time in five at the start, for training; else on the
-            ground at the start.
+        drones: number of drones, at most 5; they start 0.5 m apart in y and do not observe each other.
+        level: 0 nominal; 1 random inertia; 2 gates and poles displaced too; 3 random tracks without poles.
+        duration: duration of an episode, s.
+        random_start: for training: drones start in the air in front of a random gate, one time in five on the ground
+            at the start of the track; else always there.
     """
     check_whole("number of drones of gates", drones)
-    check_number("number of drones of gates", drones, at_most=_MOST_DRONES)
+    check_number("number of drones of gates", drones, at_most=_MAX_DRONES)
     check_whole("level", level, minimum=0)
-    check_switch("anywhere", anywhere)
+    check_switch("random_start", random_start)
     if level not in LEVELS:
         raise ValueError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
 
@@ -59,10 +59,10 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
         variables = {"gates": _track(track_key, level, dtype), "poles": _poles(pole_key, level, dtype)}
         x, y = START
         pos = jnp.stack(
-            [jnp.full(n, x, dtype), y + _APART * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1
+            [jnp.full(n, x, dtype), y + _START_SPACING * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1
         )
         index = jnp.zeros(n, jnp.int32)
-        if anywhere:
+        if random_start:
             place = jax.random.randint(gate_key, (n,), -1, len(GATES))
             index = jnp.maximum(place, 0)
             ahead = variables["gates"][index]
@@ -73,25 +73,25 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
             "before": index,
             "hit": jnp.zeros(n, bool),
             "pos": pos,
-            "came_nearer": jnp.zeros(n, dtype),
+            "progress": jnp.zeros(n, dtype),
         }
         return hovering(params, pos), variables | lap | {"lap_time": jnp.zeros(n, dtype)}
 
     def target(variables, t) -> Setpoint:
         return Setpoint.at(_gate(variables)[:, :3])
 
-    def crashed(world: World):
+    def crashed(task: Task, world: World):
         fell = world.drones.pos[:, 2] < standing_height(world.params) - 0.01
         return world.variables["hit"] | fell
 
-    def finished(world: World):
+    def finished(task: Task, world: World):
         return jnp.broadcast_to(jnp.all(world.variables["index"] >= len(GATES)), (drones,))
 
-    def passed(world: World):
+    def passed(task: Task, world: World):
         return world.variables["index"] - world.variables["before"]
 
     def as_number(condition):
-        return lambda world: condition(world).astype(world.drones.pos.dtype)
+        return lambda task, world: condition(task, world).astype(world.drones.pos.dtype)
 
     return Task(
         name="gates",
@@ -101,29 +101,30 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, anywhere: boo
         start=start,
         target=target,
         rewards={
-            "progress": (10.0, lambda world: world.variables["came_nearer"]),
+            "progress": (10.0, lambda task, world: world.variables["progress"]),
             "passed": (5.0, as_number(passed)),
             "crashed": (-10.0, as_number(crashed)),
-            "omega": (-0.002, shaping.turning),
+            "omega": (-0.002, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
         },
-        ends={"finished": finished, "crashed": crashed} | out_of_control((0, 0, 1), _ROOM),
+        terminations={"finished": finished, "crashed": crashed} | out_of_control(_ARENA, center=(0, 0, 1)),
         advance=_advance,
         metrics={
-            "gates": as_number(lambda world: world.variables["index"]),
-            "lap_time": lambda world: world.variables["lap_time"],
+            "gates": as_number(lambda task, world: world.variables["index"]),
+            "lap_time": lambda task, world: world.variables["lap_time"],
         },
         success=lambda metrics, dt: metrics["gates"][-1] == len(GATES),
-        laws=() if level == 0 else (_other_inertia,),
-        senses={"gates": Part(_see_gates, 20.0), "poles": Part(_see_poles, _IN_SIGHT)},
+        randomize=() if level == 0 else (_random_inertia,),
+        observations={"gates": ObservationTerm(_observe_gates, 20.0), "poles": ObservationTerm(_observe_poles, _SIGHT)},
         scene=_scene() if level < 2 else Scene(),
+        obstacles_terminate=True,
         contact=("ground",),
         observation=("position", "gates", "poles", "rotation_matrix", "velocity", "omega", "last_action"),
     )
 
 
-def _advance(world: World) -> dict[str, Array]:
-    """Which gates are passed and what is hit, from where a drone was to where it is."""
+def _advance(task: Task, world: World) -> dict[str, Array]:
+    """Which gates are passed and what is hit on the straight line from the last position to this one."""
     variables, params, pos = world.variables, world.params, world.drones.pos
     gate = _gate(variables)
     before, after = _in_gate(gate, variables["pos"]), _in_gate(gate, pos)
@@ -139,12 +140,13 @@ def _advance(world: World) -> dict[str, Array]:
 
     index = variables["index"]
     racing = index < len(GATES)
+    target = task.target_now(world).pos  # before the gate is passed
     return variables | {
         "index": index + (racing & crosses & inside),
         "before": index,
         "hit": pole | (racing & crosses & frame),
         "pos": pos,
-        "came_nearer": racing * (norm(variables["pos"] - gate[:, :3]) - norm(pos - gate[:, :3])),
+        "progress": racing * (norm(variables["pos"] - target) - norm(pos - target)),
         "lap_time": jnp.where(racing, world.time, variables["lap_time"]),
     }
 
@@ -155,7 +157,7 @@ def _track(key: jax.Array, level: int, dtype) -> Float[Array, "4 4"]:
         return jnp.asarray(GATES, dtype)
     if level == 2:
         return jnp.asarray(GATES, dtype) + jnp.asarray(_GATE_RANGE, dtype)[None] * u
-    quarter = jnp.asarray([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype)  # one gate in each, so that they keep apart
+    quarter = jnp.asarray([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype)  # one gate in each, so that they stay apart
     place = quarter * jnp.asarray([[1.3, 0.9]], dtype) + 0.25 * u[:, :2]
     heading = jnp.arctan2(quarter[:, 0], -quarter[:, 1]) + 0.6 * u[:, 3]  # counter-clockwise, 34 degrees off
     return jnp.concatenate([place, 0.95 + 0.25 * u[:, 2:3], heading[:, None]], axis=-1)
@@ -165,16 +167,16 @@ def _poles(key: jax.Array, level: int, dtype) -> Float[Array, "4 2"]:
     poles = jnp.asarray(POLES, dtype)
     if level == 2:
         return poles + jax.random.uniform(key, POLES.shape, dtype, -_POLE_RANGE, _POLE_RANGE)
-    return poles + (100.0 if level == 3 else 0.0)  # m: out of the way
+    return poles + (100.0 if level == 3 else 0.0)  # m: outside the arena
 
 
-def _other_inertia(key: jax.Array, params: Params) -> Params:
+def _random_inertia(key: jax.Array, params: Params) -> Params:
     factor = jax.random.uniform(key, params.inertia.shape, params.inertia.dtype, 1 - _INERTIA_RANGE, 1 + _INERTIA_RANGE)
     return params.replace(inertia=params.inertia * factor)
 
 
 def _gate(variables: dict[str, Array], later: int = 0) -> Float[Array, "n 4"]:
-    """The gate that every drone is to cross next, or one `later`; the last one when there is none."""
+    """The gate that every drone is to cross next, or the one that is `later` gates ahead, at most the last one."""
     return variables["gates"][jnp.minimum(variables["index"] + later, len(GATES) - 1)]
 
 
@@ -185,25 +187,26 @@ def _normal(gate: Float[Array, "n 4"]) -> Float[Array, "n 3"]:
 
 
 def _in_gate(gate: Float[Array, "n 4"], pos: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Places in the frame of a gate: through it, to its left, up; m."""
+    """Positions in the axes of a gate: through it, to its left, up; m."""
     dx, dy, dz = (pos - gate[:, :3]).T
     cos, sin = jnp.cos(gate[:, 3]), jnp.sin(gate[:, 3])
     return jnp.stack([cos * dx + sin * dy, cos * dy - sin * dx, dz], axis=-1)
 
 
-def _see_gates(task: Task, world: World) -> Float[Array, "n 12"]:
-    """Centre relative to the drone (m) and direction of the next gate and of the one after, world axes."""
+def _observe_gates(task: Task, world: World) -> Float[Array, "n 12"]:
+    """Centre relative to the drone (m) and direction of the next gate and of the one after it, world axes."""
     ahead = [_gate(world.variables, later) for later in (0, 1)]
     return jnp.concatenate([x for gate in ahead for x in (gate[:, :3] - world.drones.pos, _normal(gate))], axis=-1)
 
 
-def _see_poles(task: Task, world: World) -> Float[Array, "n 8"]:
-    """Where all poles are from the drone, x and y in world axes, m; cut at the limit of sight."""
+def _observe_poles(task: Task, world: World) -> Float[Array, "n 8"]:
+    """Positions of all poles relative to the drone, x and y in world axes, m; clipped at 3 m."""
     away = world.variables["poles"][None] - world.drones.pos[:, None, :2]
-    return jnp.clip(away, -_IN_SIGHT, _IN_SIGHT).reshape(len(away), -1)
+    return jnp.clip(away, -_SIGHT, _SIGHT).reshape(len(away), -1)
 
 
 def _scene() -> Scene:
-    frames = [gate((x, y, z), yaw) for x, y, z, yaw in GATES.tolist()]
-    poles = [Cylinder(pos=(x, y, POLE_HEIGHT / 2), radius=POLE_RADIUS, height=POLE_HEIGHT) for x, y in POLES.tolist()]
-    return Scene((*(beam for frame in frames for beam in frame), *poles))
+    poles = np.column_stack([POLES, np.full(len(POLES), POLE_HEIGHT / 2)])
+    return Scene.of(
+        jax.vmap(gate)(GATES[:, :3], GATES[:, 3]), Cylinder(pos=poles, radius=POLE_RADIUS, height=POLE_HEIGHT)
+    )

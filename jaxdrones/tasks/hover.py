@@ -1,4 +1,4 @@
-"""Hover from anywhere, recover from a throw, land."""
+"""Hover from any start, recover from a throw, land."""
 
 from collections.abc import Mapping
 
@@ -13,12 +13,12 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import standing_height, thrown
-from jaxdrones.tasks.task import SPINNING, Task, World, out_of_control, upright
+from jaxdrones.tasks.task import MAX_SPIN, Task, World, out_of_control, upright
 
-SPACING = 3.0  # m between the goals of neighbours, further than they are thrown apart
-_ROOM = 5.0  # m from the outermost goal to where a drone is lost, at least
-_HIGHEST = 1000.0  # m; float32 resolves 0.1 mm there
-_FASTEST = 100.0  # m/s
+SPACING = 3.0  # m between neighboring goals, more than the drones are thrown apart
+_MAX_REACH = 5.0  # m; a drone is lost 3 m or more beyond it
+_MAX_HEIGHT = 1000.0  # m; float32 resolves 0.1 mm there
+_MAX_SPEED = 100.0  # m/s
 
 
 @check_keywords
@@ -31,26 +31,26 @@ def hover(
     height: float = 2.0,
     duration: float = 5.0,
 ) -> Task:
-    """Fly to the goal and stay.
+    """Fly to the goal and hover there.
 
     Args:
         drones: number of drones; their goals are 3 m apart in x.
-        reach: start within +-reach of the goal along each axis, m; up to 5, beyond which a drone may be lost.
-        speed: +-, m/s; up to 100.
-        omega: +-, rad/s; below 100, at which a drone is lost.
-        tilt: up to, degrees.
-        height: of the goal, m; up to 1,000.
-        duration: of an episode, s.
+        reach: drones start within +-reach of the goal along each axis, m; at most 5.
+        speed: the initial velocity is within +-speed along each axis, m/s; at most 100.
+        omega: the initial body rates are within +-omega about each axis, rad/s; below 100, where episodes terminate.
+        tilt: largest initial tilt, degrees.
+        height: height of the goal, m; at most 1,000.
+        duration: duration of an episode, s.
 
     Raises:
         ValueError: a number out of range.
     """
     check_whole("number of drones of hover", drones)
-    check_number("reach", reach, "m", at_least=0, at_most=_ROOM)
-    check_number("speed", speed, "m/s", at_least=0, at_most=_FASTEST)
-    check_number("omega", omega, "rad/s", at_least=0, below=SPINNING)
+    check_number("reach", reach, "m", at_least=0, at_most=_MAX_REACH)
+    check_number("speed", speed, "m/s", at_least=0, at_most=_MAX_SPEED)
+    check_number("omega", omega, "rad/s", at_least=0, below=MAX_SPIN)
     check_number("tilt", tilt, "degrees", at_least=0, at_most=180)
-    check_number("height", height, "m", above=0, at_most=_HIGHEST)
+    check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:
         goal = _goals(params, height)
@@ -63,17 +63,17 @@ def hover(
         duration=duration,
         start=start,
         target=_stay,
-        rewards=shaping.reach_and_stay(_stay),
-        ends=out_of_control((0, 0, height), _ROOM + SPACING * drones),
+        rewards=shaping.REACH_AND_STAY,
+        terminations=out_of_control(_MAX_REACH + SPACING * drones),
         success=settled,
     )
 
 
 @check_keywords
 def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Task:
-    """Upside down, thrown and tumbling: level out at once, then fly back. Reports the altitude lost."""
+    """Start upside down, thrown and tumbling: level out at once, then fly back. Reports the altitude lost."""
     check_whole("number of drones of recovery", drones)
-    check_number("height", height, "m", above=0, at_most=_HIGHEST)
+    check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         goal = _goals(params, height)
@@ -85,7 +85,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
     def target(variables, t):
         return Setpoint.at(variables["goal"])
 
-    def advance(world: World):
+    def advance(task: Task, world: World):
         lowest = jnp.minimum(world.variables["lowest"], world.drones.pos[:, 2])
         return world.variables | {"lowest": lowest}
 
@@ -96,11 +96,11 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
         duration=duration,
         start=start,
         target=target,
-        rewards=shaping.reach_and_stay(target) | {"upright": (0.1, upright)},
-        ends=out_of_control((0, 0, height), _ROOM + SPACING * drones),
+        rewards=shaping.REACH_AND_STAY | {"upright": (0.1, upright)},
+        terminations=out_of_control(_MAX_REACH + SPACING * drones),
         advance=advance,
         metrics={
-            "altitude_lost": lambda world: world.variables["start"] - world.variables["lowest"],
+            "altitude_lost": lambda task, world: world.variables["start"] - world.variables["lowest"],
             "upright": upright,
         },
         success=_recovered,
@@ -109,9 +109,9 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
 
 @check_keywords
 def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task:
-    """Land on the pad at the origin: softly, level, at rest."""
+    """Land on the pad at the origin softly, and come to rest level."""
     check_whole("number of drones of landing", drones)
-    check_number("height", height, "m", above=0, at_most=_ROOM)
+    check_number("height", height, "m", above=0, at_most=_MAX_REACH)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:
         pad = _goals(params, 0.0).at[:, 2].set(standing_height(params))
@@ -119,9 +119,9 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         reach = jnp.array([0.5, 0.5, height / 2], pad.dtype)
         return thrown(key, params, over, reach=reach, speed=0.5, omega=0.5, tilt=jnp.radians(20.0)), pad
 
-    def descent(world: World):
-        """How much faster than 0.3 m/s plus half the height per second it sinks."""
-        height = world.drones.pos[:, 2] - world.variables[:, 2]
+    def descent(task: Task, world: World):
+        """How much faster than 0.3 m/s plus half the height per second the drone sinks, m/s."""
+        height = world.drones.pos[:, 2] - task.target_now(world).pos[:, 2]
         return jnp.maximum(-world.drones.vel[:, 2] - (0.3 + 0.5 * jnp.maximum(height, 0)), 0)
 
     return Task(
@@ -131,8 +131,8 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         duration=duration,
         start=start,
         target=_stay,
-        rewards=shaping.reach_and_stay(_stay) | {"descent": (-1.0, descent)},
-        ends=out_of_control((0, 0, height), _ROOM + SPACING * drones) | {"crashed": _upside_down},
+        rewards=shaping.REACH_AND_STAY | {"descent": (-1.0, descent)},
+        terminations=out_of_control(_MAX_REACH + SPACING * drones) | {"crashed": _upside_down},
         metrics={"upright": upright},
         success=_landed,
         contact=("ground",),
@@ -142,24 +142,24 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
 def settled(
     metrics: Mapping[str, Array], dt: float, within: float = 0.05, speed: float = 0.1, last: float = 2.0
 ) -> Array:
-    """Within 5 cm of the target and slower than 0.1 m/s for the last two seconds."""
+    """Whether a drone was within 5 cm of the target and slower than 0.1 m/s for the last two seconds."""
     steps = round(last / dt)
     return jnp.all((metrics["error"][-steps:] < within) & (metrics["speed"][-steps:] < speed), axis=0)
 
 
 def _recovered(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Level to 15 degrees, slower than 0.5 m/s and within half a metre of the goal in the end."""
+    """Whether a drone was level to 15 degrees, slower than 0.5 m/s and within half a metre of the goal in the end."""
     level = metrics["upright"][-1] > jnp.cos(jnp.radians(15.0))
     return level & (metrics["speed"][-1] < 0.5) & (metrics["error"][-1] < 0.5)
 
 
 def _landed(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Within 10 cm of the pad, at rest and level in the end."""
+    """Whether a drone was within 10 cm of the pad, at rest and level in the end."""
     return (metrics["error"][-1] < 0.1) & (metrics["speed"][-1] < 0.05) & (metrics["upright"][-1] > 0.95)
 
 
-def _upside_down(world: World):
-    return (upright(world) < 0) & (world.drones.pos[:, 2] < 2 * world.params.collision_radius)
+def _upside_down(task: Task, world: World):
+    return (upright(task, world) < 0) & (world.drones.pos[:, 2] < 2 * world.params.collision_radius)
 
 
 def _goals(params: Params, height: float) -> Array:

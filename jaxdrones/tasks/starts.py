@@ -1,4 +1,4 @@
-"""How episodes start."""
+"""Initial states of episodes."""
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,8 @@ from jaxdrones import rotation
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
-CLEARANCE = 0.1  # m between the ground and the reference's drones at the start
-_GRID = 4.0  # arms between neighbours in x and in y
+CLEARANCE = 0.1  # m between the ground and the drones of gym-pybullet-drones at the start
+_GRID = 4.0  # arms between consecutive drones in x and in y
 
 
 def hovering(params: Params, pos: Float[Array, "n 3"]) -> State:
@@ -21,7 +21,7 @@ def hovering(params: Params, pos: Float[Array, "n 3"]) -> State:
 
 
 def on_diagonal(params: Params) -> Float[Array, "n 3"]:
-    """The reference's places: four arms apart in x and in y, 0.1 m above the ground."""
+    """Starting positions of gym-pybullet-drones: four arms apart in x and in y, 0.1 m above the ground."""
     i = jnp.arange(len(params.mass))
     across = _GRID * params.arm * i
     return jnp.stack([across, across, standing_height(params) + CLEARANCE], axis=-1)
@@ -42,16 +42,16 @@ def thrown(
     omega: float,
     tilt: float | Array,
 ) -> State:
-    """Anywhere near `pos`, in any motion, with the rotors at hover speed.
+    """A random state: near `pos`, in motion, with the rotors at hover speed.
 
     Args:
         key: random key.
-        params: of the team.
-        pos: (n, 3) centres, m.
-        reach: pos + U(-reach, reach) along each axis, m: a number or one per axis.
-        speed: vel U(-speed, speed) along each axis, m/s.
-        omega: U(-omega, omega) about each axis, rad/s.
-        tilt: attitude: about any axis by U(0, tilt), rad.
+        params: parameters of the team.
+        pos: (n, 3) positions about which the drones start, m.
+        reach: displacement from there, U(-reach, reach) along each axis, m: a number or one per axis.
+        speed: velocity, U(-speed, speed) along each axis, m/s.
+        omega: body rates, U(-omega, omega) about each axis, rad/s.
+        tilt: rotation about a random axis by U(0, tilt), rad.
     """
     n, dtype = len(pos), pos.dtype
     u = jax.random.uniform(key, (n, 12), dtype, -1, 1)

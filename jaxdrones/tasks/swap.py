@@ -1,4 +1,4 @@
-"""A swarm in which drones change places without touching."""
+"""A swarm in which drones exchange places without touching."""
 
 import functools
 import math
@@ -17,22 +17,22 @@ from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Task, Term, World, norm, out_of_control
 
 HEIGHT = 2.0  # m
-_APART = 0.6  # m between neighbours on the ring, at least
-_CLOSE = 0.4  # m: nearer costs
+_MIN_SPACING = 0.6  # m between neighboring places on the ring
+_CROWDED = 0.4  # m; distance of the nearest drone below which the reward falls
 
 
 @check_keywords
 def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
-    """Drones on a ring are sent to each other's places, all as many places on; crowding costs.
+    """Drones on a ring exchange places: each flies the same number of places on, and keeps clear of the others.
 
     Two drones collide when their centres are nearer than two collision radii.
 
     Args:
         drones: number of drones, at least two.
-        duration: of an episode, s.
+        duration: duration of an episode, s.
     """
     check_whole("number of drones of swap-goals", drones, 2)
-    radius = max(1.0, _APART * drones / (2 * math.pi))
+    radius = max(1.0, _MIN_SPACING * drones / (2 * math.pi))
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         start_key, order_key = jax.random.split(key)
@@ -45,28 +45,28 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
     def target(variables, t) -> Setpoint:
         return Setpoint.at(variables["goal"])
 
-    def advance(world: World) -> dict[str, Array]:
+    def advance(task: Task, world: World) -> dict[str, Array]:
         nearest = _nearest(world.drones.pos)
         touching = nearest < 2 * world.params.collision_radius
         return world.variables | {"nearest": nearest, "collisions": world.variables["collisions"] + touching}
 
-    def crowding(world: World) -> Float[Array, " n"]:
-        """Square of how far the nearest neighbour is inside 0.4 m, as a share."""
-        return jnp.maximum(1 - world.variables["nearest"] / _CLOSE, 0) ** 2
+    def crowding(task: Task, world: World) -> Float[Array, " n"]:
+        """Squared penetration of the 0.4 m around a drone by its nearest neighbor, as a share of 0.4 m."""
+        return jnp.maximum(1 - world.variables["nearest"] / _CROWDED, 0) ** 2
 
     return Task(
         name="swap-goals",
-        summary="a swarm changes places without touching",
+        summary="a swarm exchanges places without touching",
         drones=drones,
         duration=duration,
         start=start,
         target=target,
-        rewards=shaping.reach_and_stay(target) | {"crowding": (-5.0, crowding)},
-        ends=out_of_control((0, 0, HEIGHT), radius + 4.0),
+        rewards=shaping.REACH_AND_STAY | {"crowding": (-5.0, crowding)},
+        terminations=out_of_control(2 * radius + 4.0),
         advance=advance,
         metrics={name: _variable(name) for name in ("collisions", "nearest")},
         success=_arrived_untouched,
-        observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "neighbours"),
+        observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "neighbors"),
     )
 
 
@@ -77,7 +77,7 @@ def _nearest(pos: Float[Array, "n 3"]) -> Float[Array, " n"]:
 
 
 def _variable(name: str) -> Term:
-    return lambda world: world.variables[name]
+    return lambda task, world: world.variables[name]
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:

@@ -1,4 +1,4 @@
-"""What a task is: what to start from, where to be, what is rewarded, when it ends."""
+"""A task: how an episode starts, where drones should be, what is rewarded, and when the episode ends."""
 
 from __future__ import annotations
 
@@ -12,36 +12,43 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole
+from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole, takes_scene
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
 
 
 class World(flax.struct.PyTreeNode):
-    """All there is between two control steps of an episode. Arrays of the team have a leading drone axis."""
+    """The complete state of an episode between two control steps. Arrays of the team have a leading drone axis."""
 
     params: Params
-    """Of the team, as drawn for this episode; action types and policies do not see it."""
+    """Parameters of the team, as drawn for this episode; action types and policies do not see them."""
     drones: State
+    """State of the team."""
     variables: Any
-    """The task's own: goals, the next gate, a random curve."""
+    """The task's own variables: goals, the next gate, a random curve."""
     memory: Any
-    """Of the action type's controller."""
+    """Memory of the action type's controller."""
     actions: Array
     """(n, h, a) the last h actions, the newest last; zeros before the first."""
     step: Array
-    """() control steps since the start."""
+    """() number of control steps since the start."""
     dt: float = flax.struct.field(pytree_node=False)
     """Control period, s."""
+    scene: Scene = flax.struct.field(default_factory=Scene)
+    """Obstacles and ground of this episode."""
+    sensors: dict[str, Any] = flax.struct.field(default_factory=dict)
+    """Memories of the sensors, by name."""
+    readings: dict[str, Any] = flax.struct.field(default_factory=dict)
+    """The latest readings of the sensors by name: arrays, or pytrees of arrays."""
     images: Any = None
-    """What the cameras saw last, if there are any."""
+    """The latest pictures of the cameras, if there are any."""
 
     @property
     def time(self) -> Array:
-        """() s since the start."""
+        """() time since the start, s."""
         return self.step * jnp.asarray(self.dt, self.drones.pos.dtype)
 
     @property
@@ -50,93 +57,108 @@ class World(flax.struct.PyTreeNode):
         return self.actions[:, -1]
 
 
-SPINNING = 100.0  # rad/s; a drone that turns faster is lost
+MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 CONTACTS = ("ground", "drones")
-
-Term = Callable[[World], Float[Array, " n"]]
-Condition = Callable[[World], Bool[Array, " n"]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Part:
-    """One part of an observation."""
+class ObservationTerm:
+    """One term of an observation."""
 
     observe: Callable[[Task, World], Float[Array, "n d"]]
-    """Of the world as the sensors show it."""
+    """(task, world with the state as the sensors show it) -> the numbers of every drone."""
     bound: float | tuple[float, ...]
-    """Largest magnitude, of all entries or of each; what is beyond is cut off."""
+    """Largest magnitude, of all entries or of each; what is beyond is clipped."""
     history: int = 2
-    """Past actions that must be kept for it."""
+    """Number of past actions that the term needs."""
 
     def __post_init__(self):
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
-            check_number("bound of an observation", bound, above=0)
+            check_number("bound of an observation", bound, above=0, infinite=True)
         check_whole("history of an observation", self.history)
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What to start from, where to be, what is rewarded, when it ends; all functions of one world.
+    """How an episode starts, where drones should be, what is rewarded, and when it ends; all functions of one world.
 
-    An episode is the whole team's: it ends when an end is true for one drone.
+    Rewards, conditions and metrics are functions `(task, world)`. The task is the one that the environment flies, so
+    `task.target_now(world)` is its target, also where `dataclasses.replace` has given it another one.
+
+    An episode is the whole team's: it ends when a condition is true for one drone.
     """
 
     name: str
     summary: str
     drones: int
     duration: float
-    """s, after which an episode is truncated."""
-    start: Callable[[jax.Array, Params], tuple[State, Any]]
-    """(key, params) -> the team at the start, and the task's variables."""
+    """Time after which an episode is truncated, s."""
+    start: Callable[..., tuple[State, Any]]
+    """(key, params) or (key, params, scene) -> the team at the start, and the task's variables."""
     target: Callable[[Any, Array], Setpoint]
-    """(variables, time in s) -> where every drone should be, also later than now."""
+    """(variables, time in s) -> where every drone should be; the time may be later than now."""
     rewards: Mapping[str, tuple[float, Term]]
-    """name -> (scale, term); the reward is the sum of scale times term."""
-    ends: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
-    """Name -> condition that terminates: what follows has no value."""
-    limits: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
-    """Name -> condition that truncates: the episode is cut, though it could go on."""
-    advance: Callable[[World], Any] = lambda world: world.variables
-    """The task's variables after a step, from the world with the variables before it."""
+    """Name -> (scale, term); the reward is the sum of scale times term."""
+    terminations: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
+    """Name -> condition that terminates the episode: the states that follow have no value."""
+    truncations: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
+    """Name -> condition that truncates the episode, though it could go on."""
+    advance: Callable[[Task, World], Any] = lambda task, world: world.variables
+    """(task, world after a step with the variables before it) -> the task's variables after the step."""
     metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)
-    """What is reported but not rewarded, beside the `error` (m) and `speed` (m/s) of every task."""
+    """Quantities that are reported but not rewarded, beside the `error` (m) and `speed` (m/s) of every task."""
     success: Callable[[Mapping[str, Array], float], Array] | None = None
     """(metrics over an episode (T, n), control period) -> (n,): whether a drone did what it should."""
-    senses: Mapping[str, Part] = dataclasses.field(default_factory=dict)
-    """Parts of an observation that only this task has."""
-    laws: tuple[Callable[[jax.Array, Params], Params], ...] = ()
-    """(key, params) of one drone -> its parameters in an episode: what varies as part of the task."""
+    observations: Mapping[str, ObservationTerm] = dataclasses.field(default_factory=dict)
+    """Observation terms that only this task has, by name."""
+    randomize: tuple[Callable[[jax.Array, Params], Params], ...] = ()
+    """Randomizations that belong to the task: (key, params) of one drone -> its parameters in an episode."""
     control_hz: float = 100.0
     """Control steps per second, unless the environment says otherwise."""
     substeps: int = 5
     """Physics steps per control step, unless the environment says otherwise."""
-    scene: Scene = dataclasses.field(default_factory=Scene)
+    scene: Scene | Callable[[jax.Array], Scene] = dataclasses.field(default_factory=Scene)
+    """Obstacles and ground; or a function `(key) -> Scene` that draws them for every episode."""
+    obstacles_terminate: bool = False
+    """Whether the task's terminations find hits of its scene's obstacles, so that no force needs to do it."""
     contact: tuple[str, ...] = ()
     """What drones touch on purpose, `ground` or `drones`: adds those forces to the explicit backend."""
     action: str = "rpm"
+    """Name of the default action type."""
     observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
-    overtime: int = 0
-    """Control steps an episode goes on after `duration`; 2 in the reference, which looks at the clock late."""
+    """Names of the default observation terms."""
+    extra_steps: int = 0
+    """Control steps that an episode goes on after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
 
     def __post_init__(self):
         check_whole(f"number of drones of {self.name}", self.drones)
         check_positive("duration", self.duration, "s")
         check_positive("control_hz", self.control_hz, "1/s")
         check_whole("substeps", self.substeps)
-        check_whole("overtime", self.overtime, minimum=0)
+        check_whole("extra_steps", self.extra_steps, minimum=0)
         for name, (scale, _) in self.rewards.items():
             check_number(f"scale of the reward {name!r}", scale)
         for contact in check_sequence("contact", self.contact, "'ground'"):
             check_choice("contact", contact, CONTACTS)
 
+    def begin(self, key: jax.Array, params: Params, scene: Scene) -> tuple[State, Any]:
+        """The team at the start of an episode in a scene, and the task's variables."""
+        return self.start(key, params, scene) if takes_scene(self.start) else self.start(key, params)
+
     def measure(self, world: World) -> dict[str, Float[Array, " n"]]:
-        """All metrics by name; one's own go before the standard ones."""
+        """All metrics by name; the task's own metrics replace standard ones of the same name."""
         standard = {"error": distance(self, world), "speed": norm(world.drones.vel)}
-        return standard | {name: metric(world) for name, metric in self.metrics.items()}
+        return standard | {name: metric(self, world) for name, metric in self.metrics.items()}
 
     def target_now(self, world: World) -> Setpoint:
         """Where every drone should be at this moment."""
         return self.target(world.variables, world.time)
+
+
+Term = Callable[[Task, World], Float[Array, " n"]]
+"""A number for every drone: a reward or a metric."""
+Condition = Callable[[Task, World], Bool[Array, " n"]]
+"""Whether something is the case, for every drone."""
 
 
 def norm(v: Float[Array, "n 3"]) -> Float[Array, " n"]:
@@ -154,26 +176,29 @@ def distance(task: Task, world: World) -> Float[Array, " n"]:
     return norm(world.drones.pos - task.target_now(world).pos)
 
 
-def upright(world: World) -> Float[Array, " n"]:
-    """Cosine of the tilt: 1 level, 0 on edge, -1 upside down."""
+def upright(task: Task, world: World) -> Float[Array, " n"]:
+    """Cosine of the tilt: 1 is level, 0 on edge, -1 upside down."""
     return jax.vmap(rotation.z_axis)(world.drones.quat)[:, 2]
 
 
-def out_of_control(center: tuple[float, float, float], reach: float) -> dict[str, Condition]:
-    """The ends of a flight that cannot be saved, or is not a number any more.
+def out_of_control(reach: float, center: tuple[float, float, float] | None = None) -> dict[str, Condition]:
+    """Conditions of a flight that cannot be recovered or whose state is not finite.
 
-    `lost` is further than `reach` (m) from `center` along some axis, `spinning` faster than 100 rad/s about some axis.
+    `lost`: a drone is further than `reach` (m) from `center` (m, world) along some axis; from its target when `center`
+    is left out. `spinning`: it turns faster than 100 rad/s about some axis.
     """
 
-    def lost(world: World) -> Bool[Array, " n"]:
-        return _beyond(world.drones.pos - jnp.asarray(center, world.drones.pos.dtype)[None], reach)
+    def lost(task: Task, world: World) -> Bool[Array, " n"]:
+        pos = world.drones.pos
+        middle = task.target_now(world).pos if center is None else jnp.asarray(center, pos.dtype)[None]
+        return _beyond(pos - middle, reach)
 
-    def spinning(world: World) -> Bool[Array, " n"]:
-        return _beyond(world.drones.omega, SPINNING)
+    def spinning(task: Task, world: World) -> Bool[Array, " n"]:
+        return _beyond(world.drones.omega, MAX_SPIN)
 
     return {"lost": lost, "spinning": spinning}
 
 
 def _beyond(v: Float[Array, "n 3"], limit: float) -> Bool[Array, " n"]:
-    x, y, z = (jnp.abs(column) < limit for column in v.T)  # false where it is not a number
+    x, y, z = (jnp.abs(column) < limit for column in v.T)  # false for NaN
     return ~(x & y & z)

@@ -1,1 +1,1 @@
-"""What the command line does with learners: presets, runs, the training loop, and Stable-Baselines3."""
+"""Training at the command line: presets, recipes, runs on disk, the training loop, and Stable-Baselines3."""

@@ -1,4 +1,4 @@
-"""One episode as it was flown, on either backend."""
+"""Flying one episode with a policy, on either backend, and its log."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ from jaxdrones.envs import Env
 from jaxdrones.flights.record import Record
 from jaxdrones.state import State
 
+_LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
 
-class Episode(flax.struct.PyTreeNode):
-    """K control steps of n drones, to the end of the episode."""
+
+class EpisodeLog(flax.struct.PyTreeNode):
+    """K control steps of n drones, up to the end of the episode."""
 
     t: np.ndarray
-    """(K,) s."""
+    """(K,) time, s."""
     drones: State
-    """(K, n, ...) after every control step."""
+    """(K, n, ...) states after every control step."""
     target: np.ndarray
-    """(K, n, 3) where they should be, m."""
+    """(K, n, 3) target positions, m."""
     reward: np.ndarray
     """(K, n)"""
     metrics: dict[str, np.ndarray]
-    """(K, n) of each of the task's metrics."""
-    ends: tuple[str, ...]
-    """What ended it, of the task's ends and limits; nothing when time was up."""
+    """(K, n) for each of the task's metrics."""
+    ended_by: tuple[str, ...]
+    """Names of the terminations and truncations that ended the episode; none if its time was up."""
     success: bool | None
-    """Whether all drones did what they should; `None` where the task does not say what that is."""
+    """Whether all drones met the task's criterion of success; `None` if the task has none."""
 
 
 @dataclasses.dataclass(frozen=True)
-class PolicyFlight:
-    """What a policy flew, and under which conditions; the conditions of a record."""
+class EpisodeConditions:
+    """The conditions under which a policy flew an episode, for a `Record`."""
 
     run: str
     task: str
@@ -48,12 +50,12 @@ class PolicyFlight:
     backend: str
     seed: int
     vehicle: str
-    """A bundled vehicle or the path of a URDF."""
+    """Name of a bundled vehicle, or path of a URDF."""
     options: dict[str, Any]
-    """Of `jaxdrones.make`."""
+    """Options of `jaxdrones.make`."""
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The conditions for JSON."""
         return dataclasses.asdict(self)
 
     def __str__(self) -> str:
@@ -65,30 +67,30 @@ class PolicyFlight:
         )
 
 
-def record_of(episode: Episode, flight: PolicyFlight) -> Record:
-    """The log of an episode, as other flights have it."""
-    drones = jax.tree.map(np.asarray, episode.drones)
+def to_record(log: EpisodeLog, conditions: EpisodeConditions) -> Record:
+    """The log of an episode in the form that demonstration flights have too."""
+    drones = jax.tree.map(np.asarray, log.drones)
     return Record(
-        **vars(drones),
-        t=episode.t,
+        **{name: getattr(drones, name) for name in _LOGGED},
+        t=log.t,
         rpy=np.asarray(jax.vmap(jax.vmap(rotation.to_rpy))(jnp.asarray(drones.quat))),
-        target_pos=episode.target,
-        target_vel=np.full_like(episode.target, np.nan),
+        target_pos=log.target,
+        target_vel=np.full_like(log.target, np.nan),
         labels=tuple(f"drone {i}" for i in range(drones.pos.shape[1])),
-        conditions=flight,
+        conditions=conditions,
     )
 
 
 def fly_episode(
-    env: Env, policy: Callable, key: jax.Array, tell: Callable[[float], Any] = lambda share: None
-) -> Episode:
-    """Fly one episode.
+    env: Env, policy: Callable, key: jax.Array, on_progress: Callable[[float], Any] = lambda fraction: None
+) -> EpisodeLog:
+    """Fly one episode with a policy.
 
     Args:
         env: environment of either backend.
         policy: observations (n, d), or a dictionary with images, -> actions (n, a).
-        key: of start and noise.
-        tell: is told now and then which share of the longest episode is flown; with Bullet.
+        key: random key of the start and of the noise.
+        on_progress: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)
@@ -97,40 +99,46 @@ def fly_episode(
     def step(carry, key):
         obs, world = carry
         obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
-        seen = (world.drones, env.task.target_now(world).pos, reward, info["metrics"], info["ends"])
-        return (obs, world), (seen, terminated | truncated)
+        row = (
+            world.drones,
+            env.task.target_now(world).pos,
+            reward,
+            info["metrics"],
+            info["terminations"] | info["truncations"],
+        )
+        return (obs, world), (row, terminated | truncated)
 
     if isinstance(env.physics, HostStep):
-        decide, rows = policy, []
-        policy = jax.jit(lambda obs: decide(obs))
+        act, rows = policy, []
+        policy = jax.jit(lambda obs: act(obs))
         for k in range(env.steps):
-            (obs, world), (seen, over) = step((obs, world), keys[k])
-            rows.append(jax.device_get(seen))
-            tell((k + 1) / env.steps)
-            if over:
+            (obs, world), (row, done) = step((obs, world), keys[k])
+            rows.append(jax.device_get(row))
+            on_progress((k + 1) / env.steps)
+            if done:
                 break
-        flown = jax.tree.map(lambda *x: np.stack(x), *rows)
+        log = jax.tree.map(lambda *x: np.stack(x), *rows)
     else:
-        _, (flown, over) = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys))(obs, world)
-        length = int(np.argmax(over)) + 1 if np.any(over) else env.steps
-        flown = jax.tree.map(lambda x: np.asarray(x)[:length], flown)
-    drones, target, reward, metrics, ends = flown
+        _, (log, done) = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys))(obs, world)
+        length = int(np.argmax(done)) + 1 if np.any(done) else env.steps
+        log = jax.tree.map(lambda x: np.asarray(x)[:length], log)
+    drones, target, reward, metrics, ends = log
     length = len(reward)
-    return Episode(
+    return EpisodeLog(
         t=env.dt * np.arange(1, length + 1),
         drones=drones,
         target=target,
         reward=reward,
         metrics=metrics,
-        ends=tuple(name for name, ended in ends.items() if ended[-1]),
+        ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
         success=_success(env, drones, metrics),
     )
 
 
 def _success(env: Env, drones: State, metrics: dict[str, np.ndarray]) -> bool | None:
-    """As `evaluate` judges: metrics stay what they were when the episode ended."""
+    """The criterion of `evaluate`, for which metrics keep their values after the end of the episode."""
     if env.task.success is None:
         return None
     missing = env.steps - len(drones.pos)
-    whole = {name: jnp.asarray(np.pad(x, ((0, missing), (0, 0)), mode="edge")) for name, x in metrics.items()}
-    return bool(jnp.all(env.task.success(whole, env.dt)) and np.isfinite(drones.pos).all())
+    padded = {name: jnp.asarray(np.pad(x, ((0, missing), (0, 0)), mode="edge")) for name, x in metrics.items()}
+    return bool(jnp.all(env.task.success(padded, env.dt)) and np.isfinite(drones.pos).all())

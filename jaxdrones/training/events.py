@@ -1,6 +1,6 @@
-"""Scalars as event files that TensorBoard reads, written without TensorBoard.
+"""Event files for TensorBoard, written without TensorBoard.
 
-An event file is a sequence of records: length, its checksum, an `Event` protocol buffer, its checksum.
+An event file is a sequence of records. Each is a length with its checksum, and an `Event` protocol buffer with its own.
 Format: tensorflow/core/lib/io/record_writer.h and tensorflow/core/util/event.proto.
 """
 
@@ -12,29 +12,30 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-_LARGEST = 3.4e38  # of a float32
+_MAX_FLOAT32 = 3.4e38
 PREFIX = "events.out.tfevents"
+"""Start of the name of an event file, by which TensorBoard finds it."""
 
 
 class EventFile:
-    """One event file in a folder; `tensorboard --logdir` finds it by its name."""
+    """An event file in a folder."""
 
     def __init__(self, folder: Path):
-        """Start a new file beside those that are there."""
+        """Start a new file; older ones remain."""
         self._file = (folder / f"{PREFIX}.{time.time_ns() // 1000:020d}.jaxdrones").open("wb")
         self._record(_event(0) + _bytes(3, b"brain.Event:2"))
 
     def add(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Write numbers by name."""
+        """Write the scalars of one step."""
         values = (_bytes(1, _bytes(1, name.encode()) + b"\x15" + _float(x)) for name, x in scalars.items())
         self._record(_event(step) + _bytes(5, b"".join(values)))
 
     def flush(self) -> None:
-        """Let readers see what was added."""
+        """Make everything that was added visible to readers."""
         self._file.flush()
 
     def close(self) -> None:
-        """Finish the file."""
+        """Close the file."""
         self._file.close()
 
     def _record(self, event: bytes) -> None:
@@ -43,7 +44,7 @@ class EventFile:
 
 
 def _event(step: int) -> bytes:
-    """The fields wall_time and step."""
+    """The fields `wall_time` and `step` of an event."""
     return b"\x09" + struct.pack("<d", time.time()) + b"\x10" + _varint(step)
 
 
@@ -52,7 +53,7 @@ def _bytes(field: int, content: bytes) -> bytes:
 
 
 def _float(x: float) -> bytes:
-    return struct.pack("<f", math.copysign(math.inf, x) if abs(x) > _LARGEST else x)
+    return struct.pack("<f", math.copysign(math.inf, x) if abs(x) > _MAX_FLOAT32 else x)
 
 
 def _varint(x: int) -> bytes:
@@ -76,7 +77,7 @@ _TABLE = _crc_table()
 
 
 def _checksum(content: bytes) -> bytes:
-    """CRC-32C, rotated and shifted, as records have it."""
+    """CRC-32C, masked as records require."""
     crc = 0xFFFFFFFF
     for byte in content:
         crc = _TABLE[(crc ^ byte) & 0xFF] ^ crc >> 8

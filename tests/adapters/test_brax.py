@@ -41,8 +41,8 @@ def two_ends():
     return make(
         dataclasses.replace(
             plain,
-            ends={"high": lambda world: world.drones.pos[:, 2] > 2.2},
-            limits={"low": lambda world: world.drones.pos[:, 2] < 1.8},
+            terminations={"high": lambda task, world: world.drones.pos[:, 2] > 2.2},
+            truncations={"low": lambda task, world: world.drones.pos[:, 2] < 1.8},
         )
     )
 
@@ -104,7 +104,7 @@ def test_arguments_that_the_environment_takes_instead_are_refused(env_of):
     env = brax.wrap(env_of("hover"))
     with pytest.raises(ValueError, match="action_repeat is 2"):
         brax.wrap_for_training(env, episode_length=5, action_repeat=2)
-    with pytest.raises(ValueError, match="make the environment with laws"):
+    with pytest.raises(ValueError, match="make the environment with randomize"):
         brax.wrap_for_training(env, episode_length=5, randomization_fn=lambda sys: sys)
 
 

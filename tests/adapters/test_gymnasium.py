@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from helpers import mostly_slow
 
-from jaxdrones.adapters.gymnasium import Env, VectorEnv, ids
+from jaxdrones.adapters.gymnasium import GymnasiumEnv, VectorEnv, ids
 from jaxdrones.envs import TASKS
 
 pytestmark = pytest.mark.float32
@@ -20,7 +20,7 @@ def short(env_of):
 
 
 def test_every_task_has_an_id_whose_entry_points_are_only_names():
-    assert ids()["hover-2021"] == "jaxdrones/PaperHover-v0" and ids().keys() == TASKS.keys()
+    assert ids()["hover-2021"] == "jaxdrones/Hover2021-v0" and ids().keys() == TASKS.keys()
     for name in ids().values():
         spec = gymnasium.spec(name)
         assert isinstance(spec.entry_point, str) and isinstance(spec.vector_entry_point, str)
@@ -28,7 +28,7 @@ def test_every_task_has_an_id_whose_entry_points_are_only_names():
 
 @pytest.mark.parametrize("task", mostly_slow(TASKS, ("hover", "swap-goals", "tune", "hover-2x")))
 def test_gymnasium_finds_nothing_to_complain_about(task, env_of):
-    env = Env(env_of(task))
+    env = GymnasiumEnv(env_of(task))
     env.spec = gymnasium.spec(ids()[task])  # without one it does not look at determinism
     check_env(env, skip_render_check=True, skip_close_check=True)
 
@@ -39,7 +39,7 @@ def test_made_by_its_id_it_passes_too_and_takes_pictures():
 
 
 def test_dict_spaces_by_drone_pass_and_show_what_the_boxes_show(env_of):
-    stacked, by_drone = (Env(env_of("leader-follower"), dict_spaces=choice) for choice in (False, True))
+    stacked, by_drone = (GymnasiumEnv(env_of("leader-follower"), dict_spaces=choice) for choice in (False, True))
     by_drone.spec = gymnasium.spec("jaxdrones/LeaderFollower-v0")
     check_env(by_drone, skip_render_check=True, skip_close_check=True)
     obs, _ = stacked.reset(seed=1)
@@ -54,7 +54,7 @@ def test_dict_spaces_by_drone_pass_and_show_what_the_boxes_show(env_of):
 
 
 def test_a_teams_reward_is_the_sum_over_drones_and_terms(env_of):
-    env = Env(env_of("leader-follower"))
+    env = GymnasiumEnv(env_of("leader-follower"))
     env.reset(seed=0)
     _, reward, *_, info = env.step(env.action_space.sample())
     assert type(reward) is float
@@ -62,14 +62,14 @@ def test_a_teams_reward_is_the_sum_over_drones_and_terms(env_of):
 
 
 def test_a_seed_fixes_the_episode_and_those_that_follow(env_of):
-    first, second = Env(short(env_of)), Env(short(env_of))
+    first, second = GymnasiumEnv(short(env_of)), GymnasiumEnv(short(env_of))
     starts = [[env.reset(seed=5)[0], env.reset()[0], env.reset()[0]] for env in (first, second)]
     np.testing.assert_array_equal(*starts)
     assert not np.array_equal(starts[0][0], starts[0][1]) and not np.array_equal(starts[0][1], starts[0][2])
 
 
 def test_an_episode_is_cut_at_its_time_limit_and_then_needs_a_reset(env_of):
-    env = Env(short(env_of))
+    env = GymnasiumEnv(short(env_of))
     with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
         env.step(np.zeros(4))
     env.reset(seed=0)
@@ -81,7 +81,7 @@ def test_an_episode_is_cut_at_its_time_limit_and_then_needs_a_reset(env_of):
 
 
 def test_mistakes_are_named(env_of):
-    env, envs = Env(short(env_of)), VectorEnv(short(env_of), 3)
+    env, envs = GymnasiumEnv(short(env_of)), VectorEnv(short(env_of), 3)
     with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
         envs.step(np.zeros((3, 4)))
     env.reset(seed=0), envs.reset(seed=0)
@@ -102,17 +102,17 @@ def test_mistakes_are_named(env_of):
     with pytest.raises(ValueError, match="num_envs is 0"):
         VectorEnv("hover", 0)
     with pytest.raises(ValueError, match="render_mode is 'human'"):
-        Env("hover", render_mode="human")
+        GymnasiumEnv("hover", render_mode="human")
     with pytest.raises(ValueError, match="given beside an environment"):
-        Env(short(env_of), backend="explicit")
-    by_drone = Env(env_of("leader-follower"), dict_spaces=True)
+        GymnasiumEnv(short(env_of), backend="explicit")
+    by_drone = GymnasiumEnv(env_of("leader-follower"), dict_spaces=True)
     by_drone.reset(seed=0)
     with pytest.raises(ValueError, match="action is for 0; give a dict with one each for 0, 1"):
         by_drone.step({"0": np.zeros(1)})
 
 
 def test_world_i_of_many_flies_as_one_that_is_reset_with_the_seed_plus_i(env_of):
-    envs, alone = VectorEnv(short(env_of), 3), Env(short(env_of))
+    envs, alone = VectorEnv(short(env_of), 3), GymnasiumEnv(short(env_of))
     obs, _ = envs.reset(seed=7)
     alone_obs, _ = alone.reset(seed=9)
     np.testing.assert_array_equal(obs[2], alone_obs)
@@ -157,6 +157,14 @@ def test_only_worlds_whose_episode_ended_are_masked(env_of):
     assert truncated.tolist() == infos["_final_obs"].tolist() == infos["_final_info"].tolist() == [False, True]
     assert infos["_metrics"].tolist() == [True, False]
     np.testing.assert_array_equal(infos["final_obs"][0], obs[0])
+
+
+def test_a_time_limit_is_that_of_the_adapter_and_not_of_the_environment_it_was_given(env_of):
+    env = short(env_of)
+    envs = VectorEnv(env, 2, max_episode_steps=2)
+    envs.reset(seed=0)
+    assert [bool(envs.step(np.zeros((2, 4)))[3].all()) for _ in range(2)] == [False, True]
+    assert env.steps == 5
 
 
 def test_wrappers_of_gymnasium_understand_the_infos(env_of):

@@ -12,7 +12,7 @@ import jaxdrones
 from jaxdrones import State, drone_contact, ground_contact, rotation, vector
 from jaxdrones.engine import bullet
 from jaxdrones.engine.physics import Physics
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 
 VEHICLES = {name: jaxdrones.load_params(name) for name in ("cf2x", "hb", "racer")}
 CRAZYFLIE = VEHICLES["cf2x"]

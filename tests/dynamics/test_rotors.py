@@ -99,3 +99,44 @@ def test_thrust_of_rotors_that_stand_still_has_a_finite_gradient():
     params = jaxdrones.load_params("cf2x")
     gradient = jax.jacobian(lambda rpm: rotor_wrench(params, level.replace(rpm=rpm)).force)(jnp.zeros(4))
     np.testing.assert_array_equal(gradient, 0)
+
+
+def spinning(rotors, integrator, rotor_spin=None, **aerodynamics):
+    """A team of one in weightless, airless space with rotors that have inertia, and its step."""
+    team = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1)
+    none = dict(gravity=jnp.zeros(1), kf=1e-30 * team.kf, km=1e-30 * team.km, rotor_inertia=jnp.full(1, 3e-8))
+    team = team.replace(**none | aerodynamics)
+    team = team if rotor_spin is None else team.replace(rotor_spin=jnp.array([rotor_spin]))
+    return team, jaxdrones.make_step(rotors=rotors, integrator=integrator, dt=1e-3, substeps=20)
+
+
+def total_angular_momentum(team, state):
+    """Of body and rotors, world, kg m^2/s."""
+    params, state = jax.tree.map(lambda x: x[0], (team, state))
+    rotors = -params.rotor_inertia * 2 * np.pi / 60 * np.sum(params.rotor_spin * state.rpm)
+    return jaxdrones.rotation.rotate(state.quat, params.inertia * state.omega + jaxdrones.vector.along_z(rotors))
+
+
+@pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
+def test_a_change_of_rotor_speed_turns_the_body_as_angular_momentum_demands(rotors):
+    """Without aerodynamic torque; the four rotors turn the same way, so that their momenta add up."""
+    team, step = spinning(rotors, jaxdrones.rk4, rotor_spin=[1.0, 1, 1, 1])
+    start = State.at_rest(np.zeros((1, 3)))
+    after = step(team, start, jnp.full((1, 4), 2e4))
+    turned = team.rotor_inertia * 2 * np.pi / 60 * 4 * after.rpm[:, 0] / team.inertia[:, 2]
+    assert after.rpm[0, 0] > 1000
+    np.testing.assert_allclose(after.omega, [[0, 0, turned[0]]], rtol=1e-9, atol=1e-30)
+    np.testing.assert_allclose(total_angular_momentum(team, after), 0, atol=1e-9 * 4 * 3e-8 * 2e3)
+
+
+def test_a_tumbling_drone_with_spinning_rotors_keeps_its_angular_momentum():
+    """Gyroscopic torque of rotors about a body that turns about all axes; rk4 is exact to 1e-9 here."""
+    team, step = spinning(lagging_rotors, jaxdrones.rk4, rotor_spin=[1.0, -1, 1, 1])
+    start = State.at_rest(np.zeros((1, 3))).replace(omega=jnp.array([[3.0, -2, 1]]), rpm=jnp.full((1, 4), 1e4))
+    after = start
+    for _ in range(5):
+        after = step(team, after, jnp.array([[2e4, 5e3, 1e4, 1.5e4]]))
+    before = total_angular_momentum(team, start)
+    np.testing.assert_allclose(total_angular_momentum(team, after), before, atol=1e-9 * float(jnp.linalg.norm(before)))
+    without = step(team.replace(rotor_inertia=jnp.zeros(1)), start, jnp.full((1, 4), 1e4))
+    assert np.abs(step(team, start, jnp.full((1, 4), 1e4)).omega - without.omega).max() > 0.01

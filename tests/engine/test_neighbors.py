@@ -8,7 +8,7 @@ from helpers import assert_close
 
 import jaxdrones as jd
 from jaxdrones.engine.physics import Physics
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 
 N, REACH = 60, 2.0
 rng = np.random.default_rng(0)

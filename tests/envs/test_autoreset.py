@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers import assert_close
 
-from jaxdrones.envs import autoreset, make
+from jaxdrones.envs import AutoReset, make
 
 env = make("hover", duration=0.05)
-auto = autoreset(env)
+auto = AutoReset(env)
 KEYS = jax.random.split(jax.random.key(0), 13)
 
 

@@ -1,5 +1,6 @@
 """The contract of environments, on every task, action type and observation, and its errors."""
 
+import copy
 import dataclasses
 from functools import lru_cache
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import assert_close, mostly_slow
 
-from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS, ContractError, check_env, make
+from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS, AutoReset, ContractError, check_env, make
 from jaxdrones.tasks.starts import standing_height
 
 KEY = jax.random.key(3)
@@ -47,7 +48,7 @@ def test_the_contract_holds_in_single_precision_and_realistic(task):
 
 def test_the_check_sees_a_broken_contract():
     env = make("hover")
-    broken = dataclasses.replace(env.task, rewards={"nan": (1.0, lambda world: world.drones.pos[:, 0] * jnp.nan)})
+    broken = dataclasses.replace(env.task, rewards={"nan": (1.0, lambda task, world: world.drones.pos[:, 0] * jnp.nan)})
     with pytest.raises(ContractError, match="reward is not finite"):
         check_env(make(broken))
 
@@ -88,14 +89,69 @@ def test_different_keys_start_differently_or_the_task_has_one_start(task):
     )
 
 
-def test_the_error_is_to_the_target_of_a_task_that_was_given_another():
-    task = TASKS["hover"]()
-    above = dataclasses.replace(task, target=lambda goal, t: task.target(goal + jnp.array([[0.0, 0.0, 1.0]]), t))
-    env = make(above)
+FAR = jnp.array([[0.0, 0.0, 50.0]])
+
+
+def with_target_far_up(task):
+    def target(variables, t):
+        setpoint = task.target(variables, t)
+        return setpoint.replace(pos=setpoint.pos + FAR)
+
+    return dataclasses.replace(task, target=target)
+
+
+@pytest.mark.parametrize(
+    "name", mostly_slow(["hover", "recovery", "landing", "tracking", "swap-goals"], ["hover", "landing"])
+)
+def test_rewards_terminations_and_the_error_follow_the_target_that_a_task_was_given(name):
+    """A team that is moved with its target by 50 m is rewarded as before, and not lost."""
+    plain, moved = make_env(name), make(with_target_far_up(TASKS[name]()))
+    _, world = plain.reset(KEY)
+    away = world.replace(drones=world.drones.replace(pos=world.drones.pos + FAR))
+    *_, expected = plain.step(KEY, world, zeros(plain))
+    *_, terminated, truncated, found = moved.step(KEY, away, zeros(moved))
+    assert not terminated and not truncated
+    assert_close(found["rewards"], expected["rewards"], 1e-9)
+    assert_close(found["metrics"]["error"], expected["metrics"]["error"], 1e-9)
+    assert moved.step(KEY, world, zeros(moved))[3], "50 m from its target a drone is lost"
+
+
+@pytest.mark.parametrize("name", sorted(set(TASKS) - {"takeoff", "meetup"}))
+def test_every_reward_that_is_about_the_target_is_about_that_of_the_task(name):
+    """That of takeoff is about the height alone, that of meetup about the partner."""
+    plain = make_env(name)
+    _, world = plain.reset(KEY)
+    world = world.replace(step=world.step + 1)
+    world = world.replace(drones=world.drones.replace(pos=world.drones.pos + 0.1))
+
+    def reward(task):
+        now = world.replace(variables=task.advance(task, world))
+        return sum(scale * term(task, now) for scale, term in task.rewards.values())
+
+    assert jnp.all(reward(plain.task)[:1] != reward(with_target_far_up(plain.task))[:1])
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy])
+def test_a_copy_is_an_environment_of_its_own(copied):
+    """What is set of it acts, also where the original was compiled before, and only on it."""
+    env = make("hover")
     _, world = env.reset(KEY)
-    _, world, *_, info = env.step(KEY, world, zeros(env))
-    expected = np.linalg.norm(world.drones.pos - world.variables - np.array([[0.0, 0.0, 1.0]]), axis=-1)
-    np.testing.assert_allclose(info["metrics"]["error"], expected, rtol=1e-12)
+    env.step(KEY, world, zeros(env))
+    other = copied(env)
+    other.steps = 1
+    other.task = dataclasses.replace(env.task, rewards={"one": (1.0, lambda task, world: jnp.ones(1))})
+    for _ in range(2):
+        *_, truncated, info = other.step(KEY, world, zeros(env))
+        assert truncated and info["rewards"].keys() == {"one"}
+        *_, truncated, info = env.step(KEY, world, zeros(env))
+        assert not truncated and "position" in info["rewards"]
+    first, second = AutoReset(env), AutoReset(other)
+    assert (
+        not first.step(KEY, first.reset(KEY)[1], zeros(env))[4]
+        and second.step(KEY, second.reset(KEY)[1], zeros(env))[4]
+    )
+    other.steps = 7
+    assert not other.step(KEY, world, zeros(env))[4]
 
 
 def test_an_episode_is_cut_after_its_duration_and_not_before():
@@ -114,7 +170,7 @@ def test_a_drone_that_is_lost_ends_the_episode_for_good():
     _, world = env.reset(KEY)
     world = world.replace(drones=world.drones.replace(pos=world.drones.pos + 100.0))
     *_, terminated, truncated, info = env.step(KEY, world, zeros(env))
-    assert terminated and not truncated and info["ends"]["lost"]
+    assert terminated and not truncated and info["terminations"]["lost"]
 
 
 def test_a_drone_that_spins_ends_the_episode_for_good():
@@ -122,7 +178,7 @@ def test_a_drone_that_spins_ends_the_episode_for_good():
     _, world = env.reset(KEY)
     world = world.replace(drones=world.drones.replace(omega=jnp.array([[0.0, 0.0, 200.0]])))
     *_, terminated, truncated, info = env.step(KEY, world, zeros(env))
-    assert terminated and not truncated and info["ends"]["spinning"]
+    assert terminated and not truncated and info["terminations"]["spinning"]
 
 
 def test_a_state_that_is_not_a_number_ends_the_episode():

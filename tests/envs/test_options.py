@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
-from jaxdrones.envs import ACTIONS, TASKS, Action, Env, autoreset, make
+from jaxdrones.envs import ACTIONS, TASKS, Action, AutoReset, Env, make
 from jaxdrones.envs.actions import one_d_thrust, position, rpm, thrust_and_rates
-from jaxdrones.envs.randomize import constant_wind, pushes, scaled, sensor_noise, shifted
+from jaxdrones.envs.randomize import constant_wind, random_pushes, scaled, sensor_noise, shifted
 from jaxdrones.learning import evaluate
 from jaxdrones.tasks.curves import circle
 from jaxdrones.tasks.hover import hover
-from jaxdrones.tasks.task import Part
+from jaxdrones.tasks.task import ObservationTerm
 
 CF2X = jd.load_params("cf2x")
 KEY = jax.random.key(0)
@@ -35,7 +35,7 @@ def test_every_option_of_every_task_is_refused_where_it_makes_no_sense(name):
     options = TASKS[name].__annotations__.keys() - {"return"}
     assert "drones" in options
     for option in options - {"reach", "speed", "omega", "tilt"}:
-        values = ("no", None, -1, np.nan) if option != "anywhere" else ("no", None, 2)
+        values = ("no", None, -1, np.nan) if option != "random_start" else ("no", None, 2)
         with_unit = "number of drones" if option == "drones" else option
         for value in values:
             with pytest.raises(ValueError, match=rf"{with_unit}.*{'unknown' if option == 'curve' else 'give'}|unknown"):
@@ -75,11 +75,11 @@ def test_numbers_of_make_are_refused_where_they_make_no_sense(option):
         (dict(effects="drag"), r"effects is 'drag'; give a sequence, for example \('drag',\)"),
         (dict(pairs="downwash"), r"pairs is 'downwash'; give a sequence"),
         (dict(vision="rgb"), r"vision is 'rgb'; give a sequence, for example \('rgb',\)"),
-        (dict(laws=scaled("mass", 0.9, 1.1)), r"laws is .*; give a sequence"),
-        (dict(laws=("mass",)), r"laws: 'mass' is not a function"),
+        (dict(randomize=scaled("mass", 0.9, 1.1)), r"randomize is .*; give a sequence"),
+        (dict(randomize=("mass",)), r"randomize: 'mass' is not a function"),
         (dict(noise=0.1), r"noise: 0.1 is not a function; give for example sensor_noise\(\)"),
-        (dict(disturb=0.1), r"disturb: 0.1 is not a function; give for example pushes\(0.3\)"),
-        (dict(observation=(3,)), r"observation: 3 is not a part"),
+        (dict(disturbance=0.1), r"disturbance: 0.1 is not a function; give for example random_pushes\(0.3\)"),
+        (dict(observation=(3,)), r"observation: 3 is not an observation term"),
         (dict(action=3), r"action is 3; give an object of Action"),
         (dict(effects=("downwash",)), r"'downwash' is given as one of effects; .* give pairs=\('downwash',\)"),
         (dict(pairs=("drag",)), r"'drag' is given as one of pairs; .* give effects=\('drag',\)"),
@@ -112,9 +112,9 @@ def test_an_unknown_option_beside_a_task_names_the_closest_of_make():
     [
         (lambda: sensor_noise(pos=-1), "pos of the noise is -1"),
         (lambda: sensor_noise(omega=np.nan), "omega of the noise is nan"),
-        (lambda: pushes(-0.1), "force of a push is -0.1"),
-        (lambda: pushes(0.1, every=0), "every is 0"),
-        (lambda: pushes(0.1, lasting=np.nan), "lasting is nan"),
+        (lambda: random_pushes(-0.1), "force of a push is -0.1"),
+        (lambda: random_pushes(0.1, interval=0), "interval is 0"),
+        (lambda: random_pushes(0.1, duration=np.nan), "duration is nan"),
         (lambda: constant_wind(-1), "speed of the wind is -1"),
         (lambda: scaled("mass", -1, 1), "lower bound of mass is -1"),
         (lambda: shifted("mass", 0, np.inf), "upper bound of mass is inf"),
@@ -125,7 +125,7 @@ def test_an_unknown_option_beside_a_task_names_the_closest_of_make():
         (lambda: thrust_and_rates((1, 2, -3)), "an entry of max_rate is -3"),
         (lambda: Action(0, ACTIONS["rpm"]().rpm), "size of an action type is 0"),
         (lambda: Action(4, "rpm"), "rpm of an action type: 'rpm' is not a function"),
-        (lambda: Part(lambda task, world: world.drones.pos, np.nan), "bound of an observation is nan"),
+        (lambda: ObservationTerm(lambda task, world: world.drones.pos, np.nan), "bound of an observation is nan"),
         (lambda: circle(radius=np.nan), r"circle\['radius'\] is not finite"),
         (
             lambda: Env("hover", CF2X, None, dt=0.01, action=None, observation=()),
@@ -146,7 +146,7 @@ def test_a_key_is_one_random_key_typed_or_raw():
     action = jnp.zeros((1, 4))
     takers = (
         env.reset,
-        autoreset(env).reset,
+        AutoReset(env).reset,
         lambda key: env.step(key, world, action),
         lambda key: evaluate(env, lambda obs: action, key, 2),
     )

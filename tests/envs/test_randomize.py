@@ -1,4 +1,4 @@
-"""Parameter laws, sensor noise, delay, wind and pushes."""
+"""Randomized parameters, sensor noise, delay, wind and pushes."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,16 @@ from helpers import assert_close
 
 import jaxdrones as jd
 from jaxdrones.envs import make
-from jaxdrones.envs.randomize import constant_wind, delayed, draw, pushes, scaled, sensor_noise, shifted
+from jaxdrones.envs.randomize import (
+    constant_wind,
+    delayed,
+    draw,
+    drawn_leaves,
+    random_pushes,
+    scaled,
+    sensor_noise,
+    shifted,
+)
 
 KEY = jax.random.key(5)
 TEAM = jd.repeat(jd.load_params("cf2x"), 200)
@@ -26,16 +35,16 @@ def test_an_array_is_scaled_by_one_factor_and_shifted_entry_by_entry():
     assert np.ptp(np.asarray(wind), axis=1).min() > 0
 
 
-def test_laws_compose_and_draw_independently():
+def test_randomizations_compose_and_draw_independently():
     both = draw([scaled("mass", 0.9, 1.1), scaled("kf", 0.9, 1.1)], KEY, TEAM)
     correlation = np.corrcoef(both.mass / TEAM.mass, both.kf / TEAM.kf)[0, 1]
     assert abs(correlation) < 0.25
     assert_close(both.replace(mass=TEAM.mass, kf=TEAM.kf), TEAM, 0)
 
 
-def test_what_a_law_draws_is_hidden_from_the_action_type():
+def test_a_drawn_parameter_is_hidden_from_the_action_type():
     """A heavier drone is not given more thrust; a nominal one hovers at zero action, whatever its mass."""
-    env = make("hover", laws=(scaled("mass", 1.5, 1.5),), tilt=0.0, speed=0.0, omega=0.0)
+    env = make("hover", randomize=(scaled("mass", 1.5, 1.5),), tilt=0.0, speed=0.0, omega=0.0)
     _, world = env.reset(KEY)
     zero = jnp.zeros((1, 4))
     assert env.step(KEY, world, zero)[1].drones.vel[0, 2] < world.drones.vel[0, 2] - 0.03
@@ -84,7 +93,7 @@ def test_a_delayed_action_reaches_the_rotors_late():
 
 
 def test_wind_blows_a_drone_with_drag_away():
-    env = make("hover", effects=("drag",), laws=(constant_wind(3.0),), tilt=0.0, speed=0.0, omega=0.0)
+    env = make("hover", effects=("drag",), randomize=(constant_wind(3.0),), tilt=0.0, speed=0.0, omega=0.0)
     _, world = env.reset(KEY)
     wind = world.params.wind[0]
     for _ in range(20):
@@ -93,11 +102,11 @@ def test_wind_blows_a_drone_with_drag_away():
 
 
 def test_pushes_come_as_often_and_last_as_long_as_asked():
-    disturb = pushes(0.5, every=1.0, lasting=0.1)
+    disturbance = random_pushes(0.5, interval=1.0, duration=0.1)
     team = TEAM
 
     def advance(team, key):
-        team = disturb(key, team, 0.01)
+        team = disturbance(key, team, 0.01)
         return team, team.external_force
 
     push = np.asarray(jax.lax.scan(advance, team, jax.random.split(KEY, 2000))[1])
@@ -124,15 +133,39 @@ def test_mistakes_are_named():
 
 
 @pytest.mark.slow
-def test_the_truth_is_the_observation_without_noise_and_how_far_parameters_are_off():
-    laws = (scaled("mass", 0.9, 1.1), constant_wind(2.0))
-    env = make("hover", laws=laws, noise=sensor_noise())
+def test_a_privileged_observation_has_no_noise_and_shows_the_drawn_parameters():
+    randomize = (scaled("mass", 0.9, 1.1), constant_wind(2.0))
+    env = make("hover", randomize=randomize, noise=sensor_noise())
     obs, world = env.reset(KEY)
-    truth = env.truth(world)
-    assert truth.secrets.shape == (1, env.privileged_size) == (1, 4)
-    np.testing.assert_allclose(truth.secrets[0, 0], world.params.mass[0] / env.params.mass[0] - 1, rtol=1e-12)
-    np.testing.assert_array_equal(truth.secrets[0, 1:], world.params.wind[0])
-    plain = make("hover", laws=laws)
-    np.testing.assert_allclose(truth.obs, plain.reset(KEY)[0], rtol=0, atol=1e-15)
-    assert np.abs(obs - truth.obs).max() > 1e-4
-    assert plain.reset(KEY)[0].shape == truth.obs.shape and make("hover").privileged_size == 0
+    known = env.privileged_observation(world)
+    assert known.params.shape == (1, env.privileged_size) == (1, 4)
+    np.testing.assert_allclose(known.params[0, 0], world.params.mass[0] / env.params.mass[0] - 1, rtol=1e-12)
+    np.testing.assert_array_equal(known.params[0, 1:], world.params.wind[0])
+    plain = make("hover", randomize=randomize)
+    np.testing.assert_allclose(known.obs, plain.reset(KEY)[0], rtol=0, atol=1e-15)
+    assert np.abs(obs - known.obs).max() > 1e-4
+    assert plain.reset(KEY)[0].shape == known.obs.shape and make("hover").privileged_size == 0
+
+
+def rarely_twice_as_heavy(key, params):
+    rare = jax.random.uniform(key) < 0.001
+    return jax.lax.cond(rare, lambda params: params.replace(mass=2 * params.mass), lambda params: params, params)
+
+
+@pytest.mark.parametrize(
+    ("randomize", "drawn"),
+    [
+        (rarely_twice_as_heavy, ["mass"]),
+        (jax.jit(rarely_twice_as_heavy), ["mass"]),
+        (scaled("inertia", 0.5, 1.5), ["inertia"]),
+        (jax.jit(constant_wind(1.0)), ["wind"]),
+        (lambda key, params: params.replace(mass=2 * params.mass), []),
+    ],
+)
+def test_drawn_parameters_are_found_however_rarely_they_differ(randomize, drawn):
+    """From the program, not from what one key happens to draw; what is the same in every episode is not drawn."""
+    leaves = jax.tree_util.tree_leaves_with_path(TEAM)
+    found = zip(leaves, drawn_leaves([randomize], TEAM), strict=True)
+    assert [jax.tree_util.keystr(path, simple=True) for (path, _), is_drawn in found if is_drawn] == drawn
+    env = make("hover", randomize=(randomize,))
+    assert env.privileged_size == sum(getattr(env.params, name).size for name in drawn)

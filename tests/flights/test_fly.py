@@ -1,24 +1,24 @@
-"""The four flights do what the paper's figures 6 to 9 show."""
+"""The four flights do what figures 6 to 9 of the gym-pybullet-drones paper show."""
 
 import numpy as np
 import pytest
 from helpers import mostly_slow
 
-from jaxdrones import flights
 from jaxdrones.flights.examples import FLIGHTS
+from jaxdrones.flights.fly import fly
 
 
 @pytest.fixture(scope="module")
 def circle():
-    return flights.fly("circle")
+    return fly("circle")
 
 
 def results(record):
-    return record.results(FLIGHTS[record.conditions.flight].settled)
+    return record.results(FLIGHTS[record.conditions.flight].settling_time)
 
 
 def test_the_circle_is_flown_with_the_known_steady_lag(circle):
-    # The reference lags by 0.093 to 0.098 m with its explicit dynamics: its target velocity is zero.
+    # gym-pybullet-drones (2021) lags by 0.093 to 0.098 m with its explicit dynamics: its target velocity is zero.
     error = np.linalg.norm(circle.pos - circle.target_pos, axis=-1)
     np.testing.assert_allclose(error[circle.t > 4].mean(0), 0.097, atol=0.003)
     np.testing.assert_allclose([row["rms_error_m"] for row in results(circle)], 0.0955, atol=0.0025)
@@ -27,7 +27,7 @@ def test_the_circle_is_flown_with_the_known_steady_lag(circle):
 
 def test_the_circle_has_smooth_rotors_at_120_hz_and_a_limit_cycle_at_48_hz(circle):
     assert max(row["rpm_std"] for row in results(circle)) < 1
-    cycling = flights.fly("circle", drones=1, control_hz=48, duration=6)
+    cycling = fly("circle", drones=1, control_hz=48, duration=6)
     assert results(cycling)[0]["rpm_std"] > 300
     assert cycling.diverged() == {}
 
@@ -40,7 +40,7 @@ def test_every_drone_of_the_circle_flies_alike(circle):
 
 @pytest.mark.slow
 def test_the_velocity_flight_reaches_its_steps_and_reverses_them():
-    record = flights.fly("velocity")
+    record = fly("velocity")
     assert record.diverged() == {}
     assert all(row["steady_error_m_s"] < 2e-3 for row in results(record))
     before, after = record.vel[np.searchsorted(record.t, 1.4)], record.vel[-1]
@@ -49,9 +49,9 @@ def test_the_velocity_flight_reaches_its_steps_and_reverses_them():
 
 
 def test_ground_effect_lifts_a_take_off_higher_and_faster():
-    # The reference: 0.1758 against 0.1650 m and 0.4365 against 0.3607 m/s. It starts with an unpowered
+    # gym-pybullet-drones (2021): 0.1758 against 0.1650 m and 0.4365 against 0.3607 m/s. It starts with an unpowered
     # control period and Bullet's damping, hence 2 mm and 2 mm/s.
-    record = flights.fly("ground-effect")
+    record = fly("ground-effect")
     rows = results(record)
     assert record.diverged() == {}
     np.testing.assert_allclose([row["highest_z_m"] for row in rows], [0.1758, 0.1650], atol=2.5e-3)
@@ -59,31 +59,31 @@ def test_ground_effect_lifts_a_take_off_higher_and_faster():
 
 
 def test_in_downwash_the_lower_drone_dips_and_the_upper_does_not():
-    record = flights.fly("downwash")
+    record = fly("downwash")
     upper, lower = results(record)
     assert record.diverged() == {}
-    assert abs(lower["lowest_z_m"] - 0.472) < 2e-3  # the reference's dip from 0.5 m
+    assert abs(lower["lowest_z_m"] - 0.472) < 2e-3  # the dip of gym-pybullet-drones (2021) from 0.5 m
     assert upper["lowest_z_m"] > 0.999
-    free = results(flights.fly("downwash", effects=[]))[1]
+    free = results(fly("downwash", effects=[]))[1]
     assert free["lowest_z_m"] > 0.499
 
 
 @pytest.mark.slow
 def test_the_jet_model_pushes_less_than_equation_6_but_visibly():
-    lower = results(flights.fly("downwash", effects=["downwash"], duration=6.0))[1]
+    lower = results(fly("downwash", effects=["downwash"], duration=6.0))[1]
     assert 0.48 < lower["lowest_z_m"] < 0.495
 
 
 @pytest.mark.parametrize("vehicle", mostly_slow(["cf2p", "hb", "racer"], ["hb"]))
 def test_every_vehicle_flies_the_circle(vehicle):
-    record = flights.fly("circle", vehicle=vehicle, drones=2, duration=6.0)
+    record = fly("circle", vehicle=vehicle, drones=2, duration=6.0)
     assert all(row["steady_error_m"] < 0.125 for row in results(record))
     assert record.diverged() == {}
 
 
 @pytest.mark.slow
 def test_the_same_seed_is_the_same_flight_and_another_seed_another():
-    first, again, other = (flights.fly("circle", drones=1, duration=0.5, seed=seed).pos for seed in (1, 1, 2))
+    first, again, other = (fly("circle", drones=1, duration=0.5, seed=seed).pos for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
 
@@ -91,7 +91,7 @@ def test_the_same_seed_is_the_same_flight_and_another_seed_another():
 @pytest.mark.slow
 def test_progress_goes_from_nothing_to_all():
     told = []
-    flights.fly("circle", drones=1, duration=1.0, progress=told.append)
+    fly("circle", drones=1, duration=1.0, progress=told.append)
     assert sorted(told)[-1] == 1.0 and len(told) > 50
 
 
@@ -115,4 +115,4 @@ def test_progress_goes_from_nothing_to_all():
 )
 def test_a_wrong_option_is_refused_with_what_to_do(options, message):
     with pytest.raises(ValueError, match=message):
-        flights.fly(**options)
+        fly(**options)

@@ -45,10 +45,10 @@ def test_a_steady_error_is_no_divergence(commanded):
 @pytest.mark.parametrize(
     ("commanded", "name", "value", "message"),
     [
-        ("position", "pos", [359, 0, 1], "drone 1 is 359 m off what was commanded"),
-        ("position", "pos", [1.2, 0, 1], "drone 1 is 1.2 m off what was commanded"),
-        ("position", "pos", [0, 0, -3e38], "drone 1 is 3e+38 m off what was commanded"),
-        ("velocity", "vel", [0, 0, -30], "drone 1 is 30 m/s off what was commanded"),
+        ("position", "pos", [359, 0, 1], "drone 1 is 359 m off its command"),
+        ("position", "pos", [1.2, 0, 1], "drone 1 is 1.2 m off its command"),
+        ("position", "pos", [0, 0, -3e38], "drone 1 is 3e+38 m off its command"),
+        ("velocity", "vel", [0, 0, -30], "drone 1 is 30 m/s off its command"),
         ("position", "quat", [1, 0, 0, 0], "drone 1 is upside down"),
         ("velocity", "quat", [0, 0.8, 0, 0.6], "drone 1 is upside down"),
         ("position", "pos", [np.nan, 0, 1], "the state of drone 1 is not finite from t = 0.910 s on"),
@@ -80,5 +80,5 @@ def test_a_state_that_is_not_finite_for_a_moment_is_named():
 def test_pwm_is_of_a_crazyflie():
     record = dataclasses.replace(hovering(), conditions=Conditions("circle", vehicle="racer"))
     assert "pwm" in hovering().arrays(pwm=True)
-    with pytest.raises(ValueError, match="PWM is asked for of 'racer'; it is known of cf2x and cf2p only"):
+    with pytest.raises(ValueError, match="PWM is asked for with 'racer'; it is known for cf2x and cf2p only"):
         record.arrays(pwm=True)

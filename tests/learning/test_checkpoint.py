@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
-from jaxdrones.learning import bptt, checkpoint
+from jaxdrones.learning import bptt, checkpoint, files
 from jaxdrones.learning.networks import Policy
 
 
@@ -13,7 +13,7 @@ def env():
     return envs.make("hover-2021")
 
 
-CONFIG = bptt.Config(updates=4, worlds=3, horizon=2, sizes=(4,))
+CONFIG = bptt.Config(updates=4, worlds=3, horizon=2, hidden_sizes=(4,))
 
 
 @pytest.mark.slow
@@ -24,7 +24,7 @@ def test_a_policy_flies_on_as_it_was_saved(env, tmp_path):
     obs = jax.random.normal(jax.random.key(1), (1, 12))
     np.testing.assert_array_equal(loaded(obs), policy(obs))
     assert jax.tree.structure(loaded) == jax.tree.structure(policy)
-    kept = checkpoint.about(tmp_path / "new" / "policy")
+    kept = files.read_sidecar(tmp_path / "new" / "policy")
     assert kept["env"] == "hover-2021" and kept["config"]["horizon"] == 2 and "jax" in kept["versions"]
 
 

@@ -7,14 +7,14 @@ import pytest
 
 from jaxdrones import envs
 from jaxdrones.learning import evaluate
-from jaxdrones.learning.evaluation import wilson
+from jaxdrones.learning.evaluation import wilson_interval
 
 
 def test_wilson_interval_against_known_numbers():
     # statsmodels.stats.proportion.proportion_confint(count, nobs, method="wilson")
-    np.testing.assert_allclose(wilson(10, 100), (0.0552292, 0.1743657), atol=1e-6)
-    np.testing.assert_allclose(wilson(10_000, 10_000), (0.9996160, 1.0), atol=1e-6)
-    np.testing.assert_allclose(wilson(0, 50), (0.0, 0.0713476), atol=1e-6)
+    np.testing.assert_allclose(wilson_interval(10, 100), (0.0552292, 0.1743657), atol=1e-6)
+    np.testing.assert_allclose(wilson_interval(10_000, 10_000), (0.9996160, 1.0), atol=1e-6)
+    np.testing.assert_allclose(wilson_interval(0, 50), (0.0, 0.0713476), atol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -33,16 +33,16 @@ def falling(obs):
 def test_a_drone_that_stays_succeeds_in_every_episode(env):
     report = evaluate(env, hovering, jax.random.key(0), episodes=20)
     assert report.success == 1 and report.episodes == 20
-    assert report.error < 1e-6 and report.ends["lost"] == 0
-    np.testing.assert_allclose(report.length, 5.0)
+    assert report.final_error < 1e-6 and report.end_rates["lost"] == 0
+    np.testing.assert_allclose(report.mean_length, 5.0)
 
 
 def test_a_drone_that_falls_is_lost_and_its_metrics_stay_what_they_were_then(env):
     report = evaluate(env, falling, jax.random.key(0), episodes=20)
-    assert report.success == 0 and report.ends["lost"] == 1
+    assert report.success == 0 and report.end_rates["lost"] == 1
     seconds = np.sqrt(2 * 8 / 9.8)  # 8 m of free fall
-    np.testing.assert_allclose(report.length, seconds, atol=0.01)
-    np.testing.assert_allclose(report.error, 8.0, atol=0.2)
+    np.testing.assert_allclose(report.mean_length, seconds, atol=0.01)
+    np.testing.assert_allclose(report.final_error, 8.0, atol=0.2)
 
 
 @pytest.mark.slow

@@ -9,9 +9,9 @@ import pytest
 import jaxdrones as jd
 from jaxdrones import envs
 from jaxdrones.learning import bptt, collect
-from jaxdrones.learning.gradients import differentiated_as, linked, scale_gradient, with_gradient
+from jaxdrones.learning.gradients import SurrogateStep, gradient_between_steps, scale_gradient, with_gradient
 
-CONFIG = bptt.Config(updates=2, worlds=2, horizon=6, sizes=(4,))
+CONFIG = bptt.Config(updates=2, worlds=2, horizon=6, hidden_sizes=(4,))
 
 
 def test_scaling_a_gradient_keeps_the_value():
@@ -28,7 +28,7 @@ def test_a_surrogate_has_the_values_of_one_step_and_the_derivative_of_the_other(
     def height(step, rpm):
         return step(params, state, rpm).pos[0, 2]
 
-    mixed = differentiated_as(fine, coarse)
+    mixed = SurrogateStep(fine, coarse)
     assert height(mixed, rpm) == height(fine, rpm)
     mine, theirs = (jax.grad(height, 1)(step, rpm) for step in (mixed, coarse))
     np.testing.assert_allclose(mine, theirs, rtol=1e-12)
@@ -44,16 +44,16 @@ def flights():
     def flown(params, **options):
         config = bptt.Config(**vars(CONFIG) | options)
         policy = state.policy.replace(params=params)
-        _, flight = collect.fly(
+        _, trajectory = collect.collect(
             jax.random.key(2),
-            with_gradient(env, config),
+            with_gradient(env, config.gradient, config.surrogate),
             lambda key, obs: (policy(obs), None),
             worlds,
             config.horizon,
             reset=False,
-            link=linked(config),
+            between_steps=gradient_between_steps(config.gradient, config.gradient_decay),
         )
-        return jnp.mean(flight.reward[-1])
+        return jnp.mean(trajectory.reward[-1])
 
     def both(**options):
         value, gradient = jax.jit(jax.value_and_grad(lambda params: flown(params, **options)))(state.policy.params)
@@ -61,8 +61,8 @@ def flights():
 
     return {
         "exact": both(gradient="exact"),
-        "no decay": both(gradient="decay", decay=1.0),
-        "decay": both(gradient="decay", decay=0.5),
+        "no decay": both(gradient="decay", gradient_decay=1.0),
+        "decay": both(gradient="decay", gradient_decay=0.5),
         "surrogate": both(gradient="surrogate"),
     }
 

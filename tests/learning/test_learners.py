@@ -2,57 +2,20 @@
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from double_integrator import SMALL, DoubleIntegrator, Point, PointWorld, dynamics
 
 from jaxdrones import envs
 from jaxdrones.envs.randomize import scaled
 from jaxdrones.learning import bptt, collect, ppo, shac
 from jaxdrones.learning.networks import MLP, Policy
-from jaxdrones.learning.normalize import Statistics
+from jaxdrones.learning.normalize import RunningStatistics
+from jaxdrones.learning.returns import discounted_rewards
 
-SMALL = {
-    bptt: bptt.Config(updates=3, worlds=4, horizon=4, sizes=(8,)),
-    shac: shac.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_hidden_sizes=(8,), critic_steps=2),
-    ppo: ppo.Config(updates=3, worlds=4, horizon=4, sizes=(8,), critic_hidden_sizes=(8,), epochs=2, batches=2),
-}
 LEARNERS = pytest.mark.parametrize("learner", SMALL, ids=lambda module: module.__name__.rpartition(".")[2])
-
-
-class Point(flax.struct.PyTreeNode):
-    pos: jax.Array
-
-
-class PointWorld(flax.struct.PyTreeNode):
-    drones: Point
-    step: jax.Array
-
-
-class DoubleIntegrator:
-    """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
-
-    drones, action_size, observation_size, dt, steps, kept = 1, 1, 2, 0.1, 50, ()
-
-    def reset(self, key):
-        x = jax.random.uniform(key, (1, 2), minval=-0.1, maxval=0.1)
-        return x, PointWorld(Point(x), jnp.zeros((), jnp.int32))
-
-    def step(self, key, world, action):
-        a, b = dynamics()
-        x = world.drones.pos
-        cost = 100 * x[:, 0] ** 2 + 10 * x[:, 1] ** 2 + 10 * action[:, 0] ** 2
-        x = x @ jnp.asarray(a.T, x.dtype) + action * jnp.asarray(b.T, x.dtype)
-        world = PointWorld(Point(x), world.step + 1)
-        info = {"metrics": {"error": jnp.abs(x[:, 0])}}
-        return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
-
-
-def dynamics():
-    dt = DoubleIntegrator.dt
-    return np.array([[1, dt], [0, 1]]), np.array([[dt**2 / 2], [dt]])
 
 
 def best_cost(starts):
@@ -76,9 +39,13 @@ def flown_cost(env, policy, starts):
 
 
 TOY = {
-    "bptt": (bptt, dict(updates=300, worlds=64, horizon=50, restart=1.0, learning_rate=1e-2), 1.02),
-    "shac": (shac, dict(updates=300, worlds=64, horizon=10, trust=0.3, discount=0.99, learning_rate=5e-3), 1.05),
-    "ppo": (ppo, dict(updates=150, worlds=128, horizon=25, discount=0.95, trace=0.95, min_std=0.02), 1.15),
+    "bptt": (bptt, dict(updates=300, worlds=64, horizon=50, restart_fraction=1.0, learning_rate=1e-2), 1.02),
+    "shac": (
+        shac,
+        dict(updates=300, worlds=64, horizon=10, terminal_value_warmup=0.3, gamma=0.99, learning_rate=5e-3),
+        1.05,
+    ),
+    "ppo": (ppo, dict(updates=150, worlds=128, horizon=25, gamma=0.95, gae_lambda=0.95, min_std=0.02), 1.15),
 }
 
 
@@ -88,7 +55,7 @@ TOY = {
     [pytest.param(*case, marks=() if name == "bptt" else pytest.mark.slow, id=name) for name, case in TOY.items()],
 )
 def test_a_double_integrator_is_flown_nearly_as_cheaply_as_by_lqr(learner, settings, within):
-    env, config = DoubleIntegrator(), learner.Config(sizes=(16,), **settings)
+    env, config = DoubleIntegrator(), learner.Config(hidden_sizes=(16,), **settings)
     policy = jax.jit(lambda key: learner.train(key, env, config).policy)(jax.random.key(0))
     starts = jax.random.uniform(jax.random.key(1), (200, 2), minval=-0.1, maxval=0.1)
     best = best_cost(np.asarray(starts, float))
@@ -136,7 +103,7 @@ def optax_norm(tree):
 
 @pytest.mark.slow
 @pytest.mark.float32
-def test_a_central_critic_learns_with_a_policy_per_role():
+def test_a_centralized_critic_learns_with_a_policy_per_agent():
     env = envs.make("leader-follower")
     config = dataclasses.replace(SMALL[ppo], per_agent=True, centralized_critic=True)
     state = ppo.init(jax.random.key(0), env, config)
@@ -150,14 +117,14 @@ def test_a_central_critic_learns_with_a_policy_per_role():
 
 @pytest.mark.slow
 @pytest.mark.float32
-def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
-    """Reward is a parameter that nobody sees: told, the critic knows the value; else it knows the mean."""
+def test_a_privileged_critic_learns_the_value_of_drawn_parameters():
+    """The reward is a parameter that is not observed: a privileged critic knows it, another one only its mean."""
     task = envs.make("hover").task
-    gain = {"mass": (100.0, lambda world: world.params.mass - 0.027)}
-    task = dataclasses.replace(task, rewards=gain, ends={}, duration=1.0)
-    env = envs.make(task, laws=(scaled("mass", 0.5, 1.5),))
+    gain = {"mass": (100.0, lambda task, world: world.params.mass - 0.027)}
+    task = dataclasses.replace(task, rewards=gain, terminations={}, duration=1.0)
+    env = envs.make(task, randomize=(scaled("mass", 0.5, 1.5),))
 
-    def miss(informed):
+    def value_loss(privileged):
         config = dataclasses.replace(
             SMALL[ppo],
             updates=200,
@@ -165,30 +132,30 @@ def test_an_informed_critic_learns_what_drawn_parameters_are_worth():
             worlds=64,
             horizon=8,
             learning_rate=5e-3,
-            privileged_critic=informed,
-            discount=0.9,
+            privileged_critic=privileged,
+            gamma=0.9,
         )
         history = jax.jit(lambda key: ppo.train(key, env, config))(jax.random.key(0)).history
         return jnp.mean(history["value_loss"][-10:])
 
-    assert miss(True) < 0.2 * miss(False)
+    assert value_loss(True) < 0.2 * value_loss(False)
 
 
 @pytest.mark.float32
 def test_episodes_that_ended_stay_as_they_are_and_do_not_count_until_they_are_restarted():
     env = envs.make("hover", duration=0.05)  # five steps
-    worlds = collect.restart(jax.random.key(0), env, collect.idle(env, 2))
+    worlds = collect.restart(jax.random.key(0), env, collect.empty_worlds(env, 2))
 
     def hover(key, obs):
         return jnp.zeros((2, 1, 4)), None
 
-    worlds, flight = jax.jit(lambda w: collect.fly(jax.random.key(1), env, hover, w, 7, reset=False))(worlds)
-    np.testing.assert_array_equal(flight.over[:, 0], [False] * 5 + [True] * 2)
-    assert jnp.all(worlds.ended)
-    np.testing.assert_array_equal(worlds.obs, flight.final_obs[4])
-    assert jnp.all(bptt.discounted(flight, 1.0)[5:] == 0)
+    worlds, trajectory = jax.jit(lambda w: collect.collect(jax.random.key(1), env, hover, w, 7, reset=False))(worlds)
+    np.testing.assert_array_equal(trajectory.was_done[:, 0], [False] * 5 + [True] * 2)
+    assert jnp.all(worlds.done)
+    np.testing.assert_array_equal(worlds.obs, trajectory.final_obs[4])
+    assert jnp.all(discounted_rewards(trajectory, 1.0)[5:] == 0)
     again = collect.restart(jax.random.key(2), env, worlds)
-    assert jnp.all(again.episodes.length == 0) and not jnp.any(again.ended)
+    assert jnp.all(again.episodes.length == 0) and not jnp.any(again.done)
 
 
 def test_the_logarithm_of_a_probability_is_that_of_a_normal_distribution():
@@ -201,18 +168,18 @@ def test_the_logarithm_of_a_probability_is_that_of_a_normal_distribution():
 
 @pytest.mark.slow
 def test_ppo_at_the_policy_that_flew_has_the_plain_policy_gradient():
-    config = ppo.Config(value_coef=0.0, discount=0.9)
+    config = ppo.Config(value_coef=0.0, gamma=0.9)
     rng = np.random.default_rng(0)
     network = MLP((4,), 2)
-    policy = Policy(network.init(jax.random.key(0), jnp.zeros(3)), Statistics.none(3), network)
+    policy = Policy(network.init(jax.random.key(0), jnp.zeros(3)), RunningStatistics.empty(3), network)
     critic = MLP(config.critic_hidden_sizes, 1).init(jax.random.key(1), jnp.zeros(3))
     obs, action, advantage = rng.normal(size=(20, 1, 3)), rng.normal(size=(20, 1, 2)), rng.normal(size=(20, 1))
     log_std = jnp.zeros(2)
-    flown = ppo.log_prob(action, policy(obs), log_std)
-    sample = ppo.Sample(obs, action, flown, obs, advantage, jnp.zeros((20, 1)))
+    behavior = ppo.log_prob(action, policy(obs), log_std)
+    batch = ppo.Batch(obs, action, behavior, obs, advantage, jnp.zeros((20, 1)))
 
     def clipped(params):
-        return ppo.loss(config, policy.replace(params=params), log_std, critic, sample)[0]
+        return ppo.loss(config, policy.replace(params=params), log_std, critic, batch)[0]
 
     def plain(params):
         return -jnp.mean(ppo.log_prob(action, policy.replace(params=params)(obs), log_std) * advantage)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
-from jaxdrones.learning.networks import CNN, Policy, central
+from jaxdrones.learning.networks import CNN, Policy, centralized_input
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_a_policy_is_the_same_for_one_world_and_for_many(team):
 def test_the_central_critic_of_the_paper_sees_25_numbers_its_own_first():
     obs = jnp.arange(24.0).reshape(2, 12)
     action = jnp.array([[100.0], [200.0]])
-    seen = central(obs, action)
+    seen = centralized_input(obs, action)
     np.testing.assert_array_equal(seen[0], [*range(24), 200])
     np.testing.assert_array_equal(seen[1], [*range(12, 24), *range(12), 100])
 

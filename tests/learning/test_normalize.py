@@ -1,12 +1,12 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.learning.normalize import Statistics
+from jaxdrones.learning.normalize import RunningStatistics
 
 
 def test_statistics_in_pieces_are_those_of_everything():
     x = np.random.default_rng(0).normal(3.0, 2.0, size=(90, 4))
-    running = Statistics.none(4)
+    running = RunningStatistics.empty(4)
     for piece in (x[:10], x[10:11], x[11:60], x[60:]):
         running = running.update(jnp.asarray(piece))
     np.testing.assert_allclose(running.mean, x.mean(0), rtol=1e-12)
@@ -15,18 +15,18 @@ def test_statistics_in_pieces_are_those_of_everything():
 
 
 def test_what_was_seen_first_can_be_forgotten():
-    running = Statistics.none(1).update(jnp.zeros((1000, 1))).update(jnp.ones((1000, 1)), memory=0.0)
+    running = RunningStatistics.empty(1).update(jnp.zeros((1000, 1))).update(jnp.ones((1000, 1)), window=0.0)
     np.testing.assert_allclose(running.mean, 1.0)
 
 
 def test_normal_observations_have_zero_mean_and_unit_variance_and_outliers_are_cut():
     x = jnp.asarray(np.random.default_rng(0).normal(3.0, 2.0, size=(500, 4)))
-    normal = Statistics.of(x).normalize(x)
+    normal = RunningStatistics.of(x).normalize(x)
     np.testing.assert_allclose(jnp.mean(normal, 0), 0, atol=1e-12)
     np.testing.assert_allclose(jnp.var(normal, 0), 1, rtol=1e-12)
-    assert jnp.max(Statistics.of(x).normalize(x + 1e6)) == 10
+    assert jnp.max(RunningStatistics.of(x).normalize(x + 1e6)) == 10
 
 
 def test_an_entry_that_never_changes_stays_finite():
     constant = jnp.ones((10, 2))
-    assert jnp.all(Statistics.of(constant).normalize(constant) == 0)
+    assert jnp.all(RunningStatistics.of(constant).normalize(constant) == 0)

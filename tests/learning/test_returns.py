@@ -18,7 +18,7 @@ def flight():
     )
 
 
-def by_hand(reward, value, next_value, terminated, truncated, discount, trace):
+def by_hand(reward, value, next_value, terminated, truncated, gamma, gae_lambda):
     """One world after the other, the sum written out."""
     result = np.zeros((T, W))
     for w in range(W):
@@ -26,32 +26,32 @@ def by_hand(reward, value, next_value, terminated, truncated, discount, trace):
             weight = 1.0
             for k in range(t, T):
                 ahead = 0.0 if terminated[k, w] else next_value[k, w]
-                result[t, w] += weight * (reward[k, w] + discount * ahead - value[k, w])
-                weight *= discount * trace
+                result[t, w] += weight * (reward[k, w] + gamma * ahead - value[k, w])
+                weight *= gamma * gae_lambda
                 if terminated[k, w] or truncated[k, w]:
                     break
     return result
 
 
-@pytest.mark.parametrize("trace", [0.0, 0.9, 1.0])
-def test_advantages_are_the_sums_of_their_definition(flight, trace):
-    expected = by_hand(**flight, discount=0.97, trace=trace)
-    np.testing.assert_allclose(advantages(**flight, discount=0.97, trace=trace), expected, atol=1e-12)
+@pytest.mark.parametrize("gae_lambda", [0.0, 0.9, 1.0])
+def test_advantages_are_the_sums_of_their_definition(flight, gae_lambda):
+    expected = by_hand(**flight, gamma=0.97, gae_lambda=gae_lambda)
+    np.testing.assert_allclose(advantages(**flight, gamma=0.97, gae_lambda=gae_lambda), expected, atol=1e-12)
 
 
 def test_a_time_limit_is_bootstrapped_and_a_crash_is_not():
     one = np.ones((1, 1))
     no, yes = np.zeros((1, 1), bool), np.ones((1, 1), bool)
-    common = dict(reward=one, value=0 * one, next_value=10 * one, discount=0.5, trace=0.9)
+    common = dict(reward=one, value=0 * one, next_value=10 * one, gamma=0.5, gae_lambda=0.9)
     assert advantages(**common, terminated=no, truncated=yes) == 1 + 0.5 * 10
     assert advantages(**common, terminated=yes, truncated=no) == 1
 
 
-def test_with_a_trace_of_one_values_cancel_and_the_target_is_the_discounted_return():
+def test_with_lambda_one_values_cancel_and_the_target_is_the_discounted_return():
     rng = np.random.default_rng(1)
     reward, value = rng.normal(size=(T, 1)), rng.normal(size=(T, 1))
     next_value = np.concatenate([value[1:], [[3.0]]])
     never = np.zeros((T, 1), bool)
-    target = value + advantages(reward, value, next_value, never, never, discount=0.9, trace=1.0)
+    target = value + advantages(reward, value, next_value, never, never, gamma=0.9, gae_lambda=1.0)
     expected = np.sum(reward[:, 0] * 0.9 ** np.arange(T)) + 0.9**T * 3.0
     np.testing.assert_allclose(target[0, 0], expected, rtol=1e-12)

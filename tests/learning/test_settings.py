@@ -10,15 +10,21 @@ import pytest
 from jaxdrones import envs
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.training import presets
-from jaxdrones.training.runs import Recipe
+from jaxdrones.training.recipe import Recipe
 
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
 KEY = jax.random.key(0)
-WORDS = {"sizes", "critic_hidden_sizes", "gradient", "surrogate"}
+WORDS = {"hidden_sizes", "critic_hidden_sizes", "gradient", "surrogate"}
 SWITCHES = {"per_agent", "centralized_critic", "privileged_critic"}
-ZERO_MAKES_SENSE = {"settle", "restart", "discount", "trace", "b2", "decay", "entropy", "value_coef", "cool"}
-SHARES = {"settle", "restart", "discount", "trace", "b2", "decay", "cool", "trust", "target_speed"}
-INFINITY_MAKES_SENSE = {"memory", "clip"}
+ZERO_MAKES_SENSE = {
+    *("obs_stats_freeze", "restart_fraction", "anneal_fraction", "gradient_decay"),
+    *("gamma", "gae_lambda", "adam_b2", "entropy_coef", "value_coef"),
+}
+FRACTIONS = {
+    *("obs_stats_freeze", "restart_fraction", "anneal_fraction", "gradient_decay"),
+    *("gamma", "gae_lambda", "adam_b2", "terminal_value_warmup", "target_update_rate"),
+}
+INFINITY_MAKES_SENSE = {"obs_stats_window", "max_grad_norm"}
 
 
 def numbers(learner):
@@ -31,7 +37,7 @@ def nonsense_of(name, default):
         yield 0
     if name not in INFINITY_MAKES_SENSE:
         yield np.inf
-    if name in SHARES:
+    if name in FRACTIONS:
         yield from (1.0001, 2)
     if isinstance(default, int):
         yield 2.5
@@ -52,7 +58,7 @@ def test_layers_switches_and_words_are_refused_where_they_make_no_sense(learner)
     config = LEARNERS[learner].Config
     for sizes in ((), (0,), (-1,), (2.5,), 32, "32", None, (32, "a")):
         with pytest.raises(ValueError, match=r"sizes is .*; give"):
-            config(sizes=sizes)
+            config(hidden_sizes=sizes)
     for value in ("yes", 1, None, np.nan):
         with pytest.raises(ValueError, match=r"per_agent is .*; give True or False"):
             config(per_agent=value)
@@ -63,10 +69,10 @@ def test_layers_switches_and_words_are_refused_where_they_make_no_sense(learner)
 
 
 @pytest.mark.parametrize("learner", [shac, ppo])
-def test_a_value_of_all_that_is_to_come_needs_a_discount_below_one(learner):
-    with pytest.raises(ValueError, match="discount is 1; give a number of at least 0 and below 1"):
-        learner.Config(discount=1)
-    assert bptt.Config(discount=1).discount == 1
+def test_a_value_of_an_infinite_sum_needs_a_discount_below_one(learner):
+    with pytest.raises(ValueError, match="gamma is 1; give a number of at least 0 and below 1"):
+        learner.Config(gamma=1)
+    assert bptt.Config(gamma=1).gamma == 1
 
 
 def test_what_vanishes_or_overflows_in_single_precision_is_refused():
@@ -78,10 +84,10 @@ def test_what_vanishes_or_overflows_in_single_precision_is_refused():
 def test_settings_that_contradict_each_other_are_refused():
     with pytest.raises(
         ValueError,
-        match=r"max_learning_rate is 1e-06; give a number of at least 1e-05 \(not slower than min_learning_rate",
+        match=r"max_learning_rate is 1e-06; give a number of at least 1e-05 \(not below min_learning_rate",
     ):
         ppo.Config(max_learning_rate=1e-6)
-    with pytest.raises(ValueError, match="worlds is 100; give a multiple of batches, 8"):
+    with pytest.raises(ValueError, match="worlds is 100; give a multiple of minibatches, 8"):
         ppo.Config(worlds=100)
 
 
@@ -92,12 +98,12 @@ def test_every_preset_makes_sense(task, algorithm):
 
 
 def test_arrays_of_one_number_and_numbers_of_numpy_are_numbers():
-    ppo.Config(updates=np.int64(3), worlds=jnp.asarray(8), learning_rate=np.float32(1e-3), discount=jnp.asarray(0.9))
+    ppo.Config(updates=np.int64(3), worlds=jnp.asarray(8), learning_rate=np.float32(1e-3), gamma=jnp.asarray(0.9))
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_numbers_that_are_not_shapes_may_be_traced(learner):
-    shapes = {"worlds", "horizon", "epochs", "batches", "critic_steps"}
+    shapes = {"worlds", "horizon", "epochs", "minibatches", "critic_steps"}
     traced = [name for name in numbers(LEARNERS[learner]) if name not in shapes]
 
     def made(x):
@@ -111,11 +117,13 @@ def test_numbers_that_are_not_shapes_may_be_traced(learner):
 def test_settings_pass_through_trees_of_jax(learner):
     """Registered as a tree by a user, they are rebuilt with placeholders, shapes and traced numbers in place."""
     config = dataclasses.make_dataclass("Config", [], bases=(LEARNERS[learner].Config,), frozen=True)
-    jax.tree_util.register_dataclass(config, ["learning_rate", "restart"], _rest(config, ["learning_rate", "restart"]))
+    jax.tree_util.register_dataclass(
+        config, ["learning_rate", "restart_fraction"], _rest(config, ["learning_rate", "restart_fraction"])
+    )
     doubled = jax.jit(lambda c: jax.tree.map(lambda x: -2 * x, c.learning_rate))(config())
     np.testing.assert_allclose(doubled, -2 * config().learning_rate, rtol=1e-6)
-    assert jax.eval_shape(lambda c: c, config()).restart.shape == ()
-    jax.vmap(lambda c, x: c.restart * x, in_axes=(None, 0))(config(), jnp.arange(3.0))
+    assert jax.eval_shape(lambda c: c, config()).restart_fraction.shape == ()
+    jax.vmap(lambda c, x: c.restart_fraction * x, in_axes=(None, 0))(config(), jnp.arange(3.0))
 
 
 def _rest(config, names):
@@ -149,7 +157,8 @@ def test_a_learner_takes_its_own_settings_and_no_others(name):
 
 
 @pytest.mark.parametrize(
-    "setting", [dict(learning_rate=-1), dict(decay=2.0), dict(updates=0), dict(worlds=-3), dict(sizes=(0,))]
+    "setting",
+    [dict(learning_rate=-1), dict(gradient_decay=2.0), dict(updates=0), dict(worlds=-3), dict(hidden_sizes=(0,))],
 )
 def test_a_recipe_refuses_nonsense_too(setting):
     with pytest.raises(ValueError, match=rf"{next(iter(setting))} is .*; give"):

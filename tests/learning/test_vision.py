@@ -12,9 +12,9 @@ from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.envs import Action
 from jaxdrones.envs.vision import Vision
 from jaxdrones.learning import checkpoint, evaluate, ppo
-from jaxdrones.learning.networks import SCALES, Policy
-from jaxdrones.learning.normalize import on_vector
-from jaxdrones.sensing.scene import Scene, Sphere
+from jaxdrones.learning.networks import IMAGE_CHANNELS, Policy
+from jaxdrones.learning.normalize import map_state_vector
+from jaxdrones.sensing import Scene, Sphere
 from jaxdrones.tasks.starts import hovering
 from jaxdrones.tasks.task import Task
 
@@ -55,7 +55,7 @@ def look_at_the_ball() -> Task:
         rewards={"height": (-1 / REACH, height), "bearing": (-1 / TURN, bearing)},
         metrics={"height": height, "bearing": bearing},
         success=success,
-        scene=Scene((Sphere(pos=BALL, radius=0.2, color=(0.9, 0.1, 0.1, 1.0)),)),
+        scene=Scene.of(Sphere(pos=BALL, radius=0.2, color=(0.9, 0.1, 0.1, 1.0))),
         observation=("velocity", "omega"),
         control_hz=10.0,
         substeps=1,
@@ -84,9 +84,9 @@ def learn(image: str, seeing: bool = True, key: jax.Array = KEY):
     with jd.make(look_at_the_ball(), backend="bullet", vision=(image,), action=climb_and_turn()) as env:
         if not seeing:
             env.vision = Blindfold(env.physics, images=(image,))
-        config = ppo.Config(updates=30, worlds=64, horizon=15, discount=0.95, trace=0.95)
-        trained = jax.jit(lambda key: ppo.train(key, env, config).policy)(key)
-        untrained = Policy.init(key, env, config.sizes)
+        config = ppo.Config(updates=30, worlds=64, horizon=15, gamma=0.95, gae_lambda=0.95)
+        trained = ppo.train(key, env, config).policy
+        untrained = Policy.init(key, env, config.hidden_sizes)
         return [evaluate(env, policy, jax.random.key(1), episodes=200) for policy in (untrained, trained)]
 
 
@@ -116,21 +116,21 @@ def test_what_a_policy_does_depends_on_what_it_sees(team, image):
     assert jnp.all(policy(obs) != policy(other))
 
 
-def test_colours_are_the_share_of_their_highest_and_opacity_is_none():
+def test_colors_are_scaled_to_one_and_opacity_is_dropped():
     rgb = jnp.array([[[[0, 51, 255, 255]]]], jnp.uint8)
-    np.testing.assert_allclose(SCALES["rgb"](rgb)[0, 0, 0], [0, 0.2, 1], rtol=1e-6)
+    np.testing.assert_allclose(IMAGE_CHANNELS["rgb"](rgb)[0, 0, 0], [0, 0.2, 1], rtol=1e-6)
 
 
 def test_what_is_nearer_is_brighter_from_0_far_away_to_1_at_the_eye():
-    nearness = SCALES["depth"](jnp.array([[[0.0, 0.04, 1.0, 4.9, 5.0, 1000.0]]]))[0, 0, :, 0]
+    nearness = IMAGE_CHANNELS["depth"](jnp.array([[[0.0, 0.04, 1.0, 4.9, 5.0, 1000.0]]]))[0, 0, :, 0]
     assert nearness[0] == 1 and jnp.all(nearness[-2:] == 0)
     assert jnp.all(jnp.diff(nearness[:-1]) < 0)
 
 
 @pytest.mark.needs("pybullet")
-def test_normalising_leaves_pictures_as_they_are(team):
+def test_normalizing_leaves_images_as_they_are(team):
     obs = seen(team)
-    twice = on_vector(lambda x: 2 * x, obs)
+    twice = map_state_vector(lambda x: 2 * x, obs)
     np.testing.assert_array_equal(twice["state"], 2 * obs["state"])
     assert twice["rgb"] is obs["rgb"] and twice["depth"] is obs["depth"]
 
@@ -219,6 +219,6 @@ def test_ppo_learns_where_to_look_and_that_is_due_to_the_picture():
     _, blindfolded = learn("depth", seeing=False)
     # Who cannot see can at best stay where it starts, for 4 % of the starts near enough; below 10 % at the upper end of
     # the interval of 200 episodes. Three seeds that saw came to 96 to 100 %.
-    assert before.interval[1] < 0.1 and blindfolded.interval[1] < 0.1
-    assert after.interval[0] > 0.7
-    assert after.returned > 0.5 * max(before.returned, blindfolded.returned)  # at most half the cost
+    assert before.success_interval[1] < 0.1 and blindfolded.success_interval[1] < 0.1
+    assert after.success_interval[0] > 0.7
+    assert after.mean_return > 0.5 * max(before.mean_return, blindfolded.mean_return)  # at most half the cost

@@ -1,16 +1,16 @@
 import numpy as np
 import pytest
 
-from jaxdrones import flights
+from jaxdrones.flights.fly import fly
 from jaxdrones.render import plots
 
 
 @pytest.fixture(scope="module")
 def record():
-    return flights.fly("circle", drones=2, duration=0.5)
+    return fly("circle", drones=2, duration=0.5)
 
 
-def test_every_panel_of_the_paper_is_there(record):
+def test_every_quantity_of_the_state_has_a_panel(record):
     assert len(plots.PANELS) == 16  # position, velocity, angles, rates, four motors
     for array, column, _ in plots.PANELS.values():
         assert np.isfinite(getattr(record, array)[:, :, column]).all()

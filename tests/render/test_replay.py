@@ -8,7 +8,7 @@ import pytest
 from matplotlib.image import imread
 from PIL import Image
 
-from jaxdrones import flights
+from jaxdrones.flights.fly import fly
 from jaxdrones.render import replay, video
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -20,7 +20,7 @@ pytestmark = [  # imageio-ffmpeg leaves its pipes to the garbage collector
 
 @pytest.fixture(scope="module")
 def record():
-    return flights.fly("circle", drones=2, duration=1.5)
+    return fly("circle", drones=2, duration=1.5)
 
 
 def read(path) -> tuple[dict, list[np.ndarray]]:
@@ -53,7 +53,7 @@ def test_a_film_may_be_a_gif(record, tmp_path):
 @pytest.mark.parametrize("name", ["short.mp4", "short.gif", "-x:y %d.mp4"])
 def test_the_shortest_flight_is_one_frame_whatever_its_file_is_called(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert replay.film(flights.fly("circle", drones=2, duration=0.01), Path(name)) == 1
+    assert replay.film(fly("circle", drones=2, duration=0.01), Path(name)) == 1
     assert (tmp_path / name).stat().st_size > 100
 
 

@@ -10,8 +10,7 @@ import pytest
 import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.engine import bullet
-from jaxdrones.sensing.collisions import collisions
-from jaxdrones.sensing.scene import Box, Cylinder, Mesh, Scene, Sphere, Urdf, gate
+from jaxdrones.sensing import Box, Capsule, Cylinder, Mesh, Scene, Sphere, Urdf, collisions, gate
 
 CRAZYFLIE = jaxdrones.load_params("cf2x")
 RADIUS, HEIGHT = 0.06, 0.025  # m, of the cf2x
@@ -25,7 +24,8 @@ def quats(*shape):
 
 POST = Cylinder(pos=(0, 0.5, 0.5), quat=tuple(quats()), radius=0.05, height=0.3)
 BLOCK = Box(pos=(0, 0, 0.5), quat=tuple(quats()), size=(0.2, 0.1, 0.3))
-SCENE = Scene((BLOCK, Sphere(pos=(0.5, 0, 0.5), radius=0.1), POST))
+PILL = Capsule(pos=(0.5, 0.5, 0.2), quat=tuple(quats()), radius=0.05, height=0.2)
+SCENE = Scene.of(BLOCK, Sphere(pos=(0.5, 0, 0.5), radius=0.1), POST, PILL)
 
 
 def random_teams(worlds, n, high=(0.7, 0.7, 0.7)):
@@ -37,7 +37,7 @@ def random_teams(worlds, n, high=(0.7, 0.7, 0.7)):
         yield State(pos=np.abs(pos), quat=quats(n), vel=np.zeros((n, 3)), omega=np.zeros((n, 3)), rpm=np.zeros((n, 4)))
 
 
-flags = jax.jit(collisions, static_argnames="scene")
+flags = jax.jit(collisions)
 
 
 def team(*pos, rpy=(0.0, 0.0, 0.0), vehicle=None):
@@ -96,7 +96,7 @@ def test_only_those_that_touch_are_flagged_and_nobody_touches_itself():
 
 
 def test_a_drone_fits_through_a_gate_and_not_through_its_frame():
-    scene = Scene(gate((0, 0, 1), yaw=0.5))
+    scene = Scene.of(gate((0, 0, 1), yaw=0.5))
     left = np.array([-np.sin(0.5), np.cos(0.5), 0])
     for aside, touches in (0, False), (0.13, False), (0.145, True), (-0.28, True), (0.45, False):
         assert flags(*team(np.array([0, 0, 1]) + aside * left), scene).scene.tolist() == [touches]
@@ -193,8 +193,8 @@ def test_wrong_input_is_told_apart(tmp_path):
     file = tmp_path / "rock.obj"
     file.write_text("")
     for shape in Mesh, Urdf:
-        scene = Scene((BLOCK, shape(pos=(0, 0, 0), path=file)))
-        with pytest.raises(ValueError, match=rf"obstacle 1 is a {shape.__name__}; .*step\.contacts"):
+        scene = Scene.of(BLOCK, shape(pos=(0, 0, 0), path=file))
+        with pytest.raises(ValueError, match=rf"the scene has a {shape.__name__}, .*step\.contacts"):
             flags(params, state, scene)
     with pytest.raises(ValueError, match=r"params\.collision_radius has shape \(\).*jaxdrones\.repeat"):
         collisions(CRAZYFLIE, state)
@@ -204,3 +204,6 @@ def test_wrong_input_is_told_apart(tmp_path):
         collisions(params, state, margin=-0.1)
     with pytest.raises(ValueError, match="scene is 3"):
         collisions(params, state, scene=3)
+    many = jax.tree.map(lambda x: jnp.stack([x, x]), SCENE)
+    with pytest.raises(ValueError, match=r"scene\.boxes\.pos has shape \(2, 1, 3\); .*jax\.vmap"):
+        collisions(params, state, many)

@@ -1,18 +1,35 @@
+"""A scene is data: it is built from single obstacles, mapped, drawn and read back."""
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.sensing import scene
-from jaxdrones.sensing.scene import Box, Cylinder, Mesh, Scene, Sphere, Urdf
+from jaxdrones.sensing import (
+    Box,
+    Capsule,
+    Cylinder,
+    Mesh,
+    Scene,
+    Sphere,
+    Urdf,
+    contains,
+    distance,
+    gate,
+    obstacles_2021,
+)
 
 QUARTER_TURN = (0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4))  # about z
+BALL = Sphere(pos=(1, 1, 1), radius=0.5)
+is_inside = jax.jit(contains)
 
 
 def test_a_gate_leaves_its_opening_free_and_closes_the_rest():
-    beams = scene.gate((1.0, 2.0, 1.5), yaw=np.pi / 2, opening=0.4, frame=0.16)
+    scene = Scene.of(gate((1.0, 2.0, 1.5), yaw=np.pi / 2, opening=0.4, frame=0.16))
     center = np.array([1.0, 2.0, 1.5])
 
     def blocked(left, up):  # left of someone who crosses along y is -x
-        return any(scene.contains(beam, center + np.array([-left, 0, up])) for beam in beams)
+        return is_inside(scene, center + np.array([-left, 0, up]))
 
     for left, up in (0, 0), (0.19, 0.19), (-0.19, 0), (0, -0.19):
         assert not blocked(left, up)
@@ -22,31 +39,88 @@ def test_a_gate_leaves_its_opening_free_and_closes_the_rest():
 
 
 def test_inside_is_inside_whatever_way_an_obstacle_is_turned():
-    box = Box(pos=(0, 0, 1), quat=QUARTER_TURN, size=(2.0, 0.2, 0.2))
-    assert scene.contains(box, (0, 0.9, 1)) and not scene.contains(box, (0.9, 0, 1))
-    pole = Cylinder(pos=(0, 0, 1), quat=(np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4)), radius=0.1, height=2.0)
-    assert scene.contains(pole, (0, 0.9, 1)) and not scene.contains(pole, (0, 0, 1.5))
-    ball = Sphere(pos=(1, 1, 1), radius=0.5)
-    assert scene.contains(ball, (1, 1.4, 1.2)) and not scene.contains(ball, (1, 1.4, 1.4))
+    box = Scene.of(Box(pos=(0, 0, 1), quat=QUARTER_TURN, size=(2.0, 0.2, 0.2)))
+    assert is_inside(box, (0, 0.9, 1)) and not is_inside(box, (0.9, 0, 1))
+    lying = (np.sin(np.pi / 4), 0, 0, np.cos(np.pi / 4))
+    pole = Scene.of(Cylinder(pos=(0, 0, 1), quat=lying, radius=0.1, height=2.0))
+    assert is_inside(pole, (0, 0.9, 1)) and not is_inside(pole, (0, 0, 1.5)) and not is_inside(pole, (0, 1.05, 1))
+    pill = Scene.of(Capsule(pos=(0, 0, 1), quat=lying, radius=0.1, height=2.0))
+    assert is_inside(pill, (0, 1.05, 1)) and not is_inside(pill, (0, 1.11, 1))
+    ball = Scene.of(BALL)
+    assert is_inside(ball, (1, 1.4, 1.2)) and not is_inside(ball, (1, 1.4, 1.4))
+    assert is_inside(ball, (5, 5, -0.1)) and not is_inside(Scene.of(BALL, ground=False), (5, 5, -0.1))
 
 
-def test_the_papers_obstacles_leave_the_paper_flights_their_room():
-    for obstacle in scene.paper_obstacles().obstacles:
-        for angle in np.linspace(0, 2 * np.pi, 60):
-            place = [0.3 * np.cos(angle), 0.3 * np.sin(angle) - 0.3, 0.1]
-            assert not scene.contains(obstacle, place)
+def test_the_obstacles_of_2021_leave_its_flights_their_room():
+    scene = obstacles_2021()
+    angle = np.linspace(0, 2 * np.pi, 60)
+    places = np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle) - 0.3, 0 * angle + 0.1], axis=-1)
+    assert not jax.jit(jax.vmap(contains, (None, 0)))(scene, places).any()
+
+
+def test_obstacles_are_numbered_kind_by_kind_and_a_kind_without_any_is_nothing(tmp_path):
+    file = tmp_path / "rock.obj"
+    file.write_text("")
+    rock, pole = Mesh(pos=np.zeros(3), path=file), Cylinder(pos=(3, 0, 0), radius=1, height=2)
+    scene = Scene.of(rock, BALL, Box(pos=(1, 2, 3), size=(1, 1, 1)), pole, Box(pos=(4, 5, 6), size=(1, 1, 1)))
+    kinds = [type(obstacle) for obstacle in scene.obstacles]
+    assert kinds == [Box, Box, Sphere, Cylinder, Mesh]
+    np.testing.assert_array_equal(scene.obstacles[1].pos, [4, 5, 6])
+    assert scene.boxes.pos.shape == (2, 3) and scene.boxes.color.shape == (2, 4) and scene.spheres.radius.shape == (1,)
+    assert scene.capsules is None and scene.has_obstacles and Scene.of(rock).has_obstacles
+    assert not Scene().has_obstacles and jax.tree.leaves(Scene()) == [] and Scene().obstacles == ()
+    assert hash(jax.tree.structure(scene)) == hash(jax.tree.structure(scene))  # as jax.jit asks of static data
+
+
+def test_many_obstacles_in_one_share_what_has_no_leading_axis():
+    poles = np.array([[0, 0, 1], [1, 0, 1], [2, 0, 1.0]])
+    together = Scene.of(Cylinder(pos=poles, radius=[0.1, 0.2, 0.3], height=2.0, color=(1, 0, 0, 1)), gate((5, 5, 1)))
+    singles = [
+        Cylinder(pos=p, radius=r, height=2.0, color=(1, 0, 0, 1)) for p, r in zip(poles, (0.1, 0.2, 0.3), strict=True)
+    ]
+    apart = Scene.of(gate((5, 5, 1)), *singles)
+    jax.tree.map(np.testing.assert_array_equal, together, apart)
+    assert len(together.obstacles) == 7
+    assert not Scene.of(Sphere(pos=jnp.zeros((0, 3)), radius=1)).has_obstacles
+
+
+def test_a_scene_is_drawn_in_a_compiled_program_and_mapped():
+    def drawn(key):
+        pos = jax.random.uniform(key, (5, 3), minval=1.0, maxval=2.0)
+        return Scene.of(jax.vmap(gate)(pos + 5.0, pos[:, 0]), Sphere(pos=pos, radius=0.1), ground=False)
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    scenes, found = jax.jit(jax.vmap(lambda key: (drawn(key), distance(drawn(key), jnp.zeros(3)))))(keys)
+    assert scenes.boxes.pos.shape == (4, 20, 3) and scenes.spheres.radius.shape == (4, 5)
+    nearest = np.min(np.linalg.norm(scenes.spheres.pos, axis=2), axis=1) - 0.1  # the gates are farther away
+    np.testing.assert_allclose(found, nearest, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.vmap(distance, (0, None)))(scenes, jnp.zeros(3)), nearest, rtol=1e-12)
+
+
+def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
+    boxes = jax.vmap(lambda x: Box(pos=(x, 2 * x, 0.5), size=(1.0, 2.0, 3.0)))(jnp.arange(3.0))
+    assert boxes.size.shape == boxes.pos.shape == (3, 3) and boxes.quat.shape == (3, 4)
+    np.testing.assert_array_equal(boxes.size[1], [1, 2, 3])
+    np.testing.assert_array_equal(boxes.pos[1], [1, 2, 0.5])
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Sphere(pos=(0, 0, 0), radius=0.0), "radius of Sphere is 0"),
-        (lambda: Box(pos=(0, 0, 0), size=(1, -1, 1)), "size of Box is -1"),
-        (lambda: Box(pos=(0, 0), size=(1, 1, 1)), "pos of Box is .*3 numbers"),
-        (lambda: Cylinder(pos=(0, 0, np.nan), radius=1, height=1), "pos of Cylinder.*is not finite"),
+        (lambda: Scene.of(Sphere(pos=(0, 0, 0), radius=0.0)), "radius of Sphere is 0"),
+        (lambda: Scene.of(Box(pos=(0, 0, 0), size=(1, -1, 1))), r"size of Box is \[1.0, -1.0, 1.0\]; give positive"),
+        (lambda: Scene.of(Box(pos=(0, 0), size=(1, 1, 1))), "pos of Box is .*3 numbers"),
+        (lambda: Scene.of(Cylinder(pos=(0, 0, np.nan), radius=1, height=1)), "pos of Cylinder.*is not finite"),
+        (lambda: Scene.of(Sphere(pos=(0, 0, 0), quat=(0, 0, 0, 2), radius=1)), "quat of Sphere has length 2"),
+        (lambda: Scene.of(Sphere(pos=np.zeros((3, 3)), radius=[1, 2])), r"do not fit together: pos \(3, 3\)"),
         (lambda: Mesh(pos=(0, 0, 0), path="missing.obj"), r"missing\.obj: there is no such file"),
         (lambda: Urdf(pos=(0, 0, 0), path="missing.urdf"), r"missing\.urdf: there is no such file"),
-        (lambda: Scene(("box",)), "'box' is not an obstacle"),
+        (lambda: Urdf(pos=(0, 0), path="missing.urdf"), r"pos of Urdf has shape \(2,\); give 3 numbers"),
+        (lambda: Scene.of("box"), "'box' is not an obstacle"),
+        (lambda: Scene.of((BALL, BALL)), "give each as an argument of its own"),
+        (lambda: Scene.of(BALL, ground=3), "ground is 3; give True or False"),
+        (lambda: gate((0, 0, 1), opening=-1), "opening of a gate is -1"),
+        (lambda: gate(np.zeros((2, 3))), r"pos of a gate has shape \(2, 3\).*jax\.vmap"),
     ],
 )
 def test_a_wrong_obstacle_is_refused(make, message):

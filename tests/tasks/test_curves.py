@@ -1,10 +1,13 @@
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxdrones.tasks import curves
+from jaxdrones.tasks.tracking import tracking
 
 
-def test_the_circle_is_a_circle_and_starts_where_the_paper_says():
+def test_the_circle_is_a_circle_and_starts_where_gym_pybullet_drones_does():
     circle = curves.circle(radius=0.3, period=10.0)
     start = circle.positions(4)
     angle = 2 * np.pi * np.arange(4) / 6 + np.pi / 2
@@ -29,6 +32,27 @@ def test_velocity_and_acceleration_are_the_derivatives_of_the_curve(curve):
     np.testing.assert_allclose(setpoints.pos, now, atol=1e-14)
     np.testing.assert_allclose(setpoints.vel, (after - before) / (2 * h), atol=1e-7)
     np.testing.assert_allclose(setpoints.acc, (after - 2 * now + before) / h**2, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", curves.SHAPES.values())
+def test_shapes_repeat_after_a_period_and_stay_within_their_size(shape):
+    u = jnp.array(np.random.default_rng(0).uniform(-1, 1, curves.RANDOM_NUMBERS))
+    s = jnp.linspace(0, 1, 100, endpoint=False)
+    places, later = (jax.vmap(shape, (None, 0))(u, s + turns) for turns in (0, 2))
+    np.testing.assert_allclose(places, later, atol=1e-12)
+    assert jnp.all(jnp.abs(places) <= 1 + 1e-12)
+
+
+def test_tracking_follows_the_shape_with_its_derivatives():
+    task = tracking(curve="figure-eight", period=8.0)
+    variables = {"center": jnp.ones((1, 3)), "random": jnp.zeros((1, 27)), "phase": jnp.array([0.25])}
+    setpoint = task.target(variables, jnp.array(1.0))
+    s, rate = 0.25 + 1 / 8, 2 * np.pi / 8
+    sin, cos = np.sin(2 * np.pi * s), np.cos(2 * np.pi * s)
+    sin2, cos2 = np.sin(4 * np.pi * s), np.cos(4 * np.pi * s)
+    np.testing.assert_allclose(setpoint.pos[0], [1 + sin, 1, 1 + sin2 / 2], atol=1e-12)
+    np.testing.assert_allclose(setpoint.vel[0], [rate * cos, 0, rate * cos2], atol=1e-12)
+    np.testing.assert_allclose(setpoint.acc[0], [-(rate**2) * sin, 0, -2 * rate**2 * sin2], atol=1e-12)
 
 
 def test_nobody_and_no_time_are_refused():

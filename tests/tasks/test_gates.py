@@ -18,7 +18,7 @@ def moved(start, end, index=0):
     _, world = ENV.reset(jax.random.key(0))
     variables = world.variables | {"pos": jnp.array([start]), "index": jnp.array([index])}
     world = world.replace(drones=world.drones.replace(pos=jnp.array([end])), variables=variables)
-    return ENV.task.advance(world)
+    return ENV.task.advance(ENV.task, world)
 
 
 def in_gate(offset, gate=GATES[0]):
@@ -50,7 +50,7 @@ def test_a_gate_counts_in_its_direction_and_in_its_turn():
 
 def test_after_the_last_gate_nothing_counts():
     after = moved(in_gate(-THROUGH, GATES[-1]), in_gate(THROUGH, GATES[-1]), index=len(GATES))
-    assert after["index"][0] == len(GATES) and not after["hit"][0] and after["came_nearer"][0] == 0
+    assert after["index"][0] == len(GATES) and not after["hit"][0] and after["progress"][0] == 0
 
 
 def test_poles_are_hit_as_high_as_they_are():
@@ -61,12 +61,12 @@ def test_poles_are_hit_as_high_as_they_are():
 
 def test_progress_is_the_distance_gained_on_the_next_gate():
     start, end = in_gate(-10 * THROUGH), in_gate(-3 * THROUGH)
-    np.testing.assert_allclose(moved(start, end)["came_nearer"], 0.7, rtol=1e-12)
+    np.testing.assert_allclose(moved(start, end)["progress"], 0.7, rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_who_starts_anywhere_starts_at_the_start_one_time_in_five_and_else_before_a_gate():
-    env = make("gates", anywhere=True, level=2)
+    env = make("gates", random_start=True, level=2)
     worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2000))[1]
     z, index = worlds.drones.pos[:, 0, 2], worlds.variables["index"][:, 0]
     grounded = z < 0.1

@@ -10,10 +10,10 @@ import sys
 
 import jax
 import numpy as np
-from test_learners import SMALL, DoubleIntegrator
+from double_integrator import SMALL, DoubleIntegrator
 
 from jaxdrones.learning import sharding
-from jaxdrones.training import hosts
+from jaxdrones.training import distributed
 
 CONFIG = dict(worlds=16, horizon=5)
 
@@ -21,12 +21,12 @@ CONFIG = dict(worlds=16, horizon=5)
 def trained(learner) -> tuple[dict, list[str]]:
     """The numbers of a training state, and the operations of an update in which devices talk, those in loops marked."""
     env, config = DoubleIntegrator(), dataclasses.replace(SMALL[learner], **CONFIG)
-    mesh = sharding.devices(config.worlds)
+    mesh = sharding.make_mesh(config.worlds)
 
     def init(key):
         return learner.init(key, env, config)
 
-    placed = sharding.layout(mesh, jax.eval_shape(init, jax.random.key(0)))
+    placed = sharding.state_sharding(mesh, jax.eval_shape(init, jax.random.key(0)))
     with jax.set_mesh(mesh):
         state = jax.jit(init, out_shardings=placed)(jax.random.key(0))
         update = jax.jit(lambda state: learner.update(env, config, state), in_shardings=(placed,))
@@ -35,7 +35,7 @@ def trained(learner) -> tuple[dict, list[str]]:
         state, _ = update(jax.device_put(state, placed))
     assert state.worlds.obs.sharding.device_set == set(mesh.devices.flat)
     assert state.worlds.obs.addressable_shards[0].data.shape[0] * jax.device_count() == config.worlds
-    state = sharding.whole(mesh, state).replace(key=None)
+    state = sharding.gather(mesh, state).replace(key=None)
     return {jax.tree_util.keystr(path): x for path, x in jax.tree_util.tree_leaves_with_path(state)}, talks(
         update.as_text()
     )
@@ -57,7 +57,7 @@ if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_numpy_rank_promotion", "raise")
     jax.config.update("jax_num_cpu_devices", int(devices))
-    with hosts.together(int(others[0]), int(others[1]), others[2]) if others else contextlib.nullcontext():
+    with distributed.join_hosts(int(others[0]), int(others[1]), others[2]) if others else contextlib.nullcontext():
         result = {}
         for learner in SMALL:
             name = learner.__name__.rpartition(".")[2]

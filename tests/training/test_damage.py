@@ -17,8 +17,10 @@ from jaxdrones import envs
 from jaxdrones.cli import main
 from jaxdrones.learning import checkpoint
 from jaxdrones.learning.networks import Policy
-from jaxdrones.training.loop import Trainer
-from jaxdrones.training.runs import Recipe, Run
+from jaxdrones.training.loop import check_resumable
+from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.run import Run
+from jaxdrones.training.trainer import Trainer
 
 pytestmark = pytest.mark.float32
 
@@ -38,10 +40,12 @@ def runs(policy, tmp_path_factory):
     with jax.enable_x64(False):
         for seed, folder in enumerate(folders):
             other = jax.tree.map(lambda x, seed=seed: x + seed, policy)
-            about = dict(recipe=Recipe.of("hover", sizes=(4,)).as_dict(), seed=seed, episodes=8, update=4)
+            about = dict(recipe=Recipe.of("hover", hidden_sizes=(4,)).as_dict(), seed=seed, episodes=8, update=4)
             Run(folder).save_policy("best", other, **about, score=(0.0, 1.0))
             Run(folder).save_policy("last", other, **about)
-            Run(folder).save_state(TREE | {"weights": TREE["weights"] + seed}, **about, seconds=1.0, highest=0.0)
+            Run(folder).save_state(
+                TREE | {"weights": TREE["weights"] + seed}, **about, seconds=1.0, highest_success=0.0
+            )
     return folders
 
 
@@ -121,7 +125,7 @@ def entries(x):
 
 def nest(rng, file: Path, _):
     depth = rng.choice([200, 1000, 100_000])
-    file.write_text('{"format": 2, "policy": ' + depth * "[" + depth * "]" + "}")
+    file.write_text('{"format": 3, "policy": ' + depth * "[" + depth * "]" + "}")
 
 
 def corrupted(rng, folder: Path, other: Path, name: str) -> str:
@@ -207,10 +211,10 @@ def test_a_folder_with_one_checkpoint_of_another_run_is_refused(runs, tmp_path, 
     run.policy("best")  # whole, and of another seed
     trainer = Trainer(run.recipe(), 8)
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), plain(trainer.shapes))
-    entries = ("recipe", "seed", "episodes", "update", "seconds", "highest")
-    run.save_state(zeros, **{entry: run.told("state", entry) for entry in entries})
+    entries = ("recipe", "seed", "episodes", "update", "seconds", "highest_success")
+    run.save_state(zeros, **{entry: run.sidecar_entry("state", entry) for entry in entries})
     with pytest.raises(ValueError, match=r"best\.json and state\.json are of two runs"):
-        trainer.check(run)
+        check_resumable(trainer, run)
 
 
 def plain(shapes):
@@ -227,18 +231,18 @@ def test_a_checkpoint_of_an_earlier_format_says_train_anew(runs, tmp_path):
     shutil.copytree(runs[0], tmp_path / "run")
     file = tmp_path / "run" / "best.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 1}))
-    with pytest.raises(ValueError, match="is of format 1, this version reads 2; train anew"):
+    with pytest.raises(ValueError, match="has format 1, this version reads 3; train anew"):
         checkpoint.load(tmp_path / "run" / "best")
 
 
 def test_numbers_that_are_not_finite_are_neither_saved_nor_loaded(policy, tmp_path):
-    broken = policy.replace(statistics=policy.statistics.replace(var=policy.statistics.var.at[3].set(np.nan)))
-    with pytest.raises(ValueError, match=r"statistics\.var holds numbers that are not finite"):
+    broken = policy.replace(obs_stats=policy.obs_stats.replace(var=policy.obs_stats.var.at[3].set(np.nan)))
+    with pytest.raises(ValueError, match=r"obs_stats\.var holds numbers that are not finite"):
         checkpoint.save(tmp_path / "policy", broken)
     assert list(tmp_path.iterdir()) == []
-    network = {"sizes": (4,), "outputs": 4, "scale": 0.01, "activation": "tanh"}
+    network = {"hidden_sizes": (4,), "output_size": 4, "output_scale": 0.01, "activation": "tanh"}
     checkpoint.save_tree(tmp_path / "policy", broken, policy={"network": network, "per_agent": False})
-    with pytest.raises(ValueError, match=r"statistics\.var holds numbers that are not finite; take another"):
+    with pytest.raises(ValueError, match=r"obs_stats\.var holds numbers that are not finite; take another"):
         checkpoint.load(tmp_path / "policy")
 
 
@@ -269,7 +273,7 @@ def test_a_process_that_is_killed_while_it_saves_leaves_the_old_numbers_or_the_n
         run.save_state({"x": np.ones(3, np.float32)}, update=2)
     monkeypatch.undo()
     kept = run.load_state({"x": np.zeros(3, np.float32)})["x"]
-    assert (run.about("state")["update"], kept.tolist()) == {1: (1, [0, 0, 0]), 2: (2, [1, 1, 1])}[step]
+    assert (run.sidecar("state")["update"], kept.tolist()) == {1: (1, [0, 0, 0]), 2: (2, [1, 1, 1])}[step]
     run.save_state({"x": np.full(3, 2, np.float32)}, update=3)
     assert run.load_state({"x": np.zeros(3, np.float32)})["x"].tolist() == [2, 2, 2]
     run.clear()

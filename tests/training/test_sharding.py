@@ -11,21 +11,33 @@ import numpy as np
 import pytest
 
 from jaxdrones.learning import sharding
-from jaxdrones.training import hosts
-from jaxdrones.training.runs import Run
+from jaxdrones.training import distributed
+from jaxdrones.training.run import Run
 
 SCRIPT = Path(__file__).with_name("several_devices.py")
 CACHE = Path(__file__).parent.parent.parent / ".jax_cache"
 CLI = "import sys; from jaxdrones.cli import main; sys.exit(main())"
-TRAIN = ["train", "hover", "--set", "worlds=8", "--set", "horizon=4", "--set", "sizes=8,", "--set", "duration=0.2"]
+TRAIN = [
+    "train",
+    "hover",
+    "--set",
+    "worlds=8",
+    "--set",
+    "horizon=4",
+    "--set",
+    "hidden_sizes=8,",
+    "--set",
+    "duration=0.2",
+]
 TRAIN += ["--episodes", "8", "--json", "--no-figure"]
 
 
 def start(*command, **environment) -> subprocess.Popen:
+    paths = {"PYTHONPATH": os.pathsep.join(filter(None, (str(SCRIPT.parent.parent), os.environ.get("PYTHONPATH"))))}
     cached = {"JAX_COMPILATION_CACHE_DIR": str(CACHE), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
     return subprocess.Popen(
         [sys.executable, *map(str, command)],
-        env=os.environ | cached | environment,
+        env=os.environ | paths | cached | environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -109,14 +121,14 @@ def test_a_training_on_two_devices_or_two_hosts_is_a_run_like_another_and_one_de
 
 def test_worlds_that_devices_cannot_share_equally_are_refused():
     with pytest.raises(ValueError, match="worlds is 256, to be shared by 3 devices; give a multiple of 3"):
-        sharding.devices(256, 3 * jax.devices())
+        sharding.make_mesh(256, 3 * jax.devices())
 
 
 @pytest.mark.parametrize("host", [0, 1])
 def test_a_host_that_is_left_alone_says_so(host):
     address = free_address()
-    with pytest.raises(ValueError, match=rf"host {host} of 2 did not meet all others at {address} within 0.2 s"):
-        with hosts.together(2, host, address, patience=0.2):
+    with pytest.raises(ValueError, match=rf"host {host} of 2 did not reach all others at {address} within 0.2 s"):
+        with distributed.join_hosts(2, host, address, timeout=0.2):
             pass
 
 
@@ -130,10 +142,10 @@ def test_a_host_that_is_left_alone_says_so(host):
 )
 def test_a_mistake_about_hosts_is_told_at_once(arguments, message):
     with pytest.raises(ValueError, match=message):
-        with hosts.together(*arguments):
+        with distributed.join_hosts(*arguments):
             pass
 
 
 def test_a_mistake_that_one_host_finds_is_raised_there():
-    with pytest.raises(ValueError, match="mine"), hosts.checked():
+    with pytest.raises(ValueError, match="mine"), distributed.fail_together():
         raise ValueError("mine")

@@ -40,6 +40,6 @@ slope: jd.State = jax.grad(miss)(start)
 env = jd.make("hover", action="rpm", drones=1, duration=0.1)
 obs, world = env.reset(jax.random.key(0))
 obs, world, reward, terminated, truncated, info = env.step(jax.random.key(1), world, jnp.zeros((1, env.action_size)))
-result = jax.jit(lambda key: bptt.train(key, env, bptt.Config(updates=1, worlds=2, horizon=4)))(jax.random.key(2))
+result = bptt.train(jax.random.key(2), env, bptt.Config(updates=1, worlds=2, horizon=4))
 report = evaluate(env, result.policy, jax.random.key(3), episodes=4)
 success: float = report.success

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.engine.bullet.client import Client
-from jaxdrones.sensing.scene import contains
 
 _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the body; those above name the link
 # TinyRenderer does not return when a vertex lies less than 1e-8 m, but not 0, behind the plane of the eye. Numbers
@@ -94,13 +93,7 @@ def look(
 
 def _check_outside(client: Client, drone: int, eye: np.ndarray) -> None:
     """Raise if the eye is inside a body: it would look through it without notice."""
-    point = eye.tolist()
-    near = {body for body, _ in client.p.getOverlappingObjects(point, point, physicsClientId=client.id) or ()}
-    inside = [
-        f"obstacle {i}"
-        for i, (body, obstacle) in enumerate(zip(client.obstacles, client.scene.obstacles, strict=True))
-        if body in near and contains(obstacle, eye)
-    ]
+    inside = [f"obstacle {i}" for i in client.solids_at(eye.tolist())]
     if client.ground is not None and eye[2] < 0:
         inside.append("the ground")
     if inside:

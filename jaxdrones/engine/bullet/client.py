@@ -7,20 +7,27 @@ import os
 import sys
 import weakref
 from types import ModuleType
+from typing import Any
 
+import jax
 import numpy as np
 
 from jaxdrones.checks import check_choice
-from jaxdrones.sensing.scene import Box, Cylinder, Mesh, Obstacle, Scene, Sphere, Urdf
+from jaxdrones.engine.bullet.shapes import shape_of
+from jaxdrones.engine.step import is_traced
+from jaxdrones.sensing.files import Urdf
+from jaxdrones.sensing.scene import Scene, check_scene
+from jaxdrones.sensing.shapes import Obstacle
 
 BALLS, CYLINDER = "balls", "cylinder"
 TINY, EGL = "tiny", "egl"
 BACKGROUND, GROUND = -1, 0  # of a segmentation; drone i is 1 + i, obstacle i is 1 + number of drones + i
 _BALLS = 8
-_DISC = 0.1  # thickness of the disc, of the height of the collision cylinder
-_HUB, _FRONT, _BACK = [0.15, 0.15, 0.2, 1], [0.8, 0.15, 0.1, 1], [0.35, 0.35, 0.4, 1]  # colours
+_DISC = 0.1  # thickness of the disc as a share of the height of the collision cylinder
+_POINT = 1e-6  # m; radius of the ball that stands for a point, as Bullet knows no points
+_HUB, _FRONT, _BACK = [0.15, 0.15, 0.2, 1], [0.8, 0.15, 0.1, 1], [0.35, 0.35, 0.4, 1]  # colors
 _SHAPE, _INERTIAL = slice(0, 16), slice(16, 20)  # columns of a team
-_DRONE_FRICTION, _GROUND_FRICTION = 0.5, 1.0  # the reference's
+_DRONE_FRICTION, _GROUND_FRICTION = 0.5, 1.0  # as in gym-pybullet-drones (2021)
 
 
 def import_pybullet() -> ModuleType:
@@ -48,10 +55,17 @@ class Client:
     def __init__(self, scene: Scene, dt: float, damping: float, collision: str, renderer: str, gui: bool):
         check_choice("collision shape", collision, (BALLS, CYLINDER))
         check_choice("renderer", renderer, (TINY, EGL))
-        self.p = import_pybullet()
+        check_scene(scene, files=True)
+        if is_traced(scene):
+            raise ValueError(
+                "the scene is traced by jit, vmap or grad and has no values; Bullet builds its world once: give "
+                "it a scene of numbers, or take the explicit backend"
+            )
+        obstacles = jax.device_get(scene).obstacles
         self.scene = scene
+        self.p = import_pybullet()
         self.drones: list[int] = []
-        self._damping = float(np.float32(damping))  # the reference's, Bullet's default, is in single precision
+        self._damping = float(np.float32(damping))  # Bullet's default of 0.04 is in single precision
         self._collision = collision
         self._team = np.empty((0, 20))
         if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):  # Bullet would end the process
@@ -61,7 +75,11 @@ class Client:
         self.p.setTimeStep(dt, physicsClientId=self.id)
         self.p.setGravity(0, 0, 0, physicsClientId=self.id)  # every drone's weight is part of its wrench
         self.ground = self._add_ground() if scene.ground else None
-        self.obstacles = [self._add_obstacle(obstacle) for obstacle in scene.obstacles]
+        self.obstacles = [self._add_obstacle(obstacle) for obstacle in obstacles]
+        self.solids = [
+            n for n, obstacle in zip(self.obstacles, obstacles, strict=True) if isinstance(obstacle, Obstacle)
+        ]
+        self._point = self.p.createCollisionShape(self.p.GEOM_SPHERE, radius=_POINT, physicsClientId=self.id)
         self.renderer = self.p.ER_BULLET_HARDWARE_OPENGL if gui or renderer == EGL else self.p.ER_TINY_RENDERER
         if renderer == EGL:
             self._load_egl()
@@ -153,6 +171,26 @@ class Client:
             after.append(pos + quat + vel + omega)
         return np.array(after)
 
+    def solids_at(self, point: list[float]) -> list[int]:
+        """The obstacles, by their numbers, that a point (m, world) is inside of; meshes and URDF files do not count.
+
+        Bullet takes those for their convex hulls, in which there is room to look around.
+        """
+        near = self.p.getOverlappingObjects(point, point, physicsClientId=self.id) or ()
+        bodies = {body for body, _ in near}.intersection(self.solids)
+        return sorted(self.obstacles.index(body) for body in bodies if self._is_inside(body, point))
+
+    def _is_inside(self, body: int, point: list[float]) -> bool:
+        closest = self.p.getClosestPoints(
+            bodyA=body,
+            bodyB=-1,
+            distance=0.0,
+            collisionShapeB=self._point,
+            collisionShapePositionB=point,
+            physicsClientId=self.id,
+        )
+        return any(pair[8] < -_POINT for pair in closest)
+
     def _load_egl(self) -> None:
         spec = importlib.util.find_spec("eglRenderer")
         if spec is None or self.p.loadPlugin(spec.origin, "_eglRendererPlugin", physicsClientId=self.id) < 0:
@@ -213,22 +251,14 @@ class Client:
         p.changeDynamics(ground, -1, lateralFriction=_GROUND_FRICTION, physicsClientId=self.id)
         return ground
 
-    def _add_obstacle(self, obstacle: Obstacle) -> int:
+    def _add_obstacle(self, obstacle: Any) -> int:
         p = self.p
         if isinstance(obstacle, Urdf):
             with _quiet():
                 return p.loadURDF(
                     str(obstacle.path), obstacle.pos, obstacle.quat, useFixedBase=True, physicsClientId=self.id
                 )
-        match obstacle:
-            case Box(size=size):
-                shape = dict(shapeType=p.GEOM_BOX, halfExtents=[edge / 2 for edge in size])
-            case Sphere(radius=radius):
-                shape = dict(shapeType=p.GEOM_SPHERE, radius=radius)
-            case Cylinder(radius=radius, height=height):
-                shape = dict(shapeType=p.GEOM_CYLINDER, radius=radius, height=height)
-            case Mesh(path=path, scale=scale):
-                shape = dict(shapeType=p.GEOM_MESH, fileName=str(path), meshScale=[scale] * 3)
+        shape = shape_of(p, obstacle)
         collision = p.createCollisionShape(**shape, physicsClientId=self.id)
         if "height" in shape:
             shape["length"] = shape.pop("height")  # Bullet has two words for it

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_number, check_params, check_positive, check_quaternion, check_whole
 from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors
-from jaxdrones.dynamics.rotors import angular_momentum, limited
+from jaxdrones.engine.bullet import arrays
 from jaxdrones.engine.bullet.camera import Camera, look, of_drones
 from jaxdrones.engine.bullet.client import BALLS, TINY, Client
 from jaxdrones.engine.bullet.contacts import Contact, of_last_step
@@ -25,17 +25,8 @@ from jaxdrones.engine.step import HostStep, is_traced
 from jaxdrones.engine.team import Layout, check_team, pack
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-
-# The host sees a team as one array, a row per drone: pose and velocities in the world frame, rotor speeds, commands,
-# and the states of models.
-_BODY, _COMMAND = slice(0, 13), slice(17, 21)
-_QUAT, _OMEGA, _RPM = slice(3, 7), slice(10, 13), slice(13, 17)
-_AUX = slice(21, None)
-_COLUMNS = dict(pos=slice(0, 3), quat=_QUAT, vel=slice(7, 10), omega=_OMEGA, rpm=_RPM)
-# And what acts on it: force and torque in the world frame; then the rotor speeds and states of models that follow.
-_NEXT_RPM, _NEXT_AUX = slice(6, 10), slice(10, None)
 
 _PAPER_CAMERA = Camera()
 _FILM_CAMERA = Camera(width=640, height=480)
@@ -104,7 +95,7 @@ class BulletStep(HostStep):
 
     def __init__(self, client: Client, physics: Physics, substeps: int, dt: float):
         self.client, self.physics, self._substeps, self._dt = client, physics, substeps, dt
-        self._loads = jax.jit(self._compute_loads, static_argnums=(0, 1))
+        self._loads = arrays.make_loads(physics, client.scene, dt)
         # What the last call with values was checked for and what was made of it, kept as long as it stays the same:
         self._params: Params | None = None
         self._shapes: list[tuple[int, ...]] = []
@@ -155,25 +146,10 @@ class BulletStep(HostStep):
         aux = Layout.of(state.aux)
         for _ in range(substeps):
             loads = self._loads_on(team, aux)
-            team[:, _BODY] = self.client.advance(team, loads)
-            team[:, _RPM], team[:, _AUX] = loads[:, _NEXT_RPM], loads[:, _NEXT_AUX]
+            team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
+            team[:, arrays.BODY] = self.client.advance(team, loads)
+            team[:, arrays.RPM], team[:, arrays.AUX] = loads[:, arrays.NEXT_RPM], loads[:, arrays.NEXT_AUX]
         return self._unpack(team, state)
-
-    def _compute_loads(self, layout: Layout, aux: Layout, flat_params: jax.Array, team: jax.Array) -> jax.Array:
-        """Force and torque (world), next rotor speeds and next states of models of every drone: (n, 10 + k)."""
-        params: Params = layout.unpack(flat_params)
-        state = State(**{name: team[:, columns] for name, columns in _COLUMNS.items()}, aux=aux.unpack(team[:, _AUX]))
-        omega = jax.vmap(rotation.rotate_inverse)(state.quat, state.omega)
-        state = state.replace(omega=omega, rpm=jax.vmap(limited)(params, state.rpm))
-        loads = self.physics.loads(params, state, team[:, _COMMAND], self.client.scene)
-        h, h_next = (jax.vmap(angular_momentum)(params, rpm) for rpm in (state.rpm, loads.state.rpm))
-        torque = loads.wrench.torque.at[:, 2].add((h - h_next) / self._dt)  # of rotors that take a speed at once
-        force = jax.vmap(rotation.rotate)(state.quat, loads.wrench.force).at[:, 2].add(-params.weight)
-        torque = jax.vmap(rotation.rotate)(state.quat, torque)
-        rpm = loads.state.rpm + self._dt * loads.rpm_rate
-        aux_rate = jax.tree.map(jnp.zeros_like, state.aux) | loads.aux_rate
-        following = jax.tree.map(lambda x, rate: x + self._dt * rate, state.aux, aux_rate)
-        return jnp.concatenate([force, torque, rpm, pack(following, len(team))], axis=-1)
 
     def contacts(self, params: Params, state: State) -> list[Contact]:
         """Who touches whom in the physics step that follows `state` with the rotors held at `state.rpm`.
@@ -182,7 +158,9 @@ class BulletStep(HostStep):
             ValueError: a wrong shape, a closed client, or a state that is not finite.
         """
         team = self._pack(params, state, state.rpm)
-        self.client.advance(team, self._loads_on(team, Layout.of(state.aux)))
+        loads = self._loads_on(team, Layout.of(state.aux))
+        team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
+        self.client.advance(team, loads)
         return of_last_step(self.client, self._dt)
 
     def camera(
@@ -229,34 +207,34 @@ class BulletStep(HostStep):
             check_team(params, state, rpm)
             check_params(params)
             self._layout, self._flat_params = Layout.of(params), pack(params, n)
-            self.client.set_team(np.asarray(_bodies(params), float))
+            self.client.set_team(np.asarray(arrays.bodies_of(params), float))
             self._arms = np.asarray(params.arm, float)
             self._params, self._shapes = params, shapes
-        team = np.empty((n, _COMMAND.stop + Layout.of(state.aux).width))
-        for name, columns in _COLUMNS.items():
+        team = np.empty((n, arrays.COMMAND.stop + Layout.of(state.aux).width))
+        for name, columns in arrays.COLUMNS.items():
             team[:, columns] = getattr(state, name)
-        team[:, _COMMAND] = rpm
+        team[:, arrays.COMMAND] = rpm
         if state.aux:
-            team[:, _AUX] = pack(state.aux, n)
+            team[:, arrays.AUX] = pack(state.aux, n)
         if not np.isfinite(team).all():
             check_finite("state", state)
             check_finite("rpm", rpm)
-        check_quaternion("state.quat", team[:, _QUAT])
-        team[:, _OMEGA] = (self.client.matrices(team[:, _QUAT]) @ team[:, _OMEGA, None])[..., 0]
+        check_quaternion("state.quat", team[:, arrays.QUAT])
+        team[:, arrays.OMEGA] = (self.client.matrices(team[:, arrays.QUAT]) @ team[:, arrays.OMEGA, None])[..., 0]
         return team
 
     def _unpack(self, team: np.ndarray, state: State) -> State:
         """The state with the numbers of a team, as arrays of NumPy."""
-        team[:, _OMEGA] = (team[:, None, _OMEGA] @ self.client.matrices(team[:, _QUAT]))[:, 0]
+        team[:, arrays.OMEGA] = (team[:, None, arrays.OMEGA] @ self.client.matrices(team[:, arrays.QUAT]))[:, 0]
         team = team.astype(self._flat_params.dtype)
-        arrays: dict[str, Any] = {name: team[:, columns] for name, columns in _COLUMNS.items()}
-        return state.replace(**arrays, aux=Layout.of(state.aux).unpack(team[:, _AUX]))
+        fields: dict[str, Any] = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
+        return state.replace(**fields, aux=Layout.of(state.aux).unpack(team[:, arrays.AUX]))
 
     def _traced(self, substeps: int, params: Params, state: State, rpm: jax.Array) -> State:
         """The same in a compiled program, which computes the wrenches itself and calls back for every physics step."""
-        bodies, flat_params = _bodies(params), pack(params, len(state.pos))
+        bodies, flat_params = arrays.bodies_of(params), pack(params, len(state.pos))
         layout, aux = Layout.of(params), Layout.of(state.aux)
-        team = jnp.concatenate([_one_array(state, rpm), pack(state.aux, len(state.pos))], axis=-1)
+        team = arrays.one_array(state, rpm)
 
         def advance(bodies, team, loads):
             self._become(bodies)
@@ -264,13 +242,16 @@ class BulletStep(HostStep):
 
         def substep(team, _):
             loads = self._loads(layout, aux, flat_params, team)
-            after = jax.ShapeDtypeStruct((len(team), _BODY.stop), team.dtype)
+            team = team.at[:, arrays.OMEGA].set(loads[:, arrays.START_OMEGA])
+            after = jax.ShapeDtypeStruct((len(team), arrays.BODY.stop), team.dtype)
             body = jax.pure_callback(advance, after, bodies, team, loads, vmap_method="sequential")
-            return jnp.concatenate([body, loads[:, _NEXT_RPM], team[:, _COMMAND], loads[:, _NEXT_AUX]], axis=-1), None
+            return jnp.concatenate(
+                [body, loads[:, arrays.NEXT_RPM], team[:, arrays.COMMAND], loads[:, arrays.NEXT_AUX]], axis=-1
+            ), None
 
         team, _ = jax.lax.scan(substep, team, length=substeps)
-        arrays = {name: team[:, columns] for name, columns in _COLUMNS.items()}
-        state = state.replace(**arrays, aux=aux.unpack(team[:, _AUX]))
+        fields = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
+        state = state.replace(**fields, aux=aux.unpack(team[:, arrays.AUX]))
         return state.replace(omega=jax.vmap(rotation.rotate_inverse)(state.quat, state.omega))
 
     def _traced_camera(self, params: Params, state: State, camera: Camera, raw_depth: bool) -> Any:
@@ -286,27 +267,14 @@ class BulletStep(HostStep):
             self.client.place(team)
             return of_drones(self.client, team, np.asarray(arms, float), camera, raw_depth)
 
-        team = _one_array(state, state.rpm)
-        return jax.pure_callback(take, pictures, _bodies(params), params.arm, team, vmap_method="sequential")
+        team = arrays.one_array(state, state.rpm)
+        return jax.pure_callback(take, pictures, arrays.bodies_of(params), params.arm, team, vmap_method="sequential")
 
     def _become(self, bodies: jax.Array) -> None:
         """The bodies of the team that a compiled program calls back with; no longer those of a call with values."""
         self.client.check_open()
         self._params = None
         self.client.set_team(np.asarray(bodies, float))
-
-
-def _one_array(state: State, rpm: jax.Array) -> jax.Array:
-    """What the host sees of a team."""
-    omega = jax.vmap(rotation.rotate)(state.quat, state.omega)
-    return jnp.concatenate([state.pos, state.quat, state.vel, omega, state.rpm, rpm], axis=-1)
-
-
-def _bodies(params: Params) -> jax.Array:
-    """What Bullet must know of every drone, (n, 20): see `Client.set_team`."""
-    shape = [params.collision_radius, params.collision_height, params.collision_offset, params.prop_radius]
-    rotor_pos = jnp.reshape(params.rotor_pos, (-1, 12))
-    return jnp.concatenate([jnp.stack(shape, axis=-1), rotor_pos, params.mass[:, None], params.inertia], axis=-1)
 
 
 def _refuse_gradients(function: Callable) -> Callable:

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxdrones.engine.bullet.step import BulletStep
 from jaxdrones.engine.step import HostStep
 from jaxdrones.params import Params
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 _AXES_HZ = 24  # how often the body axes are drawn, per simulated second

@@ -8,7 +8,7 @@ import pytest
 import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.engine import bullet
-from jaxdrones.sensing.scene import Box, Scene, Sphere, Urdf
+from jaxdrones.sensing import Box, Scene, Sphere, Urdf
 
 pytestmark = pytest.mark.needs("pybullet")
 
@@ -22,7 +22,7 @@ def at(pos, quat=(0.0, 0.0, 0.0, 1.0)) -> State:
 
 def test_a_coloured_box_in_front_is_seen_where_geometry_says():
     box = Box(pos=(2.0, 0.3, 1.0397), size=(0.4, 0.4, 0.4), color=(1.0, 0.0, 0.0, 1.0))
-    with bullet.make_step(scene=Scene((box,))) as step:
+    with bullet.make_step(scene=Scene.of(box)) as step:
         rgb, depth, segmentation = (x[0] for x in step.camera(CRAZYFLIE, at([0, 0, 1.0])))
     seen = segmentation == 2  # background -1, ground 0, drone 1, box 2
     rows, columns = np.nonzero(seen)
@@ -39,7 +39,7 @@ def test_a_coloured_box_in_front_is_seen_where_geometry_says():
 
 def test_the_camera_turns_with_the_drone():
     ball = Sphere(pos=(0.0, 2.0, 1.0), radius=0.3)
-    with bullet.make_step(scene=Scene((ball,))) as step:
+    with bullet.make_step(scene=Scene.of(ball)) as step:
         ahead = step.camera(CRAZYFLIE, at([0, 0, 1.0]))[2]
         left = step.camera(CRAZYFLIE, at([0, 0, 1.0], [0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)]))[2]
     assert not (ahead == 2).any() and (left == 2).sum() > 50
@@ -76,8 +76,11 @@ def test_looking_changes_nothing_in_flight():
     np.testing.assert_array_equal(first.pos, again.pos)
 
 
-def golden_scene(recorded: list) -> Scene:
-    """The stock bodies of a recorded scene, where they were recorded; its list has (id, name, pose) of each."""
+def golden_scene(recorded: list) -> tuple[Scene, np.ndarray]:
+    """The stock bodies of a recorded scene, where they were recorded, and the segmentation label of each.
+
+    The list of what was recorded has (id, name, pose) of each.
+    """
     names = [name for _, name, _ in recorded]
     if "block_2" not in names:
         files = ["samurai.urdf", "duck_vhacd.urdf", "cube_no_rotation.urdf", "sphere2.urdf"]
@@ -90,20 +93,23 @@ def golden_scene(recorded: list) -> Scene:
         bodies.append(Box(pos=(0, -1, 0.55), size=(0.8, 0.05, 0.05)))
         for i in range((len(names) - 7) // 2):
             bodies += [Urdf(pos=(x, -1, 0.02 + 0.05 * i), path=STOCK + "cube_small.urdf") for x in (-0.3, 0.3)]
-    return Scene((Urdf(pos=(0, 0, 0), path=STOCK + "plane.urdf"), *bodies), ground=False)
+    bodies = [Urdf(pos=(0, 0, 0), path=STOCK + "plane.urdf"), *bodies]
+    numbers = np.argsort(np.argsort([isinstance(body, Urdf) for body in bodies], kind="stable"))  # boxes come first
+    return Scene.of(*bodies, ground=False), 2 + numbers
 
 
 @pytest.mark.parametrize("name", golden_data.names(kind="vision"))
 def test_recorded_pictures_agree(name):
     case = golden_data.load(name)
     camera = bullet.Camera(aspect=case.about["aspect"], near=case.about["near"], far=case.about["far"])
-    with bullet.make_step(scene=golden_scene(case.about["bodies"])) as step:
+    scene, label = golden_scene(case.about["bodies"])
+    with bullet.make_step(scene=scene) as step:
         for pos, quat, raw, bodies in zip(*(case.arrays[key] for key in ("pos", "quat", "depth", "seg")), strict=True):
             _, depth, segmentation = (x[0] for x in step.camera(CRAZYFLIE, at(pos, quat), camera))
             recorded = bodies & ((1 << 24) - 1)
             others = recorded != 1  # the recorded camera sees its own drone, body 1
-            # recorded: plane 0, drone 1, obstacles from 2; here: drone 1, plane 2, obstacles from 3
-            labels = np.where(bodies < 0, -1, np.where(recorded == 0, 2, recorded + 1))
+            # recorded: plane 0, drone 1, obstacles from 2; here: drone 1, obstacles from 2, the plane among them
+            labels = np.where(bodies < 0, -1, label[np.maximum(recorded - 1, 0) % len(label)])
             same = (labels == segmentation) & others
             assert same.sum() >= 0.97 * others.sum()
             metres = camera.far * camera.near / (camera.far - (camera.far - camera.near) * raw)
@@ -113,7 +119,7 @@ def test_recorded_pictures_agree(name):
 
 
 def test_an_eye_inside_a_body_is_refused():
-    with bullet.make_step(scene=Scene((Box(pos=(0, 0, 1), size=(1, 1, 1)),))) as step:
+    with bullet.make_step(scene=Scene.of(Box(pos=(0, 0, 1), size=(1, 1, 1)))) as step:
         with pytest.raises(ValueError, match=r"camera of drone 0 is inside obstacle 0.*move the drone"):
             step.camera(CRAZYFLIE, at([0, 0, 1.0]))
         with pytest.raises(ValueError, match="inside the ground"):
@@ -142,7 +148,7 @@ def test_the_eye_is_one_arm_above_the_drone_and_world_up_stays_up():
 def test_an_eye_that_is_off_the_plane_of_a_face_by_rounding_sees_all_the_same():
     """TinyRenderer does not return from such a picture; the face is at x = 0."""
     box = Box(pos=(-0.5, -2.5, 0.5), size=(1, 1, 1))
-    with bullet.make_step(scene=Scene((box,))) as step:
+    with bullet.make_step(scene=Scene.of(box)) as step:
         exact = step.camera(CRAZYFLIE, at([0, 0, 0.1]))[1]
         for x in (1e-17, 1e-9):
             np.testing.assert_array_equal(step.camera(CRAZYFLIE, at([x, 0, 0.1]))[1], exact)

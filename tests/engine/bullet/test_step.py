@@ -11,7 +11,7 @@ from helpers import assert_close, assert_finite, assert_same_motion, flying, tap
 import jaxdrones
 from jaxdrones import State
 from jaxdrones.engine import bullet
-from jaxdrones.sensing.scene import Box, Scene
+from jaxdrones.sensing import Box, Scene
 
 pytestmark = pytest.mark.needs("pybullet")
 
@@ -38,6 +38,8 @@ def apart(state: State) -> State:
 
 @pytest.mark.parametrize("rotors", [jaxdrones.instant_rotors, jaxdrones.lagging_rotors])
 def test_free_flight_equals_the_explicit_backend(team, rotors):
+    """Also what the inertia of the rotors does."""
+    team = team.replace(rotor_inertia=2e-3 * team.inertia[:, 2])
     start, commands = apart(flying(team, tilt=0.2)), np.asarray(tape(team, 120))
     explicit = jaxdrones.make_step(**EVERYTHING, rotors=rotors)
     with bullet.make_step(**EVERYTHING, rotors=rotors) as step:
@@ -145,7 +147,7 @@ def test_a_drone_at_rest_stays_at_rest(step, vehicle):
 
 
 def test_an_obstacle_carries_a_drone():
-    scene = Scene((Box(pos=(0, 0, 0.5), size=(0.4, 0.4, 0.2)),))
+    scene = Scene.of(Box(pos=(0, 0, 0.5), size=(0.4, 0.4, 0.2)))
     params, state = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1), falling([0, 0, 0.65])
     with bullet.make_step(scene=scene) as step:
         for _ in range(240):

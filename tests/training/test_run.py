@@ -11,7 +11,9 @@ import pytest
 from jaxdrones.envs import make
 from jaxdrones.learning.networks import Policy
 from jaxdrones.training import events
-from jaxdrones.training.runs import Progress, Recipe, Run
+from jaxdrones.training.progress import Progress
+from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.run import Run
 
 
 def records(file: Path):
@@ -59,8 +61,8 @@ def test_lines_after_the_update_that_training_goes_on_from_are_dropped(tmp_path)
 
 
 def test_a_recipe_survives_json():
-    recipe = Recipe.of("tracking", "ppo", realistic=True, period=5.0, worlds=64, restart=1)
-    assert recipe.config.restart == 1.0 and recipe.options == {"period": 5.0}
+    recipe = Recipe.of("tracking", "ppo", realistic=True, period=5.0, worlds=64, restart_fraction=1)
+    assert recipe.config.restart_fraction == 1.0 and recipe.options == {"period": 5.0}
     assert Recipe.from_dict(recipe.as_dict()) == recipe
     assert recipe.env().observation_size > 0
 
@@ -86,7 +88,7 @@ def test_a_disk_that_fills_up_leaves_the_checkpoint_that_was_there(tmp_path, mon
     with pytest.raises(OSError, match=r"state\.msgpack"):
         run.save_state({"x": np.zeros(3)}, update=2)
     monkeypatch.undo()
-    assert run.about("state")["update"] == 1
+    assert run.sidecar("state")["update"] == 1
     assert run.load_state({"x": np.zeros(3)})["x"].tolist() == [0, 1, 2]
 
 

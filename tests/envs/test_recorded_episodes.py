@@ -1,4 +1,4 @@
-"""Recorded episodes of the reference: our environment, fed the recorded states, sees and rewards the same."""
+"""Recorded episodes of gym-pybullet-drones: our environment, fed the recorded states, observes and rewards the same."""
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +8,8 @@ from golden_data import explicit_params, load, names
 
 import jaxdrones
 from jaxdrones import State, rotation
+from jaxdrones.engine.physics import Physics
+from jaxdrones.engine.step import Step
 from jaxdrones.envs.actions import ACTIONS, rpm
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
@@ -36,20 +38,23 @@ ACTION = {
 }
 
 
-class Replay:
+class Replay(Step):
     """A step that hands out recorded states one after the other and keeps what was commanded."""
 
     def __init__(self, states: np.ndarray):
-        self.states, self.k, self.commands = states, 0, []
+        self.states, self.k, self.commands, self.physics = states, 0, [], Physics()
 
-    def __call__(self, params, state, rpm):
+    def rate(self, params, state, rpm, scene=None):
+        raise NotImplementedError("nothing asks for it")
+
+    def __call__(self, params, state, rpm, scene=None):
         self.k += 1
         self.commands.append(np.asarray(rpm))
         return to_state(self.states[self.k])
 
 
 def to_state(row: np.ndarray) -> State:
-    """From the reference's (n, 20): its angular velocity is in the world frame."""
+    """From a recorded row (n, 20), whose angular velocity is in the world frame."""
     row = jnp.asarray(row)
     quat = row[:, 3:7]
     omega = jax.vmap(rotation.rotate_inverse)(quat, row[:, 13:16])
@@ -65,9 +70,9 @@ def replayed(name: str):
     action = ACTIONS["destination"]() if main and about["action_type"] == "pid" else ACTION[about["action_type"]]
     params = jaxdrones.repeat(explicit_params(case._replace(about=about | {"vehicle": "cf2x"})), task.drones)
     step = Replay(arrays["state"])
-    parts = [OBSERVATIONS[part] for part in task.observation]
+    terms = [OBSERVATIONS[name] for name in task.observation]
     dt = about["physics_steps_per_record"] / about["physics_freq_hz"]
-    env = Env(task, params, step, dt=dt, action=action, observation=parts)
+    env = Env(task, params, step, dt=dt, action=action, observation=terms)
     obs, world = env.reset(jax.random.key(0))
     answers = [(obs,)]
     for row in arrays["action"]:
@@ -92,13 +97,13 @@ def episode(request):
         return replayed(request.param)
 
 
-def test_the_start_is_the_references(episode):
+def test_the_start_is_the_recorded_one(episode):
     case, answers, _ = episode
     width = min(case.arrays["obs"].shape[-1], answers[0][0].shape[-1])
     np.testing.assert_allclose(answers[0][0][:, :width], case.arrays["obs"][0][:, :width], atol=1e-7)
 
 
-def test_observations_are_the_references(episode):
+def test_observations_are_the_recorded_ones(episode):
     case, answers, _ = episode
     recorded = case.arrays["obs"]
     width = min(recorded.shape[-1], answers[0][0].shape[-1])
@@ -107,7 +112,7 @@ def test_observations_are_the_references(episode):
     np.testing.assert_allclose(ours, recorded[..., :width], rtol=rounding, atol=rounding / 10)
 
 
-def test_rewards_are_the_references(episode):
+def test_rewards_are_the_recorded_ones(episode):
     case, answers, _ = episode
     recorded = case.arrays["reward"]
     ours = np.array([answer[1] for answer in answers[1:]])
@@ -116,7 +121,7 @@ def test_rewards_are_the_references(episode):
     np.testing.assert_allclose(ours, recorded, rtol=1e-9, atol=1e-12)
 
 
-def test_ends_are_the_references(episode):
+def test_terminations_and_truncations_are_the_recorded_ones(episode):
     case, answers, _ = episode
     terminated, truncated = (np.array([answer[i] for answer in answers[1:]]) for i in (2, 3))
     if "done" in case.arrays:
@@ -126,6 +131,6 @@ def test_ends_are_the_references(episode):
         np.testing.assert_array_equal(truncated, case.arrays["truncated"])
 
 
-def test_actions_command_the_references_rotor_speeds(episode):
+def test_actions_command_the_recorded_rotor_speeds(episode):
     case, _, commands = episode
     np.testing.assert_allclose(commands, case.arrays["state"][1:, :, 16:], rtol=0, atol=1e-6)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxdrones.training.loop import best_of, score_of
+from jaxdrones.training.selection import best_of, score_of
 
 
 @pytest.mark.parametrize(
@@ -33,4 +33,4 @@ def test_small_losses_of_success_do_not_add_up():
 
 
 def test_the_first_policy_of_the_highest_success_replaces_one_that_is_no_longer_near():
-    assert best_of([(0.9, 10.0), (0.99, 1.0)], 1000, highest=0.99) == 1
+    assert best_of([(0.9, 10.0), (0.99, 1.0)], 1000, highest_success=0.99) == 1

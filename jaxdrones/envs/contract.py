@@ -1,4 +1,4 @@
-"""The contract of an environment, as a test that ships with the package."""
+"""A test of the contract of an environment, for environments of users too."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from jaxdrones.envs.env import Env
 
 
 class ContractError(AssertionError):
-    """An environment breaks its contract; the message says where."""
+    """An environment violates its contract; the message says how and where."""
 
 
 def check_env(env: Env, steps: int = 5) -> None:
-    """Fly a few steps with random actions and look at everything that comes back.
+    """Test an environment: fly a few steps with random actions and check everything that comes back.
 
-    Shapes, types and bounds; that the same key gives the same episode; that nothing given is changed; that the reward
-    is the sum of its named terms; that wrong actions are refused; on the explicit backend also that `jax.jit` and
-    `jax.vmap` give what plain calls give.
+    It checks shapes, types and bounds; that the same key gives the same episode; that arguments are not changed; that
+    the reward is the sum of its named terms; that wrong actions are refused; and on the explicit backend also that
+    `jax.jit` and `jax.vmap` give the same results as plain calls.
 
     Args:
         env: the environment.
-        steps: control steps to fly.
+        steps: number of control steps.
 
     Raises:
-        ContractError: what is broken, and where.
+        ContractError: the contract is violated.
     """
     key = jax.random.key(0)
     obs, world = env.reset(key)
     _check_obs(env, obs, "after reset")
     _check_equal(env.reset(key), (obs, world), "two resets with the same key")
-    keys, actions = _tape(env, steps)
+    keys, actions = _random_actions(env, steps)
     flown = []
     for k in range(steps):
         before = jax.tree.map(np.array, world)
@@ -48,7 +48,7 @@ def check_env(env: Env, steps: int = 5) -> None:
         _check_transformations(env, keys, actions, flown)
 
 
-def _tape(env: Env, steps: int) -> tuple[jax.Array, jax.Array]:
+def _random_actions(env: Env, steps: int) -> tuple[jax.Array, jax.Array]:
     key = jax.random.key(1)
     shape = (steps, env.drones, env.action_size)
     return jax.random.split(key, steps), jax.random.uniform(key, shape, float, -0.3, 0.3)
@@ -56,24 +56,24 @@ def _tape(env: Env, steps: int) -> tuple[jax.Array, jax.Array]:
 
 def _check_obs(env: Env, obs: Any, where: str) -> None:
     state = obs["state"] if isinstance(obs, dict) else obs
-    _demand(state.shape == (env.drones, env.observation_size), f"obs has shape {state.shape} {where}")
-    _demand(np.all(np.isfinite(state)), f"obs is not finite {where}: {state}")
-    _demand(np.all(np.abs(state) <= env.observation_bound), f"obs is beyond observation_bound {where}: {state}")
+    _require(state.shape == (env.drones, env.observation_size), f"obs has shape {state.shape} {where}")
+    _require(np.all(np.isfinite(state)), f"obs is not finite {where}: {state}")
+    _require(np.all(np.abs(state) <= env.observation_bound), f"obs is beyond observation_bound {where}: {state}")
 
 
 def _check_answer(env: Env, answer: tuple, where: str) -> None:
     obs, world, reward, terminated, truncated, info = answer
     _check_obs(env, obs, where)
-    _demand(reward.shape == (env.drones,), f"reward has shape {reward.shape} {where}; expected ({env.drones},)")
-    _demand(np.all(np.isfinite(reward)), f"reward is not finite {where}: {reward}")
+    _require(reward.shape == (env.drones,), f"reward has shape {reward.shape} {where}; expected ({env.drones},)")
+    _require(np.all(np.isfinite(reward)), f"reward is not finite {where}: {reward}")
     for name, flag in ("terminated", terminated), ("truncated", truncated):
-        _demand(flag.shape == () and flag.dtype == bool, f"{name} is not one boolean {where}: {flag}")
+        _require(flag.shape == () and flag.dtype == bool, f"{name} is not one boolean {where}: {flag}")
     terms = sum(info["rewards"].values())
-    _demand(np.allclose(terms, reward, rtol=1e-5, atol=1e-6), f"the terms sum up to {terms}, not to {reward} {where}")
+    _require(np.allclose(terms, reward, rtol=1e-5, atol=1e-6), f"the terms sum up to {terms}, not to {reward} {where}")
     for name, metric in info["metrics"].items():
-        _demand(metric.shape == (env.drones,), f"metric {name!r} has shape {metric.shape} {where}")
+        _require(metric.shape == (env.drones,), f"metric {name!r} has shape {metric.shape} {where}")
     for leaf in jax.tree.leaves(world.drones):
-        _demand(np.all(np.isfinite(leaf)), f"the state of the drones is not finite {where}")
+        _require(np.all(np.isfinite(leaf)), f"the state of the drones is not finite {where}")
 
 
 def _check_refusals(env: Env, key: jax.Array, world: Any) -> None:
@@ -103,19 +103,19 @@ def _check_transformations(env: Env, keys: jax.Array, actions: jax.Array, flown:
 
 def _check_equal(actual, expected, what: str) -> None:
     same = jax.tree.map(np.array_equal, jax.tree.map(_plain, actual), jax.tree.map(_plain, expected))
-    _demand(all(jax.tree.leaves(same)), f"{what} differ")
+    _require(all(jax.tree.leaves(same)), f"{what} differ")
 
 
 def _check_close(actual, expected, what: str) -> None:
     for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         tolerance = 1e-3 if a.dtype == np.float32 else 1e-9
-        _demand(np.allclose(a, b, rtol=tolerance, atol=tolerance), f"{what} differ by {np.max(np.abs(a - b))}")
+        _require(np.allclose(a, b, rtol=tolerance, atol=tolerance), f"{what} differ by {np.max(np.abs(a - b))}")
 
 
 def _plain(x):
     return jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
 
 
-def _demand(condition, message: str) -> None:
+def _require(condition, message: str) -> None:
     if not condition:
         raise ContractError(message)

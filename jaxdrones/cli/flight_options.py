@@ -1,11 +1,11 @@
-"""Options of `jaxdrones fly` and `jaxdrones compare`: what is to be flown."""
+"""Options of `jaxdrones fly` and `jaxdrones compare`: the conditions of a flight."""
 
 import argparse
 import contextlib
 from typing import Any
 
 from jaxdrones import assets
-from jaxdrones.cli.common import bar, complain
+from jaxdrones.cli.common import bar, print_error
 from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights.conditions import Conditions
@@ -15,7 +15,7 @@ from jaxdrones.urdf import load_params
 
 
 def add_conditions(parser: argparse.ArgumentParser) -> None:
-    """What is to be flown, but for the flight itself."""
+    """Add the options of a flight but its name."""
     parser.add_argument("--drones", type=int, metavar="N", help="number of drones")
     parser.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
     parser.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
@@ -27,35 +27,35 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
 
 
-def flown(options: argparse.Namespace, **more) -> Record:
-    """The flight that was asked for, behind a progress bar."""
-    with progress() as tell:
-        return fly(options.flight, progress=tell, **_asked(options), **more)
+def fly_options(options: argparse.Namespace, **more) -> Record:
+    """The record of the flight that the options describe; a progress bar shows how far it is."""
+    with progress() as report:
+        return fly(options.flight, progress=report, **_conditions(options), **more)
 
 
 def check_conditions(options: argparse.Namespace, **more) -> None:
-    """Raise `ValueError` if that flight cannot be flown."""
-    conditions = Conditions(options.flight, **_asked(options), **more)
+    """Raise `ValueError` if the options describe no flight."""
+    conditions = Conditions(options.flight, **_conditions(options), **more)
     load_params(conditions.vehicle)
 
 
-def _asked(options: argparse.Namespace) -> dict[str, Any]:
+def _conditions(options: argparse.Namespace) -> dict[str, Any]:
     """Fields of `Conditions`."""
     names = ("vehicle", "drones", "controller", "control_hz", "duration", "rotors", "integrator", "seed")
     return {name: getattr(options, name) for name in names} | {"effects": _names(options.effects)}
 
 
 def warn(diverged: dict[str, str]) -> int:
-    """Say on stderr that a flight diverged; returns the exit code.
+    """Write to stderr that a flight diverged, if it did; returns the exit code.
 
     Args:
-        diverged: what `Record.diverged` found, by drone.
+        diverged: result of `Record.diverged`.
     """
     if not diverged:
         return 0
     others = f" (and {len(diverged) - 1} more)" if len(diverged) > 1 else ""
     what = f"the flight diverged: {next(iter(diverged.values()))}{others}"
-    return complain(f"{what}; try a higher --control-hz, another --controller, or fewer --effects", 1)
+    return print_error(f"{what}; try a higher --control-hz, another --controller, or fewer --effects", 1)
 
 
 def _names(text: str | None) -> list[str] | None:
@@ -66,6 +66,6 @@ def _names(text: str | None) -> list[str] | None:
 
 @contextlib.contextmanager
 def progress():
-    """A progress bar that is told of the share that is done; silent without tqdm or a terminal."""
+    """A progress bar, as a function of the share that is done; `None` without tqdm, silent without a terminal."""
     with bar(100, "flying", "%") as shown:
         yield None if shown is None else lambda share: shown.update(round(100 * share) - shown.n)

@@ -1,7 +1,8 @@
-"""The tasks of the paper, and those of today's version of its simulator (`hover_2x`, `multi_hover`).
+"""The tasks of gym-pybullet-drones (2021), and those of version 2.x (`hover_2x`, `multi_hover`).
 
-Rewards, ends and starts are the reference's. Its clock is read before the step, so rewards that follow a moving point
-lag one control step behind, and an episode of T seconds has two steps more than T / dt.
+Rewards, terminations, truncations and starts are those of gym-pybullet-drones. It reads its clock before the step:
+rewards that follow a moving target lag one control step behind, and an episode of T seconds has two steps more than
+T / dt.
 """
 
 import dataclasses
@@ -17,22 +18,24 @@ from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks.starts import hovering, on_diagonal
-from jaxdrones.tasks.task import Task, World, norm, square
+from jaxdrones.tasks.task import Task, World, distance, square
 
-_DURATION, _DURATION_V2 = 5.0, 8.0  # s
+_DURATION_2021, _DURATION_2X = 5.0, 8.0  # s
 _SOLVED = 0.05  # m, at the end of an episode
-_TUNE_RATE = 0.288  # rad/s: the reference's 0.006 rad per control step at 48 Hz
-_TILT = 0.4  # rad of roll or pitch, at which today's version gives up
+_TUNE_RATE = 0.288  # rad/s: 0.006 rad per control step at 48 Hz
+_TILT = 0.4  # rad of roll or pitch, at which (2.x) truncates the episode
 
-Starts = Float[Array, "n 3"]  # where the drones started, m: the variables of all tasks here
+Starts = Float[Array, "n 3"]
+"""Where the drones started, m: the variables of all tasks here."""
 Target = Callable[[Starts, Array], Setpoint]
-Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]  # of targets and the world after a step
+Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]
+"""(target positions, world after a step) -> the negative reward of every drone."""
 
 
 @check_keywords
 def hover(drones: int = 1) -> Task:
     """Equation 12: the negative squared distance from (0, 0, 1)."""
-    return _task("hover-2021", "hover at z = 1 m (equation 12)", drones, _at(0.0, 0.0, 1.0), _squared_distance)
+    return _task_2021("hover-2021", "hover at z = 1 m (equation 12)", drones, _at(0.0, 0.0, 1.0), _squared_distance)
 
 
 @check_keywords
@@ -44,7 +47,7 @@ def takeoff(drones: int = 1) -> Task:
         low = z < 0.02
         return jnp.where(low, 5, 1 / (10 * jnp.where(low, 1, z)))
 
-    return _task("takeoff", "climb from the ground", drones, _at(0.0, 0.0, 1.0), cost)
+    return _task_2021("takeoff", "climb from the ground", drones, _at(0.0, 0.0, 1.0), cost)
 
 
 @check_keywords
@@ -53,19 +56,20 @@ def fly_through_gate(drones: int = 1) -> Task:
 
     def target(starts, t):
         zero = jnp.zeros_like(t)
-        return _everywhere(starts, [zero, -2 * t / _DURATION, zero + 0.75], vel=[zero, zero - 2 / _DURATION, zero])
+        speed = -2 / _DURATION_2021
+        return _everywhere(starts, [zero, speed * t, zero + 0.75], vel=[zero, zero + speed, zero])
 
     def cost(target, world):
         return 10 * _squared_distance(target, world)
 
-    return _task("fly-through-gate", "fly through the gate at y = -1 m", drones, target, cost)
+    return _task_2021("fly-through-gate", "fly through the gate at y = -1 m", drones, target, cost)
 
 
 @check_keywords
 def tune(drones: int = 1) -> Task:
     """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m.
 
-    The velocity asked for is the reference's: a difference over the last 1/48 s.
+    As in gym-pybullet-drones (2021), the target velocity is a difference over the last 1/48 s.
     """
 
     def y(t):
@@ -76,7 +80,7 @@ def tune(drones: int = 1) -> Task:
         return _everywhere(starts, [zero, y(t), zero + 1], vel=[zero, 48 * (y(t) - y(t - 1 / 48)), zero])
 
     summary = "tune the gains of the PID in flight"
-    return _task("tune", summary, drones, target, _squared_distance, action="pid_gains")
+    return _task_2021("tune", summary, drones, target, _squared_distance, action="pid_gains")
 
 
 @check_keywords
@@ -86,10 +90,10 @@ def leader_follower(drones: int = 2) -> Task:
     def cost(target, world):
         pos = world.drones.pos
         follower = (pos[:, 2] - pos[0, 2]) ** 2 / len(pos)
-        return _first_then(square(pos - jnp.array([[0, 0, 0.5]], pos.dtype)), follower)
+        return _first_then(_squared_distance(target, world), follower)
 
     summary = "follow the leader's height (equation 13)"
-    return _task("leader-follower", summary, drones, _at_height(0.5), cost, minimum=2)
+    return _task_2021("leader-follower", summary, drones, _at_height(0.5), cost, minimum=2)
 
 
 @check_keywords
@@ -98,14 +102,14 @@ def flock(drones: int = 2) -> Task:
 
     def cost(target, world):
         pos = world.drones.pos
-        return _first_then(square(pos - jnp.array([[0, 0, 1.0]], pos.dtype)), (jnp.roll(pos, 1, 0) - pos)[:, 2] ** 2)
+        return _first_then(_squared_distance(target, world), (jnp.roll(pos, 1, 0) - pos)[:, 2] ** 2)
 
-    return _task("flock", "fly at the height of the drone before", drones, _at_height(1.0), cost, minimum=2)
+    return _task_2021("flock", "fly at the height of the drone before", drones, _at_height(1.0), cost, minimum=2)
 
 
 @check_keywords
 def meetup(drones: int = 2) -> Task:
-    """Drone i and drone n - 1 - i are to meet."""
+    """Drone i and drone n - 1 - i meet; the reward is the negative squared distance between them."""
 
     def target(starts, t):
         return Setpoint.at((starts + starts[::-1]) / 2)
@@ -113,68 +117,65 @@ def meetup(drones: int = 2) -> Task:
     def cost(target, world):
         return square(world.drones.pos - world.drones.pos[::-1])
 
-    task = _task("meetup", "meet the partner half-way", drones, target, cost, action="velocity", minimum=2)
+    task = _task_2021("meetup", "meet the partner half-way", drones, target, cost, action="velocity", minimum=2)
     return dataclasses.replace(task, contact=("ground", "drones"))
 
 
 @check_keywords
 def hover_2x(drones: int = 1) -> Task:
     """Hover at (0, 0, 1), rewarded by max(0, 2 - d^4)."""
-    return _task_v2("hover-2x", "hover at z = 1 m, bounded reward", drones, _at(0.0, 0.0, 1.0), box=1.5)
+    return _task_2x("hover-2x", "hover at z = 1 m, bounded reward", drones, _at(0.0, 0.0, 1.0), box=1.5)
 
 
 @check_keywords
 def multi_hover(drones: int = 2) -> Task:
-    """Drone i hovers 1 / (i + 1) m above its start; the reference's reward is the sum over the team."""
+    """Drone i hovers 1 / (i + 1) m above its start; the reward of (2.x) is the sum over the team."""
 
     def target(starts, t):
         return Setpoint.at(starts.at[:, 2].add(1 / (1 + jnp.arange(len(starts), dtype=starts.dtype))))
 
-    return _task_v2("multi-hover", "every drone hovers at a height of its own", drones, target, box=2.0)
+    return _task_2x("multi-hover", "every drone hovers at a height of its own", drones, target, box=2.0)
 
 
-def _task(
+def _task_2021(
     name: str, summary: str, drones: int, target: Target, cost: Cost, action: str = "one_d_rpm", minimum: int = 1
 ) -> Task:
     check_whole(f"number of drones of {name}", drones, minimum)
 
-    def term(world: World) -> Float[Array, " n"]:
-        return cost(target(world.variables, world.time - world.dt).pos, world)
+    def late_cost(task: Task, world: World) -> Float[Array, " n"]:
+        return cost(task.target(world.variables, world.time - world.dt).pos, world)
 
     return Task(
         name=name,
         summary=summary,
         drones=drones,
-        duration=_DURATION,
+        duration=_DURATION_2021,
         start=_start,
         target=target,
-        rewards={"cost": (-1.0, term)},
+        rewards={"cost": (-1.0, late_cost)},
         success=_close_at_the_end,
         contact=("ground",),
         action=action,
         observation=("normalized_kinematics",),
         control_hz=48.0,
-        overtime=2,
+        extra_steps=2,
     )
 
 
-def _task_v2(name: str, summary: str, drones: int, target: Target, box: float) -> Task:
+def _task_2x(name: str, summary: str, drones: int, target: Target, box: float) -> Task:
     check_whole(f"number of drones of {name}", drones)
 
-    def error(world: World) -> Float[Array, " n"]:
-        return norm(target(world.variables, world.time).pos - world.drones.pos)
+    def closeness(task: Task, world: World) -> Float[Array, " n"]:
+        return jnp.maximum(0, 2 - distance(task, world) ** 4)
 
-    def closeness(world: World) -> Float[Array, " n"]:
-        return jnp.maximum(0, 2 - error(world) ** 4)
+    def arrived(task: Task, world: World):
+        return jnp.broadcast_to(jnp.sum(distance(task, world)) < 1e-4, len(world.drones.pos))
 
-    def arrived(world: World):
-        return jnp.broadcast_to(jnp.sum(error(world)) < 1e-4, len(world.drones.pos))
-
-    def out_of_box(world: World):
+    def out_of_box(task: Task, world: World):
         x, y, z = world.drones.pos.T
         return (jnp.abs(x) > box) | (jnp.abs(y) > box) | (z > 2.0)
 
-    def tilted(world: World):
+    def tilted(task: Task, world: World):
         roll, pitch, _ = jax.vmap(rotation.to_rpy)(world.drones.quat).T
         return (jnp.abs(roll) > _TILT) | (jnp.abs(pitch) > _TILT)
 
@@ -182,24 +183,24 @@ def _task_v2(name: str, summary: str, drones: int, target: Target, box: float) -
         name=name,
         summary=summary,
         drones=drones,
-        duration=_DURATION_V2,
+        duration=_DURATION_2X,
         start=_start,
         target=target,
         rewards={"closeness": (1.0, closeness)},
-        ends={"arrived": arrived},
-        limits={"out_of_box": out_of_box, "tilted": tilted},
+        terminations={"arrived": arrived},
+        truncations={"out_of_box": out_of_box, "tilted": tilted},
         success=_close_at_the_end,
         contact=("ground",),
         action="one_d_rpm",
         observation=("kinematics_2x", "last_actions_2x"),
         control_hz=30.0,
         substeps=8,
-        overtime=2,
+        extra_steps=2,
     )
 
 
 def _start(key: jax.Array, params: Params) -> tuple[State, Starts]:
-    """The reference's: on a diagonal, 0.1 m above the ground, with the rotors standing still."""
+    """On a diagonal, 0.1 m above the ground, with the rotors standing still."""
     pos = on_diagonal(params)
     return hovering(params, pos).replace(rpm=jnp.zeros((len(pos), 4), pos.dtype)), pos
 
@@ -209,7 +210,7 @@ def _at(x: float, y: float, z: float) -> Target:
 
 
 def _at_height(z: float) -> Target:
-    """Every drone above its start, except that the first is to be above the origin."""
+    """The target of every drone is above its start, that of the first one above the origin."""
     return lambda starts, t: Setpoint.at(starts.at[:, 2].set(z).at[0, :2].set(0))
 
 

@@ -1,0 +1,45 @@
+"""Compilation of trainings and evaluations: options of the compiler, and when a program is compiled again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+from jaxdrones.accelerate.compiler import training_options
+
+
+def jit(function: Callable, **arguments: Any) -> Any:
+    """`jax.jit` with the compiler options that suit training.
+
+    The result may be called or lowered, but not inside another traced function, where JAX refuses compiler options.
+    The options are those of the device, so this starts it.
+
+    Args:
+        function: function to compile.
+        **arguments: further arguments of `jax.jit`.
+    """
+    return jax.jit(function, compiler_options=training_options(), **arguments)
+
+
+def is_tracing() -> bool:
+    """Whether the caller runs inside a function that JAX is tracing to compile it."""
+    return isinstance(jax.numpy.zeros(()) + 0, jax.core.Tracer)
+
+
+class Static:
+    """An object as an argument of a compiled function, which is compiled again when an attribute of it was set."""
+
+    def __init__(self, value: Any):
+        self.value = value
+        self._attributes = dict(vars(value))
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Static) or self.value is not other.value:
+            return False
+        mine, others = self._attributes, other._attributes
+        return mine.keys() == others.keys() and all(mine[name] is others[name] for name in mine)

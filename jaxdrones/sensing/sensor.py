@@ -1,0 +1,158 @@
+"""Sensors: what a drone measures of its own motion and of its surroundings."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.checks import check_arguments, check_callable, check_number, check_sequence, shown
+from jaxdrones.params import Params
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.state import State
+
+
+def no_memory(key: jax.Array, params: Params) -> None:
+    """The memory of a sensor whose readings depend on the present alone: none."""
+    return None
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """A device on every drone of a team: an IMU, a range finder, a barometer.
+
+    Both functions are about one drone and are mapped over the team.
+    """
+
+    name: str
+    """The name by which observation terms ask for the reading, for example `imu`."""
+    measure: Callable[..., Any]
+    """`measure(key, params, state, rate, scene, memory) -> (memory, reading)`.
+
+    key: a random key for the noise of this one measurement, of this drone.
+    params: constants of the drone.
+    state: its state, with `pos` (3,) and so on; units and frames as in `State`.
+    rate: the time derivative of its state, a `State` as well: `rate.vel` (3,) is the acceleration of the center of
+        mass, m/s^2, world, and `rate.omega` (3,) the angular acceleration, rad/s^2, body.
+    scene: the `Scene` of the world, the same for all drones.
+    memory: what `init` or the previous measurement returned.
+
+    The memory that is returned has the shapes and types of the one that is given. The reading is an array or any
+    pytree of arrays; its units and frames are the sensor's to document.
+    """
+    init: Callable[..., Any] = no_memory
+    """`init(key, params) -> memory`: the memory at the start of an episode, a pytree of arrays of one drone."""
+    bound: float = np.inf
+    """The largest absolute value that a reading can have, in units of the reading."""
+
+    def __post_init__(self):
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"name of a sensor is {shown(self.name)}; give a text, for example 'imu'")
+        measured, begun = f"measure of sensor {self.name!r}", f"init of sensor {self.name!r}"
+        check_callable(measured, self.measure, "lambda key, params, state, rate, scene, memory: (memory, state.pos)")
+        check_arguments(measured, self.measure, ("key", "params", "state", "rate", "scene", "memory"))
+        check_callable(begun, self.init, "lambda key, params: jax.numpy.zeros(3)")
+        check_arguments(begun, self.init, ("key", "params"))
+        check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
+
+
+def check_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    """The sensors of a team, or an error if one is none or two have the same name."""
+    if isinstance(sensors, Sensor):
+        raise ValueError(f"sensors is the single sensor {sensors.name!r}; give a sequence, for example (sensor,)")
+    sensors = check_sequence("sensors", sensors, "sensor")
+    for sensor in sensors:
+        if not isinstance(sensor, Sensor):
+            raise ValueError(f"sensors holds {shown(sensor)}; give jaxdrones.Sensor(name, measure)")
+    names = [sensor.name for sensor in sensors]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"two sensors have the name {twice[0]!r}; give every sensor a name of its own")
+    return sensors
+
+
+def init_sensors(sensors: Sequence[Sensor], key: jax.Array, params: Params) -> dict[str, Any]:
+    """The memories of the sensors of a team at the start of an episode.
+
+    Args:
+        sensors: with names that differ.
+        key: a random key.
+        params: of a team of n drones.
+
+    Returns:
+        Memories by the sensors' names; every leaf has a leading axis of n drones.
+    """
+    n = len(params.mass)
+    keys = jax.random.split(key, (len(sensors), n))
+    return {sensor.name: jax.vmap(sensor.init)(keys[i], params) for i, sensor in enumerate(sensors)}
+
+
+def measure_sensors(
+    sensors: Sequence[Sensor],
+    key: jax.Array,
+    params: Params,
+    state: State,
+    rate: State,
+    scene: Scene,
+    memories: dict[str, Any],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """One measurement of every sensor of a team.
+
+    Args:
+        sensors: with names that differ.
+        key: a random key.
+        params: of a team of n drones.
+        state: of the team.
+        rate: the time derivative of `state`, as `step.rate` returns it.
+        scene: of the world.
+        memories: by the sensors' names, as `init_sensors` or the previous measurement returned them.
+
+    Returns:
+        Memories and readings by the sensors' names; every leaf has a leading axis of n drones.
+
+    Raises:
+        ValueError: a sensor returned something else than its memory and a reading made of arrays.
+    """
+    n = len(params.mass)
+    keys = jax.random.split(key, (len(sensors), n))
+    after, readings = {}, {}
+    for i, sensor in enumerate(sensors):
+
+        def measure(key, params, state, rate, memory, sensor=sensor):
+            return _checked(sensor, memory, sensor.measure(key, params, state, rate, scene, memory))
+
+        after[sensor.name], readings[sensor.name] = jax.vmap(measure)(
+            keys[i], params, state, rate, memories[sensor.name]
+        )
+    return after, readings
+
+
+def _checked(sensor: Sensor, memory: Any, result: Any) -> tuple[Any, Any]:
+    """The memory and the reading that a sensor returned for one drone, or an error if they are not that."""
+    called = f"measure of sensor {sensor.name!r}"
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise ValueError(f"{called} returned {shown(result)}; return the two values (memory, reading)")
+    after, reading = result
+    if _types(after) != _types(memory):
+        raise ValueError(
+            f"{called} returned a memory of {_described(after)}, but was given one of {_described(memory)}; "
+            "return a memory with the shapes and types of the one that init returns"
+        )
+    for leaf in jax.tree.leaves(reading):
+        if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
+            raise ValueError(f"{called} returned a reading with {shown(leaf)} in it; return arrays")
+    return after, jax.tree.map(jnp.asarray, reading)
+
+
+def _types(tree: Any) -> tuple:
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
+
+
+def _described(tree: Any) -> str:
+    """The shapes and types of a memory, for an error."""
+    return str(jax.tree.map(lambda leaf: f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}", tree))

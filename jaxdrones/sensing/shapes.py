@@ -1,0 +1,256 @@
+"""The kinds of obstacles, and the geometry of each: distances, rays, extents.
+
+An obstacle is convex: all points within `rounding` of a core. A sphere is a rounded point and a capsule a rounded line
+segment; a box and a cylinder are their own cores. All methods are about a single obstacle, in its own frame.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.vector import components, cross, dot, safe_sqrt
+
+Point = Float[Array, "3"]
+Number = Float[Array, ""]
+Interval = tuple[Number, Number]
+
+GREY = (0.6, 0.6, 0.6, 1.0)
+LENGTHS = {"pos": 3, "quat": 4, "color": 4, "size": 3}
+"""Numbers in a field of a single obstacle; a field that is not named here is one number."""
+
+
+class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
+    """A solid that does not move, or many of one kind, with leading axes on the arrays."""
+
+    pos: Any
+    """(3,) position of the center, m, world."""
+    quat: Any = (0.0, 0.0, 0.0, 1.0)
+    """(4,) attitude, unit quaternion (x, y, z, w), obstacle to world."""
+    color: Any = GREY
+    """(4,) red, green, blue, opacity, each 0 to 1."""
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if isinstance(value, tuple | list):  # JAX would take its numbers for arrays of their own
+                object.__setattr__(self, name, jnp.asarray(value, float))
+
+    @property
+    def rounding(self) -> Any:
+        """() distance of the surface from the core, m."""
+        return 0.0
+
+    def to_local(self, point: Point) -> Point:
+        """A point of the world in the frame of the obstacle, m."""
+        return rotation.rotate_inverse(self.quat, point - self.pos)
+
+    @abc.abstractmethod
+    def distance(self, point: Point) -> Number:
+        """Signed distance of a point from the surface, m; negative inside."""
+
+    @abc.abstractmethod
+    def interval(self, origin: Point, direction: Point) -> Interval:
+        """The multiples of `direction`, first and last, at which a line through `origin` is inside.
+
+        The first one is larger than the last one where the line misses the obstacle.
+        """
+
+    @abc.abstractmethod
+    def nearest(self, point: Point) -> Point:
+        """The point of the core that is nearest to a point, m."""
+
+    @abc.abstractmethod
+    def extent(self, direction: Point) -> Number:
+        """How far the core extends from its center along a unit vector, m: its support function."""
+
+    def separating(self, center: Point, axis: Point) -> list[Point]:
+        """Directions in which the gap to a cylinder with this center and axis is likely to be widest."""
+        return []
+
+
+class Box(Obstacle, kw_only=True):
+    """A cuboid about `pos`."""
+
+    size: Any
+    """(3,) edge lengths along x, y and z, m."""
+
+    def distance(self, point: Point) -> Number:
+        """Signed distance of a point from the surface, m."""
+        return _distance(jnp.abs(point) - self.size / 2)
+
+    def interval(self, origin: Point, direction: Point) -> Interval:
+        """Where a line is between all three pairs of faces."""
+        first, last = _between_planes(origin, direction, self.size / 2)
+        return jnp.max(first), jnp.min(last)
+
+    def nearest(self, point: Point) -> Point:
+        """The point of the box that is nearest to a point, m."""
+        return jnp.clip(point, -self.size / 2, self.size / 2)
+
+    def extent(self, direction: Point) -> Number:
+        """How far the box extends from its center along a unit vector, m."""
+        return dot(jnp.abs(direction), self.size / 2)
+
+    def separating(self, center: Point, axis: Point) -> list[Point]:
+        """The normals of the faces."""
+        return list(jnp.eye(3, dtype=center.dtype))
+
+
+class Sphere(Obstacle, kw_only=True):
+    """A ball about `pos`."""
+
+    radius: Any
+    """() m."""
+
+    @property
+    def rounding(self) -> Any:
+        """() radius, m: the core is the center."""
+        return self.radius
+
+    def distance(self, point: Point) -> Number:
+        """Signed distance of a point from the surface, m."""
+        return _length(point) - self.radius
+
+    def interval(self, origin: Point, direction: Point) -> Interval:
+        """Where a line is within the radius."""
+        return _within_radius(origin, direction, self.radius)
+
+    def nearest(self, point: Point) -> Point:
+        """The center."""
+        return jnp.zeros_like(point)
+
+    def extent(self, direction: Point) -> Number:
+        """Zero: the core is a point."""
+        return jnp.zeros((), direction.dtype)
+
+
+class Cylinder(Obstacle, kw_only=True):
+    """A cylinder about `pos`, with its axis along its own z."""
+
+    radius: Any
+    """() m."""
+    height: Any
+    """() m."""
+
+    def distance(self, point: Point) -> Number:
+        """Signed distance of a point from the surface, m."""
+        _, _, z = components(point)
+        return _distance(jnp.stack([_length(point[:2]) - self.radius, jnp.abs(z) - self.height / 2]))
+
+    def interval(self, origin: Point, direction: Point) -> Interval:
+        """Where a line is within the radius and between the two ends."""
+        first, last = _within_radius(origin[:2], direction[:2], self.radius)
+        bottom, top = _between_planes(origin[2], direction[2], self.height / 2)
+        return jnp.maximum(first, bottom), jnp.minimum(last, top)
+
+    def nearest(self, point: Point) -> Point:
+        """The point of the cylinder that is nearest to a point, m."""
+        x, y, z = components(point)
+        inward = jnp.minimum(1, self.radius / jnp.maximum(_length(point[:2]), self.radius))
+        return jnp.stack([inward * x, inward * y, jnp.clip(z, -self.height / 2, self.height / 2)])
+
+    def extent(self, direction: Point) -> Number:
+        """How far the cylinder extends from its center along a unit vector, m."""
+        _, _, z = components(direction)
+        return self.height / 2 * jnp.abs(z) + self.radius * _length(direction[:2])
+
+    def separating(self, center: Point, axis: Point) -> list[Point]:
+        """The axis, the radius towards the other cylinder, and the common normal of the two axes."""
+        return _around_z(center, axis)
+
+
+class Capsule(Obstacle, kw_only=True):
+    """A cylinder about `pos`, with its axis along its own z, and half a ball on either end."""
+
+    radius: Any
+    """() m."""
+    height: Any
+    """() height of the cylinder, without the half balls, m."""
+
+    @property
+    def rounding(self) -> Any:
+        """() radius, m: the core is the axis of the cylinder."""
+        return self.radius
+
+    def distance(self, point: Point) -> Number:
+        """Signed distance of a point from the surface, m."""
+        return _length(point - self.nearest(point)) - self.radius
+
+    def interval(self, origin: Point, direction: Point) -> Interval:
+        """Where a line is in the cylinder or in a ball: one interval, as the capsule is convex."""
+        up = jnp.array([0, 0, 1], origin.dtype) * self.height / 2
+        cylinder = Cylinder(pos=self.pos, radius=self.radius, height=self.height)
+        parts = [
+            cylinder.interval(origin, direction),
+            _within_radius(origin - up, direction, self.radius),
+            _within_radius(origin + up, direction, self.radius),
+        ]
+        first = jnp.stack([jnp.where(first <= last, first, jnp.inf) for first, last in parts])
+        last = jnp.stack([jnp.where(first <= last, last, -jnp.inf) for first, last in parts])
+        return jnp.min(first), jnp.max(last)
+
+    def nearest(self, point: Point) -> Point:
+        """The point of the axis that is nearest to a point, m."""
+        _, _, z = components(point)
+        zero = jnp.zeros_like(z)
+        return jnp.stack([zero, zero, jnp.clip(z, -self.height / 2, self.height / 2)])
+
+    def extent(self, direction: Point) -> Number:
+        """How far the axis extends from the center along a unit vector, m."""
+        _, _, z = components(direction)
+        return self.height / 2 * jnp.abs(z)
+
+    def separating(self, center: Point, axis: Point) -> list[Point]:
+        """The axis, the radius towards the other cylinder, and the common normal of the two axes."""
+        return _around_z(center, axis)
+
+
+def _length(v: Float[Array, " n"]) -> Number:
+    return safe_sqrt(dot(v, v))
+
+
+def _distance(beyond: Float[Array, " n"]) -> Number:
+    """Signed distance from a product of intervals, of how far each coordinate is beyond its interval."""
+    return _length(jnp.maximum(beyond, 0)) + jnp.minimum(jnp.max(beyond), 0)
+
+
+def _around_z(center: Point, axis: Point) -> list[Point]:
+    x, y, _ = components(center)
+    z_axis = jnp.array([0, 0, 1], center.dtype)
+    return [z_axis, jnp.stack([x, y, jnp.zeros_like(x)]), cross(axis, z_axis)]
+
+
+def _between_planes(origin: Array, direction: Array, half: Array) -> tuple[Array, Array]:
+    """Where a line is between two planes at +-`half`; elementwise."""
+    crosses = jnp.abs(direction) > jnp.finfo(direction.dtype).eps
+    speed = jnp.where(crosses, direction, 1)
+    middle, reach = -origin / speed, half / jnp.abs(speed)
+    return _interval(crosses, middle, reach, jnp.abs(origin) <= half)
+
+
+def _within_radius(origin: Float[Array, " n"], direction: Float[Array, " n"], radius: Number) -> Interval:
+    """Where a line is within `radius` of zero."""
+    square = dot(direction, direction)
+    moves = square > jnp.finfo(direction.dtype).eps ** 2
+    square = jnp.where(moves, square, 1)
+    middle = -dot(origin, direction) / square
+    closest = jnp.where(moves, origin + middle * direction, origin)
+    slack = radius**2 - dot(closest, closest)
+    return _interval(moves & (slack >= 0), middle, safe_sqrt(slack / square), ~moves & (slack >= 0))
+
+
+def _interval(crosses: Array, middle: Array, reach: Array, always: Array) -> tuple[Array, Array]:
+    """The interval of a line that crosses, of one that is always inside, or the empty one."""
+    first = jnp.where(crosses, middle - reach, jnp.where(always, -jnp.inf, jnp.inf))
+    return first, jnp.where(crosses, middle + reach, -first)
+
+
+def single(obstacles: Obstacle, i: int) -> Any:
+    """One of many obstacles of a kind."""
+    return jax.tree.map(lambda x: x[i], obstacles)

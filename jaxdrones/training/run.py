@@ -1,0 +1,208 @@
+"""A training run as a folder.
+
+    best, last       policies: the best one in an evaluation, and the newest
+    state            everything that training needs to continue, bit for bit
+    progress.csv     a row for each update; an event file holds the same for TensorBoard
+    report.json      the evaluation of the best policy, and the time that training took
+
+Each of best, last and state is a .msgpack and a .json that describes it.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxdrones.envs import Env
+from jaxdrones.learning import checkpoint, files
+from jaxdrones.learning.evaluation import Report
+from jaxdrones.learning.networks import Policy
+from jaxdrones.training.events import PREFIX
+from jaxdrones.training.recipe import Recipe
+
+
+class Run:
+    """The folder of the training of one seed."""
+
+    policy_suffix = "msgpack"
+
+    def __init__(self, folder: str | os.PathLike):
+        """Refer to a folder; nothing is read or made yet."""
+        self.folder = Path(folder)
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of a run, of whichever library, that exist: checkpoints, progress, report."""
+        endings = [f"{suffix}{new}" for suffix in ("msgpack", "zip", "json") for new in ("", ".new")]
+        names = [f"{name}.{ending}" for name in ("best", "last", "state") for ending in endings]
+        names += ["progress.csv", "report.json", "report.json.new"]
+        return [file for file in (*map(self.folder.joinpath, names), *self.event_files()) if file.exists()]
+
+    def event_files(self) -> list[Path]:
+        """The event files, oldest first."""
+        return sorted(self.folder.glob(f"{PREFIX}.*.jaxdrones"))
+
+    def prepare(self, size: int) -> None:
+        """Make the folder and check that `size` bytes can be written to it.
+
+        Raises:
+            OSError: they cannot; the error names the folder and the reason.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        probe = self.folder / ".probe"
+        try:
+            probe.write_bytes(bytes(size))
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.folder)) from error
+        finally:
+            probe.unlink(missing_ok=True)
+
+    def clear(self) -> None:
+        """Remove the files of an earlier run, and no others."""
+        for file in self.files:
+            file.unlink()
+
+    def sidecar(self, name: str = "best") -> dict[str, Any]:
+        """The description of the checkpoint `best`, `last` or `state`."""
+        return files.read_sidecar(self.folder / name)
+
+    def sidecar_entry(self, name: str, entry: str) -> Any:
+        """One entry of the description of a checkpoint.
+
+        Raises:
+            FileNotFoundError: there is no such checkpoint.
+            ValueError: it lacks the entry.
+        """
+        sidecar = self.sidecar(name)
+        if entry not in sidecar:
+            file = self.folder / f"{name}.json"
+            raise ValueError(f"{file} has no entry {entry}; it is not the {name} of a run of `jaxdrones train`")
+        return sidecar[entry]
+
+    def verify(self, name: str) -> None:
+        """Check that a checkpoint is not damaged.
+
+        Raises:
+            FileNotFoundError: there is no such checkpoint.
+            ValueError: it is damaged.
+        """
+        files.load_bytes(self.folder / f"{name}.{self.policy_suffix}", self.sidecar(name))
+
+    def recipe(self, name: str = "best") -> Recipe:
+        """The recipe of the training."""
+        return Recipe.from_dict(self.sidecar_entry(name, "recipe"))
+
+    def policy(self, name: str = "best", env: Env | None = None) -> Policy:
+        """The policy `best` or `last`.
+
+        Raises:
+            FileNotFoundError: there is no such policy.
+            ValueError: it is damaged, or does not fit `env`.
+        """
+        policy = checkpoint.load(self.folder / name)
+        if env is not None:
+            sizes = (policy.obs_stats.mean.size, policy.network.output_size)
+            self.check_sizes(name, env, sizes, (env.observation_size, env.action_size))
+        return policy
+
+    def check_sizes(self, name: str, env: Env, sizes: tuple[int, int], expected: tuple[int, int]) -> None:
+        """Raise if a policy takes observations or gives actions of other sizes than the environment does.
+
+        Args:
+            name: `best` or `last`.
+            env: environment.
+            sizes: numbers in an observation and in an action of the policy.
+            expected: the same of the environment.
+
+        Raises:
+            ValueError: they differ.
+        """
+        if sizes != expected:
+            raise ValueError(
+                f"{self.folder / name} was trained on another version of {env.task.name}: its observations and "
+                f"actions have {sizes} numbers, those of the environment {expected}; train anew"
+            )
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a training state to continue from."""
+        return (self.folder / "state.json").exists()
+
+    @property
+    def finished(self) -> bool:
+        """Whether a training came to its end."""
+        return (self.folder / "report.json").exists()
+
+    def save_policy(self, name: str, policy: Policy, **about: Any) -> None:
+        """Write `best` or `last`, with entries of its description."""
+        checkpoint.save(self.folder / name, policy, **about)
+
+    def save_state(self, state: Any, **about: Any) -> None:
+        """Write the training state, with entries of its description."""
+        checkpoint.save_tree(self.folder / "state", state, **about)
+
+    def load_state(self, like: Any) -> Any:
+        """The training state; `like` is a tree with its shapes."""
+        return checkpoint.load_tree(self.folder / "state", like)
+
+    def save_report(self, report: dict[str, Any]) -> None:
+        """Write report.json, which marks the run as finished."""
+        files.write(self.folder / "report.json", json.dumps(report, indent=2).encode())
+
+    def remove_report(self) -> None:
+        """Mark the run as not finished."""
+        (self.folder / "report.json").unlink(missing_ok=True)
+
+    def report(self) -> dict[str, Any] | None:
+        """The content of report.json; `None` for a run that did not finish.
+
+        Raises:
+            ValueError: the file is damaged.
+        """
+        file = self.folder / "report.json"
+        if not self.finished:
+            return None
+        try:
+            return json.loads(file.read_bytes())
+        except (OSError, ValueError, RecursionError) as error:
+            raise ValueError(f"{file} cannot be read: {error}; remove it and --resume, which writes it anew") from error
+
+    def history(self) -> list[dict[str, float]]:
+        """The rows of progress.csv, each without the numbers that were not measured in its update.
+
+        Raises:
+            ValueError: the file is damaged.
+        """
+        path = self.folder / "progress.csv"
+        if not path.exists():
+            return []
+        try:
+            with path.open(newline="") as file:
+                lines = [{name: x for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
+            rows = [{name: float(x) for name, x in line.items()} for line in lines]
+            if not all(math.isfinite(row.get("update", math.nan)) for row in rows):
+                raise ValueError("a row lacks its update")
+        except (OSError, ValueError, TypeError, csv.Error) as error:
+            why = files.one_line(error)
+            raise ValueError(f"{path} is damaged: {why}; remove it, training continues without its rows") from error
+        return rows
+
+
+def report_as_dict(report: Report) -> dict[str, Any]:
+    """An evaluation for JSON."""
+    entries = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
+    entries |= {"successes": round(report.success * report.episodes)}
+    percentiles = {str(q): x for q, x in report.final_error_percentiles.items()}
+    return entries | {"final_error_percentiles": percentiles}
+
+
+def size_of(tree: Any) -> int:
+    """Bytes of the arrays of a tree, or of their shapes."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))

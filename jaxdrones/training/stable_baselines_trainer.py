@@ -1,0 +1,193 @@
+"""The training loop around Stable-Baselines3: progress, evaluations, the best model."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+
+import jax
+import numpy as np
+
+from jaxdrones.adapters.sb3 import VecEnv
+from jaxdrones.learning.evaluation import Report, check_episodes, evaluate
+from jaxdrones.learning.result import Diverged
+from jaxdrones.training.loop import OnProgress
+from jaxdrones.training.progress import Progress
+from jaxdrones.training.run import report_as_dict
+from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM
+from jaxdrones.training.stable_baselines import SB3Policy, SB3Recipe, SB3Run
+
+# isort: split
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+
+_EVALUATIONS = 20  # in the course of a training
+_DISK_FACTOR = 6  # the disk must have space for two checkpoints, each with the moments of Adam
+_COLUMNS = ["update", "steps", "seconds", "reward", "success", "evaluated_return", "evaluated_error"]
+
+
+class SB3Trainer:
+    """The compiled worlds of a recipe, and the model that is trained in them."""
+
+    def __init__(self, recipe: SB3Recipe, seed: int = 0, episodes: int = 100):
+        """Prepare and compile.
+
+        Args:
+            recipe: what to train.
+            seed: seed of everything that is random.
+            episodes: number of episodes of an evaluation.
+
+        Raises:
+            ValueError: Stable-Baselines3 refuses the settings.
+        """
+        self.recipe, self.seed, self.episodes = recipe, seed, episodes
+        start = time.perf_counter()
+        self.env = recipe.env()
+        check_episodes(self.env, episodes)
+        self.worlds = VecEnv(self.env, recipe.config["worlds"])
+        self.model = recipe.model(self.worlds, seed)
+        self.worlds.reset()
+        self.worlds.step(np.zeros((self.worlds.num_envs, *self.worlds.action_space.shape), np.float32))
+        self.worlds.seed(seed)
+        self.compile_seconds = time.perf_counter() - start
+
+    def prepare(self, run: SB3Run) -> None:
+        """Make the folder of a run and check that its files can be written.
+
+        Raises:
+            OSError: they cannot be written.
+        """
+        run.prepare(_DISK_FACTOR * sum(x.nbytes for x in self.model.policy.parameters()))
+
+    def train(self, run: SB3Run, on_progress: OnProgress, deadline: float | None = None) -> None:
+        """Train to the end, and evaluate the best model.
+
+        Args:
+            run: run whose folder was prepared.
+            on_progress: function that shows progress, by control steps.
+            deadline: time of `time.perf_counter` at which to stop, s; when left out, training stops after the number of
+                steps of the recipe.
+
+        Raises:
+            Diverged: parameters are not finite; the best model so far is kept.
+            KeyboardInterrupt: passed on after the newest model was saved.
+        """
+        steps = self.recipe.config["steps"] if deadline is None else np.iinfo(np.int64).max
+        with _one_thread(), Progress(run, _COLUMNS, 0) as progress:
+            callback = _Callback(self, run, on_progress, progress, deadline)
+            try:
+                self.model.learn(steps, callback=callback)
+            except KeyboardInterrupt:
+                callback.save()
+                raise
+            except ValueError as error:  # raised by torch for a distribution, or by the environment for an action
+                what = f"parameters are not finite at update {callback.update}"
+                raise Diverged(f"{what}; try a smaller learning rate") from error
+            callback.finish()
+
+
+@contextlib.contextmanager
+def _one_thread():
+    """Let torch use one thread: batches are so small that more threads wait for each other and for those of JAX."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Callback(BaseCallback):
+    """Evaluates, saves and reports while Stable-Baselines3 trains."""
+
+    def __init__(
+        self, trainer: SB3Trainer, run: SB3Run, on_progress: OnProgress, progress: Progress, deadline: float | None
+    ):
+        super().__init__()
+        self.trainer, self.run, self.on_progress, self.progress, self.deadline = (
+            trainer,
+            run,
+            on_progress,
+            progress,
+            deadline,
+        )
+        self.about = {"recipe": trainer.recipe.as_dict(), "seed": trainer.seed, "episodes": trainer.episodes}
+        key = jax.random.key(trainer.seed)
+        self.selection_key, self.report_key = (jax.random.fold_in(key, x) for x in (SELECTION_STREAM, REPORT_STREAM))
+        self.best: float | None = None  # return
+        self.update = 0
+        self.next_evaluation = 0.0  # fraction of the budget
+        self.evaluation_seconds = 0.0
+        self.reward_sum, self.reward_count = 0.0, 0  # since the last evaluation
+        self.start = time.perf_counter()
+
+    def _on_rollout_start(self) -> None:
+        """Evaluate between two updates, if an evaluation is due."""
+        if self._spent() >= self.next_evaluation:
+            self.evaluate()
+
+    def _on_step(self) -> bool:
+        self.reward_sum += float(self.locals["rewards"].sum())
+        self.reward_count += self.trainer.worlds.num_envs * self.trainer.env.drones
+        return self.deadline is None or self.update == 0 or self._spent() < 1
+
+    def _on_rollout_end(self) -> None:
+        self.update += 1
+        self.on_progress(self.num_timesteps, self._metrics())
+
+    def _on_training_end(self) -> None:
+        self.evaluate()
+        self.save()
+
+    def evaluate(self) -> None:
+        """Evaluate the model, always in the same episodes; save it if its return is the best, as in the paper."""
+        self.next_evaluation = self._spent() + 1 / _EVALUATIONS
+        metrics = self._metrics()
+        report = self._evaluate(SB3Policy.of(self.model), self.selection_key)
+        score = report.mean_return if math.isfinite(report.mean_return) else -math.inf
+        if self.best is None or score > self.best:
+            self.best = score
+            self.run.save_model("best", self.model, **self.about, update=self.update, score=score)
+        metrics |= {"success": report.success, "evaluated_return": report.mean_return}
+        metrics |= {"evaluated_error": report.final_error_percentiles[50]}
+        row = {"update": self.update, "steps": self.num_timesteps * self.trainer.env.drones}
+        self.progress.add([row | {name: metrics[name] for name in _COLUMNS if name in metrics}])
+        self.reward_sum, self.reward_count = 0.0, 0
+        self.on_progress(self.num_timesteps, metrics)
+
+    def save(self) -> None:
+        """Write the newest model."""
+        self.run.save_model("last", self.model, **self.about, update=self.update)
+
+    def finish(self) -> None:
+        """Evaluate the best model, in other episodes than those that chose it, and write the report."""
+        seconds = {"training": self._seconds(), "compiling": self.trainer.compile_seconds}
+        report = self._evaluate(self.run.policy(), self.report_key)
+        self.run.save_report(
+            self.about
+            | {"best_update": self.run.sidecar()["update"], "updates": self.update, "steps": self.num_timesteps}
+            | {"seconds": seconds | {"evaluating": self.evaluation_seconds}, "evaluation": report_as_dict(report)}
+        )
+
+    def _spent(self) -> float:
+        """Fraction of the budget that is spent."""
+        if self.deadline is not None:
+            return (time.perf_counter() - self.start) / max(self.deadline - self.start, 1e-9)
+        return self.num_timesteps / self.trainer.recipe.config["steps"]
+
+    def _seconds(self) -> float:
+        """Seconds of training, without evaluations."""
+        return time.perf_counter() - self.start - self.evaluation_seconds
+
+    def _metrics(self) -> dict[str, float]:
+        seconds = self._seconds()
+        steps = self.num_timesteps * self.trainer.env.drones
+        reward = self.reward_sum / self.reward_count if self.reward_count else math.nan
+        return {"seconds": seconds, "steps_per_s": steps / seconds, "reward": reward}
+
+    def _evaluate(self, policy: SB3Policy, key: jax.Array) -> Report:
+        start = time.perf_counter()
+        report = evaluate(self.trainer.env, policy, key, self.trainer.episodes)
+        self.evaluation_seconds += time.perf_counter() - start
+        return report

@@ -1,0 +1,113 @@
+"""The compiled programs with which a recipe is trained."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.learning import compilation, sharding
+from jaxdrones.learning.evaluation import check_episodes
+from jaxdrones.limits import LARGEST_COUNT, check_memory
+from jaxdrones.training import algorithms, distributed
+from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.run import Run, size_of
+
+MAX_CALL = 64
+"""Largest number of updates in one call of `Trainer.advance`."""
+_TIMED_UPDATES = 3  # to estimate the time of an update
+_DISK_FACTOR = 4  # the disk must have space for so many training states
+
+
+class Trainer:
+    """The compiled programs of a recipe; all seeds share them, and all devices of all hosts share the worlds."""
+
+    def __init__(self, recipe: Recipe, episodes: int = 1000):
+        """Prepare the programs; `compile` compiles them.
+
+        Args:
+            recipe: what to train.
+            episodes: number of episodes of an evaluation.
+
+        Raises:
+            ValueError: the devices cannot share the worlds equally, or have too little memory for them.
+        """
+        self.recipe, self.episodes = recipe, episodes
+        self.mesh = sharding.make_mesh(recipe.config.worlds)
+        self.env, self.practice_env = recipe.env(), recipe.env(practice=True)
+        self.learner = algorithms.learner(recipe.algorithm)
+        self.compile_seconds = 0.0
+        self.shapes = jax.eval_shape(self._init, jax.random.key(0))
+        check_episodes(self.env, episodes)
+        self._check_memory()
+        self.metrics = sorted(jax.eval_shape(self._update, self.shapes)[1])
+
+    def compile(self) -> None:
+        """Compile the programs."""
+        start = time.perf_counter()
+        count = jnp.zeros((), jnp.int32)
+        state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
+        init = compilation.jit(self._init, in_shardings=same, out_shardings=state)
+        updates = compilation.jit(self._updates, in_shardings=(state, same, same), out_shardings=(state, same))
+        with jax.set_mesh(self.mesh):
+            self.start = init.lower(jax.random.key(0)).compile()
+            self._advance = updates.lower(self.shapes, count, count).compile()
+        self.compile_seconds = time.perf_counter() - start
+
+    def prepare(self, run: Run) -> None:
+        """Make the folder of a run and check that its files can be written.
+
+        Raises:
+            OSError: they cannot be written.
+        """
+        run.prepare(_DISK_FACTOR * size_of(self.shapes))
+
+    def fit_budget(self, seconds: float, made: int = 0) -> None:
+        """Set the number of updates to those already made and those that take about so many seconds."""
+        state, _ = self.advance(self.start(jax.random.key(0)), 1)
+        start = time.perf_counter()
+        self.advance(state, _TIMED_UPDATES)
+        update_seconds = (time.perf_counter() - start) / _TIMED_UPDATES
+        more = max(1, int(distributed.from_first_host(seconds / update_seconds)))
+        config = dataclasses.replace(self.recipe.config, updates=min(made + more, LARGEST_COUNT))
+        self.recipe = dataclasses.replace(self.recipe, config=config)
+
+    def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
+        """Make at most `MAX_CALL` updates in one call: the state after them, and (updates,) of every metric."""
+        total = jnp.asarray(self.recipe.config.updates, jnp.int32)
+        state, metrics = self._advance(state, jnp.asarray(updates, jnp.int32), total)
+        return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
+
+    def _check_memory(self) -> None:
+        """Raise if the worlds, with their observations and actions in an update, need more memory than there is."""
+        config, env = self.recipe.config, self.env
+        numbers = config.worlds * config.horizon * env.drones * (env.observation_size + env.action_size)
+        size = size_of(self.shapes) + numbers * jnp.zeros(()).dtype.itemsize
+        what = f"a training of {config.worlds} worlds x {config.horizon} control steps x {env.drones} drones"
+        check_memory(what, size // jax.process_count(), "give fewer worlds, a shorter horizon or smaller networks")
+
+    def _init(self, key: jax.Array):
+        return self.learner.init(key, self.practice_env, self.recipe.config)
+
+    def _update(self, state, total=None):
+        config = self.recipe.config
+        if total is not None:
+            config = dataclasses.replace(config, updates=total)
+        return self.learner.update(self.practice_env, config, state)
+
+    def _updates(self, state, count, total):
+        """Make `count` updates of a training of `total` updates; both may change without compiling again."""
+        metrics = jax.tree.map(
+            lambda x: jnp.zeros((MAX_CALL, *x.shape), x.dtype), jax.eval_shape(self._update, state)[1]
+        )
+
+        def update(i, carry):
+            state, metrics = carry
+            state, new = self._update(state, total)
+            return state, jax.tree.map(lambda all, x: all.at[i].set(x), metrics, new)
+
+        return jax.lax.fori_loop(0, count, update, (state, metrics))

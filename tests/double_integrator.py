@@ -1,0 +1,49 @@
+"""A double integrator as an environment, and small settings of every learner for it."""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.learning import bptt, ppo, shac
+
+SMALL = {
+    bptt: bptt.Config(updates=3, worlds=4, horizon=4, hidden_sizes=(8,)),
+    shac: shac.Config(updates=3, worlds=4, horizon=4, hidden_sizes=(8,), critic_hidden_sizes=(8,), critic_steps=2),
+    ppo: ppo.Config(
+        updates=3, worlds=4, horizon=4, hidden_sizes=(8,), critic_hidden_sizes=(8,), epochs=2, minibatches=2
+    ),
+}
+
+
+class Point(flax.struct.PyTreeNode):
+    pos: jax.Array
+
+
+class PointWorld(flax.struct.PyTreeNode):
+    drones: Point
+    step: jax.Array
+
+
+class DoubleIntegrator:
+    """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
+
+    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 50, ()
+
+    def reset(self, key):
+        x = jax.random.uniform(key, (1, 2), minval=-0.1, maxval=0.1)
+        return x, PointWorld(Point(x), jnp.zeros((), jnp.int32))
+
+    def step(self, key, world, action):
+        a, b = dynamics()
+        x = world.drones.pos
+        cost = 100 * x[:, 0] ** 2 + 10 * x[:, 1] ** 2 + 10 * action[:, 0] ** 2
+        x = x @ jnp.asarray(a.T, x.dtype) + action * jnp.asarray(b.T, x.dtype)
+        world = PointWorld(Point(x), world.step + 1)
+        info = {"metrics": {"error": jnp.abs(x[:, 0])}}
+        return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+
+def dynamics():
+    dt = DoubleIntegrator.dt
+    return np.array([[1, dt], [0, 1]]), np.array([[dt**2 / 2], [dt]])

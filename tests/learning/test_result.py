@@ -1,0 +1,140 @@
+"""What `train` does beside updates: it compiles itself once, and tells of gradients that are not finite."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from double_integrator import SMALL, DoubleIntegrator
+from helpers import mostly_slow
+
+from jaxdrones import envs, learning
+from jaxdrones.learning import Diverged, Policy, bptt, evaluate, ppo, shac
+from jaxdrones.learning.result import PATIENCE, check_gradients, clip_gradient, count_nonfinite
+
+LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
+KEY = jax.random.key(0)
+pytestmark = pytest.mark.float32
+
+
+class Counted(DoubleIntegrator):
+    """Counts how often its step is traced."""
+
+    def __init__(self):
+        self.traced = []
+
+    def step(self, key, world, action):
+        self.traced.append(True)
+        return super().step(key, world, action)
+
+
+class Steep(DoubleIntegrator):
+    """Rewards so large that the norm of their gradient overflows, while they do not."""
+
+    def step(self, key, world, action):
+        obs, world, reward, *rest = super().step(key, world, action)
+        return obs, world, 1e22 * reward, *rest
+
+
+def same(a, b, **tolerance):
+    for x, y in zip(jax.tree.leaves(a.history), jax.tree.leaves(b.history), strict=True):
+        np.testing.assert_allclose(x, y, **tolerance)
+
+
+@pytest.mark.parametrize("name", mostly_slow(LEARNERS, ["bptt"]))
+def test_gradients_that_are_not_finite_are_counted_and_stop_training_when_they_repeat(name):
+    learner, env = LEARNERS[name], Steep()
+    config = dataclasses.replace(SMALL[learner], updates=PATIENCE)
+    with pytest.raises(Diverged, match=f"gradients were not finite in {PATIENCE} updates in a row; try a smaller"):
+        learner.train(KEY, env, config)
+    history = jax.jit(lambda key: learner.train(key, env, config).history)(KEY)  # where nothing can be raised
+    assert np.all(np.isfinite(history["reward"])) and np.all(history["nonfinite_gradients"] >= 1)
+
+
+def test_finite_gradients_are_counted_as_none():
+    assert np.all(bptt.train(KEY, DoubleIntegrator(), SMALL[bptt]).history["nonfinite_gradients"] == 0)
+
+
+def test_training_goes_on_after_gradients_that_are_not_finite_unless_they_repeat():
+    bad, good = [1] * (PATIENCE - 1), [0]
+    assert check_gradients(bad + good + bad) == PATIENCE - 1
+    assert check_gradients(bad, before=0) == PATIENCE - 1
+    for counts, before in ([*good, *bad, 3], 0), (bad, 1), ([2], PATIENCE - 1):
+        with pytest.raises(Diverged, match=f"not finite in {PATIENCE} updates in a row"):
+            check_gradients(counts, before=before)
+    with pytest.raises(Diverged, match="not finite in 2 updates in a row"):
+        check_gradients([1, 1], patience=2)
+
+
+def test_a_gradient_that_is_not_finite_is_replaced_by_zero_and_counted():
+    transformation = clip_gradient(1.0)
+    for bad in (jnp.nan, jnp.inf, 1e30):
+        clipped, _ = transformation.update({"a": jnp.array([1.0, bad]), "b": jnp.array(2.0)}, None)
+        assert all(jnp.all(x == 0) for x in jax.tree.leaves(clipped))
+    np.testing.assert_array_equal(count_nonfinite(jnp.array([[1.0, jnp.nan], [jnp.inf, 0.0]])), 2)
+
+
+def test_nobody_is_asked_about_compilers():
+    assert not [name for name in dir(learning) if "compiler" in name.lower()]
+
+
+def test_train_compiles_itself_once_for_all_keys_and_equal_settings():
+    env = Counted()
+    first = bptt.train(KEY, env, SMALL[bptt])
+    traced = len(env.traced)
+    other = bptt.train(jax.random.key(1), env, dataclasses.replace(SMALL[bptt]))
+    assert len(env.traced) == traced and not np.array_equal(first.history["reward"], other.history["reward"])
+    bptt.train(KEY, env, dataclasses.replace(SMALL[bptt], learning_rate=1e-3))
+    assert len(env.traced) > traced
+
+
+def test_train_and_evaluate_notice_that_an_attribute_of_the_environment_was_set():
+    env = envs.make("hover")
+    policy = Policy.init(KEY, env, (4,))
+    for steps in (20, 10):
+        env.steps = steps
+        np.testing.assert_allclose(evaluate(env, policy, KEY, episodes=2).mean_length, steps * env.dt, rtol=1e-6)
+    toy, rewards = DoubleIntegrator(), []
+    for toy.steps in (50, 2):  # of which four are flown
+        rewards.append(bptt.train(KEY, toy, SMALL[bptt]).history["reward"])
+    assert not np.array_equal(*rewards)
+
+
+def test_train_in_a_program_of_the_user_does_what_it_does_alone():
+    env = DoubleIntegrator()
+    alone = bptt.train(KEY, env, SMALL[bptt])
+    same(jax.jit(lambda key: bptt.train(key, env, SMALL[bptt]))(KEY), alone, rtol=1e-5)
+    same(jax.jit(lambda: bptt.train(KEY, env, SMALL[bptt]))(), alone, rtol=1e-5)
+
+
+@pytest.mark.parametrize("compiled", mostly_slow([True, False], [True]))
+def test_seeds_and_settings_can_be_mapped_inside_and_outside_of_a_program(compiled):
+    env, config = DoubleIntegrator(), SMALL[bptt]
+
+    def train(key, learning_rate):
+        return bptt.train(key, env, dataclasses.replace(config, learning_rate=learning_rate)).history["reward"]
+
+    keys, rates = jax.random.split(KEY, 2), jnp.array([1e-3, 1e-2])
+    many = jax.vmap(train)
+    together = (jax.jit(many) if compiled else many)(keys, rates)
+    np.testing.assert_allclose(together[1], train(keys[1], float(rates[1])), rtol=1e-4)
+
+
+def test_settings_that_are_arrays_and_environments_that_are_mapped_train_too():
+    config = dataclasses.replace(SMALL[bptt], learning_rate=jnp.asarray(1e-2))
+    same(bptt.train(KEY, DoubleIntegrator(), config), bptt.train(KEY, DoubleIntegrator(), config), rtol=1e-6)
+
+    class Scaled(DoubleIntegrator):
+        def __init__(self, scale):
+            self.scale = scale
+
+        def step(self, key, world, action):
+            obs, world, reward, *rest = super().step(key, world, action)
+            return obs, world, self.scale * reward, *rest
+
+    def first_reward(scale):
+        return bptt.train(KEY, Scaled(scale), SMALL[bptt]).history["reward"][0]
+
+    one, two = jax.vmap(first_reward)(jnp.array([1.0, 2.0]))
+    np.testing.assert_allclose(two, 2 * one, rtol=1e-5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from jaxdrones.accelerate.fitting import ELEMENTWISE, REDUCTIONS
 _MAX_UNROLLED = 32
 """Terms up to which a reduction is written out; of more it is a loop."""
 
-_OPERATIONS = {
+_OPERATIONS: dict[str, Callable] = {
     "reduce_sum": operator.add,
     "reduce_prod": operator.mul,
     "reduce_max": jnp.maximum,
@@ -72,7 +72,7 @@ def of_numbers(numbers: Sequence, shape: tuple[int, ...]) -> Apart:
 
 def number_by_number(eqn: compiler.Equation, inputs: list[Apart]) -> list[Apart]:
     """The results of an equation that is elementwise, of shapes, or a reduction."""
-    p, x = eqn.params, inputs[0] if inputs else None
+    p, x = eqn.params, inputs[0]
     match eqn.primitive.name:
         case name if name in ELEMENTWISE:
             return [_elementwise(eqn, inputs)]
@@ -128,8 +128,8 @@ def _elementwise(eqn: compiler.Equation, inputs: list[Apart]) -> Apart:
             return numbers[0]  # `stored` in derivatives divides by one
         return eqn.primitive.bind(*_alike(numbers), **eqn.params)
 
-    inputs = np.broadcast_arrays(*inputs)
-    return of_numbers([result(*numbers) for numbers in zip(*(x.flat for x in inputs), strict=True)], inputs[0].shape)
+    alike = np.broadcast_arrays(*inputs)
+    return of_numbers([result(*numbers) for numbers in zip(*(x.flat for x in alike), strict=True)], alike[0].shape)
 
 
 def _padded(x: Apart, value: Array, eqn: compiler.Equation) -> Apart:

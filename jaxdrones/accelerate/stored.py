@@ -1,5 +1,7 @@
 """Numbers that XLA's CPU compiler is made to store."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -7,7 +9,7 @@ from jaxdrones.accelerate import compiler
 
 
 @jax.custom_jvp
-def stored(tree):
+def stored(tree: Any) -> Any:
     """The same numbers, which XLA's CPU compiler stores before they are used.
 
     The compiler would otherwise compute them anew in every expression that reads them, or read them there out of the
@@ -18,7 +20,7 @@ def stored(tree):
 
 
 @jax.custom_jvp
-def stored_for_derivatives(tree):
+def stored_for_derivatives(tree: Any) -> Any:
     """The same numbers, which are stored only where derivatives are taken."""
     return tree
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
 from jaxdrones.checks import check_callable, check_number, check_shape, check_whole
-from jaxdrones.control import Setpoint, attitude, geometric, pid, rates, velocity
+from jaxdrones.control import Setpoint, attitude, for_team, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -39,6 +39,10 @@ class Action:
     """() -> memory of one drone at the start of an episode."""
     for_vehicle: Callable[[Params], Action] | None = None
     """Nominal parameters of the team -> the action type for this vehicle; `None` where it is the same for all."""
+
+    def team_memory(self, n: int) -> Any:
+        """The memory of a team of n drones at the start of an episode."""
+        return for_team(self.init(), n)
 
     def fitted(self, params: Params) -> Action:
         """The action type for this vehicle.

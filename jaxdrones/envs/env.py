@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.checks import check_callable, check_finite, check_key, check_shape
-from jaxdrones.control import for_team
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs.actions import Action
 from jaxdrones.envs.arguments import check_randomizations, check_team, check_terms, delay_steps, episode_steps
@@ -210,7 +209,7 @@ class Env:
             params=params,
             drones=self.physics.init(params, drones),
             variables=variables,
-            memory=for_team(self.action.init(), self.drones),
+            memory=self.action.team_memory(self.drones),
             actions=jnp.zeros((self.drones, self._history, self.action_size), drones.pos.dtype),
             step=jnp.zeros((), jnp.int32),
             dt=self.dt,

@@ -15,5 +15,5 @@ def test_a_function_that_takes_another_shape_than_it_says_is_found():
 
 
 def test_an_error_of_the_function_itself_comes_first():
-    with pytest.raises(ValueError, match="use jax.vmap for a team"):
+    with pytest.raises(ValueError, match=r"use jax\.vmap for a team"):
         allocation.rpm_from_wrench(jd.load_params("cf2x"), jnp.ones(2), jnp.ones((2, 3)))

@@ -10,11 +10,12 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_shape, shown
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.params import Params
+from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
 from jaxdrones.vector import components
 from jaxdrones.wrench import Wrench
 
-Effect = Callable[..., Wrench]
+Effect = Callable[[Params, State], Wrench] | Callable[[Params, State, Scene], Wrench]
 """`(params, state)` or `(params, state, scene)` of one drone -> wrench on it."""
 Pair = Callable[[Params, State, Params, State], Wrench]
 """`(params, state, other, other_state)` of two drones -> wrench on the first."""

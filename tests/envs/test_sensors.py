@@ -10,7 +10,7 @@ from helpers import assert_close
 
 import jaxdrones as jd
 from jaxdrones.accelerate import compiler
-from jaxdrones.accelerate.soa import fits_a_kernel
+from jaxdrones.accelerate.fitting import fits_a_kernel
 from jaxdrones.dynamics import Model
 from jaxdrones.envs import AutoReset, check_env, make
 from jaxdrones.envs.observations import reading

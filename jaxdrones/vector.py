@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-def components(v: Float[Array, " n"]) -> list[Float[Array, ""]]:
+def components(v: Float[Array, "n *shape"]) -> list[Float[Array, "*shape"]]:
     """The components of a vector, or the rows of a matrix."""
     return [jnp.squeeze(x, 0) for x in jax.lax.split(v, [1] * len(v))]
 

@@ -4,7 +4,10 @@ import importlib.util
 from pathlib import Path
 
 import jax
+import jaxtyping
 import pytest
+
+jaxtyping.install_import_hook("jaxdrones", "shapes.checked")
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

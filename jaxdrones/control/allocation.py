@@ -71,7 +71,7 @@ def _within_authority(
     squares, sign = inverse @ target, jnp.sign(target[3])
     yaw = sign * inverse[:, 3]
     too_fast = _excess(squares, limit, yaw)
-    backwards = jnp.where(jnp.isinf(limit), 0, _excess(-squares, 0, -yaw))
+    backwards = jnp.where(jnp.isinf(limit), 0, _excess(-squares, 0.0, -yaw))
     given_up = jnp.minimum(jnp.maximum(too_fast, backwards), jnp.abs(target[3]))
     return target.at[3].add(-sign * given_up)
 

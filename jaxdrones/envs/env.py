@@ -268,12 +268,8 @@ class Env:
         )
         terminated = _any(terminations.values())
         truncated = _any(truncations.values()) | (world.step >= self.steps)
-        info = {
-            "rewards": rewards,
-            "metrics": task.measure(world),
-            "terminations": terminations,
-            "truncations": truncations,
-        }
+        info = {"rewards": rewards, "metrics": task.measure(world)}
+        info |= {"terminations": terminations, "truncations": truncations}
         obs = self._noisy_observation(key, world)
         return obs, world, sum(rewards.values()), terminated, truncated, info
 

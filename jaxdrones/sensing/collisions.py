@@ -1,4 +1,4 @@
-"""Who touches something, from the poses alone, so that it is the same on every backend."""
+"""Collision flags: which drones touch something. They depend on the poses alone and are the same on every backend."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Collisions(flax.struct.PyTreeNode):
 
 
 def collisions(params: Params, state: State, scene: Scene = _BARE, margin: ArrayLike = _MARGIN) -> Collisions:
-    """Who of a team touches the ground, another drone, an obstacle.
+    """Find which drones of a team touch the ground, another drone or an obstacle.
 
     A drone is its collision cylinder. The `balls` that touch in either backend lie inside it; they reach its faces and
     its rim but not its edges.

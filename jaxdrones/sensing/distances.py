@@ -12,8 +12,8 @@ from jaxdrones.sensing.scene import Scene, check_scene
 def distance(scene: Scene, point: ArrayLike) -> Float[Array, ""]:
     """Signed distance of a point from the nearest surface of a scene, m; negative inside an obstacle or underground.
 
-    It is differentiable in the point and in the scene. Where obstacles overlap it is, inside them, the negative depth
-    in the one that the point is deepest in.
+    It is differentiable in the point and in the scene. Of obstacles that overlap, the one in which the point is deepest
+    counts.
 
     Args:
         scene: of one world.

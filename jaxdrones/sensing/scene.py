@@ -32,17 +32,17 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
     """
 
     boxes: Box | None = None
-    """(k, ...) arrays of all k boxes; nothing where there are none."""
+    """All k boxes, with a leading axis on every array; `None` where there are none."""
     spheres: Sphere | None = None
-    """(k, ...) arrays of all k spheres; nothing where there are none."""
+    """All k spheres, with a leading axis on every array; `None` where there are none."""
     cylinders: Cylinder | None = None
-    """(k, ...) arrays of all k cylinders; nothing where there are none."""
+    """All k cylinders, with a leading axis on every array; `None` where there are none."""
     capsules: Capsule | None = None
-    """(k, ...) arrays of all k capsules; nothing where there are none."""
+    """All k capsules, with a leading axis on every array; `None` where there are none."""
     meshes: tuple[Mesh, ...] = flax.struct.field(pytree_node=False, default=())
-    """What only Bullet can show."""
+    """Meshes, for Bullet alone."""
     urdfs: tuple[Urdf, ...] = flax.struct.field(pytree_node=False, default=())
-    """What only Bullet can show."""
+    """Bodies from URDF files, for Bullet alone."""
     ground: bool = flax.struct.field(pytree_node=False, default=True)
     """Whether there is a ground plane."""
 
@@ -51,9 +51,9 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         """A scene of obstacles of any kind.
 
         Args:
-            obstacles: `Box`, `Sphere`, `Cylinder`, `Capsule`, each one obstacle or many: what has leading axes is an
-                array of obstacles, and what has none is shared by all of them. Their numbers may be traced.
-                `Mesh` and `Urdf` are for Bullet alone.
+            obstacles: `Box`, `Sphere`, `Cylinder` and `Capsule`, each a single obstacle or many of them. Of many the
+                arrays have leading axes, and an array without them is shared by all. They may be traced. `Mesh` and
+                `Urdf` are for Bullet alone.
             ground: whether there is a ground plane at z = 0.
 
         Raises:
@@ -85,17 +85,17 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         return (*(single(stack, i) for stack in stacks for i in range(len(stack.pos))), *self.meshes, *self.urdfs)
 
     def shapes(self, dtype: DTypeLike) -> list[Obstacle]:
-        """The kinds that there are, in this precision; each with a leading axis over its obstacles."""
+        """The kinds of obstacles in the scene, each with a leading axis over its obstacles, as arrays of this type."""
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
         return [jax.tree.map(lambda x: jnp.asarray(x, dtype), stack) for stack in stacks]
 
 
 def check_scene(scene: Any, files: bool = False) -> None:
-    """Raise unless this is the scene of one world, and if it is read for its geometry, one without files.
+    """Raise unless `scene` is the scene of one world, without meshes and URDF files unless those are allowed.
 
     Args:
         scene: what was given.
-        files: whether meshes and URDF files are understood.
+        files: whether meshes and URDF files are allowed.
     """
     if not isinstance(scene, Scene):
         raise ValueError(

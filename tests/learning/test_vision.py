@@ -33,11 +33,11 @@ def look_at_the_ball() -> Task:
         rpy = TURN * turn * jnp.array([0, 0, 1], up.dtype)
         return state.replace(quat=rotation.from_rpy(rpy)[None]), None
 
-    def height(world):
+    def height(task, world):
         """Above or below the ball, m."""
         return jnp.abs(world.drones.pos[:, 2] - BALL[2])
 
-    def bearing(world):
+    def bearing(task, world):
         """From the nose to the ball, rad."""
         return jnp.abs(jax.vmap(rotation.to_rpy)(world.drones.quat)[:, 2])
 

@@ -1,4 +1,4 @@
-"""Cameras: one on every drone, and a free one for films."""
+"""Cameras of Bullet: one on every drone, and a free one for films."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.engine.bullet.client import Client
 
 _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the body; those above name the link
-# TinyRenderer does not return when a vertex lies less than 1e-8 m, but not 0, behind the plane of the eye. Numbers
-# such as 1e-17 in a pose that should be 0 lead there; they are rounded away, to a micrometre and a microradian.
+# TinyRenderer does not return when a vertex lies behind the plane of the eye by less than 1e-8 m, but not by 0. A pose
+# with 1e-17 in place of 0 leads there, so poses are rounded to a micrometre and a microradian.
 _DIGITS = 6
 _AWAY = [0.0, 0.0, -1e4]  # m; where a drone waits while its own camera looks
 _AHEAD = 1000.0  # m; how far in front of the eye the camera's target is
@@ -20,7 +20,7 @@ _AHEAD = 1000.0  # m; how far in front of the eye the camera's target is
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; the default is the paper's, with square pixels."""
+    """A pinhole camera. The default is that of gym-pybullet-drones (2021), but with square pixels."""
 
     width: int = 64
     """Pixels."""
@@ -29,13 +29,14 @@ class Camera:
     fov: float = 60.0
     """Vertical field of view, degrees."""
     aspect: float | None = None
-    """Width over height of the view; that of the picture when left out. The reference's is 1, which squeezes it."""
+    """Width over height of the view; that of the picture when left out. With 1, as in gym-pybullet-drones, the
+    picture is squeezed."""
     near: float | None = None
     """Nearest visible distance, m; the drone's arm when left out."""
     far: float = 1000.0
     """Farthest visible distance, m."""
     shadows: bool = False
-    """Whether things cast shadows; takes twice the time."""
+    """Whether bodies cast shadows, which takes twice the time."""
 
     def __post_init__(self):
         check_whole("width", self.width)
@@ -45,12 +46,13 @@ class Camera:
             raise ValueError(f"fov is {self.fov}; give an angle between 0 and 180 degrees")
 
 
-def of_drones(
+def drone_pictures(
     client: Client, body: np.ndarray, arms: np.ndarray, camera: Camera, raw_depth: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What every drone of a placed team sees along its body x: RGBA, depth, segmentation, each (n, height, width, ...).
+    """RGBA, depth and segmentation that every drone of a team sees along its body x, each (n, height, width, ...).
 
-    The eye is one arm above the centre of mass along world z, up is world z. A drone does not see itself.
+    The team has been placed. The eye is one arm above the center of mass along world z, and up is world z. A drone does
+    not see itself.
     """
     p = client.p
     frames = []
@@ -60,13 +62,13 @@ def of_drones(
         p.resetBasePositionAndOrientation(drone, _AWAY, [0, 0, 0, 1], physicsClientId=client.id)
         _check_outside(client, drone, eye)
         near = arm if camera.near is None else camera.near
-        frames.append(look(client, eye, eye + _AHEAD * x, camera, near, raw_depth))
+        frames.append(picture(client, eye, eye + _AHEAD * x, camera, near, raw_depth))
         p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], physicsClientId=client.id)
     rgb, depth, segmentation = zip(*frames, strict=True)
     return np.stack(rgb), np.stack(depth), np.stack(segmentation)
 
 
-def look(
+def picture(
     client: Client, eye: ArrayLike, target: ArrayLike, camera: Camera, near: float, raw_depth: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One picture from `eye` towards `target` (m, world): RGBA uint8, depth float32 (m or raw), segmentation int32."""
@@ -92,7 +94,7 @@ def look(
 
 
 def _check_outside(client: Client, drone: int, eye: np.ndarray) -> None:
-    """Raise if the eye is inside a body: it would look through it without notice."""
+    """Raise if the eye is inside a body, as the renderer would look through that body."""
     inside = [f"obstacle {i}" for i in client.solids_at(eye.tolist())]
     if client.ground is not None and eye[2] < 0:
         inside.append("the ground")

@@ -1,4 +1,4 @@
-"""One Bullet world: its connection, its bodies, and the only import of pybullet."""
+"""A Bullet world: its connection and its bodies; the only import of pybullet."""
 
 import contextlib
 import ctypes
@@ -31,10 +31,10 @@ _DRONE_FRICTION, _GROUND_FRICTION = 0.5, 1.0  # as in gym-pybullet-drones (2021)
 
 
 def import_pybullet() -> ModuleType:
-    """The pybullet module; its greeting is not printed.
+    """Import pybullet without printing its greeting.
 
     Raises:
-        ImportError: it is not installed; says which extra to install, and for which Python.
+        ImportError: it is not installed. The error names the extra and the versions of Python with wheels.
     """
     if "pybullet" in sys.modules:
         return sys.modules["pybullet"]
@@ -58,8 +58,8 @@ class Client:
         check_scene(scene, files=True)
         if is_traced(scene):
             raise ValueError(
-                "the scene is traced by jit, vmap or grad and has no values; Bullet builds its world once: give "
-                "it a scene of numbers, or take the explicit backend"
+                "the scene is traced by jit, vmap or grad and has no values yet, but Bullet builds its world now; "
+                "make the step outside, of a scene of numbers, or take the explicit backend"
             )
         obstacles = jax.device_get(scene).obstacles
         self.scene = scene
@@ -76,9 +76,9 @@ class Client:
         self.p.setGravity(0, 0, 0, physicsClientId=self.id)  # every drone's weight is part of its wrench
         self.ground = self._add_ground() if scene.ground else None
         self.obstacles = [self._add_obstacle(obstacle) for obstacle in obstacles]
-        self.solids = [
-            n for n, obstacle in zip(self.obstacles, obstacles, strict=True) if isinstance(obstacle, Obstacle)
-        ]
+        self._solids = {
+            body for body, obstacle in zip(self.obstacles, obstacles, strict=True) if isinstance(obstacle, Obstacle)
+        }
         self._point = self.p.createCollisionShape(self.p.GEOM_SPHERE, radius=_POINT, physicsClientId=self.id)
         self.renderer = self.p.ER_BULLET_HARDWARE_OPENGL if gui or renderer == EGL else self.p.ER_TINY_RENDERER
         if renderer == EGL:
@@ -172,12 +172,12 @@ class Client:
         return np.array(after)
 
     def solids_at(self, point: list[float]) -> list[int]:
-        """The obstacles, by their numbers, that a point (m, world) is inside of; meshes and URDF files do not count.
+        """Numbers of the obstacles that a point (m, world) is inside of.
 
-        Bullet takes those for their convex hulls, in which there is room to look around.
+        Meshes and URDF files do not count: Bullet takes them for their convex hulls, which have free space in them.
         """
         near = self.p.getOverlappingObjects(point, point, physicsClientId=self.id) or ()
-        bodies = {body for body, _ in near}.intersection(self.solids)
+        bodies = self._solids.intersection(body for body, _ in near)
         return sorted(self.obstacles.index(body) for body in bodies if self._is_inside(body, point))
 
     def _is_inside(self, body: int, point: list[float]) -> bool:

@@ -1,4 +1,4 @@
-"""Who touches whom, where and how hard."""
+"""Contacts between bodies: which bodies, where, and with what force."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Contact:
     impulse: float
     """Normal impulse of the physics step, N s."""
     depth: float
-    """How far the bodies are in each other, m; negative for a gap within the collision margin."""
+    """How deep the bodies are in each other, m; negative where there is a gap, within the collision margin."""
 
 
-def of_last_step(client: Client, dt: float) -> list[Contact]:
+def contacts_of_last_step(client: Client, dt: float) -> list[Contact]:
     """The contacts of Bullet's last physics step of length dt (s) that carry a force."""
     names, contacts = client.names(), []
     for point in client.p.getContactPoints(physicsClientId=client.id):
@@ -37,7 +37,7 @@ def of_last_step(client: Client, dt: float) -> list[Contact]:
         if force <= 0:
             continue
         pos, normal = np.array(on_second), np.array(normal)
-        if first not in client.drones:  # name the drone first
+        if first not in client.drones:  # `body` is a drone
             first, second, pos, normal = second, first, np.array(point[5]), -normal
         contacts.append(Contact(names[first], names[second], pos, normal, force, force * dt, -distance))
     return contacts

@@ -16,9 +16,9 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_number, check_params, check_positive, check_quaternion, check_whole
 from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors
 from jaxdrones.engine.bullet import arrays
-from jaxdrones.engine.bullet.camera import Camera, look, of_drones
+from jaxdrones.engine.bullet.camera import Camera, drone_pictures, picture
 from jaxdrones.engine.bullet.client import BALLS, TINY, Client
-from jaxdrones.engine.bullet.contacts import Contact, of_last_step
+from jaxdrones.engine.bullet.contacts import Contact, contacts_of_last_step
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Physics, Rotors
 from jaxdrones.engine.step import HostStep, is_traced
@@ -161,7 +161,7 @@ class BulletStep(HostStep):
         loads = self._loads_on(team, Layout.of(state.aux))
         team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
         self.client.advance(team, loads)
-        return of_last_step(self.client, self._dt)
+        return contacts_of_last_step(self.client, self._dt)
 
     def camera(
         self, params: Params, state: State, camera: Camera = _PAPER_CAMERA, raw_depth: bool = False
@@ -181,14 +181,14 @@ class BulletStep(HostStep):
             check_team(params, state, state.rpm)
             return self._traced_camera(params, state, camera, raw_depth)
         team = self._place(params, state)
-        return of_drones(self.client, team, self._arms, camera, raw_depth)
+        return drone_pictures(self.client, team, self._arms, camera, raw_depth)
 
     def photo(
         self, params: Params, state: State, eye: npt.ArrayLike, target: npt.ArrayLike, camera: Camera = _FILM_CAMERA
     ) -> np.ndarray:
         """A picture of the team from `eye` towards `target` (3,) (m, world): RGB (height, width, 3) uint8."""
         self._place(params, state)
-        return look(self.client, eye, target, camera, _FILM_NEAR)[0][..., :3]
+        return picture(self.client, eye, target, camera, _FILM_NEAR)[0][..., :3]
 
     def _place(self, params: Params, state: State) -> np.ndarray:
         team = self._pack(params, state, state.rpm)
@@ -265,7 +265,7 @@ class BulletStep(HostStep):
             team = np.asarray(team, float)
             check_finite("state", team)
             self.client.place(team)
-            return of_drones(self.client, team, np.asarray(arms, float), camera, raw_depth)
+            return drone_pictures(self.client, team, np.asarray(arms, float), camera, raw_depth)
 
         team = arrays.one_array(state, state.rpm)
         return jax.pure_callback(take, pictures, arrays.bodies_of(params), params.arm, team, vmap_method="sequential")

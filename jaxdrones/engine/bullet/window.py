@@ -18,7 +18,7 @@ _COLORS = np.eye(3).tolist()  # of the body axes: x red, y green, z blue
 
 
 class Window(HostStep):
-    """A step that is watched: it runs no faster than real time and obeys the sliders while the button is on."""
+    """A Bullet step with a window: it runs no faster than real time, and has sliders for the motors."""
 
     def __init__(self, step: BulletStep, params: Params, control_dt: float):
         self._step, self._dt, self._count = step, control_dt, 0
@@ -48,11 +48,11 @@ class Window(HostStep):
         return state
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """The time derivative of the step that is watched."""
+        """The time derivative, as of the Bullet step."""
         return self._step.rate(params, state, rpm, scene)
 
     def close(self) -> None:
-        """End the connection of the step that is watched, and the window with it."""
+        """End the connection to Bullet, which closes the window."""
         self._step.close()
 
     def _draw_axes(self, length: float) -> None:

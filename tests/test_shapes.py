@@ -1,0 +1,19 @@
+"""The shapes in annotations are checked while the tests run."""
+
+import jax.numpy as jnp
+import jaxtyping
+import pytest
+
+import jaxdrones as jd
+from jaxdrones import rotation
+from jaxdrones.control import allocation
+
+
+def test_a_function_that_takes_another_shape_than_it_says_is_found():
+    with pytest.raises(jaxtyping.TypeCheckError, match=r"rotation\.multiply"):
+        rotation.multiply(jnp.ones((4, 1)), jnp.ones((4, 1)))
+
+
+def test_an_error_of_the_function_itself_comes_first():
+    with pytest.raises(ValueError, match=r"use jax\.vmap for a team"):
+        allocation.rpm_from_wrench(jd.load_params("cf2x"), jnp.ones(2), jnp.ones((2, 3)))

@@ -16,6 +16,11 @@ def components(v: Float[Array, "n *shape"]) -> list[Float[Array, "*shape"]]:
     return [jnp.squeeze(x, 0) for x in jax.lax.split(v, [1] * len(v))]
 
 
+def total(v: Float[Array, " n"]) -> Float[Array, ""]:
+    """The sum of the components of a short vector."""
+    return cast(Array, sum(components(v)))
+
+
 def dot(a: Float[Array, " n"], b: Float[Array, " n"]) -> Float[Array, ""]:
     """Scalar product of two short vectors."""
     return cast(Array, sum(x * y for x, y in zip(components(a), components(b), strict=True)))

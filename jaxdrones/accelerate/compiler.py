@@ -21,6 +21,16 @@ try:
 except ImportError:
     AVAILABLE = False
 
+try:
+    from jax.extend.core import unsafe_am_i_under_a_jit_DO_NOT_USE as is_inside_jit
+except ImportError:
+    _constant = jax.jit(lambda: 0)
+
+    def is_inside_jit() -> bool:
+        """Whether what is computed here becomes a part of a traced program."""
+        return isinstance(_constant(), jax.core.Tracer)
+
+
 Equation = Any
 """One line of a traced program, with `primitive`, `params`, `invars`, `outvars` and `effects`."""
 Variable = Any

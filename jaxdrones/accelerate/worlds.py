@@ -189,12 +189,9 @@ def _number_of_worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
     return found.pop()
 
 
-_probe = jax.jit(lambda: 0)
-
-
 def _is_traced(tree: Any) -> bool:
     """Whether some of the arrays are being traced, or all that is computed here is."""
-    return isinstance(_probe(), jax.core.Tracer) or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
+    return compiler.is_inside_jit() or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
 
 
 def _shapes(tree: Any) -> Any:

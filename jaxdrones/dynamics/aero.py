@@ -64,7 +64,7 @@ def external_force(params: Params, state: State) -> Wrench:
 
 def _summed_rotor_speed(state: State) -> Float[Array, ""]:
     """Sum of the four rotor speeds, rad/s."""
-    return _RADIANS_PER_SECOND * jnp.sum(state.rpm)
+    return _RADIANS_PER_SECOND * vector.total(state.rpm)
 
 
 def _rotor_heights(params: Params, state: State) -> Float[Array, "4"]:

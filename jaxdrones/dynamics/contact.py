@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import along_z, components, cross, dot
+from jaxdrones.vector import along_z, components, cross, dot, total
 from jaxdrones.wrench import Wrench
 
 _SPHERES = 8  # as in Bullet
@@ -71,7 +71,7 @@ def ground_contact(params: Params, state: State) -> Wrench:
     viscosity = _friction_per_slip(_GROUND_FRICTION * normal_force, vx**2 + vy**2, max_viscosity)
     forces = [-viscosity * vx, -viscosity * vy, normal_force]
 
-    force = jnp.stack([jnp.sum(f) for f in forces])
+    force = jnp.stack([total(f) for f in forces])
     torque = cross(p, force)
     torque += cross(x, jnp.stack([dot(cos, f) for f in forces])) + cross(y, jnp.stack([dot(sin, f) for f in forces]))
     return Wrench(rotation.rotate_inverse(state.quat, force), rotation.rotate_inverse(state.quat, torque))
@@ -95,7 +95,7 @@ def drone_contact(params: Params, state: State, other: Params, other_state: Stat
     ours, theirs = _contacts(first, second), _contacts(second, first)
     contacts = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), ours, theirs._replace(normal=-theirs.normal))
     mass = _series_mass(_tilting_mass(params), _tilting_mass(other))
-    share = mass / (1 + jnp.sum(_onset(contacts.depth)))
+    share = mass / (1 + total(_onset(contacts.depth)))
 
     def at_point(contact: _Contact) -> Wrench:
         vel = _velocity(first, contact.point) - _velocity(second, contact.point)
@@ -106,8 +106,8 @@ def drone_contact(params: Params, state: State, other: Params, other_state: Stat
         force = normal_force * contact.normal - viscosity * slip
         return Wrench(force, cross(contact.point, force))
 
-    total = jax.tree.map(lambda x: jnp.sum(x, axis=0), jax.vmap(at_point)(contacts))
-    return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), total)
+    wrench = jax.tree.map(lambda x: jax.vmap(total)(x.T), jax.vmap(at_point)(contacts))
+    return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), wrench)
 
 
 class _Body(NamedTuple):

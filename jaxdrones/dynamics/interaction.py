@@ -1,6 +1,5 @@
 """Downwash: what one drone does to another through the air (paper, equation 6)."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -46,7 +45,8 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
         onset = jnp.clip(z, 0, 1)
         return -speed * width**2 * onset**2 * (3 - 2 * onset) * loss * rpm**2 / (depth * spread**2)
 
-    return Wrench.of_thrusts(params.rotor_pos, jax.vmap(thrust_change)(params.rotor_pos, state.rpm))
+    rotors = zip(vector.components(params.rotor_pos), vector.components(state.rpm), strict=True)
+    return Wrench.of_thrusts(params.rotor_pos, jnp.stack([thrust_change(*rotor) for rotor in rotors]))
 
 
 def downwash_2021(params: Params, state: State, other: Params, other_state: State) -> Wrench:
@@ -68,4 +68,4 @@ def downwash_2021(params: Params, state: State, other: Params, other_state: Stat
 def _induced_speed(params: Params, state: State) -> Float[Array, ""]:
     """Air speed through the rotor discs in hover by momentum theory, m/s: the mean of sqrt(F_i / (2 rho A))."""
     area = jnp.pi * params.prop_radius**2
-    return jnp.mean(jnp.abs(state.rpm)) * jnp.sqrt(params.kf / (2 * params.air_density * area))
+    return vector.total(jnp.abs(state.rpm)) / 4 * jnp.sqrt(params.kf / (2 * params.air_density * area))

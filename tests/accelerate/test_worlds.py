@@ -1,5 +1,6 @@
 """Many worlds in chunks, each chunk one kernel."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -242,6 +243,17 @@ def test_within_a_transformation_it_is_what_vmap_is(name, looped):
         return WITHIN[name](lambda g: vmap(repeated(g)), jnp.linspace(-1, 1, 6).reshape(3, 2))
 
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), along(jd.over_worlds), along(jax.vmap))
+
+
+def test_it_knows_a_trace_without_the_interface_that_tells(monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.delattr(jax.extend.core, "unsafe_am_i_under_a_jit_DO_NOT_USE")
+        found = importlib.util.module_from_spec(compiler.__spec__)
+        compiler.__spec__.loader.exec_module(found)
+    assert not found.is_inside_jit() and not compiler.is_inside_jit()
+    told = []
+    jax.jit(lambda: told.append((found.is_inside_jit(), compiler.is_inside_jit())))()
+    assert told == [(True, True)]
 
 
 def test_the_same_function_may_be_called_with_arrays_and_within_a_transformation():

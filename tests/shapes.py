@@ -19,6 +19,8 @@ def checked(function: Callable) -> Callable:
     hints = function.__annotations__
     if hints.get("return", Any) is Any:  # what it calls before, or a function without an annotation
         return function
+    if not any(map(_has_shape, hints.values())):
+        return function
     function.__annotations__ = {name: hint if _has_shape(hint) else Any for name, hint in hints.items()}
     checking = beartype.beartype(function)
 

@@ -17,6 +17,8 @@ from jaxdrones.accelerate.chunks import ChunkedProgram
 from jaxdrones.accelerate.fitting import NoKernelError
 from jaxdrones.checks import check_whole
 
+_TRACER = jax.core.Tracer
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -191,7 +193,7 @@ def _number_of_worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
 
 def _is_traced(tree: Any) -> bool:
     """Whether some of the arrays are being traced, or all that is computed here is."""
-    return compiler.is_inside_jit() or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
+    return compiler.is_inside_jit() or True in [isinstance(x, _TRACER) for x in jax.tree.leaves(tree)]
 
 
 def _shapes(tree: Any) -> Any:

@@ -70,6 +70,6 @@ def angular_momentum(params: Params, rpm: Float[Array, "4"]) -> Float[Array, ""]
 
 def with_rotor_speed(params: Params, state: State, rpm: Float[Array, "4"]) -> State:
     """The state after the rotors have taken another speed at once; the body keeps the angular momentum of both."""
-    change = angular_momentum(params, rpm) - angular_momentum(params, state.rpm)
+    change = angular_momentum(params, rpm - state.rpm)
     _, _, inertia = components(params.inertia)
     return state.replace(rpm=rpm, omega=state.omega - along_z(change / inertia))

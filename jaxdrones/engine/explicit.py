@@ -136,7 +136,8 @@ class ExplicitStep(Step):
 
         def substep(params: Params, state: State, command: jax.Array, scene: Scene) -> State:
             speed, _ = physics.rotor_speed(params, state, command)
-            state = jax.vmap(with_rotor_speed)(params, state, speed)
+            if speed is not state.rpm:  # rotors with a lag do not jump
+                state = jax.vmap(with_rotor_speed)(params, state, speed)
             return integrator(lambda s: derivative(params, s, command, scene), state, dt)
 
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:

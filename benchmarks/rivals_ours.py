@@ -135,10 +135,10 @@ def angle(quat, other) -> float:
     return float(4 * np.arcsin(np.minimum(np.max(difference) / 2, 1)))
 
 
-def piloted(step: jd.Step, dt: float) -> Callable:
+def controlled(step: jd.Step, dt: float) -> Callable:
     """`(params, start, commands) -> final state` of a world; commands (steps, 1, 4) are roll, pitch, yaw, thrust.
 
-    The pilot is the paper's attitude loop and PWM mixer, the kind of cascade that crazyflow flies.
+    The controller is the attitude loop and PWM mixer of `control.pid`, the kind of cascade that crazyflow flies.
     """
     gains = pid.gains("cf2x")
 

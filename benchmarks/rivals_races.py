@@ -95,7 +95,7 @@ class Attitude:
         rpy, thrust_to_weight = ours.attitudes(worlds, steps, jax.random.key(1))
         self._asked = rpy[-1]
         commands = jnp.asarray(np.concatenate([rpy, thrust_to_weight * np.asarray(params.weight[0])], axis=-1))
-        programs = ours.ways(ours.piloted(step, DT), jax.devices(), params, start, commands, axis=1)
+        programs = ours.ways(ours.controlled(step, DT), jax.devices(), params, start, commands, axis=1)
         if alone:
             return programs
         import rivals_crazyflow_many as crazyflow

@@ -1,7 +1,7 @@
 """How do speed, memory and time to compile grow with the number of worlds?
 
 One drone a world, lagging rotors, drag, semi-implicit Euler at 240 Hz, float32, flown by `jaxdrones.over_worlds`,
-shared by the devices that the CPU is cut into. `controlled`: the paper's attitude loop and mixer, a new attitude in
+shared by the devices that the CPU is cut into. `controlled`: the attitude loop and mixer of the PID, a new attitude in
 every step. Memory is what the compiled program takes beside its inputs and results, of one device.
 """
 
@@ -72,7 +72,7 @@ def measure(worlds: int, options) -> dict[str, object]:
     commands = jnp.asarray(np.concatenate([rpy, thrust * np.asarray(params.weight[0])], axis=-1))
     flights = {
         "held": (ours.flight(step, most), rpm, 0, most),
-        "controlled": (ours.piloted(step, DT), commands, 1, fewer),
+        "controlled": (ours.controlled(step, DT), commands, 1, fewer),
     }
     places = {"": ()}
     if options.devices > 1 and worlds % options.devices == 0:

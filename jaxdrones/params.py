@@ -50,9 +50,9 @@ class Params(flax.struct.PyTreeNode):
     drag_coeff: Array
     """(3,) rotor drag per axis, N per m/s of air speed and rad/s of summed rotor speed."""
     ground_effect_coeff: Array
-    """() k_G of the paper's equation 5."""
+    """() k_G of equation 5 of the paper."""
     downwash_coeff: Array
-    """(3,) k_D1 (N), k_D2, k_D3 (m) of the paper's equation 6."""
+    """(3,) k_D1 (N), k_D2, k_D3 (m) of equation 6 of the paper."""
     inflow_loss: Array
     """() share of a rotor's thrust lost per m/s of downwash through it, s/m."""
     prop_radius: Array

@@ -19,7 +19,7 @@ from jaxdrones import assets
 from jaxdrones.checks import check_choice, shown
 from jaxdrones.params import Params
 
-GRAVITY = 9.8  # m/s^2, the reference's value
+GRAVITY = 9.8  # m/s^2, as in gym-pybullet-drones
 AIR_DENSITY = 1.225  # kg/m^3, standard atmosphere at sea level
 
 _ANY = (-np.inf, np.inf)

@@ -98,7 +98,7 @@ def unlimited(params: Params) -> Params:
 
 
 def flown(case: Case, params: Params) -> tuple[Params, np.ndarray]:
-    """The drone of a flight and its commands: clipped by our motors where the reference clipped, else not limited."""
+    """The drone of a flight and its commands, which our motors clip where gym-pybullet-drones clipped them."""
     if "rpm_cmd" in case.arrays:
         return params, case.arrays["rpm_cmd"]
     return unlimited(params), case.arrays["rpm_applied"]

@@ -1,4 +1,4 @@
-"""Bundled vehicles against the constants recorded from the reference, and files that are wrong."""
+"""Bundled vehicles against the constants recorded from gym-pybullet-drones, and files that are wrong."""
 
 import re
 
@@ -42,15 +42,15 @@ def test_constants_are_the_recorded_ones(name):
         "collision_h": params.collision_height,
         "collision_z_offset": params.collision_offset,
     }
-    if vehicle != "hb":  # the reference gives its hb propellers no size
+    if vehicle != "hb":  # gym-pybullet-drones gives its hb propellers no size
         pairs["prop_radius"] = params.prop_radius
     for key, value in pairs.items():
         np.testing.assert_allclose(value, recorded[key], rtol=RTOL, err_msg=key)
 
 
 @pytest.mark.parametrize("name", [*RECORDED, *RECORDED_HB])
-def test_rotors_are_where_the_reference_has_them(name):
-    """To 0.3 %: the reference rounds the rotor positions of the cf2x to millimetres. The racer's arm is another's."""
+def test_rotors_are_where_gym_pybullet_drones_has_them(name):
+    """To 0.3 %: gym-pybullet-drones rounds those of the cf2x to millimetres. The racer has an arm of its own."""
     case = golden_data.load(name)
     rotor_pos = jaxdrones.load_params(case.about["vehicle"]).rotor_pos
     np.testing.assert_allclose(rotor_pos, case.constants["rotor_positions"], rtol=0.003, atol=0)

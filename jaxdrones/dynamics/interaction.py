@@ -13,9 +13,9 @@ _JET_SPEED = 10.11  # center speed over induced speed, at one motor distance per
 _JET_ORIGIN = 5.817  # motor distances from the virtual origin of the jet to the rotors
 _JET_WIDTH = 0.07668  # half width over distance from the virtual origin
 
-_CUTOFF = 10.0  # m, horizontal reach of the paper's downwash
-_MIN_HEIGHT = 0.05  # m; the paper's downwash grows without bound below
-_MIN_WIDTH = 5e-4  # m; the paper's downwash has no width at a height of 0.6875 m
+_CUTOFF = 10.0  # m, horizontal cutoff of equation 6 in gym-pybullet-drones (2021)
+_MIN_HEIGHT = 0.05  # m; equation 6 grows without bound below
+_MIN_WIDTH = 5e-4  # m; equation 6 has no width at a height of 0.6875 m
 
 
 def downwash(params: Params, state: State, other: Params, other_state: State) -> Wrench:

@@ -11,8 +11,7 @@ from jaxdrones.wrench import Wrench
 
 def newton_euler(params: Params, state: State, wrench: Wrench) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Linear acceleration (m/s^2, world) and angular acceleration (rad/s^2, body); paper, equations 2 and 3."""
-    gravity = jnp.stack([jnp.zeros_like(params.gravity), jnp.zeros_like(params.gravity), params.gravity])
-    acc = rotation.rotate(state.quat, wrench.force) / params.mass - gravity
+    acc = rotation.rotate(state.quat, wrench.force) / params.mass - vector.along_z(params.gravity)
     gyroscopic = vector.cross(state.omega, params.inertia * state.omega)
     return acc, (wrench.torque - gyroscopic) / params.inertia
 

@@ -1,6 +1,6 @@
 """Observation terms by name; an observation is their concatenation. Every term has a bound.
 
-`kinematics` is the paper's equation 7, `adjacency` its equation 8; images (equation 9) belong to the environment.
+`kinematics` is equation 7 of the paper, `adjacency` equation 8; images (equation 9) belong to the environment.
 """
 
 from __future__ import annotations

@@ -186,7 +186,7 @@ def centralized_input(
 ) -> Float[Array, "*batch n e"]:
     """Input of a centralized critic for each drone: all observations, its own first, then the others' actions.
 
-    For two drones of the paper's leader-follower task these are 12 + 12 + 1 = 25 numbers.
+    For two drones of the leader-follower task (2021) these are 12 + 12 + 1 = 25 numbers.
     """
     n = obs.shape[-2]
     own_first = [jnp.roll(obs, -i, axis=-2).reshape(*obs.shape[:-2], -1) for i in range(n)]

@@ -42,7 +42,7 @@ _ONE_D_PPO = {
     "min_std": 0.2,
     "final_std": 0.05,
 }
-"""The paper's tasks are slow: all rotor speeds are within 5 % of hover, so that an action shows after seconds."""
+"""The tasks of (2021) are slow: all rotor speeds are within 5 % of hover, so that an action shows after seconds."""
 
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     # The exact gradient fails for 1 of 10 seeds.

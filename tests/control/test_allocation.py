@@ -20,7 +20,7 @@ allocate = jax.jit(rpm_from_wrench)
 differentiate = jax.jit(jax.jacrev(rpm_from_wrench, argnums=(1, 2)))
 allocate_all = jax.jit(jax.vmap(rpm_from_wrench, (None, 0, 0)))
 
-MIXERS = {  # columns roll, pitch, yaw; of the reference
+MIXERS = {  # columns roll, pitch, yaw; of gym-pybullet-drones
     "cf2x": [(-0.5, -0.5, -1), (-0.5, 0.5, 1), (0.5, 0.5, -1), (0.5, -0.5, 1)],
     "cf2x of the paper": [(0.5, -0.5, -1), (0.5, 0.5, 1), (-0.5, 0.5, -1), (-0.5, -0.5, 1)],
     "cf2p": [(0, -1, -1), (1, 0, 1), (0, 1, -1), (-1, 0, 1)],
@@ -262,7 +262,7 @@ def wild_wrenches(params, seed):
 
 
 def least_squares_problem(params, thrust, torque):
-    """A and b of A x = b in squares of RPM, as the reference weighs its rows."""
+    """A and b of A x = b in squares of RPM, as gym-pybullet-drones weighs its rows."""
     x, y, _ = np.asarray(params.rotor_pos).T
     arm = np.mean(np.hypot(x, y))
     matrix = np.stack([np.ones(4), y / arm, -x / arm, np.asarray(params.rotor_spin)])

@@ -1,6 +1,6 @@
 """Controllers along recorded flights: they are given the recorded states and have to command what was recorded.
 
-Where the reference flew at 48 Hz it was in a limit cycle, so only this comparison is well conditioned.
+Where gym-pybullet-drones flew at 48 Hz it was in a limit cycle, so only this comparison is well conditioned.
 """
 
 from functools import partial
@@ -35,7 +35,7 @@ def test_the_simple_pid_commands_what_was_recorded(name):
 
 @pytest.mark.parametrize("name", golden_data.names("action", kind="closed_loop"))
 def test_velocities_are_commanded_as_recorded(name):
-    """The reference asks its controller before it moves: first for no velocity at the initial state."""
+    """gym-pybullet-drones asks its controller before it moves: first for no velocity at the initial state."""
     case = golden_data.load(name)
     arrays = case.arrays
     pos, quat, _, vel, omega, _ = np.split(arrays["initial_state"], np.cumsum([3, 4, 3, 3, 3]), axis=-1)
@@ -65,7 +65,7 @@ def assert_commands(controller, case):
 
 
 def clipped(case, rpm):
-    """As the reference limits what its controllers command before it flies it."""
+    """As gym-pybullet-drones limits what its controllers command before it flies it."""
     return np.clip(rpm, 0, case.constants["max_rpm"])
 
 

@@ -70,7 +70,7 @@ def test_at_48_hz_it_is_in_a_limit_cycle_and_at_120_hz_it_is_not():
         ripple[hz] = jnp.max(jnp.std(rpm, axis=0), axis=-1)
         lowest[hz], highest[hz] = jnp.min(rpm), jnp.max(rpm)
     assert jnp.all((ripple[48] > 700) & (ripple[48] < 1600))  # RPM; measured: 1330 and 846
-    assert 12_700 < lowest[48] < 13_000 and 15_900 < highest[48] < 16_170  # the reference's are 12,710 and 16,160
+    assert 12_700 < lowest[48] < 13_000 and 15_900 < highest[48] < 16_170  # gym-pybullet-drones' are 12,710 and 16,160
     assert jnp.all(ripple[120] < 1)  # RPM; measured: 5e-5
 
 
@@ -138,5 +138,5 @@ def call_in_sequence(params, dt, pos, quat, vel, target_pos, target_rpy, target_
 
 
 def intrinsic_xyz(angles):
-    """Rotation matrices Rx Ry Rz, as the reference writes its target attitudes down."""
+    """Rotation matrices Rx Ry Rz, as gym-pybullet-drones writes its target attitudes down."""
     return scipy_rotation.from_euler("XYZ", angles).as_matrix()

@@ -32,7 +32,7 @@ def test_at_60_hz_a_hummingbird_reaches_a_place_30_cm_off():
 
 
 def test_at_48_hz_a_hummingbird_with_its_own_inertia_is_not_stable():
-    """The reference's flights at 48 Hz have the fivefold inertia that its engine made of the collision shape.
+    """Flights of gym-pybullet-drones at 48 Hz have the fivefold inertia that its engine made of the collision shape.
 
     With motors without a limit, as its controller has them.
     """

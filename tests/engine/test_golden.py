@@ -1,4 +1,4 @@
-"""The explicit backend against recorded flights of the reference's explicit model, whose equations are ours."""
+"""The explicit backend against recorded flights of gym-pybullet-drones' explicit model, whose equations are ours."""
 
 from functools import lru_cache
 

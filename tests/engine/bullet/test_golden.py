@@ -1,4 +1,4 @@
-"""The Bullet backend against recorded Bullet flights of the reference."""
+"""The Bullet backend against recorded Bullet flights of gym-pybullet-drones."""
 
 from functools import lru_cache
 
@@ -14,7 +14,7 @@ from jaxdrones.engine import bullet
 
 pytestmark = pytest.mark.needs("pybullet")
 
-DAMPING = 0.04  # the reference leaves Bullet's own on
+DAMPING = 0.04  # gym-pybullet-drones leaves Bullet's own on
 PYB_EFFECTS = {
     "gnd": jaxdrones.ground_effect_2021,
     "drag": jaxdrones.drag_world_axes,
@@ -25,7 +25,7 @@ make_step = lru_cache(bullet.make_step)
 
 
 def step_of(physics: str, dt: float = 1 / 240):
-    """The step of one of the reference's physics options, such as `pyb_gnd_drag_dw`."""
+    """The step of one of gym-pybullet-drones' physics options, such as `pyb_gnd_drag_dw`."""
     chosen = [PYB_EFFECTS[name] for name in physics.split("_")[1:]]
     pairs = tuple(f for f in chosen if f is jaxdrones.downwash_2021)
     return make_step(effects=tuple(f for f in chosen if f not in pairs), pairs=pairs, dt=dt, damping=DAMPING)
@@ -54,7 +54,7 @@ def test_single_steps_agree(name):
     params = jaxdrones.repeat(golden_data.unlimited(golden_data.recorded_params(case)), 1)
     previous = a.get("rpm_previous")
 
-    def drag_of_the_step_before(params, state):  # the reference's drag sees the rotor speeds of the step before
+    def drag_of_the_step_before(params, state):  # gym-pybullet-drones' drag sees the rotor speeds of the step before
         return jaxdrones.drag_world_axes(params, state.replace(rpm=params.max_speed * jnp.ones(4)))
 
     effects = [PYB_EFFECTS[word] for word in physics.split("_")[1:] if word != "drag"]
@@ -81,7 +81,7 @@ def test_single_steps_agree(name):
     ),
 )
 def test_rows_of_rollouts_agree_but_for_the_stale_link_frame(name):
-    """The reference turns a force with the attitude of the step before, which is |omega| dt away from ours."""
+    """gym-pybullet-drones turns a force with the attitude of the step before, which is |omega| dt away from ours."""
     case = golden_data.load(name)
     a, dt = case.arrays, 1 / case.about["physics_freq_hz"]
     step = step_of(case.about["physics"], dt)

@@ -102,6 +102,15 @@ def test_what_jax_does_not_promise_to_keep_is_touched_in_one_file():
     assert [f.name for f in FILES if any(name in f.read_text() for name in inner)] == ["compiler.py"]
 
 
+PHYSICS = [f for f in FILES if top(f) in ("dynamics", "control", "rotation", "vector", "state", "params", "wrench")]
+
+
+@pytest.mark.parametrize("file", PHYSICS, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_physics_knows_no_compiler(file):
+    words = ("XLA", "jaxpr", "fusion", "kernel", "stored", "nanosecond", "optimization_barrier", "compiler")
+    assert [word for word in words if word in file.read_text()] == []
+
+
 def test_importing_the_package_starts_no_device():
     code = "import jax, jaxdrones.learning; jax.config.update('jax_num_cpu_devices', 3); print(len(jax.devices()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

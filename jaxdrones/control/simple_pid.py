@@ -74,7 +74,8 @@ def control(
     """Rotor speeds of one drone, RPM, up to `max_rpm`; those of gym-pybullet-drones are not limited.
 
     The drone keeps yaw zero: of the setpoint only `pos` is used. Derivatives are differences of errors, so the first
-    call jumps. With the inertia of the Hummingbird it needs 60 calls per second, with a fivefold one the 48 of the paper.
+    call jumps. With the inertia of the Hummingbird it needs 60 calls per second; the paper flies it at 48 with a
+    fivefold one.
 
     Args:
         gains: of the two loops.

@@ -57,8 +57,7 @@ def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | No
 def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGrid | None) -> Wrench:
     """The sum of a pair effect over all other drones, or over those within the cutoff, for every drone of a team.
 
-    Sums are taken component by component, over an axis in front of that of the drones acted on: so XLA's CPU compiler
-    vectorises a pair along the latter.
+    The wrenches are computed and summed as six components, each (others, drones).
     """
     index = jnp.arange(len(state.pos))
 

@@ -27,7 +27,7 @@ from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
-from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.sensing import Scene, Sensor
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
@@ -38,6 +38,7 @@ __all__ = [
     "NeighborGrid",
     "Pair",
     "Params",
+    "Scene",
     "Sensor",
     "State",
     "Step",

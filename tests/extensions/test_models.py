@@ -204,3 +204,16 @@ def test_gradients_through_a_full_battery_are_finite():
     step = make_step("battery", jd.rk4)
     start = moving(step)
     assert_finite(jax.grad(lambda s: jnp.sum(flown(step, s, 3, share=10.0)[0].pos))(start))
+
+
+@pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.needs("pybullet"))])
+@each_extension
+def test_a_model_flies_in_an_environment_and_starts_anew_with_the_episode(name, backend):
+    with jd.make("hover", drones=2, backend=backend, **EXTENSIONS[name]) as env:
+        _, world = env.reset(jax.random.key(0))
+        fresh = world.drones.aux
+        _, world, reward, *_ = env.step(jax.random.key(1), world, jnp.zeros((2, 4)))
+        assert jax.tree.structure(world.drones.aux) == jax.tree.structure(fresh) and name in fresh
+        assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (world.drones.aux, fresh)), strict=True))
+        assert_finite((world.drones, reward))
+        assert_close(env.reset(jax.random.key(2))[1].drones.aux, fresh, 0)

@@ -108,7 +108,7 @@ def test_rivals_races_our_side_where_there_are_no_rivals():
 def test_limit_in_c_flies_our_trajectory():
     result = quick("limit")
     assert max(result["agreement"].values()) < 1e-4  # float32, 240 steps
-    assert all(row["share"] > 0 and len(row["rates"]) == 6 for row in result["rows"])
+    assert all(row["share"] > 0 and len(row["rates"]) == 5 for row in result["rows"])
 
 
 @pytest.mark.parametrize("name", sorted({path.name for path in BENCHMARKS.glob("*.py")} - HELPERS | {"limit"}))

@@ -12,6 +12,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
@@ -21,6 +22,7 @@ Point = Float[Array, "3"]
 Number = Float[Array, ""]
 Interval = tuple[Number, Number]
 
+_NUMBERS = (int, float, np.ndarray, np.generic, jax.Array)
 GREY = (0.6, 0.6, 0.6, 1.0)
 LENGTHS = {"pos": 3, "quat": 4, "color": 4, "size": 3}
 """Numbers in a field of a single obstacle; a field that is not named here is one number."""
@@ -38,8 +40,8 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
 
     def __post_init__(self):
         for name, value in vars(self).items():
-            if isinstance(value, tuple | list):  # JAX would take its numbers for arrays of their own
-                object.__setattr__(self, name, jnp.asarray(value, float))
+            if isinstance(value, tuple | list) and all(isinstance(x, _NUMBERS) for x in jax.tree.leaves(value)):
+                object.__setattr__(self, name, jnp.asarray(value, float))  # JAX would take each number for an array
 
     @property
     def rounding(self) -> Any:

@@ -126,3 +126,13 @@ def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
 def test_a_wrong_obstacle_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_scene_can_be_rebuilt_with_anything_in_place_of_its_arrays():
+    """As JAX and its libraries do: of shapes and types, of placeholders, of nothing."""
+    scene = Scene.of(Box(pos=(0.0, 0.0, 1.0), size=(1.0, 1.0, 1.0)), Sphere(pos=(0.0, 1.0, 1.0), radius=0.5))
+    described = jax.tree.map(lambda x: (x.shape, x.dtype), scene)
+    assert described.boxes.pos == ((1, 3), scene.boxes.pos.dtype)
+    assert described == jax.tree.map(lambda x: (x.shape, x.dtype), scene)
+    nothing = jax.tree.map(lambda x: None, scene)
+    assert nothing.boxes.pos is None and nothing.spheres.radius is None

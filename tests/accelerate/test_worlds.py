@@ -100,6 +100,7 @@ def test_with_our_options_gradients_through_contacts_and_downwash_are_one_kernel
     assert jnp.all(jnp.abs(inside) > 0)
 
 
+@pytest.mark.slow
 def test_a_controlled_flight_is_one_kernel():
     gains, hold = pid.gains(), setpoint.Setpoint.at(jnp.array([[0.0, 0.0, 1.0]] * 2))
 

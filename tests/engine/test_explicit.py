@@ -82,7 +82,9 @@ def test_a_start_with_rotor_speeds_out_of_range_flies_as_one_on_the_limit():
     assert_close(*(fly(full_step, mixed, s, tape(mixed, 30)) for s in starts), atol=0)
 
 
-@pytest.mark.parametrize("step", [single_step, full_step], ids=["instant", "lagging"])
+@pytest.mark.parametrize(
+    "step", [single_step, pytest.param(full_step, marks=pytest.mark.slow)], ids=["instant", "lagging"]
+)
 def test_without_a_limit_motors_follow_and_the_gradient_of_a_flight_is_finite(step):
     """As recordings of versions that did not limit are flown; `rollout` takes an infinite `max_rpm` for a number."""
     team = mixed.replace(max_rpm=jnp.full(len(VEHICLES), jnp.inf))

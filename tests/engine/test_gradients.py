@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import INTEGRATORS, assert_close, assert_finite, fly, name_of, tape
+from helpers import INTEGRATORS, assert_close, assert_finite, fly, mostly_slow, name_of, tape
 
 import jaxdrones
 from jaxdrones import (
@@ -90,7 +90,7 @@ def inner(gradient, direction):
     return sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True))
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
+@pytest.mark.parametrize("name", mostly_slow(FLIGHTS, ["default"]))
 def test_gradients_of_a_hundred_steps_agree_with_central_differences(name):
     """In the commands, the start and every array of `Params`.
 
@@ -169,7 +169,7 @@ def test_gradients_are_finite_in_float32_too(effects):
     assert_finite_everywhere(jaxdrones.make_step(*effects))
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS, ids=name_of)
+@pytest.mark.parametrize("integrator", mostly_slow(INTEGRATORS, [jaxdrones.rk4]), ids=name_of)
 def test_integrators_and_lagging_rotors_have_finite_gradients(integrator):
     assert_finite_everywhere(jaxdrones.make_step(rotors=lagging_rotors, integrator=integrator))
 

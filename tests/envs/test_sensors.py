@@ -45,6 +45,7 @@ def battery():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_an_environment_with_sensors_and_models_keeps_the_contract(backend):
     with make(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from extensions import battery, flapping
 from extensions.payload import Payload
-from helpers import assert_close, assert_finite
+from helpers import assert_close, assert_finite, mostly_slow
 
 import jaxdrones as jd
 
@@ -22,7 +22,9 @@ EXTENSIONS = {
 }
 INTEGRATORS = {"rk4": jd.rk4, "semi-implicit Euler": jd.semi_implicit_euler}
 each_extension = pytest.mark.parametrize("name", EXTENSIONS)
-each_integrator = pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
+each_integrator = pytest.mark.parametrize(
+    "integrator", [pytest.param(jd.rk4, marks=pytest.mark.slow), jd.semi_implicit_euler], ids=INTEGRATORS
+)
 
 make_step = lru_cache(
     lambda name, integrator, dt=1 / 240: jd.make_step(**EXTENSIONS[name], integrator=integrator, dt=dt)
@@ -46,7 +48,7 @@ def flown(step, state, steps, team=TEAM, share=1.05):
     return jd.rollout(step, lambda params, memory, s, k: (memory, command), team, state, None, steps)
 
 
-@each_extension
+@pytest.mark.parametrize("name", mostly_slow(EXTENSIONS, ["payload"]))
 def test_rk4_measures_order_four_in_the_states_of_models(name):
     def end(dt):
         step = make_step(name, jd.rk4, dt)
@@ -200,6 +202,7 @@ def test_a_rate_of_another_type_is_named(rate, message):
         flown(step, jd.State.at_rest(np.zeros((2, 3))), 1)
 
 
+@pytest.mark.slow
 def test_gradients_through_a_full_battery_are_finite():
     step = make_step("battery", jd.rk4)
     start = moving(step)
@@ -207,7 +210,7 @@ def test_gradients_through_a_full_battery_are_finite():
 
 
 @pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.needs("pybullet"))])
-@each_extension
+@pytest.mark.parametrize("name", mostly_slow(EXTENSIONS, ["battery"]))
 def test_a_model_flies_in_an_environment_and_starts_anew_with_the_episode(name, backend):
     with jd.make("hover", drones=2, backend=backend, **EXTENSIONS[name]) as env:
         _, world = env.reset(jax.random.key(0))

@@ -211,6 +211,7 @@ def touch(params, state, scene):
     return jd.Wrench.of_force(jd.rotation.rotate_inverse(state.quat, force))
 
 
+@pytest.mark.slow
 def test_an_effect_of_a_drawn_scene_and_a_sensor_agree_where_a_drone_comes_to_rest():
     """Drones fall on tables that are drawn for every episode; the range finder then reads half their height."""
 

@@ -102,6 +102,7 @@ def test_a_drone_fits_through_a_gate_and_not_through_its_frame():
         assert flags(*team(np.array([0, 0, 1]) + aside * left), scene).scene.tolist() == [touches]
 
 
+@pytest.mark.slow
 def test_flags_of_many_worlds_are_those_of_each():
     params = jaxdrones.repeat(CRAZYFLIE, 3)
     worlds = list(random_teams(30, 3, high=(0.1, 0.1, 0.2)))
@@ -115,6 +116,7 @@ def test_flags_of_many_worlds_are_those_of_each():
     assert 0.1 < at_once.drones.mean() < 0.9 and 0.1 < at_once.ground.mean() < 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_flags_in_float32_far_from_the_origin():
     """At 100 m a float32 is right to 4 micrometres."""

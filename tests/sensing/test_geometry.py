@@ -165,6 +165,7 @@ def test_gradients_are_central_differences(name, kind):
         np.testing.assert_allclose(other, central_differences(moved, arguments[i]), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     """At centers, on axes, edges and rims, along faces, grazing and missing."""
     scene = Scene.of(*SOLIDS)
@@ -179,6 +180,7 @@ def test_gradients_are_finite_everywhere():
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(missing))
 
 
+@pytest.mark.slow
 def test_rays_through_drawn_scenes_are_the_same_over_worlds_as_mapped():
     def seen(key, origin, direction):
         pos = jax.random.uniform(key, (6, 3), minval=-2.0, maxval=2.0)
@@ -189,6 +191,7 @@ def test_rays_through_drawn_scenes_are_the_same_over_worlds_as_mapped():
     assert_close(jax.jit(jd.over_worlds(seen))(*arguments), jax.jit(jax.vmap(seen))(*arguments), 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_in_float32_a_ray_is_right_to_rounding():
     scene, points, directions = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (SCENE, POINTS, DIRECTIONS))

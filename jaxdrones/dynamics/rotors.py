@@ -65,7 +65,7 @@ def angular_momentum(params: Params, rpm: Float[Array, "4"]) -> Float[Array, ""]
 
     A rotor turns against the torque that its drag exerts on the body. Linear: of RPM/s it is the rate.
     """
-    return -params.rotor_inertia * _RADIANS_PER_SECOND * dot(params.rotor_spin, rpm)
+    return dot(-params.rotor_inertia * _RADIANS_PER_SECOND * params.rotor_spin, rpm)
 
 
 def with_rotor_speed(params: Params, state: State, rpm: Float[Array, "4"]) -> State:

@@ -27,12 +27,13 @@ from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
-from jaxdrones.sensing import Scene, Sensor
+from jaxdrones.sensing import Camera, Scene, Sensor
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
 
 __all__ = [
+    "Camera",
     "Effect",
     "Model",
     "NeighborGrid",

@@ -1,5 +1,6 @@
 """What stands around, who touches it, and what the drones measure."""
 
+from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
 from jaxdrones.sensing.distances import contains, distance
 from jaxdrones.sensing.files import Mesh, Urdf
@@ -10,6 +11,7 @@ from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
 __all__ = [
     "Box",
+    "Camera",
     "Capsule",
     "Collisions",
     "Cylinder",
@@ -18,6 +20,7 @@ __all__ = [
     "Sensor",
     "Sphere",
     "Urdf",
+    "camera_2021",
     "collisions",
     "contains",
     "distance",

@@ -10,6 +10,7 @@ from jaxdrones.checks import check_shape
 from jaxdrones.sensing.distances import as_floats
 from jaxdrones.sensing.scene import Scene, check_scene
 from jaxdrones.sensing.shapes import Obstacle
+from jaxdrones.vector import components
 
 
 def ray(scene: Scene, origin: ArrayLike, direction: ArrayLike) -> Float[Array, ""]:
@@ -41,7 +42,8 @@ def ray(scene: Scene, origin: ArrayLike, direction: ArrayLike) -> Float[Array, "
 
 
 def _to_shape(shape: Obstacle, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float[Array, ""]:
-    first, last = shape.interval(shape.to_local(origin), rotation.rotate_inverse(shape.quat, direction))
+    local_origin, local_direction = shape.to_local(origin), rotation.rotate_inverse(shape.quat, direction)
+    first, last = shape.interval(components(local_origin), components(local_direction))
     return jnp.where((first <= last) & (last >= 0), jnp.maximum(first, 0), jnp.inf)
 
 

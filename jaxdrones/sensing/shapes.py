@@ -7,6 +7,8 @@ segment; a box and a cylinder are their own cores. All methods are about a singl
 from __future__ import annotations
 
 import abc
+import functools
+from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
@@ -20,7 +22,9 @@ from jaxdrones.vector import components, cross, dot, safe_sqrt
 
 Point = Float[Array, "3"]
 Number = Float[Array, ""]
-Interval = tuple[Number, Number]
+Interval = tuple[Array, Array]
+Components = Sequence[Array]
+"""x, y and z of one vector, or of many, as three arrays that broadcast with each other."""
 
 _NUMBERS = (int, float, np.ndarray, np.generic, jax.Array)
 GREY = (0.6, 0.6, 0.6, 1.0)
@@ -57,10 +61,10 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
         """Signed distance of a point from the surface, m; negative inside."""
 
     @abc.abstractmethod
-    def interval(self, origin: Point, direction: Point) -> Interval:
-        """The multiples of `direction`, first and last, at which a line through `origin` is inside.
+    def interval(self, origin: Components, direction: Components) -> Interval:
+        """The multiples of `direction`, first and last, at which lines through `origin` are inside.
 
-        The first one is larger than the last one where the line misses the obstacle.
+        The first one is larger than the last one where a line misses the obstacle.
         """
 
     @abc.abstractmethod
@@ -86,10 +90,11 @@ class Box(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return _distance(jnp.abs(point) - self.size / 2)
 
-    def interval(self, origin: Point, direction: Point) -> Interval:
-        """Where a line is between all three pairs of faces."""
-        first, last = _between_planes(origin, direction, self.size / 2)
-        return jnp.max(first), jnp.min(last)
+    def interval(self, origin: Components, direction: Components) -> Interval:
+        """Where lines are between all three pairs of faces."""
+        faces = zip(origin, direction, components(self.size / 2), strict=True)
+        first, last = zip(*(_between_planes(*face) for face in faces), strict=True)
+        return functools.reduce(jnp.maximum, first), functools.reduce(jnp.minimum, last)
 
     def nearest(self, point: Point) -> Point:
         """The point of the box that is nearest to a point, m."""
@@ -119,8 +124,8 @@ class Sphere(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return _length(point) - self.radius
 
-    def interval(self, origin: Point, direction: Point) -> Interval:
-        """Where a line is within the radius."""
+    def interval(self, origin: Components, direction: Components) -> Interval:
+        """Where lines are within the radius."""
         return _within_radius(origin, direction, self.radius)
 
     def nearest(self, point: Point) -> Point:
@@ -145,8 +150,8 @@ class Cylinder(Obstacle, kw_only=True):
         _, _, z = components(point)
         return _distance(jnp.stack([_length(point[:2]) - self.radius, jnp.abs(z) - self.height / 2]))
 
-    def interval(self, origin: Point, direction: Point) -> Interval:
-        """Where a line is within the radius and between the two ends."""
+    def interval(self, origin: Components, direction: Components) -> Interval:
+        """Where lines are within the radius and between the two ends."""
         first, last = _within_radius(origin[:2], direction[:2], self.radius)
         bottom, top = _between_planes(origin[2], direction[2], self.height / 2)
         return jnp.maximum(first, bottom), jnp.minimum(last, top)
@@ -184,18 +189,18 @@ class Capsule(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return _length(point - self.nearest(point)) - self.radius
 
-    def interval(self, origin: Point, direction: Point) -> Interval:
-        """Where a line is in the cylinder or in a ball: one interval, as the capsule is convex."""
-        up = jnp.array([0, 0, 1], origin.dtype) * self.height / 2
+    def interval(self, origin: Components, direction: Components) -> Interval:
+        """Where lines are in the cylinder or in a ball: one interval, as the capsule is convex."""
+        x, y, z = origin
         cylinder = Cylinder(pos=self.pos, radius=self.radius, height=self.height)
         parts = [
             cylinder.interval(origin, direction),
-            _within_radius(origin - up, direction, self.radius),
-            _within_radius(origin + up, direction, self.radius),
+            _within_radius((x, y, z - self.height / 2), direction, self.radius),
+            _within_radius((x, y, z + self.height / 2), direction, self.radius),
         ]
-        first = jnp.stack([jnp.where(first <= last, first, jnp.inf) for first, last in parts])
-        last = jnp.stack([jnp.where(first <= last, last, -jnp.inf) for first, last in parts])
-        return jnp.min(first), jnp.max(last)
+        first = (jnp.where(first <= last, first, jnp.inf) for first, last in parts)
+        last = (jnp.where(first <= last, last, -jnp.inf) for first, last in parts)
+        return functools.reduce(jnp.minimum, first), functools.reduce(jnp.maximum, last)
 
     def nearest(self, point: Point) -> Point:
         """The point of the axis that is nearest to a point, m."""
@@ -228,29 +233,27 @@ def _around_z(center: Point, axis: Point) -> list[Point]:
     return [z_axis, jnp.stack([x, y, jnp.zeros_like(x)]), cross(axis, z_axis)]
 
 
-def _between_planes(origin: Array, direction: Array, half: Array) -> tuple[Array, Array]:
-    """Where a line is between two planes at +-`half`; elementwise."""
-    crosses = jnp.abs(direction) > jnp.finfo(direction.dtype).eps
-    speed = jnp.where(crosses, direction, 1)
-    middle, reach = -origin / speed, half / jnp.abs(speed)
-    return _interval(crosses, middle, reach, jnp.abs(origin) <= half)
+def _between_planes(origin: Array, direction: Array, half: Array) -> Interval:
+    """Where lines are between two planes at +-`half`."""
+    per_unit = 1 / _nonzero(direction)
+    middle, reach = -origin * per_unit, half * jnp.abs(per_unit)
+    return middle - reach, middle + reach
 
 
-def _within_radius(origin: Float[Array, " n"], direction: Float[Array, " n"], radius: Number) -> Interval:
-    """Where a line is within `radius` of zero."""
-    square = dot(direction, direction)
-    moves = square > jnp.finfo(direction.dtype).eps ** 2
-    square = jnp.where(moves, square, 1)
-    middle = -dot(origin, direction) / square
-    closest = jnp.where(moves, origin + middle * direction, origin)
-    slack = radius**2 - dot(closest, closest)
-    return _interval(moves & (slack >= 0), middle, safe_sqrt(slack / square), ~moves & (slack >= 0))
+def _within_radius(origin: Components, direction: Components, radius: Number) -> Interval:
+    """Where lines are within `radius` of zero; the empty interval [inf, -inf] where they are never."""
+    square = _nonzero(sum(x * x for x in direction))
+    middle = -sum(o * d for o, d in zip(origin, direction, strict=True)) / square
+    closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
+    slack = radius**2 - sum(x * x for x in closest)
+    reach = jnp.where(slack >= 0, safe_sqrt(slack / square), -jnp.inf)
+    return middle - reach, middle + reach
 
 
-def _interval(crosses: Array, middle: Array, reach: Array, always: Array) -> tuple[Array, Array]:
-    """The interval of a line that crosses, of one that is always inside, or the empty one."""
-    first = jnp.where(crosses, middle - reach, jnp.where(always, -jnp.inf, jnp.inf))
-    return first, jnp.where(crosses, middle + reach, -first)
+def _nonzero(x: Array) -> Array:
+    """The same number, but no smaller than one whose inverse has finite derivatives."""
+    smallest = jnp.finfo(x.dtype).tiny ** 0.25
+    return jnp.where(jnp.abs(x) < smallest, smallest, x)
 
 
 def single(obstacles: Obstacle, i: int) -> Any:

@@ -27,7 +27,7 @@ from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.envs import make
 from jaxdrones.params import Params, repeat, stack
-from jaxdrones.sensing import Camera, Scene, Sensor
+from jaxdrones.sensing import Camera, Scene, Sensor, render
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 from jaxdrones.wrench import Wrench
@@ -63,6 +63,7 @@ __all__ = [
     "make_derivative",
     "make_step",
     "over_worlds",
+    "render",
     "repeat",
     "rk4",
     "rollout",

@@ -4,6 +4,7 @@ from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
 from jaxdrones.sensing.distances import contains, distance
 from jaxdrones.sensing.files import Mesh, Urdf
+from jaxdrones.sensing.images import Images, render
 from jaxdrones.sensing.rays import ray
 from jaxdrones.sensing.scene import Scene, gate, obstacles_2021
 from jaxdrones.sensing.sensor import Sensor
@@ -15,6 +16,7 @@ __all__ = [
     "Capsule",
     "Collisions",
     "Cylinder",
+    "Images",
     "Mesh",
     "Scene",
     "Sensor",
@@ -27,4 +29,5 @@ __all__ = [
     "gate",
     "obstacles_2021",
     "ray",
+    "render",
 ]

@@ -235,22 +235,26 @@ def _around_z(center: Point, axis: Point) -> list[Point]:
 
 def _between_planes(origin: Array, direction: Array, half: Array) -> Interval:
     """Where lines are between two planes at +-`half`."""
-    per_unit = 1 / _nonzero(direction)
+    per_unit = 1 / nonzero(direction)
     middle, reach = -origin * per_unit, half * jnp.abs(per_unit)
     return middle - reach, middle + reach
 
 
 def _within_radius(origin: Components, direction: Components, radius: Number) -> Interval:
     """Where lines are within `radius` of zero; the empty interval [inf, -inf] where they are never."""
-    square = _nonzero(sum(x * x for x in direction))
-    middle = -sum(o * d for o, d in zip(origin, direction, strict=True)) / square
+    square = nonzero(_dot(direction, direction))
+    middle = -_dot(origin, direction) / square
     closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
-    slack = radius**2 - sum(x * x for x in closest)
+    slack = radius**2 - _dot(closest, closest)
     reach = jnp.where(slack >= 0, safe_sqrt(slack / square), -jnp.inf)
     return middle - reach, middle + reach
 
 
-def _nonzero(x: Array) -> Array:
+def _dot(a: Components, b: Components) -> Array:
+    return functools.reduce(jnp.add, (x * y for x, y in zip(a, b, strict=True)))
+
+
+def nonzero(x: Array) -> Array:
     """The same number, but no smaller than one whose inverse has finite derivatives."""
     smallest = jnp.finfo(x.dtype).tiny ** 0.25
     return jnp.where(jnp.abs(x) < smallest, smallest, x)

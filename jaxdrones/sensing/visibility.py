@@ -1,0 +1,215 @@
+"""What each pixel of a camera sees: an analytic ray for every pixel, against all solids.
+
+Each quantity of an image is a pass over the solids that keeps one number per pixel, so that a compiler can turn it into
+a loop over pixels without intermediate arrays: the depth of the nearest surface, then the index of the solid that it
+belongs to. The gradient of the depth is that of the surface that is visible; where the silhouette of a solid moves over
+a pixel, the depth jumps, and the gradient does not know.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, Int
+
+from jaxdrones import rotation
+from jaxdrones.sensing.shapes import Components, Interval, Obstacle, nonzero
+from jaxdrones.vector import components
+
+_UNROLL = 2  # solids per turn of the loop; all of them in one turn would make compilers keep each one's image
+
+
+class View(flax.struct.PyTreeNode):
+    """Where a camera is and the rays of its pixels; the ray of a pixel is axes^T (1, u, v)."""
+
+    eye: Array
+    """(3,) m, world."""
+    axes: Array
+    """(3, 3) forward, left and up, one in each row, world."""
+    u: Array
+    """(1, w) how far the ray of a column goes to the left for every meter forward."""
+    v: Array
+    """(h, 1) how far the ray of a row goes up for every meter forward."""
+    near: Array
+    """() smallest visible depth, m."""
+    far: Array
+    """() largest visible depth, m."""
+
+
+class Placed(flax.struct.PyTreeNode):
+    """Solids of one kind as a camera sees them; arrays have a leading axis over solids."""
+
+    solid: Obstacle
+    origin: Array
+    """(3,) the eye in the frame of the solid, m."""
+    axes: Array
+    """(3, 3) forward, left and up of the camera in the frame of the solid, one in each row."""
+
+    def interval(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Depths at which the rays of pixels are inside, first and last."""
+        forward, left, up = (components(axis) for axis in components(self.axes))
+        direction = [x + u * y + v * z for x, y, z in zip(forward, left, up, strict=True)]
+        return self.solid.interval(components(self.origin), direction)
+
+
+class Ground(flax.struct.PyTreeNode):
+    """All points below z = 0, as a solid."""
+
+    pos: Array
+    """(3,) zero."""
+    quat: Array
+    """(4,) the identity."""
+
+    @classmethod
+    def of(cls, dtype: DTypeLike) -> Ground:
+        """The ground as the only solid of its kind: with a leading axis of length 1."""
+        return cls(jnp.zeros((1, 3), dtype), jnp.array([[0, 0, 0, 1]], dtype))
+
+    def to_local(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The same point."""
+        return point
+
+    def interval(self, origin: Components, direction: Components) -> Interval:
+        """Where lines are underground."""
+        z, climb = origin[2], nonzero(direction[2])
+        crossing = -z / climb
+        return jnp.where(climb < 0, crossing, -jnp.inf), jnp.where(climb < 0, jnp.inf, crossing)
+
+
+Solids = list[Obstacle | Ground]
+"""Kinds of solids; arrays of each have a leading axis over the solids of the kind."""
+
+
+def _placed(view: View, solids: Any) -> Placed:
+    """Solids of one kind as a camera sees them."""
+
+    def one(solid: Any) -> Placed:
+        to_local = jax.vmap(functools.partial(rotation.rotate_inverse, solid.quat))
+        return Placed(solid, solid.to_local(view.eye), to_local(view.axes))
+
+    return jax.vmap(one)(solids)
+
+
+@jax.custom_jvp
+def depth(view: View, solids: Solids, active: list[Array]) -> Float[Array, "h w"]:
+    """Depth along the viewing axis of what each pixel sees, m; `far` where it sees nothing.
+
+    Args:
+        view: rays.
+        solids: what can be seen.
+        active: for each kind (k,) bool, which solids are there.
+    """
+
+    def nearer(depth: Array, solid: Placed, active: Array, index: Array) -> Array:
+        return jnp.minimum(depth, _first_hit(view, solid, active))
+
+    return _pass(nearer, jnp.full_like(view.u + view.v, view.far), view, solids, active)
+
+
+def visible(view: View, solids: Solids, active: list[Array]) -> Int[Array, "h w"]:
+    """Index of the solid that each pixel sees; the number of solids where it sees none.
+
+    Surfaces whose depths differ by less than a share of 1e-5 (in float64, 1e-14) may be mistaken for each other: a pass
+    keeps one number, so the last bits of a depth are replaced by the index of its solid.
+    """
+    count = sum(len(kind.pos) for kind in solids)
+    mask = (1 << count.bit_length()) - 1
+    integer = jnp.int64 if view.eye.dtype == jnp.float64 else jnp.int32
+
+    def key_of(depth: Array, index: Array | int) -> Array:  # a positive number grows with the integer of its bits
+        return jax.lax.bitcast_convert_type(depth, integer) & ~mask | index
+
+    def nearer(key: Array, solid: Placed, active: Array, index: Array) -> Array:
+        return jnp.minimum(key, key_of(_first_hit(view, solid, active), index.astype(integer)))
+
+    nothing = key_of(jnp.full_like(view.u + view.v, view.far), count)
+    return (_pass(nearer, nothing, view, solids, active) & mask).astype(jnp.int32)
+
+
+def slopes(view: View, solids: Solids, active: list[Array], index: Int[Array, "h w"]) -> tuple[Array, Array]:
+    """Derivatives (h, w) of the depth with respect to u and v on the surface that is visible; zero where none is."""
+
+    def along(du: float, dv: float) -> Array:
+        def add(slope: Array, solid: Placed, active: Array, i: Array) -> Array:
+            moved = (jnp.full_like(view.u, du), jnp.full_like(view.v, dv))
+            _, derivative = jax.jvp(lambda u, v: solid.interval(u, v)[0], (view.u, view.v), moved)
+            return jnp.where(index == i, derivative, slope)
+
+        return _pass(add, jnp.zeros_like(view.u + view.v), view, solids, active)
+
+    return along(1, 0), along(0, 1)
+
+
+def _first_hit(view: View, solid: Placed, active: Array) -> Array:
+    """Depth at which the rays of pixels are inside of a solid for the first time; infinity where they never are."""
+    first, last = solid.interval(view.u, view.v)
+    first = jnp.maximum(first, view.near)
+    return jnp.where((last >= first) & active, first, jnp.inf)
+
+
+def _pass(function: Callable[..., Array], start: Array, view: View, solids: Solids, active: list[Array]) -> Array:
+    """Apply `(image, solid, whether it is active, its index) -> image` for one solid after the other."""
+    image, count = start, 0
+    for kind, mask in zip(solids, active, strict=True):
+        xs = (_placed(view, kind), mask, count + jnp.arange(len(mask)))
+        image, _ = jax.lax.scan(lambda image, x: (function(image, *x), None), image, xs, unroll=_UNROLL)
+        count += len(mask)
+    return image
+
+
+@functools.partial(depth.defjvp, symbolic_zeros=True)
+def _depth_jvp(primals: tuple[View, Solids, list], tangents: tuple[View, Solids, list]) -> tuple[Array, Array]:
+    """A pixel's depth where the camera and the solids move: it stays in the tangent plane of the visible surface.
+
+    With X = depth (1, u, v) on that plane, and W the plane's normal scaled so that W . (1, u, v) = 1, a displacement d
+    of the plane relative to the camera, in camera axes, changes the depth by W . d.
+    """
+    view, solids, active = primals
+    moved, changed, _ = tangents
+    depths = depth(view, solids, active)
+    index = visible(view, solids, active)
+    free = (depths > view.near) & (depths < view.far)
+    rate = jnp.zeros_like(depths)
+    if not _is_zero((moved.eye, moved.axes)):
+        by_u, by_v = (slope / depths for slope in slopes(view, solids, active, index))
+        w = jnp.stack([1 + view.u * by_u + view.v * by_v, -by_u, -by_v])
+        x = jnp.stack([jnp.ones_like(depths), depths, depths * view.u, depths * view.v])
+        eye, axes = (_instantiated(t, p) for t, p in ((moved.eye, view.eye), (moved.axes, view.axes)))
+        motion = view.axes @ jnp.concatenate([eye[None], axes]).T  # of the eye and of the rays, in camera axes
+        rate = -jnp.sum(w * jnp.tensordot(motion, x, 1), axis=0)
+    count = 0
+    for kind, tangent in zip(solids, changed, strict=True):
+        if not _is_zero(tangent):
+            rate += _rate_of_solids(view, kind, tangent, index - count)
+        count += len(kind.pos)
+    return depths, jnp.where(free, rate, 0)
+
+
+def _rate_of_solids(view: View, solids: Any, changed: Any, index: Int[Array, "h w"]) -> Float[Array, "h w"]:
+    """Rate of a pixel's depth where the solids of one kind change; zero where another kind is visible."""
+    changed = jax.tree.map(_instantiated, changed, solids, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    placed, tangents = jax.jvp(functools.partial(_placed, view), (solids,), (changed,))
+
+    @jax.checkpoint
+    def add(rate: Array, solid: Placed, tangent: Placed, i: Array) -> Array:
+        _, derivative = jax.jvp(lambda solid: solid.interval(view.u, view.v)[0], (solid,), (tangent,))
+        return jnp.where(index == i, derivative, rate)
+
+    xs = (placed, tangents, jnp.arange(len(solids.pos)))
+    return jax.lax.scan(lambda rate, x: (add(rate, *x), None), jnp.zeros_like(view.u + view.v), xs)[0]
+
+
+def _is_zero(tangents: Any) -> bool:
+    leaves = jax.tree.leaves(tangents, is_leaf=lambda x: isinstance(x, SymbolicZero))
+    return all(isinstance(leaf, SymbolicZero) for leaf in leaves)
+
+
+def _instantiated(tangent: Any, primal: Array) -> Array:
+    return jnp.zeros_like(primal) if isinstance(tangent, SymbolicZero) else tangent

@@ -17,7 +17,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("dynamics",), ("control",), ("sensing",), ("accelerate",)),
     (("engine",), ("tasks",)),
     (("envs",), ("flights",)),
-    (("adapters",), ("learning",), ("render",)),
+    (("adapters",), ("learning",), ("visualization",)),
     (("training",),),
     (("cli",),),
     (("",),),  # the package itself, which re-exports

@@ -13,8 +13,8 @@ from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.fly import scene_of
 from jaxdrones.flights.record import Record, check_pwm
 from jaxdrones.limits import check_seed
-from jaxdrones.render import plots, video
 from jaxdrones.sensing import Scene
+from jaxdrones.visualization import plots, video
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
 
@@ -72,7 +72,7 @@ def _fly(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.video:
         video.check_video(options.video)
     if options.video or options.cameras:
-        from jaxdrones.render import replay  # noqa: F401  says which extra to install
+        from jaxdrones.visualization import replay  # noqa: F401  says which extra to install
     return _fly_policy(options) if options.policy is not None else _fly_example(options)
 
 
@@ -186,7 +186,7 @@ def _write(
         files.append(output / "flight.png")
         plots.save_flight(record, files[-1], title, panels)
     if options.video or options.cameras:
-        from jaxdrones.render import replay  # needs pybullet
+        from jaxdrones.visualization import replay  # needs pybullet
 
         if options.video:
             replay.film(record, options.video, scene)

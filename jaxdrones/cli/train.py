@@ -24,7 +24,7 @@ from jaxdrones.cli.training import (
 )
 from jaxdrones.envs import TASKS
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
-from jaxdrones.render import plots
+from jaxdrones.visualization import plots
 
 _MAX_SEEDS = 1000
 

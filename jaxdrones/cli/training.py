@@ -10,7 +10,7 @@ from typing import Any
 from jaxdrones.cli.common import as_json, bar
 from jaxdrones.cli.evaluate import evaluation_table, percent
 from jaxdrones.limits import LARGEST_COUNT
-from jaxdrones.render import plots
+from jaxdrones.visualization import plots
 
 _NO_SETTINGS = ("cls", "task", "algorithm", "realistic")  # arguments of `Recipe.of` that are options of the command
 _MAX_SECONDS = 3.6e6

@@ -9,7 +9,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from jaxdrones.flights.fly import fly
-from jaxdrones.render import replay, video
+from jaxdrones.visualization import replay, video
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 pytestmark = [  # imageio-ffmpeg leaves its pipes to the garbage collector

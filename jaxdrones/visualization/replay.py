@@ -8,10 +8,10 @@ import numpy as np
 from jaxdrones.engine import bullet
 from jaxdrones.flights.record import Record
 from jaxdrones.params import repeat
-from jaxdrones.render import video
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
+from jaxdrones.visualization import video
 
 FPS = 24  # frames per simulated second; the camera rate of gym-pybullet-drones (2021)
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from jaxdrones.flights.fly import fly
-from jaxdrones.render import plots
+from jaxdrones.visualization import plots
 
 
 @pytest.fixture(scope="module")

@@ -107,16 +107,17 @@ def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Image
 def view_of(camera: Camera, params: Params, state: State) -> View:
     """The rays of the camera on one drone."""
     eye, axes = camera.pose(params, state)
-    (width, height), (horizontal, vertical) = camera.resolution, camera.slopes
 
-    def centers(pixels: int, slope: float) -> Array:
-        return jnp.asarray(slope * (1 - (2 * np.arange(pixels) + 1) / pixels), eye.dtype)
+    def centers(axis: int) -> Array:
+        pixels = camera.resolution[axis]
+        middle = pixels / 2 + camera.principal_point[axis]
+        return jnp.asarray(camera.slopes[axis] * (middle - np.arange(pixels) - 0.5) / (pixels / 2), eye.dtype)
 
     return View(
         eye=eye,
         axes=axes,
-        u=centers(width, horizontal)[None],
-        v=centers(height, vertical)[:, None],
+        u=centers(0)[None],
+        v=centers(1)[:, None],
         near=camera.near_of(params),
         far=jnp.asarray(camera.far, eye.dtype),
     )

@@ -98,7 +98,7 @@ def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Image
         depths = depth(view, kinds, seen_kinds)
         still, there, depths_there = jax.lax.stop_gradient((view, kinds, depths))
         index = visible(still, there, seen_kinds)
-        rgb = shade(still, there, seen_kinds, jnp.concatenate(colors), ground, index, depths_there)
+        rgb = shade(still, there, jnp.concatenate(colors), ground, index, depths_there)
         return Images(rgb=rgb, depth=depths, segmentation=labels[index])
 
     return jax.vmap(one)(params, state, drones)

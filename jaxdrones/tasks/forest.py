@@ -93,14 +93,14 @@ def forest(
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
         return Setpoint.at(variables["goal"])
 
-    def wanted(task: Task, world: World) -> Float[Array, "n 3"]:
+    def desired(task: Task, world: World) -> Float[Array, "n 3"]:
         """The velocity towards the goal, m/s, world; slower only where the goal is reached."""
         away = task.target_now(world).pos - world.drones.pos
         return speed * away / jnp.maximum(norm(away), REACHED)[:, None]
 
     def velocity(task: Task, world: World) -> Float[Array, " n"]:
         """Magnitude of the velocity error as a share of the commanded speed."""
-        return shaping.length(world.drones.vel - wanted(task, world), 0.1 * speed) / speed
+        return shaping.length(world.drones.vel - desired(task, world), 0.1 * speed) / speed
 
     def progress(task: Task, world: World) -> Float[Array, " n"]:
         """Approach to the goal as a share of the commanded speed."""
@@ -109,10 +109,10 @@ def forest(
     def heading(task: Task, world: World) -> Float[Array, " n"]:
         """One minus the cosine of the angle between the camera's axis and the direction of the goal."""
         forward = jax.vmap(lambda quat: rotation.axes(quat)[0])(world.drones.quat)
-        return 1 - jnp.sum(forward * wanted(task, world), axis=-1) / speed
+        return 1 - jnp.sum(forward * desired(task, world), axis=-1) / speed
 
-    def observe_wanted(task: Task, world: World) -> Float[Array, "n 3"]:
-        return jax.vmap(rotation.rotate_inverse)(world.drones.quat, wanted(task, world))
+    def observe_desired(task: Task, world: World) -> Float[Array, "n 3"]:
+        return jax.vmap(rotation.rotate_inverse)(world.drones.quat, desired(task, world))
 
     def left(task: Task, world: World) -> Bool[Array, " n"]:
         x, y, z = world.drones.pos.T
@@ -146,7 +146,7 @@ def forest(
         advance=_advance,
         metrics={name: _variable(name) for name in ("touched", "reached", "clearance")} | {"detour": _detour},
         success=lambda metrics, dt: (metrics["reached"][-1] > 0) & (metrics["touched"][-1] == 0),
-        observations={"wanted_velocity": ObservationTerm(observe_wanted, _MAX_SPEED)},
+        observations={"desired_velocity": ObservationTerm(observe_desired, _MAX_SPEED)},
         control_hz=50.0,
         substeps=2,
         scene=scene,
@@ -154,7 +154,7 @@ def forest(
         camera=camera,
         vision=("depth",),
         action="thrust_and_rates",
-        observation=("velocity_body", "gravity", "omega", "wanted_velocity", "last_action"),
+        observation=("velocity_body", "gravity", "omega", "desired_velocity", "last_action"),
     )
 
 

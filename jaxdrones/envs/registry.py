@@ -49,7 +49,7 @@ from jaxdrones.envs.vision import IMAGES, Vision
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
-from jaxdrones.tasks import gates, gym_pybullet_drones, hover, swap, tracking
+from jaxdrones.tasks import forest, gates, gym_pybullet_drones, hover, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
 
@@ -59,6 +59,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "landing": hover.landing,
     "tracking": tracking.tracking,
     "gates": gates.gates,
+    "forest": forest.forest,
     "swap-goals": swap.swap_goals,
     "hover-2021": gym_pybullet_drones.hover,
     "takeoff": gym_pybullet_drones.takeoff,

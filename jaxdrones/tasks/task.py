@@ -15,7 +15,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole, takes_scene
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import Camera, Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
 
@@ -121,6 +121,10 @@ class Task:
     """Obstacles and ground; or a function `(key) -> Scene` that draws them for every episode."""
     obstacles_terminate: bool = False
     """Whether the task's terminations find hits of its scene's obstacles, so that no force needs to do it."""
+    camera: Camera | None = None
+    """The camera of every drone, unless the environment says otherwise; `Camera()` when left out."""
+    vision: tuple[str, ...] = ()
+    """Names of the images that are observed, unless the environment says otherwise."""
     contact: tuple[str, ...] = ()
     """What drones touch on purpose, `ground` or `drones`: adds those forces to the explicit backend."""
     action: str = "rpm"

@@ -81,7 +81,7 @@ def make(
     vehicle: str | os.PathLike | Params = "cf2x",
     action: str | Action | None = None,
     observation: Sequence[str | ObservationTerm] | None = None,
-    vision: Sequence[str] = (),
+    vision: Sequence[str] | None = None,
     camera: Camera | None = None,
     realistic: bool = False,
     effects: Sequence[str | Callable] | None = None,
@@ -109,8 +109,9 @@ def make(
         action: a name of `ACTIONS` or an action type; the task's own when left out.
         observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
             out.
-        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, as images of a camera on every drone.
-        camera: that camera, with its rate, latency and noise; a `Camera()` when left out.
+        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, images of a camera on every drone;
+            the task's own when left out.
+        camera: that camera, with its rate, latency and noise; the task's own, or else a `Camera()`, when left out.
         realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
@@ -177,6 +178,7 @@ def make(
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
+    vision = task.vision if vision is None else vision
     observation = task.observation if observation is None else observation
     known = _known_terms(task, sensors)
     observation = check_sequence("observation", observation, "'position_error'")
@@ -194,7 +196,7 @@ def make(
         noise=preset["noise"] if noise is None else noise,
         disturbance=disturbance,
         delay=preset["delay"] if delay is None else delay,
-        vision=make_vision(step, vision, camera, dt, scene),
+        vision=make_vision(step, vision, camera or (task.camera if vision else None), dt, scene),
         sensors=sensors,
         scene=scene,
         vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,

@@ -20,7 +20,8 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxdrones import rotation
-from jaxdrones.sensing.shapes import Components, Interval, Obstacle, nonzero
+from jaxdrones.sensing.geometry import Components, Interval, nonzero
+from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import components
 
 _UNROLL = 2  # solids per turn of the loop; all of them in one turn would make compilers keep each one's image

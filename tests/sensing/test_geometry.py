@@ -137,9 +137,9 @@ def test_an_obstacle_that_is_not_active_is_not_there():
     some = SCENE.replace(**{k: getattr(SCENE, k).replace(active=m) for k, m in zip(kinds, of_kinds, strict=True)})
     few = Scene.of(*(obstacle for obstacle in some.obstacles if obstacle.active))
     assert [bool(obstacle.active) for obstacle in some.obstacles] == mask.tolist()
-    np.testing.assert_array_equal(distances(some, POINTS), distances(few, POINTS))
-    np.testing.assert_array_equal(rays(some, POINTS, DIRECTIONS), rays(few, POINTS, DIRECTIONS))
-    jax.tree.map(np.testing.assert_array_equal, surfaces(some, POINTS), surfaces(few, POINTS))
+    np.testing.assert_allclose(distances(some, POINTS), distances(few, POINTS), rtol=1e-12)
+    np.testing.assert_allclose(rays(some, POINTS, DIRECTIONS), rays(few, POINTS, DIRECTIONS), rtol=1e-9)
+    assert_close(surfaces(some, POINTS), surfaces(few, POINTS), 1e-12)
     none = Scene.of(BALL.replace(active=False), ground=False)
     assert none.distance((0, 0, 2)) == none.nearest((0, 0, 2)).distance == ray(none, (5, 0, 2), (-1, 0, 0)) == jnp.inf
 

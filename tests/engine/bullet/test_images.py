@@ -9,7 +9,7 @@ import pytest
 import jaxdrones
 from jaxdrones import Scene, State, render, rotation
 from jaxdrones.engine import bullet
-from jaxdrones.sensing import Box, Capsule, Cylinder, Sphere, camera_2021, distance
+from jaxdrones.sensing import Box, Capsule, Cylinder, Sphere, camera_2021
 
 pytestmark = pytest.mark.needs("pybullet")
 
@@ -38,7 +38,7 @@ def drawn(seed: int) -> tuple[Scene, State]:
     quat = rotate(rng.uniform([-0.5, -0.5, -3], [0.5, 0.5, 3], (2, 3)))
     while True:
         pos = rng.uniform([-5, -5, 1], [5, 5, 2.5], (2, 3))
-        if min(distance(scene, point) for point in pos) > FAR_FROM_FACETS:
+        if min(scene.distance(point) for point in pos) > FAR_FROM_FACETS:
             return scene, State.at_rest(jnp.asarray(pos)).replace(quat=jnp.asarray(quat))
 
 

@@ -32,10 +32,10 @@ def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> None:
                 "scene is a function that draws it for every episode, and Bullet builds it once; give a Scene, or take "
                 "the explicit backend"
             )
-    elif example.has_obstacles and not (step.physics.takes_scene or (task.obstacles_terminate and scene is task.scene)):
+    elif example.has_obstacles and not (step.physics.takes_scene or task.obstacles_terminate):
         raise ValueError(
             "the scene has obstacles and on the explicit backend drones would fly through them; give an effect "
-            "(params, state, scene) -> Wrench, a task whose terminations find its obstacles (obstacles_terminate), no "
+            "(params, state, scene) -> Wrench, a task whose terminations find obstacles (obstacles_terminate), no "
             "obstacles, or take the bullet backend"
         )
 

@@ -77,6 +77,12 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         return any(getattr(self, name) is not None for name in KINDS) or bool(self.meshes or self.urdfs)
 
     @property
+    def count(self) -> int:
+        """Number of obstacles; known before the program runs."""
+        stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
+        return sum(len(stack.pos) for stack in stacks) + len(self.meshes) + len(self.urdfs)
+
+    @property
     def obstacles(self) -> tuple[Any, ...]:
         """Single obstacles, in the order of their numbers."""
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]

@@ -43,8 +43,10 @@ class World(flax.struct.PyTreeNode):
     """Memories of the sensors, by name."""
     readings: dict[str, Any] = flax.struct.field(default_factory=dict)
     """The latest readings of the sensors by name: arrays, or pytrees of arrays."""
-    images: Any = None
-    """The latest pictures of the cameras, if there are any."""
+    images: dict[str, Array] = flax.struct.field(default_factory=dict)
+    """The images that the cameras show, by name: those of `jaxdrones.make(vision=...)`."""
+    poses: Any = None
+    """(k, n, 7) poses at the last k control steps, oldest first, from which images are still to come."""
 
     @property
     def time(self) -> Array:

@@ -1,6 +1,6 @@
 """What stands around, who touches it, and what the drones measure."""
 
-from jaxdrones.sensing.builders import forest, gate, obstacles_2021, room, track
+from jaxdrones.sensing.builders import BEAMS, forest, gate, obstacles_2021, room, track
 from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
 from jaxdrones.sensing.distances import Surface
@@ -12,6 +12,7 @@ from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
 __all__ = [
+    "BEAMS",
     "Box",
     "Camera",
     "Capsule",

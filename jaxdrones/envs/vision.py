@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice, check_sequence
+from jaxdrones.checks import check_choice
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.envs.exposures import where_due
 from jaxdrones.envs.surroundings import DrawScene
@@ -114,31 +114,21 @@ class Vision:
         return images
 
 
-def make_vision(
-    step: Step, images: Sequence[str], camera: Camera | None, dt: float, scene: Scene | DrawScene
-) -> Vision | None:
-    """The vision of an environment; `None` where no image is asked for.
+def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, scene: Scene | DrawScene) -> Vision:
+    """The vision of an environment.
 
     Args:
         step: of either backend; that of Bullet renders the images itself.
         images: which of `rgb`, `depth`, `segmentation`.
-        camera: on every drone; a `Camera()` when left out.
+        camera: on every drone.
         dt: control period, s.
         scene: of the environment; a step of Bullet was built with it unless it is drawn.
 
     Raises:
-        ValueError: an unknown image, a camera without images, or more images than control steps.
+        ValueError: an unknown image, something else than a camera, or more images than control steps.
     """
-    images = check_sequence("vision", images, "'depth'")
     for image in images:
         check_choice("image", image, IMAGES)
-    if not images:
-        if camera is not None:
-            raise ValueError(
-                "camera is given, but vision asks for no image; give for example vision=('depth',), or leave it out"
-            )
-        return None
-    camera = Camera() if camera is None else camera
     check_camera(camera)
     every = 1 if camera.rate is None else 1 / (camera.rate * dt)
     if every < 1 - 1e-6:
@@ -153,7 +143,7 @@ def make_vision(
             return step.camera(params, drones, camera, scene if drawn else None)
         return render(scene, params, drones, camera)
 
-    return Vision(images, camera, take, isinstance(step, HostStep), round(every), round(camera.latency / dt))
+    return Vision(tuple(images), camera, take, isinstance(step, HostStep), round(every), round(camera.latency / dt))
 
 
 def _pose(drones: State) -> Float[Array, "n 7"]:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.envs.env import RESET, Env, Obs
+from jaxdrones.envs.vision import observation, renewed_images
 from jaxdrones.tasks.task import World
 
 _WORLDS_PER_RESET = 64  # if more than one in so many worlds ends in a step, all worlds are drawn
@@ -65,8 +66,8 @@ class AutoReset:
             (vector, Episode(world, episode_return, length)),
         )
         if self.env.vision:
-            episode = episode.replace(world=self.env.with_images(_renewed_images, key, episode.world, ended))
-        return self.env.observed(vector, episode.world), episode, reward, terminated, truncated, info
+            episode = episode.replace(world=self.env.with_images(renewed_images, key, episode.world, ended))
+        return observation(vector, episode.world), episode, reward, terminated, truncated, info
 
     @property
     def _kept(self) -> tuple[str, ...]:
@@ -77,10 +78,6 @@ class AutoReset:
         """A reset, without images and without the fields that are the same in every episode."""
         obs, world = self.env.begin(key)
         return obs, world.replace(**dict.fromkeys(self._kept))
-
-
-def _renewed_images(env: Env, key: Any, world: World, ended: Array) -> World:
-    return env.vision.renewed(ended, key, world)
 
 
 def _where_needed(draw: Callable) -> Callable:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs.env import Env
 
-
 _IMAGE_AXES = 4  # of images of an episode: time, drones, rows, columns
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -103,7 +103,7 @@ class Vision:
         args = key, world.params, pose, world.scene
         if self.on_host and not is_traced((due, world.images, args)):
             return self._exposed(*args) if due else world.images
-        worlds = 1 if self.on_host else max(1, _PIXELS // (len(pose) * np.prod(self.camera.resolution)))
+        worlds = 1 if self.on_host else max(1, _PIXELS // (len(pose) * math.prod(self.camera.resolution)))
         return where_due(self._exposed, worlds)(due, world.images, *args)
 
     def _exposed(self, key: Any, params: Params, pose: Float[Array, "n 7"], scene: Scene) -> dict[str, Array]:
@@ -112,6 +112,26 @@ class Vision:
         if self.camera.noise is not None and "depth" in images:
             images["depth"] = self.camera.noise.apply(key, images["depth"], self.camera)
         return images
+
+
+def observation(vector: Float[Array, "n d"], world: World) -> Any:
+    """An observation: its vector, or a dictionary of `state` and the images of the world if there are any."""
+    return {"state": vector, **world.images} if world.images else vector
+
+
+def first_images(env: Any, key: Any, world: World) -> World:
+    """`Vision.first` of an environment."""
+    return env.vision.first(key, world)
+
+
+def next_images(env: Any, key: Any, world: World) -> World:
+    """`Vision.next` of an environment."""
+    return env.vision.next(key, world)
+
+
+def renewed_images(env: Any, key: Any, world: World, ended: Array) -> World:
+    """`Vision.renewed` of an environment."""
+    return env.vision.renewed(ended, key, world)
 
 
 def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, scene: Scene | DrawScene) -> Vision:

@@ -1,4 +1,4 @@
-"""What is drawn where it is due is what drawing it everywhere and choosing would be, in every order of transformation."""
+"""What is drawn only where it is due is what a choice among drawings of all would be, however it is transformed."""
 
 import functools
 

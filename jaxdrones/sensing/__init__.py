@@ -3,6 +3,7 @@
 from jaxdrones.sensing.builders import BEAMS, forest, gate, obstacles_2021, room, track
 from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
+from jaxdrones.sensing.depth_noise import DepthNoise
 from jaxdrones.sensing.distances import Surface
 from jaxdrones.sensing.files import Mesh, Urdf
 from jaxdrones.sensing.images import Images, render
@@ -18,6 +19,7 @@ __all__ = [
     "Capsule",
     "Collisions",
     "Cylinder",
+    "DepthNoise",
     "Images",
     "Mesh",
     "Scene",

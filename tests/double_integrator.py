@@ -1,4 +1,4 @@
-"""A double integrator as an environment, and small settings of every learner for it."""
+"""Environments with a known answer, a double integrator and a cue, and small settings of every learner for them."""
 
 import flax.struct
 import jax
@@ -42,6 +42,36 @@ class DoubleIntegrator:
         world = PointWorld(Point(x), world.step + 1)
         info = {"metrics": {"error": jnp.abs(x[:, 0])}}
         return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+
+class Cue:
+    """Cost (u - cue)^2 in every step, for a cue of 0.5 or -0.5 that is observed in the first step only, or in all.
+
+    The cue is a number of the observation or the depth that an image shows. Who does not remember it pays at least 0.25
+    in every step in which it is not shown.
+    """
+
+    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 1, 0.1, 6, ()
+
+    def __init__(self, shown: int = 1, image: bool = False):
+        self.shown, self.image = shown, image
+
+    def reset(self, key):
+        world = PointWorld(Point(jax.random.choice(key, jnp.array([-0.5, 0.5]), (1, 1))), jnp.zeros((), jnp.int32))
+        return self.observe(world), world
+
+    def step(self, key, world, action):
+        cue = world.drones.pos
+        world = PointWorld(Point(cue), world.step + 1)
+        cost = (action[:, 0] - cue[:, 0]) ** 2
+        info = {"metrics": {"error": jnp.sqrt(cost)}}
+        return self.observe(world), world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+    def observe(self, world):
+        visible = jnp.where(world.step < self.shown, world.drones.pos, 0)
+        return (
+            {"state": 0 * visible, "depth": 3 + 4 * jnp.tile(visible[..., None], (1, 3, 4))} if self.image else visible
+        )
 
 
 def dynamics():

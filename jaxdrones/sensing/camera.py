@@ -38,6 +38,8 @@ class Camera:
     """Vertical field of view, degrees."""
     aspect: float | None = None
     """Width over height of the view; that of the resolution, which makes square pixels, when left out."""
+    principal_point: tuple[float, float] = (0.0, 0.0)
+    """Where the optical axis meets the image, pixels to the right of and below the middle of the image."""
     offset: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
     """(3,) position of the eye relative to the center of mass, m, body axes; world axes if the camera is levelled.
     `None`: one arm of the drone above the center of mass."""
@@ -73,7 +75,7 @@ class Camera:
         check_number("latency of a camera", self.latency, "s", at_least=0)
         check_switch("levelled of a camera", self.levelled)
         check_switch("sees_self of a camera", self.sees_self)
-        for name, length in ("offset", 3), ("orientation", 4):
+        for name, length in ("principal_point", 2), ("offset", 3), ("orientation", 4):
             value = getattr(self, name)
             if value is None and name == "offset":
                 continue
@@ -114,5 +116,12 @@ class Camera:
         return params.arm if self.near is None else jnp.asarray(self.near, params.arm.dtype)
 
 
-camera_2021 = Camera(levelled=True, aspect=1.0, offset=None, near=None)
-"""The camera of gym-pybullet-drones (2021), whose pixels are not square."""
+camera_2021 = Camera(levelled=True, aspect=1.0, principal_point=(0.5, -0.5), offset=None, near=None)
+"""The camera of gym-pybullet-drones (2021), whose pixels are not square. Its renderer looks through the lower left
+corners of the pixels in place of their centers."""
+
+
+def check_camera(camera: Any) -> None:
+    """Raise unless `camera` is a camera."""
+    if not isinstance(camera, Camera):
+        raise ValueError(f"camera is {shown(camera)}; give a jaxdrones.Camera, for example Camera(resolution=(16, 12))")

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_shape, shown
+from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
-from jaxdrones.sensing.camera import Camera
+from jaxdrones.sensing.camera import Camera, check_camera
 from jaxdrones.sensing.scene import Scene, check_scene
 from jaxdrones.sensing.shading import shade
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle
@@ -58,8 +58,7 @@ def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT
     Raises:
         ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
     """
-    if not isinstance(camera, Camera):
-        raise ValueError(f"camera is {shown(camera)}; give a jaxdrones.Camera, for example Camera(resolution=(16, 12))")
+    check_camera(camera)
     check_scene(scene)
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
     check_shape("params.mass", params.mass, (len(state.pos),), f"state.pos has {len(state.pos)} drones")
@@ -98,7 +97,7 @@ def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Image
         depths = depth(view, kinds, seen_kinds)
         still, there, depths_there = jax.lax.stop_gradient((view, kinds, depths))
         index = visible(still, there, seen_kinds)
-        rgb = shade(still, there, seen_kinds, jnp.concatenate(colors), ground, index, depths_there)
+        rgb = shade(still, there, jnp.concatenate(colors), ground, index, depths_there)
         return Images(rgb=rgb, depth=depths, segmentation=labels[index])
 
     return jax.vmap(one)(params, state, drones)
@@ -107,16 +106,17 @@ def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Image
 def view_of(camera: Camera, params: Params, state: State) -> View:
     """The rays of the camera on one drone."""
     eye, axes = camera.pose(params, state)
-    (width, height), (horizontal, vertical) = camera.resolution, camera.slopes
 
-    def centers(pixels: int, slope: float) -> Array:
-        return jnp.asarray(slope * (1 - (2 * np.arange(pixels) + 1) / pixels), eye.dtype)
+    def centers(axis: int) -> Array:
+        pixels = camera.resolution[axis]
+        middle = pixels / 2 + camera.principal_point[axis]
+        return jnp.asarray(camera.slopes[axis] * (middle - np.arange(pixels) - 0.5) / (pixels / 2), eye.dtype)
 
     return View(
         eye=eye,
         axes=axes,
-        u=centers(width, horizontal)[None],
-        v=centers(height, vertical)[:, None],
+        u=centers(0)[None],
+        v=centers(1)[:, None],
         near=camera.near_of(params),
         far=jnp.asarray(camera.far, eye.dtype),
     )

@@ -68,6 +68,10 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
         """
 
     @abc.abstractmethod
+    def normal(self, point: Components) -> Components:
+        """Vectors of any length that point outward where a point is on the surface."""
+
+    @abc.abstractmethod
     def nearest(self, point: Point) -> Point:
         """The point of the core that is nearest to a point, m."""
 
@@ -95,6 +99,12 @@ class Box(Obstacle, kw_only=True):
         faces = zip(origin, direction, components(self.size / 2), strict=True)
         first, last = zip(*(_between_planes(*face) for face in faces), strict=True)
         return functools.reduce(jnp.maximum, first), functools.reduce(jnp.minimum, last)
+
+    def normal(self, point: Components) -> Components:
+        """The normal of the face that a point is on."""
+        x, y, z = (p / half for p, half in zip(point, components(self.size / 2), strict=True))
+        largest = functools.reduce(jnp.maximum, map(jnp.abs, (x, y, z)))
+        return [jnp.where(jnp.abs(p) == largest, p, 0) for p in (x, y, z)]
 
     def nearest(self, point: Point) -> Point:
         """The point of the box that is nearest to a point, m."""
@@ -128,6 +138,10 @@ class Sphere(Obstacle, kw_only=True):
         """Where lines are within the radius."""
         return _within_radius(origin, direction, self.radius)
 
+    def normal(self, point: Components) -> Components:
+        """The direction from the center."""
+        return point
+
     def nearest(self, point: Point) -> Point:
         """The center."""
         return jnp.zeros_like(point)
@@ -155,6 +169,12 @@ class Cylinder(Obstacle, kw_only=True):
         first, last = _within_radius(origin[:2], direction[:2], self.radius)
         bottom, top = _between_planes(origin[2], direction[2], self.height / 2)
         return jnp.maximum(first, bottom), jnp.minimum(last, top)
+
+    def normal(self, point: Components) -> Components:
+        """The direction from the axis, or along the axis at the ends."""
+        x, y, z = point
+        at_end = (z * self.radius) ** 2 > (x * x + y * y) * (self.height / 2) ** 2
+        return [jnp.where(at_end, 0, x), jnp.where(at_end, 0, y), jnp.where(at_end, z, 0)]
 
     def nearest(self, point: Point) -> Point:
         """The point of the cylinder that is nearest to a point, m."""
@@ -201,6 +221,11 @@ class Capsule(Obstacle, kw_only=True):
         first = (jnp.where(first <= last, first, jnp.inf) for first, last in parts)
         last = (jnp.where(first <= last, last, -jnp.inf) for first, last in parts)
         return functools.reduce(jnp.minimum, first), functools.reduce(jnp.maximum, last)
+
+    def normal(self, point: Components) -> Components:
+        """The direction from the nearest point of the axis."""
+        x, y, z = point
+        return [x, y, z - jnp.clip(z, -self.height / 2, self.height / 2)]
 
     def nearest(self, point: Point) -> Point:
         """The point of the axis that is nearest to a point, m."""

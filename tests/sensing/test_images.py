@@ -1,0 +1,226 @@
+"""Images hold what geometry says, and their depth moves as the surfaces do."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import marching
+import numpy as np
+import pytest
+
+import jaxdrones
+from jaxdrones import Camera, Scene, State, render, rotation
+from jaxdrones.sensing import Box, Capsule, Cylinder, Mesh, Sphere
+from jaxdrones.sensing.images import drone_solids, view_of
+
+CRAZYFLIE = jaxdrones.load_params("cf2x")
+CAMERA = Camera(resolution=(32, 24), field_of_view=70, far=30.0)
+
+
+def team(*drones) -> tuple[jaxdrones.Params, State]:
+    """Drones at positions with roll, pitch and yaw."""
+    pos, rpy = (jnp.array(rows, float) for rows in zip(*drones, strict=True))
+    state = State.at_rest(pos).replace(quat=jax.vmap(rotation.from_rpy)(rpy))
+    return jaxdrones.repeat(CRAZYFLIE, len(drones)), state
+
+
+def scattered(seed: int, of_each: int = 3) -> Scene:
+    """Obstacles of all kinds between 4 m and 7 m ahead of (-5, 0, 1.5)."""
+    rng = np.random.default_rng(seed)
+
+    def poses():
+        quat = rng.normal(size=(of_each, 4))
+        pos = rng.uniform([-1, -2, 0.3], [2, 2, 3], (of_each, 3))
+        return dict(pos=pos, quat=quat / np.linalg.norm(quat, axis=1, keepdims=True))
+
+    return Scene.of(
+        Box(**poses(), size=rng.uniform(0.3, 1, (of_each, 3))),
+        Sphere(**poses(), radius=rng.uniform(0.2, 0.5, of_each)),
+        Cylinder(**poses(), radius=rng.uniform(0.2, 0.4, of_each), height=rng.uniform(0.4, 1.5, of_each)),
+        Capsule(**poses(), radius=rng.uniform(0.1, 0.3, of_each), height=rng.uniform(0.3, 1, of_each)),
+    )
+
+
+WATCHING = team(([-5.0, 0, 1.5], [0.1, 0.05, 0.0]), ([-4.2, 0.1, 1.5], [0.3, -0.2, 0.4]), ([-3, -0.5, 2], [0, 0.4, 3]))
+
+
+def interior(segmentation: np.ndarray) -> np.ndarray:
+    """Pixels whose neighbors show the same."""
+    padded = np.pad(segmentation, 1, mode="edge")
+    h, w = segmentation.shape
+    shifts = [padded[i : i + h, j : j + w] for i in range(3) for j in range(3)]
+    return np.all([shift == segmentation for shift in shifts], axis=0)
+
+
+def test_depth_is_that_of_a_march_along_every_ray():
+    scene, (params, state) = scattered(0), WATCHING
+    images = render(scene, params, state, CAMERA)
+    parts = [solid for kind in drone_solids(params, state) for solid in marching.single(kind)]
+    owners = [0, 1, 2, *np.repeat([0, 1, 2], 4)]
+    for i in range(3):
+        view = view_of(CAMERA, *jax.tree.map(lambda x, i=i: x[i], (params, state)))
+        visible = [part for part, owner in zip(parts, owners, strict=True) if owner != i]
+        depth = marching.depth(view, [*scene.obstacles, *visible], CAMERA.far)
+        inside = interior(np.asarray(images.segmentation[i])) & (depth < CAMERA.far)
+        assert inside.mean() > 0.15
+        np.testing.assert_allclose(np.asarray(images.depth[i])[inside], depth[inside], rtol=1e-6)
+
+
+def test_a_wall_is_at_its_distance_in_every_pixel():
+    wall = Box(pos=(4.0, 0.0, 2.0), size=(1.0, 100.0, 100.0))
+    images = render(Scene.of(wall, ground=False), *team(([0, 0, 1], [0, 0, 0])), Camera(resolution=(9, 7)))
+    np.testing.assert_allclose(images.depth, 3.5, rtol=1e-12)
+    np.testing.assert_array_equal(images.segmentation, 2)  # 0 ground, 1 drone, 2 wall
+
+
+def test_labels_are_ground_drones_obstacles_and_nothing():
+    scene = Scene.of(Sphere(pos=(0.0, 0.0, 1.0), radius=0.3), Box(pos=(2.0, 3.0, 1.0), size=(1.0, 1.0, 1.0)))
+    params, state = team(([-2, 0, 1], [0, 0, 0]), ([-1.5, 0.3, 0.9], [0, 0, 0]))
+    labels = render(scene, params, state, CAMERA).segmentation[0]
+    assert set(np.unique(labels)) == {-1, 0, 2, 3, 4}  # of drones only the other one; boxes come before spheres
+    assert labels[0, 0] == -1 and labels[-1, 0] == 0 and labels[12, 16] == 4
+
+
+def test_a_drone_sees_itself_only_if_asked():
+    params, state = team(([0, 0, 1], [0, 0, 0]))
+    above = dict(offset=(-0.3, 0.0, 0.0), resolution=(24, 24))
+    assert not (render(Scene(), params, state, Camera(**above)).segmentation == 1).any()
+    assert (render(Scene(), params, state, Camera(**above, sees_self=True)).segmentation == 1).any()
+
+
+def test_a_levelled_camera_ignores_roll_and_a_fixed_one_turns():
+    scene, level, rolled = scattered(0), team(([-5, 0, 1.5], [0, 0, 0])), team(([-5, 0, 1.5], [0.5, 0, 0]))
+    for levelled in True, False:
+        camera = Camera(resolution=(16, 12), levelled=levelled)
+        same = jnp.allclose(render(scene, *level, camera).depth, render(scene, *rolled, camera).depth)
+        assert same == levelled
+
+
+def test_an_orientation_turns_the_camera():
+    scene = scattered(0)
+    left = Camera(resolution=(16, 12), orientation=(0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)))
+    turned, fixed = team(([-5, 0, 1.5], [0, 0, 0])), team(([-5, 0, 1.5], [0, 0, -np.pi / 2]))
+    ahead = render(scene, *turned, Camera(resolution=(16, 12))).depth
+    np.testing.assert_allclose(render(scene, *fixed, left).depth, ahead, rtol=1e-9)
+
+
+def test_what_is_too_near_is_seen_at_the_nearest_depth_and_what_is_too_far_not_at_all():
+    around = Sphere(pos=(0.0, 0.0, 1.0), radius=0.5)
+    inside = render(Scene.of(around), *team(([0, 0, 1], [0, 0, 0])), CAMERA)
+    np.testing.assert_array_equal(inside.depth, CAMERA.near)
+    wall = Box(pos=(40.0, 0.0, 0.0), size=(1.0, 1000.0, 1000.0))
+    beyond = render(Scene.of(wall, ground=False), *team(([0, 0, 1], [0, 0, 0])), CAMERA)
+    np.testing.assert_array_equal(beyond.depth, CAMERA.far)
+    np.testing.assert_array_equal(beyond.segmentation, -1)
+
+
+def test_the_gradient_of_depth_is_that_of_the_visible_surface():
+    scene, (params, state) = scattered(1), WATCHING
+    moving = dict(pos=state.pos, quat=state.quat)
+
+    def depth(moving, scene):
+        return render(scene, params, state.replace(**moving), CAMERA).depth
+
+    rng = np.random.default_rng(2)
+    labels = np.asarray(render(scene, params, state, CAMERA).segmentation)
+    assert len(set(np.unique(labels)) & set(range(4, 4 + 12))) > 8  # of 12 obstacles
+    inside = np.stack([interior(image) for image in labels])
+    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), (moving, scene))
+    weights = jnp.asarray(rng.normal(size=labels.shape))
+    tangent_of = jax.jit(lambda direction: jax.jvp(depth, (moving, scene), direction)[1])
+    gradient = jax.jit(jax.grad(lambda *x: jnp.sum(weights * depth(*x)), (0, 1)))(moving, scene)
+    for part in range(2):  # the drones, then the obstacles
+        along = tuple(x if i == part else jax.tree.map(jnp.zeros_like, x) for i, x in enumerate(direction))
+        tangent = tangent_of(along)
+        ahead, behind = (
+            depth(*jax.tree.map(lambda x, d, sign=sign: x + sign * 1e-5 * d, (moving, scene), along))
+            for sign in (1, -1)
+        )
+        differences = np.asarray(ahead - behind) / 2e-5
+        np.testing.assert_allclose(np.asarray(tangent)[inside], differences[inside], rtol=1e-4, atol=1e-5)
+        product = sum(jnp.sum(g * d) for g, d in zip(*map(jax.tree.leaves, (gradient, along)), strict=True))
+        np.testing.assert_allclose(product, jnp.sum(weights * tangent), rtol=1e-9)
+
+
+def test_gradients_are_finite_along_faces_and_axes_in_single_precision():
+    scene = Scene.of(
+        Box(pos=(3.0, 0.0, 1.0), size=(1.0, 1.0, 1.0)),
+        Cylinder(pos=(4.0, 1.0, 1.0), radius=0.4, height=2.0),
+        Sphere(pos=(3.0, -1.0, 1.0), radius=0.3),
+    )
+    params, state = team(([0, 0, 1.0], [0, 0, 0]))
+    params, state, scene = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (params, state, scene))
+    camera = Camera(resolution=(17, 13))  # the middle pixel looks along an axis of the box
+
+    @jax.jit
+    @functools.partial(jax.value_and_grad, argnums=(0, 1))
+    def nearness(state, scene):
+        return jnp.sum(1 / render(scene, params, state, camera).depth)
+
+    value, gradient = nearness(state, scene)
+    assert value.dtype == jnp.float32
+    assert all(jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient))
+
+
+def test_the_image_is_that_of_one_world_in_every_one_of_many():
+    params, state = WATCHING
+    scenes = jax.tree.map(lambda *x: jnp.stack(x), *(scattered(seed) for seed in range(3)))
+    many = jax.vmap(lambda scene: render(scene, params, state, CAMERA))(scenes)
+    for seed in range(3):
+        alone = render(scattered(seed), params, state, CAMERA)
+        np.testing.assert_allclose(many.depth[seed], alone.depth, rtol=1e-12)
+        np.testing.assert_array_equal(many.segmentation[seed], alone.segmentation)
+        np.testing.assert_array_equal(many.rgb[seed], alone.rgb)
+
+
+def test_colors_are_those_of_what_is_seen():
+    red = Box(pos=(3.0, 0.0, 1.0), size=(1.0, 1.0, 1.0), color=(1.0, 0.0, 0.0, 1.0))
+    params, state = team(([0, 0, 1], [0, 0, 0]))
+    rgb = np.asarray(render(Scene.of(red), params, state, CAMERA).rgb[0], float)
+    assert rgb.shape == (24, 32, 4) and (rgb[..., 3] == 255).all()
+    r, g, b = rgb[12, 16, :3]
+    assert r > 80 and g == b == 0
+    sky_r, _, sky_b = rgb[0, 0, :3]
+    assert sky_b > sky_r
+    down = Camera(resolution=(32, 24), orientation=(0.0, np.sin(np.pi / 4), 0.0, np.cos(np.pi / 4)))
+    tiles = np.asarray(render(Scene(), params, state, down).rgb[0, ..., 0], float)
+    assert tiles.max() - tiles.min() > 30
+
+
+def test_light_falls_from_above():
+    ball = Sphere(pos=(3.0, 0.0, 1.5), radius=1.0, color=(1.0, 1.0, 1.0, 1.0))
+    images = render(Scene.of(ball, ground=False), *team(([6, 0, 1.5], [0, 0, np.pi])), CAMERA)
+    rows = np.nonzero(np.asarray(images.segmentation[0, :, 16]) == 2)[0]
+    light = np.asarray(images.rgb[0, :, 16, 0], int)[rows]
+    assert light[1] > light[-2] + 50
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ({"camera": "front"}, r"camera is 'front'; give a jaxdrones.Camera"),
+        ({"scene": Scene.of(Mesh(path=__file__, pos=(0, 0, 0)))}, "the scene has a Mesh, which only Bullet reads"),
+        ({"scene": None}, "scene is None; give a jaxdrones.sensing.Scene"),
+    ],
+)
+def test_nonsense_is_refused(arguments, error):
+    params, state = team(([0, 0, 1], [0, 0, 0]))
+    with pytest.raises(ValueError, match=error):
+        render(**{"scene": Scene(), "params": params, "state": state, "camera": CAMERA} | arguments)
+
+
+@pytest.mark.parametrize(
+    ("option", "error"),
+    [
+        (dict(resolution=(0, 48)), "width of a camera is 0"),
+        (dict(resolution=64), r"resolution of a camera is 64; give \(width, height\)"),
+        (dict(field_of_view=180), "field_of_view of a camera is 180"),
+        (dict(orientation=(0, 0, 0, 0)), "orientation of a camera has length 0"),
+        (dict(far=0.01), "far of a camera is 0.01"),
+        (dict(offset=(0, 0)), r"offset of a camera is \(0, 0\); give 3 numbers"),
+        (dict(rate=-1), "rate of a camera is -1"),
+    ],
+)
+def test_a_camera_says_what_is_wrong_with_it(option, error):
+    with pytest.raises(ValueError, match=error):
+        Camera(**option)

@@ -23,9 +23,23 @@ class Point(flax.struct.PyTreeNode):
 class PointWorld(flax.struct.PyTreeNode):
     drones: Point
     step: jax.Array
+    images: None = None
+    poses: None = None
 
 
-class DoubleIntegrator:
+class Vectors:
+    """What an environment without images is to `AutoReset`."""
+
+    vision = None
+
+    def begin(self, key):
+        return self.reset(key)
+
+    def observed(self, vector, world):
+        return vector
+
+
+class DoubleIntegrator(Vectors):
     """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
 
     drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 50, ()
@@ -44,7 +58,7 @@ class DoubleIntegrator:
         return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
 
 
-class Cue:
+class Cue(Vectors):
     """Cost (u - cue)^2 in every step, for a cue of 0.5 or -0.5 that is observed in the first step only, or in all.
 
     The cue is a number of the observation or the depth that an image shows. Who does not remember it pays at least 0.25
@@ -56,22 +70,31 @@ class Cue:
     def __init__(self, shown: int = 1, image: bool = False):
         self.shown, self.image = shown, image
 
+    def begin(self, key):
+        cue = jax.random.choice(key, jnp.array([-0.5, 0.5]), (1, 1))
+        world = PointWorld(Point(cue), jnp.zeros((), jnp.int32))
+        return self.vector(world), world
+
     def reset(self, key):
-        world = PointWorld(Point(jax.random.choice(key, jnp.array([-0.5, 0.5]), (1, 1))), jnp.zeros((), jnp.int32))
-        return self.observe(world), world
+        vector, world = self.begin(key)
+        return self.observed(vector, world), world
 
     def step(self, key, world, action):
-        cue = world.drones.pos
-        world = PointWorld(Point(cue), world.step + 1)
-        cost = (action[:, 0] - cue[:, 0]) ** 2
+        cost = (action[:, 0] - world.drones.pos[:, 0]) ** 2
+        world = world.replace(step=world.step + 1)
         info = {"metrics": {"error": jnp.sqrt(cost)}}
-        return self.observe(world), world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+        obs = self.observed(self.vector(world), world)
+        return obs, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
 
-    def observe(self, world):
-        visible = jnp.where(world.step < self.shown, world.drones.pos, 0)
-        return (
-            {"state": 0 * visible, "depth": 3 + 4 * jnp.tile(visible[..., None], (1, 3, 4))} if self.image else visible
-        )
+    def visible(self, world):
+        return jnp.where(world.step < self.shown, world.drones.pos, 0)
+
+    def vector(self, world):
+        return jnp.zeros_like(world.drones.pos) if self.image else self.visible(world)
+
+    def observed(self, vector, world):
+        depth = 3 + 4 * jnp.tile(self.visible(world)[..., None], (1, 3, 4))
+        return {"state": vector, "depth": depth} if self.image else vector
 
 
 def dynamics():

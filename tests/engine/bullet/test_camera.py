@@ -121,7 +121,9 @@ def test_recorded_pictures_agree(name):
 
 def test_an_eye_inside_a_solid_sees_that_solid_as_near_as_it_can():
     camera = Camera(resolution=(8, 6), near=0.02)
-    with bullet.make_step(scene=Scene.of(Sphere(pos=(0, 0, 3), radius=0.1), Box(pos=(0, 0, 1), size=(1, 1, 1)))) as step:
+    with bullet.make_step(
+        scene=Scene.of(Sphere(pos=(0, 0, 3), radius=0.1), Box(pos=(0, 0, 1), size=(1, 1, 1)))
+    ) as step:
         for place, label in ([0, 0, 1.0], 2), ([3, 0, -1.0], 0):
             _, depth, segmentation = pictures(step, at(place), camera)
             assert np.all(depth == 0.02) and np.all(segmentation == label)

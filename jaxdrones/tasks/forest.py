@@ -15,7 +15,7 @@ from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, norm, out_of_control
+from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control
 from jaxdrones.tasks.touching import touches
 
 HEIGHT = 1.5  # m, of flight
@@ -96,8 +96,7 @@ def forest(
 
     def desired(task: Task, world: World) -> Float[Array, "n 3"]:
         """The velocity towards the goal, m/s, world; slower only where the goal is reached."""
-        away = task.target_now(world).pos - world.drones.pos
-        return speed * away / jnp.maximum(norm(away), REACHED)[:, None]
+        return shaping.velocity_to_target(task, world, speed, REACHED)
 
     def velocity(task: Task, world: World) -> Float[Array, " n"]:
         """Magnitude of the velocity error as a share of the commanded speed."""
@@ -135,8 +134,8 @@ def forest(
             "heading": (-0.2, heading),
             "omega": (-0.02, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
-            "touched": (-10.0, _variable("touched")),
-            "reached": (10.0, _variable("reached")),
+            "touched": (-10.0, shaping.variable("touched")),
+            "reached": (10.0, shaping.variable("reached")),
         },
         terminations={
             "touched": lambda task, world: world.variables["touched"],
@@ -145,7 +144,7 @@ def forest(
             "spinning": out_of_control(length)["spinning"],
         },
         advance=_advance,
-        metrics={name: _variable(name) for name in ("touched", "reached", "clearance")} | {"detour": _detour},
+        metrics={name: shaping.variable(name) for name in ("touched", "reached", "clearance")} | {"detour": _detour},
         success=lambda metrics, dt: (metrics["reached"][-1] > 0) & (metrics["touched"][-1] == 0),
         observations={"desired_velocity": ObservationTerm(observe_desired, _MAX_SPEED)},
         control_hz=50.0,
@@ -182,7 +181,3 @@ def _detour(task: Task, world: World) -> Float[Array, " n"]:
     """Length of the path over the straight line."""
     straight = norm(world.drones.pos - world.variables["start"])
     return world.variables["path"] / jnp.where(straight > 0, straight, 1)
-
-
-def _variable(name: str) -> Term:
-    return lambda task, world: world.variables[name].astype(world.drones.pos.dtype)

@@ -3,7 +3,7 @@
 from jaxdrones.sensing.builders import BEAMS, forest, gate, obstacles_2021, room, track
 from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
-from jaxdrones.sensing.distances import contains, distance
+from jaxdrones.sensing.distances import Surface
 from jaxdrones.sensing.files import Mesh, Urdf
 from jaxdrones.sensing.images import Images, render
 from jaxdrones.sensing.rays import ray
@@ -23,11 +23,10 @@ __all__ = [
     "Scene",
     "Sensor",
     "Sphere",
+    "Surface",
     "Urdf",
     "camera_2021",
     "collisions",
-    "contains",
-    "distance",
     "forest",
     "gate",
     "obstacles_2021",

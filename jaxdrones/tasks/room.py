@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_keywords, check_number, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing import Scene, distance
+from jaxdrones.sensing import Scene
 from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
@@ -126,12 +126,7 @@ def _advance(task: Task, world: World) -> dict[str, Array]:
 
 def _observe_nearest_surface(task: Task, world: World) -> Float[Array, "n 3"]:
     """Vector from the drone to the nearest surface, m, world axes."""
-
-    def of_drone(pos: Float[Array, "3"]) -> Float[Array, "3"]:
-        apart, away = jax.value_and_grad(distance, argnums=1)(world.scene, pos)
-        return -apart * away
-
-    return jax.vmap(of_drone)(world.drones.pos)
+    return jax.vmap(lambda pos: world.scene.nearest(pos).point - pos)(world.drones.pos)
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:

@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool
 
 from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.params import Params
-from jaxdrones.sensing import Collisions, Scene, collisions, distance
+from jaxdrones.sensing import Collisions, Scene, collisions
 from jaxdrones.state import State
 from jaxdrones.tasks.task import World, norm
 from jaxdrones.vector import safe_sqrt
@@ -39,7 +39,7 @@ def _near(params: Params, drones: State, scene: Scene) -> Bool[Array, " n"]:
     """Whether an obstacle, the ground or another drone is within the ball about each drone."""
     half = params.collision_height / 2
     ball = jnp.abs(params.collision_offset) + safe_sqrt(params.collision_radius**2 + half**2) + _MARGIN
-    near = jax.vmap(distance, (None, 0))(scene, drones.pos) <= ball
+    near = jax.vmap(scene.distance)(drones.pos) <= ball
     for k in range(1, len(ball)):
         near |= norm(jnp.roll(drones.pos, k, axis=0) - drones.pos) <= jnp.roll(ball, k) + ball
     return near

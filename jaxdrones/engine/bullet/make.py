@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import jax
 
 from jaxdrones.checks import check_number, check_positive, check_whole
-from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors
+from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors, obstacle_contact
 from jaxdrones.engine.bullet.client import BALLS, TINY, Client
 from jaxdrones.engine.bullet.step import BulletStep
 from jaxdrones.engine.neighbors import NeighborGrid
@@ -37,7 +37,7 @@ def make_step(
     """Build the step of a world in which Bullet integrates and resolves contacts.
 
     Args:
-        effects: as for the explicit backend, but for `ground_contact`.
+        effects: as for the explicit backend, but for `ground_contact` and `obstacle_contact`.
         pairs: as for the explicit backend, but for `drone_contact`.
         rotors: as for the explicit backend.
         dt: physics step, s.
@@ -65,7 +65,7 @@ def make_step(
     check_whole("substeps", substeps)
     check_number("damping", damping, "1/s", at_least=0)
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
-    for contact in ground_contact, drone_contact:
+    for contact in ground_contact, obstacle_contact, drone_contact:
         if physics.contains(contact):
             raise ValueError(
                 f"{contact.__name__} is given and Bullet resolves contacts by itself, so drones would touch twice; "

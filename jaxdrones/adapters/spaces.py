@@ -12,9 +12,6 @@ from gymnasium import spaces
 
 from jaxdrones.checks import check_shape
 from jaxdrones.envs import Env
-from jaxdrones.sensing import Scene
-
-_MAX_DEPTH = 1001.0  # m; the farthest visible distance of the cameras, 1000 m, and rounding
 
 
 def observation_of_drone(env: Env) -> spaces.Space:
@@ -22,7 +19,8 @@ def observation_of_drone(env: Env) -> spaces.Space:
     state = spaces.Box(-env.observation_bound, env.observation_bound, dtype=np.float32)
     if env.vision is None:
         return state
-    return spaces.Dict({"state": state} | {name: _image(env, name) for name in env.vision.images})
+    images = {name: spaces.Box(x.low, x.high, x.shape, x.dtype) for name, x in env.image_spaces.items()}
+    return spaces.Dict({"state": state} | images)
 
 
 def action_of_drone(env: Env) -> spaces.Box:
@@ -103,12 +101,3 @@ def _where(action: np.ndarray) -> str:
 
 def _pick(tree: Any, i: int, axis: int) -> Any:
     return jax.tree.map(lambda x: x[(slice(None),) * axis + (i,)], tree)
-
-
-def _image(env: Env, name: str) -> spaces.Box:
-    if name == "rgb":
-        return spaces.Box(0, 255, (48, 64, 4), np.uint8)
-    if name == "depth":
-        return spaces.Box(0, _MAX_DEPTH, (48, 64), np.float32)
-    assert isinstance(env.scene, Scene), "Bullet, which takes the pictures, has refused others"
-    return spaces.Box(-1, env.drones + len(env.scene.obstacles), (48, 64), np.int32)

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 
 from jaxdrones.engine.physics import Physics
 from jaxdrones.params import Params
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import Camera, Images, Scene
 from jaxdrones.state import State
 
 
@@ -47,6 +47,10 @@ class HostStep(Step):
 
     Compiled code reaches it through a callback; a rollout that is not itself compiled loops over it in Python.
     """
+
+    @abc.abstractmethod
+    def camera(self, params: Params, state: State, camera: Camera, scene: Scene | None = None) -> Images:
+        """What the camera on every drone of a team sees."""
 
     @abc.abstractmethod
     def close(self) -> None:

@@ -54,20 +54,33 @@ class AutoReset:
         info = info | last | {"episode": {"return": episode_return, "length": length}}
 
         ended = terminated | truncated
-        fresh_obs, fresh = _where_needed(self._fresh)(ended, jax.random.fold_in(key, RESET))
-        fresh = fresh.replace(**{name: getattr(world, name) for name in self.env.constant_fields})
+        key = jax.random.fold_in(key, RESET)
+        vector = obs["state"] if isinstance(obs, dict) else obs
+        fresh_obs, fresh = _where_needed(self._fresh)(ended, key)
+        fresh = fresh.replace(**{name: getattr(world, name) for name in self._kept})
         fresh = Episode(fresh, jnp.zeros_like(episode_return), jnp.zeros_like(length))
-        obs, episode = jax.tree.map(
+        vector, episode = jax.tree.map(
             lambda new, old: old if new is old else jnp.where(ended, new, old),
             (fresh_obs, fresh),
-            (obs, Episode(world, episode_return, length)),
+            (vector, Episode(world, episode_return, length)),
         )
-        return obs, episode, reward, terminated, truncated, info
+        if self.env.vision:
+            episode = episode.replace(world=self.env.with_images(_renewed_images, key, episode.world, ended))
+        return self.env.observed(vector, episode.world), episode, reward, terminated, truncated, info
 
-    def _fresh(self, key: jax.Array) -> tuple[Obs, World]:
-        """A reset, without the fields that are the same in every episode."""
-        obs, world = self.env.reset(key)
-        return obs, world.replace(**dict.fromkeys(self.env.constant_fields))
+    @property
+    def _kept(self) -> tuple[str, ...]:
+        """Fields of a world that a reset leaves as they are: what is the same in every episode, and images."""
+        return (*self.env.constant_fields, "images", "poses")
+
+    def _fresh(self, key: jax.Array) -> tuple[Array, World]:
+        """A reset, without images and without the fields that are the same in every episode."""
+        obs, world = self.env.begin(key)
+        return obs, world.replace(**dict.fromkeys(self._kept))
+
+
+def _renewed_images(env: Env, key: Any, world: World, ended: Array) -> World:
+    return env.vision.renewed(ended, key, world)
 
 
 def _where_needed(draw: Callable) -> Callable:

@@ -19,14 +19,14 @@ from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
 from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
-from jaxdrones.envs.vision import Vision
+from jaxdrones.envs.vision import ImageSpace, Vision
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors, init_sensors, measure_sensors
 from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
-DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE = range(7)
+DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE, VISION = range(8)
 """Random streams: what a key is folded with, so that only the draws that are used cost time."""
 
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
@@ -72,7 +72,7 @@ class Env:
             noise: noise of the observed state.
             disturbance: sets the surroundings before every control step, for example `random_pushes`.
             delay: delay between action and command, s.
-            vision: cameras; only with the Bullet backend.
+            vision: cameras, as `jaxdrones.envs.vision.make_vision` returns them for the same step and scene.
             sensors: sensors of every drone, which measure after `reset` and after every control step.
             scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's
                 when left out.
@@ -89,10 +89,12 @@ class Env:
             check_callable("disturbance", disturbance, "random_pushes(0.3)")
         self.scene = task.scene if scene is None else scene
         """Obstacles and ground, or the function that draws them."""
-        check_scene(self.scene, step, task)
+        obstacles = check_scene(self.scene, step, task)
         self.task, self.params, self.dt, self.drones = task, params, dt, task.drones
         self.action, self.action_size = action.fitted(params), action.size
         self.physics, self.vision, self._vehicle = step, vision, vehicle
+        self.image_spaces: dict[str, ImageSpace] = {} if vision is None else vision.spaces(task.drones, obstacles)
+        """Shape, dtype and bounds of every image of a drone, by name."""
         self.steps = episode_steps(task, dt)
         """Number of control steps after which an episode is truncated."""
         self.sensors = check_sensors(sensors)
@@ -113,7 +115,7 @@ class Env:
 
     def __repr__(self) -> str:
         backend = "bullet" if isinstance(self.physics, HostStep) else "explicit"
-        images = "".join(f" and {image}" for image in (self.vision.images if self.vision else ()))
+        images = f" and {self.vision}" if self.vision else ""
         return (
             f"<Env {self.task.name}: {self.drones} x {self._vehicle}, dt {self.dt:.4g} s, {self.steps} steps, "
             f"{self.action_size} actions and {self.observation_size} observations{images} a drone, {backend} backend>"
@@ -137,13 +139,27 @@ class Env:
         Raises:
             ValueError: `key` is not one random key.
         """
+        obs, world = self.begin(key)
+        if self.vision:
+            world = self.with_images(_first_images, key, world)
+        return self.observed(obs, world), world
+
+    def begin(self, key: jax.Array) -> tuple[Float[Array, "n d"], World]:
+        """The same as `reset` without images: what needs them waits for `observed`."""
         check_key("key", key)
         world = self.compiled(Env._start)(key)
         rate = self._rate(world, world.drones.rpm)
-        obs, world = self.compiled(Env._first_observation)(key, world, rate)
-        if self.vision:
-            world = world.replace(images=self.vision.look(world.params, world.drones))
-        return self._with_images(obs, world), world
+        return self.compiled(Env._first_observation)(key, world, rate)
+
+    def with_images(self, look: Callable[..., World], key: jax.Array, world: World, *args: Any) -> World:
+        """`look(env, key, world, *args)`, which gives the world new images, compiled unless it leaves JAX."""
+        assert self.vision is not None
+        noise = jax.random.fold_in(key, VISION) if self.vision.camera.noise else None
+        return (functools.partial(look, self) if self.vision.on_host else self.compiled(look))(noise, world, *args)
+
+    def observed(self, obs: Float[Array, "n d"], world: World) -> Obs:
+        """The observation: its vector, with the images of the world beside it if there are any."""
+        return {"state": obs, **world.images} if self.vision else obs
 
     def step(
         self, key: jax.Array, world: World, action: Float[ArrayLike, "n a"]
@@ -169,12 +185,12 @@ class Env:
         random = self._noise or self._disturbance or self.sensors
         key_of_draws: Key = key if random else None  # a program without random keys can be a single kernel
         world, rpm = self.compiled(Env._command)(key_of_draws, world, action)
-        drones = self.physics(world.params, world.drones, rpm, scene_for_step(self.physics, world))
+        drones = self.physics(world.params, world.drones, rpm, scene_for_step(self.physics, self.scene, world))
         world = world.replace(drones=drones)
         obs, world, *outcome = self.compiled(Env._outcome)(key_of_draws, world, self._rate(world, rpm))
         if self.vision:
-            world = world.replace(images=self.vision.next(world))
-        return self._with_images(obs, world), world, *outcome
+            world = self.with_images(_next_images, key, world)
+        return self.observed(obs, world), world, *outcome
 
     def privileged_observation(self, world: World) -> PrivilegedObservation:
         """What a critic may know in training: the observation without noise, and the drawn parameters."""
@@ -228,7 +244,7 @@ class Env:
         """The time derivative of the state for the sensors, if there are any."""
         if not self.sensors:
             return None
-        return self.physics.rate(world.params, world.drones, rpm, scene_for_step(self.physics, world))
+        return self.physics.rate(world.params, world.drones, rpm, scene_for_step(self.physics, self.scene, world))
 
     def _measured(self, key: jax.Array, world: World, rate: State) -> World:
         """The world with new readings of the sensors."""
@@ -288,8 +304,13 @@ class Env:
 
         return [x.shape[-1] for x in jax.eval_shape(terms, jax.random.key(0))]
 
-    def _with_images(self, obs: Array, world: World) -> Obs:
-        return obs if self.vision is None else {"state": obs, **world.images}
+
+def _first_images(env: Env, key: Key, world: World) -> World:
+    return env.vision.first(key, world)
+
+
+def _next_images(env: Env, key: Key, world: World) -> World:
+    return env.vision.next(key, world)
 
 
 def _any(conditions: Iterable[Array]) -> Array:

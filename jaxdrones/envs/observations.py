@@ -67,6 +67,11 @@ def rotation_matrix(task: Task, world: World) -> Array:
     return jnp.reshape(jax.vmap(rotation.to_matrix)(world.drones.quat), (-1, 9))
 
 
+def gravity(task: Task, world: World) -> Array:
+    """Direction of gravity in body axes: the attitude but for the heading, as an accelerometer at rest shows it."""
+    return -jax.vmap(lambda quat: rotation.to_matrix(quat)[2])(world.drones.quat)
+
+
 def omega(task: Task, world: World) -> Array:
     """Angular velocity, rad/s, body."""
     return world.drones.omega
@@ -208,6 +213,7 @@ OBSERVATIONS: dict[str, ObservationTerm] = {
     "quaternion": ObservationTerm(quaternion, _UNIT),
     "rpy": ObservationTerm(rpy, _TURN),
     "rotation_matrix": ObservationTerm(rotation_matrix, _UNIT),
+    "gravity": ObservationTerm(gravity, _UNIT),
     "omega": ObservationTerm(omega, _MAX_RATE),
     "omega_world": ObservationTerm(omega_world, _MAX_RATE),
     "rotor_speed": ObservationTerm(rotor_speed, 10.0),

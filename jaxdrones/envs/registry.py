@@ -45,11 +45,11 @@ from jaxdrones.envs.randomize import (
     sensor_noise,
 )
 from jaxdrones.envs.surroundings import DrawScene
-from jaxdrones.envs.vision import IMAGES, Vision
+from jaxdrones.envs.vision import make_vision
 from jaxdrones.params import Params, repeat
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
-from jaxdrones.tasks import gates, gym_pybullet_drones, hover, swap, tracking
+from jaxdrones.tasks import forest, gates, gym_pybullet_drones, hover, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
 
@@ -59,6 +59,7 @@ TASKS: dict[str, Callable[..., Task]] = {
     "landing": hover.landing,
     "tracking": tracking.tracking,
     "gates": gates.gates,
+    "forest": forest.forest,
     "swap-goals": swap.swap_goals,
     "hover-2021": gym_pybullet_drones.hover,
     "takeoff": gym_pybullet_drones.takeoff,
@@ -80,8 +81,8 @@ def make(
     vehicle: str | os.PathLike | Params = "cf2x",
     action: str | Action | None = None,
     observation: Sequence[str | ObservationTerm] | None = None,
-    vision: Sequence[str] = (),
-    vision_hz: float | None = None,
+    vision: Sequence[str] | None = None,
+    camera: Camera | None = None,
     realistic: bool = False,
     effects: Sequence[str | Callable] | None = None,
     pairs: Sequence[str | Callable] = (),
@@ -108,8 +109,9 @@ def make(
         action: a name of `ACTIONS` or an action type; the task's own when left out.
         observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
             out.
-        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest; with the Bullet backend.
-        vision_hz: pictures per second; one per control step when left out.
+        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, images of a camera on every drone;
+            the task's own when left out.
+        camera: that camera, with its rate, latency and noise; the task's own, or else a `Camera()`, when left out.
         realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
@@ -176,6 +178,7 @@ def make(
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
+    vision = task.vision if vision is None else vision
     observation = task.observation if observation is None else observation
     known = _known_terms(task, sensors)
     observation = check_sequence("observation", observation, "'position_error'")
@@ -193,7 +196,7 @@ def make(
         noise=preset["noise"] if noise is None else noise,
         disturbance=disturbance,
         delay=preset["delay"] if delay is None else delay,
-        vision=_vision(step, backend, vision, vision_hz, control_hz),
+        vision=make_vision(step, vision, camera or (task.camera if vision else None), dt, scene),
         sensors=sensors,
         scene=scene,
         vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
@@ -258,19 +261,3 @@ def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, Observation
         if sensor.name in terms:
             raise ValueError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
     return terms | {sensor.name: reading(sensor.name, sensor.bound) for sensor in sensors}
-
-
-def _vision(step, backend: str, images: Sequence[str], hz: float | None, control_hz: float) -> Vision | None:
-    images = check_sequence("vision", images, "'rgb'")
-    for image in images:
-        check_choice("image", image, IMAGES)
-    if not images:
-        return None
-    if backend != "bullet":
-        raise ValueError("vision is asked for; the explicit backend has no cameras, take backend='bullet'")
-    if hz is not None:
-        check_positive("vision_hz", hz, "1/s")
-    every = 1 if hz is None else control_hz / hz
-    if abs(every - round(every)) > 1e-6 or every < 1:
-        raise ValueError(f"vision_hz is {hz}; give a divisor of the control rate, {control_hz:g}")
-    return Vision(step, round(every), tuple(images))

@@ -15,8 +15,12 @@ DrawScene = Callable[[jax.Array], Scene]
 """(key) -> the scene of an episode."""
 
 
-def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> None:
-    """Raise `ValueError` unless the step or the terminations of the task honor the obstacles of a scene."""
+def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> int:
+    """The number of obstacles in a scene.
+
+    Raises:
+        ValueError: it is none, or neither the step nor the terminations of the task honor its obstacles.
+    """
     if isinstance(scene, Scene):
         example = scene
     elif callable(scene):
@@ -26,20 +30,23 @@ def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> None:
     if not isinstance(example, Scene):
         returned = shown(scene(jax.random.key(0)))
         raise ValueError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
-    if isinstance(step, HostStep):
-        if scene is not example:
-            raise ValueError(
-                "scene is a function that draws it for every episode, and Bullet builds it once; give a Scene, or take "
-                "the explicit backend"
-            )
-    elif example.has_obstacles and not (step.physics.takes_scene or (task.obstacles_terminate and scene is task.scene)):
+    honored = isinstance(step, HostStep) or step.physics.takes_scene
+    if example.has_obstacles and not (honored or (task.obstacles_terminate and scene is task.scene)):
         raise ValueError(
             "the scene has obstacles and on the explicit backend drones would fly through them; give an effect "
             "(params, state, scene) -> Wrench, a task whose terminations find its obstacles (obstacles_terminate), no "
             "obstacles, or take the bullet backend"
         )
+    return example.count
 
 
-def scene_for_step(step: Step, world: World) -> Scene | None:
-    """The scene that a step is given at every call; none where it was built with it, or no effect takes it."""
-    return None if isinstance(step, HostStep) or not step.physics.takes_scene else world.scene
+def scene_for_step(step: Step, scene: Scene | DrawScene, world: World) -> Scene | None:
+    """What a step is given at every call, of the scene of its environment; none if it needs none or was built with it.
+
+    Args:
+        step: of either backend.
+        scene: of the environment.
+        world: an episode of it.
+    """
+    needed = not isinstance(scene, Scene) if isinstance(step, HostStep) else step.physics.takes_scene
+    return world.scene if needed else None

@@ -1,48 +1,159 @@
-"""Images of the drones' cameras as an observation (equation 9 of the paper)."""
+"""Images of the drones' cameras as an observation (equation 9 of the paper), on either backend."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
-import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from jaxdrones.engine.step import is_traced
+from jaxdrones.checks import check_choice, check_sequence
+from jaxdrones.engine.step import HostStep, Step, is_traced
+from jaxdrones.envs.exposures import where_due
+from jaxdrones.envs.surroundings import DrawScene
 from jaxdrones.params import Params
+from jaxdrones.sensing import Camera, Images, Scene, render
+from jaxdrones.sensing.camera import check_camera
 from jaxdrones.state import State
 from jaxdrones.tasks.task import World
 
-IMAGES = {"rgb": (np.uint8, 4), "depth": (np.float32, None), "segmentation": (np.int32, None)}
+IMAGES = ("rgb", "depth", "segmentation")
+_PIXELS = 4096  # that are computed at a time: so many stay in a cache
+
+
+class ImageSpace(NamedTuple):
+    """The values that an image of one drone can have."""
+
+    shape: tuple[int, ...]
+    dtype: type
+    low: float
+    high: float
 
 
 @dataclasses.dataclass(frozen=True)
 class Vision:
-    """Images of every drone's camera: `rgb` (n, 48, 64, 4), `depth` (n, 48, 64) (m), `segmentation` (n, 48, 64)."""
+    """Images of the camera on every drone of a team, at the camera's rate and latency and with its noise.
 
-    physics: Any
-    """A Bullet step, which renders the images."""
-    every: int = 1
-    """Control steps between images; in between the last one is observed again."""
-    images: tuple[str, ...] = ("rgb",)
+    An image shows the state of the control step at whose end it was taken. It is observed when it is as old as the
+    latency, and again at every control step until the next one. Until then the start of the episode is observed.
+    """
+
+    images: tuple[str, ...]
     """Which of `rgb`, `depth`, `segmentation`."""
+    camera: Camera
+    render: Callable[[Params, State, Scene], Images]
+    """Takes the images of a team."""
+    on_host: bool
+    """Whether `render` leaves JAX, so that images are taken one after the other."""
+    every: int
+    """Control steps between images."""
+    delay: int
+    """Control steps from when an image is taken to when it is observed."""
 
-    def look(self, params: Params, drones: State) -> dict[str, Any]:
-        """The images of a state."""
-        rgb, depth, segmentation = self.physics.camera(params, drones)
-        pictures = {"rgb": rgb, "depth": depth, "segmentation": segmentation}
-        return {name: pictures[name] for name in self.images}
+    def __str__(self) -> str:
+        width, height = self.camera.resolution
+        rate = f" every {self.every} steps" if self.every > 1 else ""
+        late = f", {self.delay} steps late" if self.delay else ""
+        return f"{' and '.join(self.images)} of {width} x {height} pixels{rate}{late}"
 
-    def next(self, world: World) -> dict[str, Any]:
-        """The images after a control step."""
-        due = world.step % self.every == 0
+    def look(self, params: Params, drones: State, scene: Scene) -> dict[str, Array]:
+        """The images of a state, without noise."""
+        images = self.render(params, drones, scene)
+        return {name: getattr(images, name) for name in self.images}
+
+    def first(self, key: Any, world: World) -> World:
+        """The world at the start of an episode with its images."""
+        pose = _pose(world.drones)
+        poses = jnp.tile(pose[None], (self.delay, 1, 1))
+        return world.replace(images=self._exposed(key, world.params, pose, world.scene), poses=poses)
+
+    def next(self, key: Any, world: World) -> World:
+        """The world after a control step with its images."""
+        poses = jnp.concatenate([world.poses, _pose(world.drones)[None]])
         if self.every == 1:
-            return self.look(world.params, world.drones)
-        if not is_traced((world.drones, due)):
-            return self.look(world.params, world.drones) if due else world.images
+            images = self._exposed(key, world.params, poses[0], world.scene)
+        else:
+            due = ((world.step - self.delay) % self.every == 0) & (world.step > self.delay)
+            images = self._where(due, key, world, poses[0])
+        return world.replace(images=images, poses=poses[1:])
 
-        @jax.custom_batching.sequential_vmap  # else, of many worlds, each would render an image in every step
-        def shown(due, params, drones, before):
-            return jax.lax.cond(due, lambda: self.look(params, drones), lambda: before)
+    def renewed(self, ended: Array, key: Any, world: World) -> World:
+        """The world with the images of a start where an episode has ended."""
+        pose = _pose(world.drones)
+        poses = jnp.where(ended, pose[None], world.poses)
+        return world.replace(images=self._where(ended, key, world, pose), poses=poses)
 
-        return shown(due, world.params, world.drones, world.images)
+    def spaces(self, drones: int, obstacles: int) -> dict[str, ImageSpace]:
+        """The values that the images of one drone can have, by name."""
+        width, height = self.camera.resolution
+        shape = (height, width)
+        known = {
+            "rgb": ImageSpace((*shape, 4), np.uint8, 0, 255),
+            "depth": ImageSpace(shape, np.float32, 0.0, self.camera.far),
+            "segmentation": ImageSpace(shape, np.int32, -1, drones + obstacles),
+        }
+        return {name: known[name] for name in self.images}
+
+    def _where(self, due: Any, key: Any, world: World, pose: Array) -> dict[str, Array]:
+        """New images where they are due, elsewhere those that the world has."""
+        args = key, world.params, pose, world.scene
+        if self.on_host and not is_traced((due, world.images, args)):
+            return self._exposed(*args) if due else world.images
+        worlds = 1 if self.on_host else max(1, _PIXELS // (len(pose) * np.prod(self.camera.resolution)))
+        return where_due(self._exposed, worlds)(due, world.images, *args)
+
+    def _exposed(self, key: Any, params: Params, pose: Float[Array, "n 7"], scene: Scene) -> dict[str, Array]:
+        """The images from these poses, with noise."""
+        images = self.look(params, State.at_rest(pose[:, :3]).replace(quat=pose[:, 3:]), scene)
+        if self.camera.noise is not None and "depth" in images:
+            images["depth"] = self.camera.noise.apply(key, images["depth"], self.camera)
+        return images
+
+
+def make_vision(
+    step: Step, images: Sequence[str], camera: Camera | None, dt: float, scene: Scene | DrawScene
+) -> Vision | None:
+    """The vision of an environment; `None` where no image is asked for.
+
+    Args:
+        step: of either backend; that of Bullet renders the images itself.
+        images: which of `rgb`, `depth`, `segmentation`.
+        camera: on every drone; a `Camera()` when left out.
+        dt: control period, s.
+        scene: of the environment; a step of Bullet was built with it unless it is drawn.
+
+    Raises:
+        ValueError: an unknown image, a camera without images, or more images than control steps.
+    """
+    images = check_sequence("vision", images, "'depth'")
+    for image in images:
+        check_choice("image", image, IMAGES)
+    if not images:
+        if camera is not None:
+            raise ValueError(
+                "camera is given, but vision asks for no image; give for example vision=('depth',), or leave it out"
+            )
+        return None
+    camera = Camera() if camera is None else camera
+    check_camera(camera)
+    every = 1 if camera.rate is None else 1 / (camera.rate * dt)
+    if every < 1 - 1e-6:
+        raise ValueError(
+            f"the rate of the camera is {camera.rate:g} images/s; give at most the control rate, {1 / dt:g}, or a "
+            "higher control_hz"
+        )
+    drawn = not isinstance(scene, Scene)
+
+    def take(params: Params, drones: State, scene: Scene) -> Images:
+        if isinstance(step, HostStep):
+            return step.camera(params, drones, camera, scene if drawn else None)
+        return render(scene, params, drones, camera)
+
+    return Vision(images, camera, take, isinstance(step, HostStep), round(every), round(camera.latency / dt))
+
+
+def _pose(drones: State) -> Float[Array, "n 7"]:
+    return jnp.concatenate([drones.pos, drones.quat], axis=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import flax.linen as nn
@@ -16,52 +16,8 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_choice, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
+from jaxdrones.learning.layers import CNN, IMAGE_CHANNELS, MLP, convolutions, image_channels
 from jaxdrones.learning.normalize import RunningStatistics, map_state_vector, state_vector
-
-ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
-_MAX_DEPTH = 5.0  # m; larger depths are clipped
-
-
-class MLP(nn.Module):
-    """A multilayer perceptron with a linear output layer, whose initial outputs are near zero if `output_scale` is."""
-
-    hidden_sizes: Sequence[int]
-    output_size: int
-    output_scale: float = 1.0
-    activation: str = "tanh"
-
-    @nn.compact
-    def __call__(self, x: Float[Array, "*batch d"]) -> Array:
-        """(*batch, output_size)."""
-        for size in self.hidden_sizes:
-            x = ACTIVATIONS[self.activation](nn.Dense(size, kernel_init=_kernel_init(1.0))(x))
-        return nn.Dense(self.output_size, kernel_init=_kernel_init(self.output_scale))(x)
-
-
-class CNN(nn.Module):
-    """Features of an image: convolutions, and a dense layer over all their outputs.
-
-    Kernels are as wide as their strides, so that a convolution is a product of matrices, which is far faster on a CPU
-    than overlapping kernels are.
-    """
-
-    channels: Sequence[int]
-    strides: Sequence[int]
-    features: int
-
-    @nn.compact
-    def __call__(self, image: Float[Array, "*batch h w c"]) -> Float[Array, "*batch features"]:
-        """Features of numbers in [0, 1]; h and w are multiples of the product of the strides."""
-        for channels, stride in zip(self.channels, self.strides, strict=True):
-            image = nn.relu(nn.Dense(channels)(_patches(image, stride)))
-        return nn.relu(nn.Dense(self.features)(image.reshape(*image.shape[:-3], -1)))
-
-
-def _patches(image: Float[Array, "*batch h w c"], stride: int) -> Array:
-    """(*batch, h / stride, w / stride, stride^2 c): the image cut into squares, each a vector."""
-    *batch, h, w, c = image.shape
-    squares = image.reshape(*batch, h // stride, stride, w // stride, stride, c)
-    return jnp.moveaxis(squares, -4, -3).reshape(*batch, h // stride, w // stride, -1)
 
 
 class VisionMLP(nn.Module):
@@ -71,49 +27,35 @@ class VisionMLP(nn.Module):
     output_size: int
     output_scale: float = 1.0
     activation: str = "tanh"
-    channels: Sequence[int] = (16, 32, 32)
-    strides: Sequence[int] = (4, 2, 2)
-    features: int = 32
+    channels: Sequence[int] = ()
+    strides: Sequence[int] = ()
+    features: int = 64
+    depth_scale: float = 3.0
+    """Depth that the network takes for a nearness of 1/2, m; of 0.3, 5 and 10 m it makes 0.91, 0.38 and 0.23."""
 
     @nn.compact
     def __call__(self, obs: dict[str, Array]) -> Array:
         """(*batch, output_size)."""
-        images = [IMAGE_CHANNELS[name](obs[name]) for name in sorted(obs.keys() - {"state"})]
-        features = CNN(self.channels, self.strides, self.features)(jnp.concatenate(images, axis=-1))
+        images = image_channels({name: x for name, x in obs.items() if name != "state"}, self.depth_scale)
+        features = CNN(self.channels, self.strides, self.features)(images)
         mlp = MLP(self.hidden_sizes, self.output_size, self.output_scale, self.activation)
         return mlp(jnp.concatenate([obs["state"], features], axis=-1))
 
 
 def make_network(obs: Obs, hidden_sizes: Sequence[int], output_size: int, output_scale: float) -> MLP | VisionMLP:
-    """A network of the kind that such observations need.
+    """A network of the kind that such observations need, with a CNN that suits the resolution of images.
 
     Raises:
         ValueError: the observations have images that no network takes.
     """
     if not isinstance(obs, dict):
         return MLP(tuple(hidden_sizes), output_size, output_scale)
-    for name in obs.keys() - {"state"}:
+    names = sorted(obs.keys() - {"state"})
+    for name in names:
         check_choice("image for a policy", name, IMAGE_CHANNELS)
-    return VisionMLP(tuple(hidden_sizes), output_size, output_scale)
-
-
-def _normalize_rgb(rgb: Array) -> Float[Array, "*batch h w 3"]:
-    """Red, green and blue in [0, 1] of an image (*batch, h, w, 4) of bytes; the opacity is dropped."""
-    return rgb[..., :3].astype(jnp.float32) / 255
-
-
-def _normalize_depth(depth: Array) -> Float[Array, "*batch h w 1"]:
-    """1 at the camera, 0 at the largest depth and beyond, of depths (*batch, h, w) in m."""
-    return 1 - jnp.clip(depth, 0, _MAX_DEPTH)[..., None] / _MAX_DEPTH
-
-
-IMAGE_CHANNELS: dict[str, Callable[[Array], Array]] = {"rgb": _normalize_rgb, "depth": _normalize_depth}
-"""The images that policies take, each with the function that makes channels in [0, 1] of it."""
-
-
-def _kernel_init(scale: float):
-    """Normally distributed weights, with which the variance of the outputs is `scale`^2 times that of the inputs."""
-    return nn.initializers.variance_scaling(scale**2, "fan_in", "normal")
+    batch = obs["state"].ndim - 1
+    channels, strides = convolutions(*obs[names[0]].shape[batch : batch + 2])
+    return VisionMLP(tuple(hidden_sizes), output_size, output_scale, channels=channels, strides=strides)
 
 
 class Policy(flax.struct.PyTreeNode):

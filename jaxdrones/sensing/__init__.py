@@ -1,12 +1,13 @@
 """What stands around, who touches it, and what the drones measure."""
 
+from jaxdrones.sensing.builders import forest, gate, obstacles_2021, room, track
 from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
 from jaxdrones.sensing.distances import Surface
 from jaxdrones.sensing.files import Mesh, Urdf
 from jaxdrones.sensing.images import Images, render
 from jaxdrones.sensing.rays import ray
-from jaxdrones.sensing.scene import Scene, gate, obstacles_2021
+from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
@@ -25,8 +26,11 @@ __all__ = [
     "Urdf",
     "camera_2021",
     "collisions",
+    "forest",
     "gate",
     "obstacles_2021",
     "ray",
     "render",
+    "room",
+    "track",
 ]

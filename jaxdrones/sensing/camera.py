@@ -119,3 +119,9 @@ class Camera:
 camera_2021 = Camera(levelled=True, aspect=1.0, principal_point=(0.5, -0.5), offset=None, near=None)
 """The camera of gym-pybullet-drones (2021), whose pixels are not square. Its renderer looks through the lower left
 corners of the pixels in place of their centers."""
+
+
+def check_camera(camera: Any) -> None:
+    """Raise unless `camera` is a camera."""
+    if not isinstance(camera, Camera):
+        raise ValueError(f"camera is {shown(camera)}; give a jaxdrones.Camera, for example Camera(resolution=(16, 12))")

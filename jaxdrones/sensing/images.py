@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_shape, shown
+from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
-from jaxdrones.sensing.camera import Camera
+from jaxdrones.sensing.camera import Camera, check_camera
 from jaxdrones.sensing.scene import Scene, check_scene
 from jaxdrones.sensing.shading import shade
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle
@@ -58,8 +58,7 @@ def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT
     Raises:
         ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
     """
-    if not isinstance(camera, Camera):
-        raise ValueError(f"camera is {shown(camera)}; give a jaxdrones.Camera, for example Camera(resolution=(16, 12))")
+    check_camera(camera)
     check_scene(scene)
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
     check_shape("params.mass", params.mass, (len(state.pos),), f"state.pos has {len(state.pos)} drones")
@@ -102,7 +101,7 @@ def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Image
         depths = depth(view, kinds, seen_kinds)
         still, solids, still_depths = jax.lax.stop_gradient((view, kinds, depths))
         index = visible(still, solids, seen_kinds)
-        rgb = shade(still, solids, seen_kinds, jnp.concatenate(colors), ground, index, still_depths)
+        rgb = shade(still, solids, jnp.concatenate(colors), ground, index, still_depths)
         return Images(rgb=rgb, depth=depths, segmentation=labels[index])
 
     return jax.vmap(one)(params, state, drones)

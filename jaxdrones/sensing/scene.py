@@ -11,13 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import (
     check_choice,
     check_finite,
-    check_positive,
     check_quaternion,
     check_shape,
     check_switch,
@@ -25,12 +24,12 @@ from jaxdrones.checks import (
     is_known,
     shown,
 )
-from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of
+from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of, touched_of
 from jaxdrones.sensing.files import File, Mesh, Urdf
+from jaxdrones.sensing.geometry import Number
 from jaxdrones.sensing.shapes import LENGTHS, Box, Capsule, Cylinder, Obstacle, Sphere, single
-from jaxdrones.vector import sin_cos
 
-__all__ = ["Box", "Capsule", "Cylinder", "Mesh", "Scene", "Sphere", "Urdf", "gate", "obstacles_2021"]
+__all__ = ["Box", "Capsule", "Cylinder", "Mesh", "Scene", "Sphere", "Urdf"]
 
 KINDS: dict[str, type[Obstacle]] = {"boxes": Box, "spheres": Sphere, "cylinders": Cylinder, "capsules": Capsule}
 """The fields of a scene that hold arrays."""
@@ -91,10 +90,21 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         return any(getattr(self, name) is not None for name in KINDS) or bool(self.meshes or self.urdfs)
 
     @property
+    def count(self) -> int:
+        """Number of obstacles; known before the program runs."""
+        stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
+        return sum(len(stack.pos) for stack in stacks) + len(self.meshes) + len(self.urdfs)
+
+    @property
     def obstacles(self) -> tuple[Any, ...]:
         """Single obstacles, in the order of their numbers."""
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
         return (*(single(stack, i) for stack in stacks for i in range(len(stack.pos))), *self.meshes, *self.urdfs)
+
+    @property
+    def numbered(self) -> dict[int, Any]:
+        """Single obstacles that are active, by their numbers; of a scene with values."""
+        return {i: solid for i, solid in enumerate(self.obstacles) if isinstance(solid, File) or solid.active}
 
     def shapes(self, dtype: DTypeLike) -> list[Obstacle]:
         """The kinds of obstacles in the scene, each with a leading axis over its obstacles, as arrays of this type."""
@@ -132,6 +142,23 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         """
         point = self._point(point)
         return nearest_of(self.shapes(point.dtype), self.ground, point)
+
+    def touched(self, points: Float[Array, "m 3"], within: Number) -> Surface:
+        """The nearest surface of an obstacle for each of some points of one body.
+
+        It is found faster than by `nearest`, as only obstacles within reach of the body are looked at.
+
+        Args:
+            points: m, world, near each other.
+            within: m; where no obstacle is nearer to a point, the surface is that of any obstacle.
+
+        Raises:
+            ValueError: there is no obstacle, a wrong shape, or a mesh or URDF file in the scene.
+        """
+        check_scene(self)
+        if not self.has_obstacles:
+            raise ValueError("the scene has no obstacles that could be touched; look at scene.has_obstacles before")
+        return touched_of(self.shapes(points.dtype), points, within)
 
     def contains(self, point: ArrayLike) -> Bool[Array, ""]:
         """Whether a point (3,) (m, world) is inside an obstacle or underground."""
@@ -192,54 +219,6 @@ def check_scene(scene: Any, files: bool = False) -> None:
             f"the scene has a {type(file).__name__}, which only Bullet reads; give {known}, for example "
             f"{builder} in its place, or ask the Bullet backend, for example step.contacts(params, state)"
         )
-
-
-def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Box:
-    """The four beams of a gate: a square opening in a square frame.
-
-    The default size is that of the gates of lsy_drone_racing: 0.4 m inside, 0.72 m outside. For many gates use
-    `jax.vmap`.
-
-    Args:
-        pos: (3,) center of the opening, m, world.
-        yaw: () heading in which the gate is crossed, rad.
-        opening: edge of the opening, m.
-        frame: width of the beams, m.
-        depth: of the beams along the heading, m.
-    """
-    for name, value in ("opening", opening), ("frame", frame), ("depth", depth):
-        check_positive(f"{name} of a gate", value, "m")
-    pos, yaw = jnp.asarray(pos, float), jnp.asarray(yaw, float)
-    check_shape("pos of a gate", pos, (3,), "one gate; for many use jax.vmap")
-    check_shape("yaw of a gate", yaw, (), "one gate; for many use jax.vmap")
-    outer, offset = opening + 2 * frame, (opening + frame) / 2
-    sin, cos = sin_cos(yaw)
-    half_sin, half_cos = sin_cos(yaw / 2)
-    left = jnp.array([0.0, 0.0, offset, -offset], pos.dtype)
-    up = jnp.array([offset, -offset, 0.0, 0.0], pos.dtype)
-    lying, standing = (depth, outer, frame), (depth, frame, opening)
-    return Box(
-        pos=pos[None] + jnp.stack([-sin * left, cos * left, up], axis=-1),
-        quat=jnp.tile(jnp.stack([0 * yaw, 0 * yaw, half_sin, half_cos])[None], (4, 1)),
-        size=jnp.array([lying, lying, standing, standing], pos.dtype),
-        color=jnp.tile(jnp.array([[0.9, 0.35, 0.1, 1.0]], pos.dtype), (4, 1)),
-    )
-
-
-def obstacles_2021() -> Scene:
-    """Counterparts of the default obstacles of gym-pybullet-drones (2021), at their places and of their size.
-
-    They are the walls of a courtyard around the origin, a duck at (-0.5, -0.5), a cube of 1 m at (-0.5, -2.5) and a
-    ball of 1 m at (0, 2), all made of boxes and spheres.
-    """
-    wall = (0.55, 0.3, 0.25, 1.0)
-    return Scene.of(
-        Box(pos=(6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
-        Box(pos=(-6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
-        Sphere(pos=(-0.5, -0.5, 0.05), radius=0.05, color=(1.0, 0.85, 0.0, 1.0)),
-        Box(pos=(-0.5, -2.5, 0.5), size=(1.0, 1.0, 1.0), color=(0.4, 0.6, 0.9, 1.0)),
-        Sphere(pos=(0.0, 2.0, 0.5), radius=0.5, color=(0.95, 0.95, 0.95, 1.0)),
-    )
 
 
 def _as_arrays(obstacles: Obstacle, dtype: DTypeLike) -> Obstacle:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxdrones.sensing.visibility import Solids, View, slopes
+from jaxdrones.sensing.visibility import Solids, View, normals
 from jaxdrones.vector import safe_sqrt
 
 _SUN = (0.48, 0.36, 0.8)  # unit vector towards the sun, world
@@ -18,7 +18,6 @@ _HORIZON, _ZENITH = (0.82, 0.88, 0.95), (0.35, 0.55, 0.85)
 def shade(
     view: View,
     solids: Solids,
-    active: list[Array],
     colors: Float[Array, "k 3"],
     ground: int | None,
     index: Int[Array, "h w"],
@@ -29,14 +28,12 @@ def shade(
     Args:
         view: rays.
         solids: what can be seen.
-        active: for each kind, which solids are there.
         colors: of every solid, 0 to 1.
         ground: index of the ground among the solids, if there is one.
         index: of the solid that each pixel sees.
         depth: of its surface, m.
     """
-    by_u, by_v = (slope / depth for slope in slopes(view, solids, active, index))
-    normal = jnp.stack([-1 - view.u * by_u - view.v * by_v, by_u, by_v])  # towards the camera, in its axes
+    normal = -normals(view, solids, index, depth)  # towards the camera
     facing = jnp.tensordot(view.axes @ jnp.asarray(_SUN, depth.dtype), normal, 1)
     cosine = facing / safe_sqrt(jnp.sum(normal**2, axis=0))
     light = _AMBIENT + (1 - _AMBIENT) * jnp.maximum(cosine, 0)

@@ -69,7 +69,7 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
         """Signed distance of a point from the surface, m; negative inside."""
 
     @abc.abstractmethod
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point: the gradient of the distance.
 
         Where several points of the surface are equally near, it is that of one of them.
@@ -81,6 +81,10 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
 
         The first one is larger than the last one where a line misses the obstacle.
         """
+
+    @abc.abstractmethod
+    def normal(self, point: Components) -> Components:
+        """Vectors of any length that point outward where a point is on the surface."""
 
     @abc.abstractmethod
     def nearest(self, point: Point) -> Point:
@@ -105,7 +109,7 @@ class Box(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return signed_distance(jnp.abs(point) - self.size / 2)
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         side = jnp.where(point < 0, -1, 1).astype(point.dtype)
         return side * outward(jnp.abs(point) - self.size / 2)
@@ -115,6 +119,12 @@ class Box(Obstacle, kw_only=True):
         faces = zip(origin, direction, components(self.size / 2), strict=True)
         first, last = zip(*(between_planes(*face) for face in faces), strict=True)
         return functools.reduce(jnp.maximum, first), functools.reduce(jnp.minimum, last)
+
+    def normal(self, point: Components) -> Components:
+        """The normal of the face that a point is on."""
+        x, y, z = (p / half for p, half in zip(point, components(self.size / 2), strict=True))
+        largest = functools.reduce(jnp.maximum, map(jnp.abs, (x, y, z)))
+        return [jnp.where(jnp.abs(p) == largest, p, 0) for p in (x, y, z)]
 
     def nearest(self, point: Point) -> Point:
         """The point of the box that is nearest to a point, m."""
@@ -144,13 +154,17 @@ class Sphere(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return length(point) - self.radius
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         return direction(point)
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are within the radius."""
         return within_radius(origin, direction, self.radius)
+
+    def normal(self, point: Components) -> Components:
+        """The direction from the center."""
+        return point
 
     def nearest(self, point: Point) -> Point:
         """The center."""
@@ -173,7 +187,7 @@ class Cylinder(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return signed_distance(self._beyond(point))
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         x, y = components(direction(point[:2]))
         _, _, z = components(point)
@@ -185,6 +199,12 @@ class Cylinder(Obstacle, kw_only=True):
         first, last = within_radius(origin[:2], direction[:2], self.radius)
         bottom, top = between_planes(origin[2], direction[2], self.height / 2)
         return jnp.maximum(first, bottom), jnp.minimum(last, top)
+
+    def normal(self, point: Components) -> Components:
+        """The direction from the axis, or along the axis at the ends."""
+        x, y, z = point
+        at_end = (z * self.radius) ** 2 > (x * x + y * y) * (self.height / 2) ** 2
+        return [jnp.where(at_end, 0, x), jnp.where(at_end, 0, y), jnp.where(at_end, z, 0)]
 
     def nearest(self, point: Point) -> Point:
         """The point of the cylinder that is nearest to a point, m."""
@@ -224,7 +244,7 @@ class Capsule(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return length(point - self.nearest(point)) - self.radius
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         return direction(point - self.nearest(point))
 
@@ -240,6 +260,11 @@ class Capsule(Obstacle, kw_only=True):
         first = (jnp.where(first <= last, first, jnp.inf) for first, last in parts)
         last = (jnp.where(first <= last, last, -jnp.inf) for first, last in parts)
         return functools.reduce(jnp.minimum, first), functools.reduce(jnp.maximum, last)
+
+    def normal(self, point: Components) -> Components:
+        """The direction from the nearest point of the axis."""
+        x, y, z = point
+        return [x, y, z - jnp.clip(z, -self.height / 2, self.height / 2)]
 
     def nearest(self, point: Point) -> Point:
         """The point of the axis that is nearest to a point, m."""

@@ -59,6 +59,15 @@ class Placed(flax.struct.PyTreeNode):
         direction = [x + u * y + v * z for x, y, z in zip(forward, left, up, strict=True)]
         return self.solid.interval(components(self.origin), direction)
 
+    def normal(self, u: Array, v: Array, depth: Array) -> tuple[Array, Array]:
+        """Components to the left and up, over that along the ray, of the normals where the rays of pixels hit."""
+        axes = [components(axis) for axis in components(self.axes)]
+        ray = [x + u * y + v * z for x, y, z in zip(*axes, strict=True)]
+        normal = self.solid.normal([o + depth * d for o, d in zip(components(self.origin), ray, strict=True)])
+        forward, left, up = (sum(n * x for n, x in zip(normal, axis, strict=True)) for axis in axes)
+        along = nonzero(forward + u * left + v * up)
+        return left / along, up / along
+
 
 class Ground(flax.struct.PyTreeNode):
     """All points below z = 0, as a solid."""
@@ -76,6 +85,11 @@ class Ground(flax.struct.PyTreeNode):
     def to_local(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """The same point."""
         return point
+
+    def normal(self, point: Components) -> Components:
+        """The vertical."""
+        zero = jnp.zeros_like(point[2])
+        return [zero, zero, jnp.ones_like(zero)]
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are underground."""
@@ -134,18 +148,25 @@ def visible(view: View, solids: Solids, active: list[Array]) -> Int[Array, "h w"
     return (_pass(nearer, nothing, view, solids, active) & mask).astype(jnp.int32)
 
 
-def slopes(view: View, solids: Solids, active: list[Array], index: Int[Array, "h w"]) -> tuple[Array, Array]:
-    """Derivatives (h, w) of the depth with respect to u and v on the surface that is visible; zero where none is."""
+def normals(view: View, solids: Solids, index: Int[Array, "h w"], depth: Float[Array, "h w"]) -> Float[Array, "3 h w"]:
+    """Normals of the visible surfaces in camera axes (forward, left, up), scaled to a product of 1 with (1, u, v).
 
-    def along(du: float, dv: float) -> Array:
-        def add(slope: Array, solid: Placed, active: Array, i: Array) -> Array:
-            moved = (jnp.full_like(view.u, du), jnp.full_like(view.v, dv))
-            _, derivative = jax.jvp(lambda u, v: solid.interval(u, v)[0], (view.u, view.v), moved)
-            return jnp.where(index == i, derivative, slope)
+    Args:
+        view: rays.
+        solids: what can be seen.
+        index: of the solid that each pixel sees.
+        depth: of its surface, m.
+    """
+    active = [jnp.ones(len(kind.pos), bool) for kind in solids]
 
-        return _pass(add, jnp.zeros_like(view.u + view.v), view, solids, active)
+    def component(k: int) -> Array:
+        def add(normal: Array, solid: Placed, active: Array, i: Array) -> Array:
+            return jnp.where(index == i, solid.normal(view.u, view.v, depth)[k], normal)
 
-    return along(1, 0), along(0, 1)
+        return _pass(add, jnp.zeros_like(depth), view, solids, active)
+
+    left, up = component(0), component(1)
+    return jnp.stack([1 - view.u * left - view.v * up, left, up])
 
 
 def _first_hit(view: View, solid: Placed, active: Array) -> Array:
@@ -179,8 +200,7 @@ def _depth_jvp(primals: tuple[View, Solids, list], tangents: tuple[View, Solids,
     free = (depths > view.near) & (depths < view.far)
     rate = jnp.zeros_like(depths)
     if not _is_zero((moved.eye, moved.axes)):
-        by_u, by_v = (slope / depths for slope in slopes(view, solids, active, index))
-        w = jnp.stack([1 + view.u * by_u + view.v * by_v, -by_u, -by_v])
+        w = normals(view, solids, index, depths)
         x = jnp.stack([jnp.ones_like(depths), depths, depths * view.u, depths * view.v])
         eye, axes = (_instantiated(t, p) for t, p in ((moved.eye, view.eye), (moved.axes, view.axes)))
         motion = view.axes @ jnp.concatenate([eye[None], axes]).T  # of the eye and of the rays, in camera axes

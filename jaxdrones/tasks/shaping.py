@@ -1,5 +1,6 @@
 """Reward terms that several tasks share; all are smooth, for policies that are optimised by gradient."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -8,6 +9,14 @@ from jaxdrones.tasks.task import Task, Term, World, square
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
 _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
+_MARGIN = 0.2  # m between a drone and an obstacle beside it
+_MARGIN_TIME = 0.1  # s: by how much the margin grows with the closing speed
+_SOFTNESS = 0.1  # m, over which the margin begins
+
+
+def length(v: Float[Array, "n 3"], small: float) -> Float[Array, " n"]:
+    """Length of every row; below `small` it is a parabola."""
+    return jnp.sqrt(square(v) + small**2) - small
 
 
 def alive(task: Task, world: World) -> Float[Array, " n"]:
@@ -17,18 +26,39 @@ def alive(task: Task, world: World) -> Float[Array, " n"]:
 
 def position(task: Task, world: World) -> Float[Array, " n"]:
     """Distance from the target, m; it levels off far away."""
-    distance = _length(world.drones.pos - task.target_now(world).pos, _NEAR)
+    distance = length(world.drones.pos - task.target_now(world).pos, _NEAR)
     return distance / (1 + distance / _FAR)
 
 
 def velocity(task: Task, world: World) -> Float[Array, " n"]:
     """Speed relative to the target, m/s."""
-    return _length(world.drones.vel - task.target_now(world).vel, _SLOW)
+    return length(world.drones.vel - task.target_now(world).vel, _SLOW)
 
 
 def body_rates(task: Task, world: World) -> Float[Array, " n"]:
     """Magnitude of the body rates, rad/s; quadratic where they are small."""
-    return _length(world.drones.omega, _SLOW_TURN)
+    return length(world.drones.omega, _SLOW_TURN)
+
+
+def gap(world: World) -> Float[Array, " n"]:
+    """Distance of every drone's center from the nearest obstacle or the ground, less its collision radius, m."""
+    return jax.vmap(world.scene.distance)(world.drones.pos) - world.params.collision_radius
+
+
+def clearance(task: Task, world: World) -> Float[Array, " n"]:
+    """How far each drone is inside the margin about obstacles and ground, smoothed, m; more if it approaches them.
+
+    The margin grows with the closing speed, and so does the term: as the cost of DiffPhysDrone ("Back to Newton's
+    laws", 2024), it asks for more distance the faster a drone flies at an obstacle, and for none beside it.
+    """
+
+    def of_drone(radius: Array, pos: Array, vel: Array) -> Array:
+        away, rate = jax.jvp(world.scene.distance, (pos,), (vel,))
+        closing = jnp.maximum(-rate, 0)
+        inside = _MARGIN + _MARGIN_TIME * closing - (away - radius)
+        return (1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS)
+
+    return jax.vmap(of_drone)(world.params.collision_radius, world.drones.pos, world.drones.vel)
 
 
 def action_change(task: Task, world: World) -> Float[Array, " n"]:
@@ -44,8 +74,3 @@ REACH_AND_STAY: dict[str, tuple[float, Term]] = {
     "action_change": (-0.02, action_change),
 }
 """Terms that bring a drone to a moving or resting target and keep it there with small body rates."""
-
-
-def _length(v: Float[Array, "n 3"], small: float) -> Float[Array, " n"]:
-    """Length of every row; below `small` it is a parabola."""
-    return jnp.sqrt(square(v) + small**2) - small

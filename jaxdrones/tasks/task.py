@@ -15,7 +15,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole, takes_scene
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import Camera, Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
 
@@ -43,8 +43,10 @@ class World(flax.struct.PyTreeNode):
     """Memories of the sensors, by name."""
     readings: dict[str, Any] = flax.struct.field(default_factory=dict)
     """The latest readings of the sensors by name: arrays, or pytrees of arrays."""
-    images: Any = None
-    """The latest pictures of the cameras, if there are any."""
+    images: dict[str, Array] = flax.struct.field(default_factory=dict)
+    """The images that the cameras show, by name: those of `jaxdrones.make(vision=...)`."""
+    poses: Any = None
+    """(k, n, 7) poses at the last k control steps, oldest first, from which images are still to come."""
 
     @property
     def time(self) -> Array:
@@ -121,6 +123,10 @@ class Task:
     """Obstacles and ground; or a function `(key) -> Scene` that draws them for every episode."""
     obstacles_terminate: bool = False
     """Whether the task's terminations find hits of its scene's obstacles, so that no force needs to do it."""
+    camera: Camera | None = None
+    """The camera of every drone, unless the environment says otherwise; `Camera()` when left out."""
+    vision: tuple[str, ...] = ()
+    """Names of the images that are observed, unless the environment says otherwise."""
     contact: tuple[str, ...] = ()
     """What drones touch on purpose, `ground` or `drones`: adds those forces to the explicit backend."""
     action: str = "rpm"

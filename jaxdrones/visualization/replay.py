@@ -8,7 +8,7 @@ import numpy as np
 from jaxdrones.engine import bullet
 from jaxdrones.flights.record import Record
 from jaxdrones.params import repeat
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import Scene, camera_2021
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 from jaxdrones.visualization import video
@@ -57,7 +57,7 @@ def save_cameras(record: Record, folder: Path, scene: Scene | None = None, fps: 
     with bullet.make_step(scene=scene) as step:
         params = _params(record)
         for frame, state in enumerate(_states(record, fps)):
-            for label, picture in zip(record.labels, step.camera(params, state)[0], strict=True):
+            for label, picture in zip(record.labels, step.camera(params, state, camera_2021).rgb, strict=True):
                 (folder / label).mkdir(parents=True, exist_ok=True)
                 imsave(folder / label / f"{frame:05d}.png", picture)
                 count += 1

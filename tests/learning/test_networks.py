@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
-from jaxdrones.learning.networks import CNN, Policy, centralized_input
+from jaxdrones.learning.layers import CNN, IMAGE_CHANNELS, convolutions
+from jaxdrones.learning.networks import Policy, centralized_input
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +56,37 @@ def test_a_layer_of_the_cnn_is_a_convolution():
     params = params | {"Dense_0": params["Dense_0"] | {"bias": jnp.ones(5)}}
     expected = nn.relu(found.reshape(2, -1) @ head["kernel"] + head["bias"][None])
     np.testing.assert_allclose(cnn.apply({"params": params}, picture), expected, rtol=1e-5, atol=1e-5)
+
+
+QUICK = [(17, 13), (5, 3)]
+SLOW = [pytest.param(*size, marks=pytest.mark.slow) for size in [(16, 12), (16, 9), (80, 60), (64, 48), (33, 1)]]
+
+
+@pytest.mark.parametrize(("width", "height"), QUICK + SLOW)
+def test_a_cnn_takes_images_of_any_resolution_and_sees_all_of_it(width, height):
+    channels, strides = convolutions(height, width)
+    cnn = CNN(channels, strides, features=64)
+    image = jax.random.uniform(jax.random.key(1), (height, width, 1))
+    params = cnn.init(jax.random.key(0), image)
+    gradient = jax.grad(lambda image: jnp.sum(cnn.apply(params, image)))(image)
+    assert jnp.mean(gradient != 0) > 0.9  # a pixel whose units are all off has none
+
+
+def test_an_image_that_is_no_multiple_of_the_strides_has_a_margin_of_nothing():
+    cnn = CNN(channels=(5,), strides=(4,), features=7)
+    image = jax.random.uniform(jax.random.key(1), (10, 15, 2))
+    framed = jnp.pad(image, ((1, 1), (0, 1), (0, 0)))
+    params = cnn.init(jax.random.key(0), framed)
+    np.testing.assert_array_equal(cnn.apply(params, image), cnn.apply(params, framed))
+
+
+def test_nearness_is_1_at_the_eye_and_0_where_nothing_is_with_finite_gradients_throughout():
+    depth = jnp.array([[-0.1, 0.0, 0.3, 1.0, 5.0, 10.0, 24.0, 1000.0, jnp.inf]])
+
+    def nearness(depth):
+        return IMAGE_CHANNELS["depth"](depth, 3.0)[..., 0]
+
+    seen, slope = nearness(depth)[0], jax.grad(lambda x: jnp.sum(nearness(x)))(depth)[0]
+    assert seen[0] == seen[1] == 1 and seen[-1] == 0 and jnp.all(jnp.diff(seen[1:]) < 0)
+    assert jnp.all(jnp.isfinite(slope)) and jnp.all(jnp.abs(slope) <= 1 / 3 + 1e-12) and jnp.all(slope[2:-1] < 0)
+    assert seen[5] - seen[-2] > 0.2  # what is 10 m away differs clearly from nothing

@@ -12,7 +12,8 @@ from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.envs import Action
 from jaxdrones.envs.vision import Vision
 from jaxdrones.learning import checkpoint, evaluate, ppo
-from jaxdrones.learning.networks import IMAGE_CHANNELS, Policy
+from jaxdrones.learning.layers import IMAGE_CHANNELS
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import map_state_vector
 from jaxdrones.sensing import Scene, Sphere
 from jaxdrones.tasks.starts import hovering
@@ -118,13 +119,7 @@ def test_what_a_policy_does_depends_on_what_it_sees(team, image):
 
 def test_colors_are_scaled_to_one_and_opacity_is_dropped():
     rgb = jnp.array([[[[0, 51, 255, 255]]]], jnp.uint8)
-    np.testing.assert_allclose(IMAGE_CHANNELS["rgb"](rgb)[0, 0, 0], [0, 0.2, 1], rtol=1e-6)
-
-
-def test_what_is_nearer_is_brighter_from_0_far_away_to_1_at_the_eye():
-    nearness = IMAGE_CHANNELS["depth"](jnp.array([[[0.0, 0.04, 1.0, 4.9, 5.0, 1000.0]]]))[0, 0, :, 0]
-    assert nearness[0] == 1 and jnp.all(nearness[-2:] == 0)
-    assert jnp.all(jnp.diff(nearness[:-1]) < 0)
+    np.testing.assert_allclose(IMAGE_CHANNELS["rgb"](rgb, 3.0)[0, 0, 0], [0, 0.2, 1], rtol=1e-6)
 
 
 @pytest.mark.needs("pybullet")

@@ -135,7 +135,7 @@ def bullets_distances(client) -> dict[str, list[float]]:
     return dict(
         ground=[distance(body, client.ground) for body in client.drones],
         drones=[distance(*client.drones)] * 2,
-        scene=[min(distance(body, obstacle) for obstacle in client.obstacles) for body in client.drones],
+        scene=[min(distance(body, obstacle) for obstacle in client.obstacles.values()) for body in client.drones],
     )
 
 

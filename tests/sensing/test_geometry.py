@@ -285,7 +285,7 @@ def test_distances_are_bullets_distances(client):
         ball = dict(bodyB=-1, collisionShapeB=client._point, collisionShapePositionB=point.tolist())
         pairs = (
             client.p.getClosestPoints(bodyA=body, distance=9.0, physicsClientId=client.id, **ball)
-            for body in (*client.obstacles, client.ground)
+            for body in (*client.obstacles.values(), client.ground)
         )
         return min(pair[8] for found in pairs for pair in found)
 

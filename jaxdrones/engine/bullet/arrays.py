@@ -40,13 +40,13 @@ def bodies_of(params: Params) -> jax.Array:
     return jnp.concatenate([jnp.stack(shape, axis=-1), rotor_pos, params.mass[:, None], params.inertia], axis=-1)
 
 
-def make_loads(physics: Physics, scene: Scene, dt: float) -> Callable[..., jax.Array]:
-    """Build `loads(layout, aux, flat_params, team)`, compiled: what acts on every drone, and what follows, (n, 13 + k).
+def make_loads(physics: Physics, dt: float) -> Callable[..., jax.Array]:
+    """Build `loads(layout, aux, flat_params, team, scene)`, compiled: what acts on drones, what follows, (n, 13 + k).
 
     The layouts are those of the parameters and of the states of models, which the arrays were packed by.
     """
 
-    def loads(layout: Layout, aux: Layout, flat_params: jax.Array, team: jax.Array) -> jax.Array:
+    def loads(layout: Layout, aux: Layout, flat_params: jax.Array, team: jax.Array, scene: Scene) -> jax.Array:
         params: Params = layout.unpack(flat_params)
         state = State(**{name: team[:, columns] for name, columns in COLUMNS.items()}, aux=aux.unpack(team[:, AUX]))
         omega = jax.vmap(rotation.rotate_inverse)(state.quat, state.omega)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_positive, check_whole
-from jaxdrones.engine.bullet.client import Client
+from jaxdrones.engine.bullet.client import GROUND, Client
+from jaxdrones.params import Params
+from jaxdrones.sensing import Camera, Scene
+from jaxdrones.state import State
 
 _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the body; those above name the link
 # TinyRenderer does not return when a vertex lies behind the plane of the eye by less than 1e-8 m, but not by 0. A pose
@@ -16,90 +21,91 @@ _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the bo
 _DIGITS = 6
 _AWAY = [0.0, 0.0, -1e4]  # m; where a drone waits while its own camera looks
 _AHEAD = 1000.0  # m; how far in front of the eye the camera's target is
+_TINY_PRINCIPAL_POINT = np.array([0.5, -0.5])  # pixels; TinyRenderer looks through the lower left corners of pixels
+_NOWHERE = -1
+_EYE, _FORWARD, _UP, _NEAR, _INSIDE = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10  # columns of a view
 
 
-@dataclasses.dataclass(frozen=True)
-class Camera:
-    """A pinhole camera. The default is that of gym-pybullet-drones (2021), but with square pixels."""
+@functools.partial(jax.jit, static_argnames="camera")
+def views(params: Params, state: State, scene: Scene, camera: Camera) -> Float[Array, "n 11"]:
+    """How the camera on every drone of a team looks: eye, forward and up (world), `near`, what the eye is inside of.
 
-    width: int = 64
-    """Pixels."""
-    height: int = 48
-    """Pixels."""
-    fov: float = 60.0
-    """Vertical field of view, degrees."""
-    aspect: float | None = None
-    """Width over height of the view; that of the picture when left out. With 1, as in gym-pybullet-drones, the
-    picture is squeezed."""
-    near: float | None = None
-    """Nearest visible distance, m; the drone's arm when left out."""
-    far: float = 1000.0
-    """Farthest visible distance, m."""
-    shadows: bool = False
-    """Whether bodies cast shadows, which takes twice the time."""
+    The last is a label of the segmentation, -1 for nothing. Meshes and URDF files do not count: they may be hollow.
+    """
+    n, dtype = len(state.pos), state.pos.dtype
 
-    def __post_init__(self):
-        check_whole("width", self.width)
-        check_whole("height", self.height)
-        check_positive("far", self.far, "m")
-        if not 0 < self.fov < 180:
-            raise ValueError(f"fov is {self.fov}; give an angle between 0 and 180 degrees")
+    def one(params: Params, state: State) -> Array:
+        eye, axes = camera.pose(params, state)
+        distances = [jax.vmap(lambda shape: shape.distance(shape.to_local(eye)))(kind) for kind in scene.shapes(dtype)]
+        solids = jnp.concatenate([eye[2:] if scene.ground else jnp.ones(1, dtype), *distances])
+        first = jnp.argmax(solids < 0)
+        label = jnp.where(solids[first] < 0, jnp.where(first == 0, GROUND, n + first), _NOWHERE)
+        return jnp.concatenate([eye, axes[0], axes[2], jnp.stack([camera.near_of(params), label.astype(dtype)])])
+
+    return jax.vmap(one)(params, state)
 
 
 def drone_pictures(
-    client: Client, body: np.ndarray, arms: np.ndarray, camera: Camera, raw_depth: bool
+    client: Client, body: np.ndarray, looks: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """RGBA, depth and segmentation that every drone of a team sees along its body x, each (n, height, width, ...).
+    """RGBA, depth and segmentation that the camera on every drone of a team sees, each (n, height, width, ...).
 
-    The team has been placed. The eye is one arm above the center of mass along world z, and up is world z. A drone does
-    not see itself.
+    The team has been placed. An eye inside a solid sees that solid, black, at `near`.
+
+    Args:
+        client: the world.
+        body: (n, 7+) poses of the drones.
+        looks: (n, 11) `views` of the team.
+        camera: on every drone.
     """
-    p = client.p
+    p, (width, height) = client.p, camera.resolution
     frames = []
-    forward = np.round(client.matrices(body[:, 3:7])[:, :, 0], _DIGITS)
-    for drone, row, arm, x in zip(client.drones, body, arms, forward, strict=True):
-        eye = np.round(row[:3] + np.array([0, 0, arm]), _DIGITS)
-        p.resetBasePositionAndOrientation(drone, _AWAY, [0, 0, 0, 1], physicsClientId=client.id)
-        _check_outside(client, drone, eye)
-        near = arm if camera.near is None else camera.near
-        frames.append(picture(client, eye, eye + _AHEAD * x, camera, near, raw_depth))
-        p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], physicsClientId=client.id)
+    for drone, row, look in zip(client.drones, body, looks, strict=True):
+        near, inside = float(look[_NEAR]), int(look[_INSIDE])
+        if inside != _NOWHERE:
+            black = np.tile(np.array([0, 0, 0, 255], np.uint8), (height, width, 1))
+            frames.append((black, np.full((height, width), near), np.full((height, width), inside, np.int32)))
+            continue
+        if not camera.sees_self:
+            p.resetBasePositionAndOrientation(drone, _AWAY, [0, 0, 0, 1], physicsClientId=client.id)
+        frames.append(_picture(client, *np.round([look[_EYE], look[_FORWARD], look[_UP]], _DIGITS), camera, near))
+        if not camera.sees_self:
+            p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], physicsClientId=client.id)
     rgb, depth, segmentation = zip(*frames, strict=True)
     return np.stack(rgb), np.stack(depth), np.stack(segmentation)
 
 
-def picture(
-    client: Client, eye: ArrayLike, target: ArrayLike, camera: Camera, near: float, raw_depth: bool = False
+def photo(client: Client, eye: ArrayLike, target: ArrayLike, camera: Camera) -> np.ndarray:
+    """One picture from `eye` towards `target` (m, world), upright: RGB (height, width, 3) uint8."""
+    eye, target = np.asarray(eye, float), np.asarray(target, float)
+    assert camera.near is not None
+    return _picture(client, eye, (target - eye) / _AHEAD, np.array([0, 0, 1.0]), camera, camera.near)[0][..., :3]
+
+
+def _picture(
+    client: Client, eye: np.ndarray, forward: np.ndarray, up: np.ndarray, camera: Camera, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One picture from `eye` towards `target` (m, world): RGBA uint8, depth float32 (m or raw), segmentation int32."""
-    p = client.p
-    view = p.computeViewMatrix(np.asarray(eye).tolist(), np.asarray(target).tolist(), [0, 0, 1])
-    aspect = camera.width / camera.height if camera.aspect is None else camera.aspect
-    projection = p.computeProjectionMatrixFOV(camera.fov, aspect, near, camera.far)
+    """RGBA uint8, depth (m), segmentation int32."""
+    p, (width, height), far = client.p, camera.resolution, camera.far
+    view = p.computeViewMatrix(eye.tolist(), (eye + _AHEAD * forward).tolist(), up.tolist())
     _, _, rgb, depth, bodies = p.getCameraImage(
-        camera.width,
-        camera.height,
+        width,
+        height,
         view,
-        projection,
-        shadow=camera.shadows,
+        p.computeProjectionMatrix(*_frustum(client, camera, near), near, far),
         renderer=client.renderer,
         physicsClientId=client.id,
     )
-    rgb = np.reshape(rgb, (camera.height, camera.width, 4)).astype(np.uint8)
-    depth = np.reshape(depth, (camera.height, camera.width)).astype(float)
-    if not raw_depth:
-        depth = camera.far * near / (camera.far - (camera.far - near) * depth)
+    depth = np.reshape(depth, (height, width)).astype(float)
+    depth = np.minimum(far * near / (far - (far - near) * depth), far)
     bodies = np.reshape(bodies, depth.shape)
-    return rgb, depth.astype(np.float32), client.labels[np.where(bodies < 0, -1, bodies & _BODY_MASK)]
+    labels = client.labels[np.where(bodies < 0, -1, bodies & _BODY_MASK)]
+    return np.reshape(rgb, (height, width, 4)).astype(np.uint8), depth, labels
 
 
-def _check_outside(client: Client, drone: int, eye: np.ndarray) -> None:
-    """Raise if the eye is inside a body, as the renderer would look through that body."""
-    inside = [f"obstacle {i}" for i in client.solids_at(eye.tolist())]
-    if client.ground is not None and eye[2] < 0:
-        inside.append("the ground")
-    if inside:
-        raise ValueError(
-            f"the camera of drone {client.drones.index(drone)} is inside {inside[0]}, at {eye.round(3).tolist()} m; "
-            "move the drone or the obstacle"
-        )
+def _frustum(client: Client, camera: Camera, near: float) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top edge of the image in the plane at `near`, m."""
+    own = _TINY_PRINCIPAL_POINT if client.renderer == client.p.ER_TINY_RENDERER else np.zeros(2)
+    half = near * np.array(camera.slopes)
+    x, y = 2 * half * (np.array(camera.principal_point) - own) / np.array(camera.resolution)
+    return -half[0] - x, half[0] - x, -half[1] + y, half[1] + y

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import dataclasses
 import importlib.util
 import os
 import sys
@@ -14,17 +15,14 @@ import numpy as np
 
 from jaxdrones.checks import check_choice
 from jaxdrones.engine.bullet.shapes import shape_of
-from jaxdrones.engine.step import is_traced
 from jaxdrones.sensing.files import Urdf
-from jaxdrones.sensing.scene import Scene, check_scene
-from jaxdrones.sensing.shapes import Obstacle
+from jaxdrones.sensing.scene import Scene
 
 BALLS, CYLINDER = "balls", "cylinder"
 TINY, EGL = "tiny", "egl"
 BACKGROUND, GROUND = -1, 0  # of a segmentation; drone i is 1 + i, obstacle i is 1 + number of drones + i
 _BALLS = 8
 _DISC = 0.1  # thickness of the disc as a share of the height of the collision cylinder
-_POINT = 1e-6  # m; radius of the ball that stands for a point, as Bullet knows no points
 _HUB, _FRONT, _BACK = [0.15, 0.15, 0.2, 1], [0.8, 0.15, 0.1, 1], [0.35, 0.35, 0.4, 1]  # colors
 _SHAPE, _INERTIAL = slice(0, 16), slice(16, 20)  # columns of a team
 _DRONE_FRICTION, _GROUND_FRICTION = 0.5, 1.0  # as in gym-pybullet-drones (2021)
@@ -50,21 +48,19 @@ def import_pybullet() -> ModuleType:
 
 
 class Client:
-    """A connection to Bullet with a scene and, once `set_team` was called, a team of drones."""
+    """A connection to Bullet, where there are a scene and a team once `set_scene` and `set_team` were called."""
 
-    def __init__(self, scene: Scene, dt: float, damping: float, collision: str, renderer: str, gui: bool):
+    def __init__(self, dt: float, damping: float, collision: str, renderer: str, gui: bool):
         check_choice("collision shape", collision, (BALLS, CYLINDER))
         check_choice("renderer", renderer, (TINY, EGL))
-        check_scene(scene, files=True)
-        if is_traced(scene):
-            raise ValueError(
-                "the scene is traced by jit, vmap or grad and has no values yet, but Bullet builds its world now; "
-                "make the step outside, of a scene of numbers, or take the explicit backend"
-            )
-        obstacles = jax.device_get(scene).obstacles
-        self.scene = scene
         self.p = import_pybullet()
         self.drones: list[int] = []
+        self.ground: int | None = None
+        self.obstacles: dict[int, int] = {}  # number of an obstacle -> body
+        self._placed: dict[int, _Placed] = {}  # by number
+        self._scene: Scene | None = None
+        self._structure = jax.tree.structure(None)
+        self._numbers = np.zeros(0)
         self._damping = float(np.float32(damping))  # Bullet's default of 0.04 is in single precision
         self._collision = collision
         self._team = np.empty((0, 20))
@@ -74,12 +70,6 @@ class Client:
         self._disconnect = weakref.finalize(self, _disconnect, self.p, self.id)
         self.p.setTimeStep(dt, physicsClientId=self.id)
         self.p.setGravity(0, 0, 0, physicsClientId=self.id)  # every drone's weight is part of its wrench
-        self.ground = self._add_ground() if scene.ground else None
-        self.obstacles = [self._add_obstacle(obstacle) for obstacle in obstacles]
-        self._solids = {
-            body for body, obstacle in zip(self.obstacles, obstacles, strict=True) if isinstance(obstacle, Obstacle)
-        }
-        self._point = self.p.createCollisionShape(self.p.GEOM_SPHERE, radius=_POINT, physicsClientId=self.id)
         self.renderer = self.p.ER_BULLET_HARDWARE_OPENGL if gui or renderer == EGL else self.p.ER_TINY_RENDERER
         if renderer == EGL:
             self._load_egl()
@@ -102,7 +92,44 @@ class Client:
         """Name of every body: `ground`, `drone i`, `obstacle i`; the order is that of segmentations."""
         ground = {} if self.ground is None else {self.ground: "ground"}
         drones = {body: f"drone {i}" for i, body in enumerate(self.drones)}
-        return ground | drones | {body: f"obstacle {i}" for i, body in enumerate(self.obstacles)}
+        return ground | drones | {body: f"obstacle {i}" for i, body in self.obstacles.items()}
+
+    def set_scene(self, scene: Scene) -> None:
+        """Let this scene, of NumPy arrays, stand around: obstacles of the same shape are moved, others built anew."""
+        if scene is self._scene:
+            return
+        leaves, structure = jax.tree.flatten(scene)
+        numbers = np.concatenate([np.zeros(0), *map(np.ravel, leaves)])
+        same = structure == self._structure and np.array_equal(numbers, self._numbers)
+        self._scene, self._structure, self._numbers = scene, structure, numbers
+        if same:
+            return
+        if scene.ground != (self.ground is not None):
+            if self.ground is None:
+                self.ground = self._add_ground()
+            else:
+                self.p.removeBody(self.ground, physicsClientId=self.id)
+                self.ground = None
+        obstacles = scene.numbered
+        for number in self.obstacles.keys() - obstacles.keys():
+            self._remove_obstacle(number)
+        for number, obstacle in obstacles.items():
+            self._place_obstacle(number, obstacle)
+        self.labels = self._labels()
+
+    def _place_obstacle(self, number: int, obstacle: Any) -> None:
+        new, old = _Placed.of(obstacle), self._placed.get(number)
+        if old is None or new.shape != old.shape:
+            if old is not None:
+                self._remove_obstacle(number)
+            self.obstacles[number] = self._add_obstacle(obstacle)
+        elif new.pose != old.pose:
+            self.p.resetBasePositionAndOrientation(self.obstacles[number], *new.pose, self.id)
+        self._placed[number] = new
+
+    def _remove_obstacle(self, number: int) -> None:
+        self.p.removeBody(self.obstacles.pop(number), physicsClientId=self.id)
+        del self._placed[number]
 
     def set_team(self, team: np.ndarray) -> None:
         """Give the drones these bodies.
@@ -131,9 +158,10 @@ class Client:
 
     def _labels(self) -> np.ndarray:
         """Bullet's body -> segmentation label; the last entry, at -1, is the background."""
-        labels = np.full(max([0, *self.drones, *self.obstacles]) + 2, BACKGROUND, np.int32)
+        labels = np.full(max([0, *self.drones, *self.obstacles.values()]) + 2, BACKGROUND, np.int32)
         labels[self.drones] = 1 + np.arange(len(self.drones))
-        labels[self.obstacles] = 1 + len(self.drones) + np.arange(len(self.obstacles))
+        for number, body in self.obstacles.items():
+            labels[body] = 1 + len(self.drones) + number
         if self.ground is not None:
             labels[self.ground] = GROUND
         return labels
@@ -170,26 +198,6 @@ class Client:
             vel, omega = p.getBaseVelocity(drone, client)
             after.append(pos + quat + vel + omega)
         return np.array(after)
-
-    def solids_at(self, point: list[float]) -> list[int]:
-        """Numbers of the obstacles that a point (m, world) is inside of.
-
-        Meshes and URDF files do not count: Bullet takes them for their convex hulls, which have free space in them.
-        """
-        near = self.p.getOverlappingObjects(point, point, physicsClientId=self.id) or ()
-        bodies = self._solids.intersection(body for body, _ in near)
-        return sorted(self.obstacles.index(body) for body in bodies if self._is_inside(body, point))
-
-    def _is_inside(self, body: int, point: list[float]) -> bool:
-        closest = self.p.getClosestPoints(
-            bodyA=body,
-            bodyB=-1,
-            distance=0.0,
-            collisionShapeB=self._point,
-            collisionShapePositionB=point,
-            physicsClientId=self.id,
-        )
-        return any(pair[8] < -_POINT for pair in closest)
 
     def _load_egl(self) -> None:
         spec = importlib.util.find_spec("eglRenderer")
@@ -264,6 +272,21 @@ class Client:
             shape["length"] = shape.pop("height")  # Bullet has two words for it
         visual = p.createVisualShape(**shape, rgbaColor=obstacle.color, physicsClientId=self.id)
         return p.createMultiBody(0, collision, visual, obstacle.pos, obstacle.quat, physicsClientId=self.id)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Placed:
+    """An obstacle of numbers in Bullet's world."""
+
+    shape: Any
+    """Everything but the pose; where that is equal, a body can be moved."""
+    pose: tuple[list[float], list[float]]
+    """Position (3,), m, and attitude (4,)."""
+
+    @classmethod
+    def of(cls, obstacle: Any) -> "_Placed":
+        fields = {name: np.asarray(x).tolist() for name, x in vars(obstacle).items() if name not in ("pos", "quat")}
+        return cls((type(obstacle), fields), (list(map(float, obstacle.pos)), list(map(float, obstacle.quat))))
 
 
 def _disconnect(p: ModuleType, client: int) -> None:

@@ -16,7 +16,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_number, check_params, check_positive, check_quaternion, check_whole
 from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors, obstacle_contact
 from jaxdrones.engine.bullet import arrays
-from jaxdrones.engine.bullet.camera import Camera, drone_pictures, picture
+from jaxdrones.engine.bullet.camera import drone_pictures, photo, views
 from jaxdrones.engine.bullet.client import BALLS, TINY, Client
 from jaxdrones.engine.bullet.contacts import Contact, contacts_of_last_step
 from jaxdrones.engine.neighbors import NeighborGrid
@@ -25,12 +25,14 @@ from jaxdrones.engine.step import HostStep, is_traced
 from jaxdrones.engine.team import Layout, check_team, pack
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.params import Params
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import Camera, Images, Scene
+from jaxdrones.sensing.camera import check_camera
+from jaxdrones.sensing.scene import check_scene
 from jaxdrones.state import State
 
-_PAPER_CAMERA = Camera()
-_FILM_CAMERA = Camera(width=640, height=480)
-_FILM_NEAR = 0.1  # m
+_BARE = Scene()
+_DEFAULT_CAMERA = Camera()
+_FILM_CAMERA = Camera(resolution=(640, 480), near=0.1)
 
 
 def make_step(
@@ -60,7 +62,7 @@ def make_step(
         team_effects: as for the explicit backend.
         models: as for the explicit backend; their states take explicit Euler steps of `dt`, as rotors do.
         neighbors: as for the explicit backend.
-        scene: ground and obstacles; a bare ground plane when left out.
+        scene: ground and obstacles; a bare ground plane when left out. It can be another one at every call.
         damping: Bullet's linear and angular damping, 1/s; that of gym-pybullet-drones is 0.04.
         collision: `balls`, a ring of balls on a disc, which rests and rebounds stably, or `cylinder`, the shape in
             gym-pybullet-drones.
@@ -87,21 +89,28 @@ def make_step(
                 "leave it out"
             )
     scene = Scene() if scene is None else scene
-    return BulletStep(Client(scene, dt, damping, collision, renderer, gui), physics, substeps, dt)
+    check_scene(scene, files=True)
+    if is_traced(scene):
+        raise ValueError(
+            "the scene is traced by jit, vmap or grad and has no values yet; make the step outside, of a scene of "
+            "numbers, and give the traced one to its calls"
+        )
+    client = Client(dt, damping, collision, renderer, gui)
+    return BulletStep(client, physics, substeps, dt, jax.device_get(scene))
 
 
 class BulletStep(HostStep):
     """`step(params, state, rpm) -> state`. The same input gives the same output whatever was called between."""
 
-    def __init__(self, client: Client, physics: Physics, substeps: int, dt: float):
-        self.client, self.physics, self._substeps, self._dt = client, physics, substeps, dt
-        self._loads = arrays.make_loads(physics, client.scene, dt)
+    def __init__(self, client: Client, physics: Physics, substeps: int, dt: float, scene: Scene):
+        self.client, self.physics, self._substeps, self._dt, self._scene = client, physics, substeps, dt, scene
+        client.set_scene(scene)
+        self._loads = arrays.make_loads(physics, dt)
         # What the last call with values was checked for and what was made of it, kept as long as it stays the same:
         self._params: Params | None = None
         self._shapes: list[tuple[int, ...]] = []
         self._layout: Layout
         self._flat_params: jax.Array  # one array is handed over faster than twenty
-        self._arms: np.ndarray
 
     def __repr__(self) -> str:
         return f"<step: Bullet at {1 / (self._dt * self._substeps):.4g} Hz x {self._substeps}>"
@@ -122,8 +131,7 @@ class BulletStep(HostStep):
         Given values it returns NumPy arrays; under `jit` and `vmap` it goes through a callback.
 
         Raises:
-            ValueError: a wrong shape, a closed client, a scene, or a number that is not finite (where it can be looked
-                at).
+            ValueError: a wrong shape, a closed client, or a number that is not finite (where it can be looked at).
             TypeError: a gradient is asked for.
         """
         return self._flown(params, state, rpm, scene, self._substeps)
@@ -136,67 +144,97 @@ class BulletStep(HostStep):
         return jax.tree.map(lambda b, a: (b - a) / self._dt, after, state)
 
     def _flown(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None, substeps: int) -> State:
-        if scene is not None and scene is not self.client.scene:
-            raise ValueError("a scene is given to a call of a Bullet step; give it to make_step instead")
-        if is_traced((state, rpm)) or (params is not self._params and is_traced(params)):
+        scene = self._given(scene)
+        if is_traced((state, rpm, scene)) or (params is not self._params and is_traced(params)):
             self.client.check_open()
             check_team(params, state, rpm)
-            return _refuse_gradients(functools.partial(self._traced, substeps))(params, state, rpm)
+            return _refuse_gradients(functools.partial(self._traced, substeps))(params, state, rpm, scene)
+        acting = self._stand(scene)
         team = self._pack(params, state, rpm)
         aux = Layout.of(state.aux)
         for _ in range(substeps):
-            loads = self._loads_on(team, aux)
+            loads = self._loads_on(team, aux, acting)
             team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
             team[:, arrays.BODY] = self.client.advance(team, loads)
             team[:, arrays.RPM], team[:, arrays.AUX] = loads[:, arrays.NEXT_RPM], loads[:, arrays.NEXT_AUX]
         return self._unpack(team, state)
 
-    def contacts(self, params: Params, state: State) -> list[Contact]:
+    def contacts(self, params: Params, state: State, scene: Scene | None = None) -> list[Contact]:
         """Who touches whom in the physics step that follows `state` with the rotors held at `state.rpm`.
 
         Raises:
             ValueError: a wrong shape, a closed client, or a state that is not finite.
         """
+        acting = self._stand(self._given(scene))
         team = self._pack(params, state, state.rpm)
-        loads = self._loads_on(team, Layout.of(state.aux))
+        loads = self._loads_on(team, Layout.of(state.aux), acting)
         team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
         self.client.advance(team, loads)
         return contacts_of_last_step(self.client, self._dt)
 
     def camera(
-        self, params: Params, state: State, camera: Camera = _PAPER_CAMERA, raw_depth: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What every drone sees along its body x.
+        self, params: Params, state: State, camera: Camera = _DEFAULT_CAMERA, scene: Scene | None = None
+    ) -> Images:
+        """What the camera on every drone of a team sees, as `jaxdrones.render` returns it; Bullet renders it.
 
-        Returns:
-            RGBA (n, height, width, 4) uint8; depth along the viewing axis (n, height, width) float32, m, or Bullet's
-            buffer in 0..1 if `raw_depth`; segmentation (n, height, width) int32: -1 nothing, 0 ground, 1 + i drone i,
-            1 + n + i obstacle i. A drone does not see itself.
+        An eye inside an obstacle or underground sees that, black, at `near`.
 
         Raises:
-            ValueError: a wrong shape, a closed client, a state that is not finite, or an eye inside a body.
+            ValueError: a wrong shape, a closed client, a state that is not finite, or something else than a camera.
         """
-        if is_traced((params, state)):
+        check_camera(camera)
+        scene = self._given(scene)
+        if is_traced((params, state, scene)):
             self.client.check_open()
             check_team(params, state, state.rpm)
-            return self._traced_camera(params, state, camera, raw_depth)
+            return self._traced_camera(params, state, camera, scene)
+        self._stand(scene)
         team = self._place(params, state)
-        return drone_pictures(self.client, team, self._arms, camera, raw_depth)
+        looks = np.asarray(views(params, state, scene, camera), float)
+        rgb, depth, segmentation = drone_pictures(self.client, team, looks, camera)
+        return Images(rgb, depth.astype(self._flat_params.dtype), segmentation)
 
     def photo(
-        self, params: Params, state: State, eye: npt.ArrayLike, target: npt.ArrayLike, camera: Camera = _FILM_CAMERA
+        self,
+        params: Params,
+        state: State,
+        eye: npt.ArrayLike,
+        target: npt.ArrayLike,
+        camera: Camera = _FILM_CAMERA,
+        scene: Scene | None = None,
     ) -> np.ndarray:
-        """A picture of the team from `eye` towards `target` (3,) (m, world): RGB (height, width, 3) uint8."""
+        """A picture of the team from `eye` towards `target` (3,) (m, world), upright: RGB (height, width, 3) uint8.
+
+        Of the camera the lens matters, not where it is mounted.
+        """
+        self._stand(self._given(scene))
         self._place(params, state)
-        return picture(self.client, eye, target, camera, _FILM_NEAR)[0][..., :3]
+        return photo(self.client, eye, target, camera)
+
+    def _given(self, scene: Scene | None) -> Scene:
+        """The scene of a call, that of `make_step` where none is given."""
+        if scene is None:
+            return self._scene
+        check_scene(scene, files=True)
+        return scene
+
+    def _stand(self, scene: Scene) -> Scene:
+        """Let a scene with values stand around; returns what wrenches depend on of it."""
+        self.client.check_open()
+        self.client.set_scene(scene if scene is self._scene else jax.device_get(scene))
+        return self._acting(scene)
+
+    def _acting(self, scene: Scene) -> Scene:
+        return scene if self.physics.takes_scene else _BARE
 
     def _place(self, params: Params, state: State) -> np.ndarray:
         team = self._pack(params, state, state.rpm)
         self.client.place(team)
         return team
 
-    def _loads_on(self, team: np.ndarray, aux: Layout) -> np.ndarray:
-        return np.asarray(self._loads(self._layout, aux, self._flat_params, team.astype(self._flat_params.dtype)))
+    def _loads_on(self, team: np.ndarray, aux: Layout, scene: Scene) -> np.ndarray:
+        team = team.astype(self._flat_params.dtype)
+        return np.asarray(self._loads(self._layout, aux, self._flat_params, team, scene))
 
     def _pack(self, params: Params, state: State, rpm: ArrayLike) -> np.ndarray:
         """Check a call with values and make one array of it; the bodies are those of the team from here on."""
@@ -208,7 +246,6 @@ class BulletStep(HostStep):
             check_params(params)
             self._layout, self._flat_params = Layout.of(params), pack(params, n)
             self.client.set_team(np.asarray(arrays.bodies_of(params), float))
-            self._arms = np.asarray(params.arm, float)
             self._params, self._shapes = params, shapes
         team = np.empty((n, arrays.COMMAND.stop + Layout.of(state.aux).width))
         for name, columns in arrays.COLUMNS.items():
@@ -230,21 +267,21 @@ class BulletStep(HostStep):
         fields: dict[str, Any] = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
         return state.replace(**fields, aux=Layout.of(state.aux).unpack(team[:, arrays.AUX]))
 
-    def _traced(self, substeps: int, params: Params, state: State, rpm: jax.Array) -> State:
+    def _traced(self, substeps: int, params: Params, state: State, rpm: jax.Array, scene: Scene) -> State:
         """The same in a compiled program, which computes the wrenches itself and calls back for every physics step."""
         bodies, flat_params = arrays.bodies_of(params), pack(params, len(state.pos))
         layout, aux = Layout.of(params), Layout.of(state.aux)
-        team = arrays.one_array(state, rpm)
+        team, acting, handed = arrays.one_array(state, rpm), self._acting(scene), self._handed(scene)
 
-        def advance(bodies, team, loads):
-            self._become(bodies)
+        def advance(bodies, scene, team, loads):
+            self._become(bodies, scene)
             return self.client.advance(np.asarray(team, float), np.asarray(loads, float)).astype(team.dtype)
 
         def substep(team, _):
-            loads = self._loads(layout, aux, flat_params, team)
+            loads = self._loads(layout, aux, flat_params, team, acting)
             team = team.at[:, arrays.OMEGA].set(loads[:, arrays.START_OMEGA])
             after = jax.ShapeDtypeStruct((len(team), arrays.BODY.stop), team.dtype)
-            body = jax.pure_callback(advance, after, bodies, team, loads, vmap_method="sequential")
+            body = jax.pure_callback(advance, after, bodies, handed, team, loads, vmap_method="sequential")
             return jnp.concatenate(
                 [body, loads[:, arrays.NEXT_RPM], team[:, arrays.COMMAND], loads[:, arrays.NEXT_AUX]], axis=-1
             ), None
@@ -254,26 +291,33 @@ class BulletStep(HostStep):
         state = state.replace(**fields, aux=aux.unpack(team[:, arrays.AUX]))
         return state.replace(omega=jax.vmap(rotation.rotate_inverse)(state.quat, state.omega))
 
-    def _traced_camera(self, params: Params, state: State, camera: Camera, raw_depth: bool) -> Any:
+    def _traced_camera(self, params: Params, state: State, camera: Camera, scene: Scene) -> Images:
         """The same in a compiled program; the callback itself computes nothing with JAX, which would be slow."""
-        n, size = len(state.pos), (camera.height, camera.width)
-        kinds = (((*size, 4), np.uint8), (size, np.float32), (size, np.int32))
+        n, size = len(state.pos), camera.resolution[::-1]
+        kinds = (((*size, 4), np.uint8), (size, state.pos.dtype), (size, np.int32))
         pictures = tuple(jax.ShapeDtypeStruct((n, *shape), dtype) for shape, dtype in kinds)
 
-        def take(bodies, arms, team):
-            self._become(bodies)
+        def take(bodies, scene, team, looks):
+            self._become(bodies, scene)
             team = np.asarray(team, float)
             check_finite("state", team)
             self.client.place(team)
-            return drone_pictures(self.client, team, np.asarray(arms, float), camera, raw_depth)
+            rgb, depth, segmentation = drone_pictures(self.client, team, np.asarray(looks, float), camera)
+            return rgb, depth.astype(pictures[1].dtype), segmentation
 
-        team = arrays.one_array(state, state.rpm)
-        return jax.pure_callback(take, pictures, arrays.bodies_of(params), params.arm, team, vmap_method="sequential")
+        given = arrays.bodies_of(params), self._handed(scene), arrays.one_array(state, state.rpm)
+        looks = views(params, state, scene, camera)
+        return Images(*jax.pure_callback(take, pictures, *given, looks, vmap_method="sequential"))
 
-    def _become(self, bodies: jax.Array) -> None:
-        """The bodies of the team that a compiled program calls back with; no longer those of a call with values."""
+    def _handed(self, scene: Scene) -> Scene | None:
+        """What a compiled program hands over of a scene; nothing of that of `make_step`."""
+        return None if scene is self._scene else scene
+
+    def _become(self, bodies: jax.Array, scene: Scene | None) -> None:
+        """The world that a compiled program calls back with; its team is no longer that of a call with values."""
         self.client.check_open()
         self._params = None
+        self.client.set_scene(self._scene if scene is None else jax.tree.map(np.asarray, scene))
         self.client.set_team(np.asarray(bodies, float))
 
 

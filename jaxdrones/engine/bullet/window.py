@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxdrones.engine.bullet.step import BulletStep
 from jaxdrones.engine.step import HostStep
 from jaxdrones.params import Params
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import Camera, Images, Scene
 from jaxdrones.state import State
 
 _AXES_HZ = 24  # how often the body axes are drawn, per simulated second
@@ -50,6 +50,10 @@ class Window(HostStep):
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """The time derivative, as of the Bullet step."""
         return self._step.rate(params, state, rpm, scene)
+
+    def camera(self, params: Params, state: State, camera: Camera, scene: Scene | None = None) -> Images:
+        """What the camera on every drone sees, as of the Bullet step."""
+        return self._step.camera(params, state, camera, scene)
 
     def close(self) -> None:
         """End the connection to Bullet, which closes the window."""

@@ -73,8 +73,7 @@ def test_an_effect_sees_the_scene_of_either_backend():
     assert explicit.vel[0, 2] > 0.01 and abs(float(explicit.vel[1, 2])) < 1e-12
     with bullet.make_step((fan,), scene=scene) as step:
         assert_close(step(TEAM, HIGH, HOVER), explicit, 1e-9)
-        with pytest.raises(ValueError, match="a scene is given to a call of a Bullet step; give it to make_step"):
-            step(TEAM, HIGH, HOVER, Scene())
+        assert_close(step(TEAM, HIGH, HOVER, Scene()), jd.make_step()(TEAM, HIGH, HOVER), 1e-9)
 
 
 def test_obstacles_that_nothing_honors_are_refused_by_the_explicit_backend():

@@ -1,0 +1,300 @@
+"""Scenes to fly in: forests, rooms, tracks of gates, the obstacles of gym-pybullet-drones (2021).
+
+What is random is drawn from a key and has arrays of the same shapes for every key, so that one compiled program serves
+any number of worlds with a scene each.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_finite, check_key, check_number, check_positive, check_shape, check_whole, shown
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle, Sphere
+from jaxdrones.vector import sin_cos
+
+Kind = TypeVar("Kind", bound=Obstacle)
+
+_WOOD, _GREEN = (0.4, 0.28, 0.18, 1.0), (0.2, 0.5, 0.2, 1.0)  # red, green, blue, opacity
+_STONE, _WALL = (0.5, 0.5, 0.55, 1.0), (0.8, 0.8, 0.75, 1.0)
+_SPHERE_RADIUS = (0.2, 0.5)  # m
+_BOX_EDGE = (0.3, 1.0)  # m
+_MAX_TREES = 10_000
+_UNDERGROUND = -1000.0  # m
+_HEIGHT_OF_FLIGHT = 1.5  # m; height of the points that are kept free unless others are given
+
+
+def forest(
+    key: jax.Array,
+    *,
+    density: float | tuple[float, float] = 0.15,
+    length: float = 20.0,
+    width: float = 10.0,
+    radius: tuple[float, float] = (0.1, 0.3),
+    height: float = 5.0,
+    tilt: float = 0.0,
+    spheres: int = 0,
+    boxes: int = 0,
+    keep_free: ArrayLike | None = None,
+    clearance: float = 1.5,
+) -> Scene:
+    """A forest: trees at random places of a strip from x = 0 to `length`, and from y = -`width`/2 to `width`/2.
+
+    Places are uniform and independent, as in the forests of Karaman and Frazzoli (2012); trees may overlap. Those that
+    are too close to a point that is to be kept free are left out.
+
+    Args:
+        key: random key; the same key gives the same forest.
+        density: trees per m^2, before some are left out; of two numbers, it is U(first, second) in every forest.
+        length: of the strip, m.
+        width: of the strip, m.
+        radius: of the trunks, U(first, second), m.
+        height: of the trunks, m.
+        tilt: largest tilt of a trunk, U(0, tilt) about a random level axis, degrees; below 90.
+        spheres: number of balls, of radius U(0.2, 0.5) m, anywhere up to `height`.
+        boxes: number of boxes, with edges of U(0.3, 1) m and any heading, anywhere up to `height`.
+        keep_free: (k, 3) points that are at least `clearance` from every obstacle, m; the two ends of the strip's
+            center line, at a height of 1.5 m, when left out.
+        clearance: distance of obstacles from the points that are kept free, m.
+
+    Raises:
+        ValueError: no random key, or a number out of range.
+    """
+    check_key("key", key)
+    low, high = _range("density of a forest", density, "trees/m^2", at_least=0)
+    for name, value in ("length", length), ("width", width), ("height", height):
+        check_positive(f"{name} of a forest", value, "m")
+    check_number("tilt of a forest", tilt, "degrees", at_least=0, below=90)
+    check_whole("number of spheres of a forest", spheres, minimum=0)
+    check_whole("number of boxes of a forest", boxes, minimum=0)
+    check_number("clearance of a forest", clearance, "m", at_least=0)
+    trees = round(high * length * width)
+    check_number("density x length x width of a forest", high * length * width, "trees", at_most=_MAX_TREES)
+    count_key, tree_key, sphere_key, box_key = jax.random.split(key, 4)
+    free = _points([(0, 0, _HEIGHT_OF_FLIGHT), (length, 0, _HEIGHT_OF_FLIGHT)] if keep_free is None else keep_free)
+    corners = jnp.array([[0, -width / 2, 0], [length, width / 2, height]])
+
+    count = jnp.round(jax.random.uniform(count_key, minval=low, maxval=high) * length * width)
+    trunks = _trunks(tree_key, trees, corners, _range("radius of a forest", radius, "m", above=0), tilt)
+    alive = jnp.arange(trees) < count
+    others = _spheres(sphere_key, spheres, corners), _boxes(box_key, boxes, corners)
+    return Scene.of(
+        _kept(trunks, alive & _is_free(trunks, free, clearance)),
+        *(_kept(solids, _is_free(solids, free, clearance)) for solids in others),
+    )
+
+
+def room(
+    size: tuple[float, float, float] = (8.0, 8.0, 3.0),
+    *,
+    key: jax.Array | None = None,
+    pillars: int = 0,
+    spheres: int = 0,
+    boxes: int = 0,
+    radius: tuple[float, float] = (0.15, 0.3),
+    keep_free: ArrayLike = (),
+    clearance: float = 0.5,
+    wall: float = 0.2,
+) -> Scene:
+    """A room about the origin: four walls and a ceiling, with pillars and clutter at random places.
+
+    What is too close to a point that is to be kept free is left out.
+
+    Args:
+        size: inner length, width and height, m.
+        key: random key of pillars and clutter; needed only for these. The same key gives the same room.
+        pillars: number of pillars from floor to ceiling.
+        spheres: number of balls, of radius U(0.2, 0.5) m.
+        boxes: number of boxes, with edges of U(0.3, 1) m and any heading.
+        radius: of the pillars, U(first, second), m.
+        keep_free: (k, 3) points that are at least `clearance` from pillars and clutter, m.
+        clearance: distance of pillars and clutter from the points that are kept free, m.
+        wall: thickness of walls and ceiling, m.
+
+    Raises:
+        ValueError: a number out of range, or pillars or clutter without a key.
+    """
+    check_shape("size of a room", size, (3,), "length, width and height, m")
+    for edge in size:
+        check_positive("an edge of a room", edge, "m")
+    check_positive("wall of a room", wall, "m")
+    check_number("clearance of a room", clearance, "m", at_least=0)
+    for name, number in ("pillars", pillars), ("spheres", spheres), ("boxes", boxes):
+        check_whole(f"number of {name} of a room", number, minimum=0)
+    x, y, z = size
+    shell = Box(
+        pos=jnp.array(
+            [[s * (x + wall) / 2, 0, z / 2] for s in (1, -1)]
+            + [[0, s * (y + wall) / 2, z / 2] for s in (1, -1)]
+            + [[0, 0, z + wall / 2]]
+        ),
+        size=jnp.array([[wall, y + 2 * wall, z]] * 2 + [[x, wall, z]] * 2 + [[x + 2 * wall, y + 2 * wall, wall]]),
+        color=_WALL,
+    )
+    if not pillars + spheres + boxes:
+        return Scene.of(shell)
+    check_key("key of a room with pillars or clutter", key)
+    pillar_key, sphere_key, box_key = jax.random.split(key, 3)
+    free, corners = _points(keep_free), jnp.array([[-x / 2, -y / 2, 0], [x / 2, y / 2, z]])
+    inside = (
+        _trunks(pillar_key, pillars, corners, _range("radius of a room", radius, "m", above=0)),
+        _spheres(sphere_key, spheres, corners),
+        _boxes(box_key, boxes, corners),
+    )
+    return Scene.of(shell, *(_kept(solids, _is_free(solids, free, clearance)) for solids in inside))
+
+
+def track(gates: ArrayLike, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:
+    """Gates at given poses, made of four boxes each, in the order of the poses.
+
+    Args:
+        gates: (k, 4) x, y, z of the center of the opening (m) and heading in which it is crossed (rad).
+        opening: edge of the openings, m.
+        frame: width of the beams, m.
+        depth: of the beams along the heading, m.
+    """
+    gates = jnp.asarray(gates, float)
+    check_shape("gates of a track", gates, ("k", 4), "x, y, z (m) and heading (rad) of every gate")
+    return Scene.of(jax.vmap(lambda pose: gate(pose[:3], pose[3], opening, frame, depth))(gates))
+
+
+def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Box:
+    """The four beams of a gate: a square opening in a square frame.
+
+    The default size is that of the gates of lsy_drone_racing: 0.4 m inside, 0.72 m outside. For many gates use
+    `jax.vmap`.
+
+    Args:
+        pos: (3,) center of the opening, m, world.
+        yaw: () heading in which the gate is crossed, rad.
+        opening: edge of the opening, m.
+        frame: width of the beams, m.
+        depth: of the beams along the heading, m.
+    """
+    for name, value in ("opening", opening), ("frame", frame), ("depth", depth):
+        check_positive(f"{name} of a gate", value, "m")
+    pos, yaw = jnp.asarray(pos, float), jnp.asarray(yaw, float)
+    check_shape("pos of a gate", pos, (3,), "one gate; for many use jax.vmap")
+    check_shape("yaw of a gate", yaw, (), "one gate; for many use jax.vmap")
+    outer, offset = opening + 2 * frame, (opening + frame) / 2
+    sin, cos = sin_cos(yaw)
+    half_sin, half_cos = sin_cos(yaw / 2)
+    left = jnp.array([0.0, 0.0, offset, -offset], pos.dtype)
+    up = jnp.array([offset, -offset, 0.0, 0.0], pos.dtype)
+    lying, standing = (depth, outer, frame), (depth, frame, opening)
+    return Box(
+        pos=pos[None] + jnp.stack([-sin * left, cos * left, up], axis=-1),
+        quat=jnp.tile(jnp.stack([0 * yaw, 0 * yaw, half_sin, half_cos])[None], (4, 1)),
+        size=jnp.array([lying, lying, standing, standing], pos.dtype),
+        color=jnp.tile(jnp.array([[0.9, 0.35, 0.1, 1.0]], pos.dtype), (4, 1)),
+    )
+
+
+def obstacles_2021() -> Scene:
+    """Counterparts of the default obstacles of gym-pybullet-drones (2021), at their places and of their size.
+
+    They are the walls of a courtyard around the origin, a duck at (-0.5, -0.5), a cube of 1 m at (-0.5, -2.5) and a
+    ball of 1 m at (0, 2), all made of boxes and spheres.
+    """
+    wall = (0.55, 0.3, 0.25, 1.0)
+    return Scene.of(
+        Box(pos=(6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
+        Box(pos=(-6.0, 0.0, 1.0), size=(0.3, 12.0, 2.0), color=wall),
+        Sphere(pos=(-0.5, -0.5, 0.05), radius=0.05, color=(1.0, 0.85, 0.0, 1.0)),
+        Box(pos=(-0.5, -2.5, 0.5), size=(1.0, 1.0, 1.0), color=(0.4, 0.6, 0.9, 1.0)),
+        Sphere(pos=(0.0, 2.0, 0.5), radius=0.5, color=(0.95, 0.95, 0.95, 1.0)),
+    )
+
+
+def _trunks(
+    key: jax.Array, count: int, corners: Float[Array, "2 3"], radius: tuple[float, float], tilt: float = 0.0
+) -> Cylinder:
+    """Cylinders at random places between two corners, which reach from the ground to the height of the second one."""
+    place_key, radius_key, tilt_key, axis_key = jax.random.split(key, 4)
+    height = corners[1, 2]
+    foot = _places(place_key, count, corners) * jnp.array([[1, 1, 0]])
+    sin, cos = sin_cos(jax.random.uniform(axis_key, (count,), maxval=2 * jnp.pi))
+    angle = jnp.radians(jax.random.uniform(tilt_key, (count, 1), maxval=tilt))
+    quat = jax.vmap(rotation.exp)(angle * jnp.stack([cos, sin, 0 * sin], axis=-1))
+    return Cylinder(
+        pos=foot + height / 2 * jax.vmap(rotation.z_axis)(quat),
+        quat=quat,
+        radius=jax.random.uniform(radius_key, (count,), minval=radius[0], maxval=radius[1]),
+        height=jnp.full(count, height),
+        color=jnp.tile(jnp.array([_WOOD]), (count, 1)),
+    )
+
+
+def _spheres(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Sphere:
+    place_key, radius_key = jax.random.split(key)
+    pos = _places(place_key, count, corners)
+    low, high = _SPHERE_RADIUS
+    return Sphere(
+        pos=pos,
+        quat=_level(jnp.zeros(count)),
+        radius=jax.random.uniform(radius_key, (count,), minval=low, maxval=high),
+        color=jnp.tile(jnp.array([_GREEN]), (count, 1)),
+    )
+
+
+def _boxes(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Box:
+    place_key, size_key, yaw_key = jax.random.split(key, 3)
+    low, high = _BOX_EDGE
+    return Box(
+        pos=_places(place_key, count, corners),
+        quat=_level(jax.random.uniform(yaw_key, (count,), maxval=2 * jnp.pi)),
+        size=jax.random.uniform(size_key, (count, 3), minval=low, maxval=high),
+        color=jnp.tile(jnp.array([_STONE]), (count, 1)),
+    )
+
+
+def _places(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Float[Array, "k 3"]:
+    return jax.random.uniform(key, (count, 3), minval=corners[:1], maxval=corners[1:])
+
+
+def _level(yaw: Float[Array, " k"]) -> Float[Array, "k 4"]:
+    """Quaternions of headings, rad."""
+    sin, cos = sin_cos(yaw / 2)
+    return jnp.stack([0 * sin, 0 * sin, sin, cos], axis=-1)
+
+
+def _points(points: ArrayLike) -> Float[Array, "k 3"]:
+    array = jnp.asarray(points, float)
+    array = array.reshape(0, 3) if array.size == 0 else array
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"keep_free has shape {array.shape}; give points (k, 3), m")
+    check_finite("keep_free", array)
+    return array
+
+
+def _is_free(solids: Obstacle, points: Float[Array, "k 3"], clearance: float) -> Bool[Array, " n"]:
+    """Whether each obstacle of a kind is far enough from all points."""
+
+    def gap(solid: Obstacle, point: Array) -> Array:
+        return solid.distance(solid.to_local(point))
+
+    gaps = jax.vmap(jax.vmap(gap, (None, 0)), (0, None))(solids, points)
+    return jnp.all(gaps >= clearance, axis=1)
+
+
+def _kept(solids: Kind, kept: Bool[Array, " n"]) -> Kind:
+    """The obstacles of a kind, of which some are left out."""
+    away = jnp.array([0, 0, _UNDERGROUND], solids.pos.dtype)
+    return solids.replace(pos=jnp.where(kept[:, None], solids.pos, away[None]))
+
+
+def _range(name: str, bounds: ArrayLike, unit: str, **limits: float) -> tuple[float, float]:
+    """The two ends of an interval, of which one number is both."""
+    if np.shape(bounds) not in ((), (2,)):
+        raise ValueError(f"{name} is {shown(bounds)}; give a number or (smallest, largest) ({unit})")
+    low, high = np.broadcast_to(np.asarray(bounds), (2,)).tolist()
+    check_number(name, low, unit, **limits)
+    check_number(f"the largest {name}", high, unit, at_least=low)
+    return low, high

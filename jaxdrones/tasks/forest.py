@@ -1,0 +1,187 @@
+"""Fly through a forest to a goal on the other side, by what a depth camera sees."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.sensing import Camera, Scene, collisions
+from jaxdrones.sensing import forest as draw_forest
+from jaxdrones.state import State
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, norm, out_of_control
+
+HEIGHT = 1.5  # m, of flight
+REACHED = 1.0  # m: a drone that is nearer to its goal has reached it
+_HIGHEST = 4.0  # m; trees are higher, so that the way over them is not open
+_TREE_HEIGHT = 5.0  # m
+_SPACING = 1.0  # m in y between drones
+_CLEARANCE = 1.5  # m between a tree and where a drone starts or arrives
+_REACH = (0.0, 0.5, 0.2)  # m: drones start within this of their places
+_BEHIND = 2.0  # m before the start and beyond the goal that still belong to the strip
+_MAX_SPEED = 20.0  # m/s
+
+camera = Camera(resolution=(16, 12), field_of_view=90.0, far=24.0)
+"""The camera of the task, fixed to the body; 24 m are more than from one side of the forest to the other."""
+
+
+@check_keywords
+def forest(
+    drones: int = 1,
+    speed: float = 3.0,
+    density: float = 0.15,
+    length: float = 20.0,
+    width: float = 10.0,
+    duration: float | None = None,
+) -> Task:
+    """Fly through a forest, drawn anew in every episode, to a goal on the other side.
+
+    Args:
+        drones: number of drones; they start 1 m apart in y.
+        speed: commanded speed, m/s; at most 20.
+        density: trees per m^2.
+        length: distance of the goal, m.
+        width: width of the forest, m; a drone that leaves it to the side is lost.
+        duration: duration of an episode, s; twice what the way takes at the commanded speed, and a second, when left
+            out.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+    check_whole("number of drones of forest", drones)
+    check_number("speed", speed, "m/s", above=0, at_most=_MAX_SPEED)
+    check_positive("length", length, "m")
+    check_number("width", width, "m", above=_SPACING * (drones + 1))
+    if duration is None:
+        duration = 2 * length / speed + 1
+    y = [_SPACING * (i - (drones - 1) / 2) for i in range(drones)]
+
+    def scene(key: jax.Array) -> Scene:
+        ends = [(x, place, HEIGHT) for x in (0.0, length) for place in y]
+        return draw_forest(
+            key,
+            density=density,
+            length=length,
+            width=width,
+            height=_TREE_HEIGHT,
+            keep_free=ends,
+            clearance=_CLEARANCE,
+        )
+
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        place = jnp.asarray([(0.0, place, HEIGHT) for place in y], params.mass.dtype)
+        goal = place + jnp.array([[length, 0, 0]], place.dtype)
+        state = thrown(key, params, place, reach=_REACH, speed=0.5, omega=0.5, tilt=0.2)
+        zero, false = jnp.zeros_like(params.mass), jnp.zeros(drones, bool)
+        return state, {
+            "goal": goal,
+            "start": state.pos,
+            "pos": state.pos,
+            "progress": zero,
+            "path": zero,
+            "clearance": zero + _CLEARANCE,
+            "touched": false,
+            "reached": false,
+        }
+
+    def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        return Setpoint.at(variables["goal"])
+
+    def desired(task: Task, world: World) -> Float[Array, "n 3"]:
+        """The velocity towards the goal, m/s, world; slower only where the goal is reached."""
+        away = task.target_now(world).pos - world.drones.pos
+        return speed * away / jnp.maximum(norm(away), REACHED)[:, None]
+
+    def velocity(task: Task, world: World) -> Float[Array, " n"]:
+        """Magnitude of the velocity error as a share of the commanded speed."""
+        return shaping.length(world.drones.vel - desired(task, world), 0.1 * speed) / speed
+
+    def progress(task: Task, world: World) -> Float[Array, " n"]:
+        """Approach to the goal as a share of the commanded speed."""
+        return world.variables["progress"] / (speed * world.dt)
+
+    def heading(task: Task, world: World) -> Float[Array, " n"]:
+        """One minus the cosine of the angle between the camera's axis and the direction of the goal."""
+        forward = jax.vmap(lambda quat: rotation.axes(quat)[0])(world.drones.quat)
+        return 1 - jnp.sum(forward * desired(task, world), axis=-1) / speed
+
+    def observe_desired(task: Task, world: World) -> Float[Array, "n 3"]:
+        return jax.vmap(rotation.rotate_inverse)(world.drones.quat, desired(task, world))
+
+    def left(task: Task, world: World) -> Bool[Array, " n"]:
+        x, y, z = world.drones.pos.T
+        return ~((jnp.abs(x - length / 2) < length / 2 + _BEHIND) & (jnp.abs(y) < width / 2) & (z < _HIGHEST))
+
+    return Task(
+        name="forest",
+        summary="fly through a forest to a goal 20 m away",
+        drones=drones,
+        duration=duration,
+        start=start,
+        target=target,
+        rewards={
+            "alive": (1.0, shaping.alive),
+            "velocity": (-1.0, velocity),
+            "progress": (0.5, progress),
+            "clearance": (-2.0, shaping.clearance),
+            "height": (-0.3, _height),
+            "heading": (-0.2, heading),
+            "omega": (-0.02, shaping.body_rates),
+            "action_change": (-0.02, shaping.action_change),
+            "touched": (-10.0, _variable("touched")),
+            "reached": (10.0, _variable("reached")),
+        },
+        terminations={
+            "touched": lambda task, world: world.variables["touched"],
+            "reached": lambda task, world: jnp.broadcast_to(jnp.all(world.variables["reached"]), (drones,)),
+            "left": left,
+            "spinning": out_of_control(length)["spinning"],
+        },
+        advance=_advance,
+        metrics={name: _variable(name) for name in ("touched", "reached", "clearance")} | {"detour": _detour},
+        success=lambda metrics, dt: (metrics["reached"][-1] > 0) & (metrics["touched"][-1] == 0),
+        observations={"desired_velocity": ObservationTerm(observe_desired, _MAX_SPEED)},
+        control_hz=50.0,
+        substeps=2,
+        scene=scene,
+        obstacles_terminate=True,
+        camera=camera,
+        vision=("depth",),
+        action="thrust_and_rates",
+        observation=("velocity_body", "gravity", "omega", "desired_velocity", "last_action"),
+    )
+
+
+def _advance(task: Task, world: World) -> dict[str, Array]:
+    variables, pos = world.variables, world.drones.pos
+    goal = variables["goal"]
+    touches = collisions(world.params, world.drones, world.scene)
+    return variables | {
+        "pos": pos,
+        "progress": norm(variables["pos"] - goal) - norm(pos - goal),
+        "path": variables["path"] + norm(pos - variables["pos"]),
+        "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
+        "touched": variables["touched"] | touches.ground | touches.drones | touches.scene,
+        "reached": variables["reached"] | (norm(pos - goal) < REACHED),
+    }
+
+
+def _height(task: Task, world: World) -> Float[Array, " n"]:
+    """Squared deviation from the height of flight, m^2."""
+    return (world.drones.pos[:, 2] - HEIGHT) ** 2
+
+
+def _detour(task: Task, world: World) -> Float[Array, " n"]:
+    """Length of the path over the straight line."""
+    straight = norm(world.drones.pos - world.variables["start"])
+    return world.variables["path"] / jnp.where(straight > 0, straight, 1)
+
+
+def _variable(name: str) -> Term:
+    return lambda task, world: world.variables[name].astype(world.drones.pos.dtype)

@@ -1,4 +1,4 @@
-"""A double integrator as an environment, and small settings of every learner for it."""
+"""Environments with a known answer, a double integrator and a cue, and small settings of every learner for them."""
 
 import flax.struct
 import jax
@@ -23,9 +23,23 @@ class Point(flax.struct.PyTreeNode):
 class PointWorld(flax.struct.PyTreeNode):
     drones: Point
     step: jax.Array
+    images: None = None
+    poses: None = None
 
 
-class DoubleIntegrator:
+class Vectors:
+    """What an environment without images is to `AutoReset`."""
+
+    vision = None
+
+    def begin(self, key):
+        return self.reset(key)
+
+    def observed(self, vector, world):
+        return vector
+
+
+class DoubleIntegrator(Vectors):
     """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
 
     drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 50, ()
@@ -42,6 +56,45 @@ class DoubleIntegrator:
         world = PointWorld(Point(x), world.step + 1)
         info = {"metrics": {"error": jnp.abs(x[:, 0])}}
         return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+
+class Cue(Vectors):
+    """Cost (u - cue)^2 in every step, for a cue of 0.5 or -0.5 that is observed in the first step only, or in all.
+
+    The cue is a number of the observation or the depth that an image shows. Who does not remember it pays at least 0.25
+    in every step in which it is not shown.
+    """
+
+    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 1, 0.1, 6, ()
+
+    def __init__(self, shown: int = 1, image: bool = False):
+        self.shown, self.image = shown, image
+
+    def begin(self, key):
+        cue = jax.random.choice(key, jnp.array([-0.5, 0.5]), (1, 1))
+        world = PointWorld(Point(cue), jnp.zeros((), jnp.int32))
+        return self.vector(world), world
+
+    def reset(self, key):
+        vector, world = self.begin(key)
+        return self.observed(vector, world), world
+
+    def step(self, key, world, action):
+        cost = (action[:, 0] - world.drones.pos[:, 0]) ** 2
+        world = world.replace(step=world.step + 1)
+        info = {"metrics": {"error": jnp.sqrt(cost)}}
+        obs = self.observed(self.vector(world), world)
+        return obs, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+    def visible(self, world):
+        return jnp.where(world.step < self.shown, world.drones.pos, 0)
+
+    def vector(self, world):
+        return jnp.zeros_like(world.drones.pos) if self.image else self.visible(world)
+
+    def observed(self, vector, world):
+        depth = 3 + 4 * jnp.tile(self.visible(world)[..., None], (1, 3, 4))
+        return {"state": vector, "depth": depth} if self.image else vector
 
 
 def dynamics():

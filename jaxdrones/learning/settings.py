@@ -57,6 +57,8 @@ Count = Annotated[int, check_whole]
 TracedCount = Annotated[int | jax.Array, _check_whole_if_known]
 """A whole number that may be traced."""
 Switch = Annotated[bool, check_switch]
+CountOrNone = Annotated[int, partial(check_whole, minimum=0)]
+"""A whole number, 0 where the thing that is counted is left out."""
 HiddenSizes = Annotated[tuple[int, ...], _check_layers]
 """Sizes of the hidden layers of a network."""
 Gradient = Annotated[Literal["exact", "decay", "surrogate"], _check_gradient]

@@ -14,6 +14,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdrones import rotation
 from jaxdrones.sensing.geometry import (
@@ -53,7 +54,8 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
     def __post_init__(self):
         for name, value in vars(self).items():
             if isinstance(value, tuple | list) and all(isinstance(x, _NUMBERS) for x in jax.tree.leaves(value)):
-                object.__setattr__(self, name, jnp.asarray(value, float))  # JAX would take each number for an array
+                array = jnp.asarray(value, None if name == "active" else float)
+                object.__setattr__(self, name, array)  # JAX would take each number for an array
 
     @property
     def rounding(self) -> Any:
@@ -83,8 +85,8 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
         """
 
     @abc.abstractmethod
-    def normal(self, point: Components) -> Components:
-        """Vectors of any length that point outward where a point is on the surface."""
+    def normals(self, point: Components) -> Components:
+        """Vectors of any length that point outward, of many points that are on the surface."""
 
     @abc.abstractmethod
     def nearest(self, point: Point) -> Point:
@@ -120,7 +122,7 @@ class Box(Obstacle, kw_only=True):
         first, last = zip(*(between_planes(*face) for face in faces), strict=True)
         return functools.reduce(jnp.maximum, first), functools.reduce(jnp.minimum, last)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The normal of the face that a point is on."""
         x, y, z = (p / half for p, half in zip(point, components(self.size / 2), strict=True))
         largest = functools.reduce(jnp.maximum, map(jnp.abs, (x, y, z)))
@@ -162,7 +164,7 @@ class Sphere(Obstacle, kw_only=True):
         """Where lines are within the radius."""
         return within_radius(origin, direction, self.radius)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The direction from the center."""
         return point
 
@@ -200,7 +202,7 @@ class Cylinder(Obstacle, kw_only=True):
         bottom, top = between_planes(origin[2], direction[2], self.height / 2)
         return jnp.maximum(first, bottom), jnp.minimum(last, top)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The direction from the axis, or along the axis at the ends."""
         x, y, z = point
         at_end = (z * self.radius) ** 2 > (x * x + y * y) * (self.height / 2) ** 2
@@ -261,7 +263,7 @@ class Capsule(Obstacle, kw_only=True):
         last = (jnp.where(first <= last, last, -jnp.inf) for first, last in parts)
         return functools.reduce(jnp.minimum, first), functools.reduce(jnp.maximum, last)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The direction from the nearest point of the axis."""
         x, y, z = point
         return [x, y, z - jnp.clip(z, -self.height / 2, self.height / 2)]

@@ -63,7 +63,7 @@ class Placed(flax.struct.PyTreeNode):
         """Components to the left and up, over that along the ray, of the normals where the rays of pixels hit."""
         axes = [components(axis) for axis in components(self.axes)]
         ray = [x + u * y + v * z for x, y, z in zip(*axes, strict=True)]
-        normal = self.solid.normal([o + depth * d for o, d in zip(components(self.origin), ray, strict=True)])
+        normal = self.solid.normals([o + depth * d for o, d in zip(components(self.origin), ray, strict=True)])
         forward, left, up = (sum(n * x for n, x in zip(normal, axis, strict=True)) for axis in axes)
         along = nonzero(forward + u * left + v * up)
         return left / along, up / along
@@ -86,7 +86,7 @@ class Ground(flax.struct.PyTreeNode):
         """The same point."""
         return point
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The vertical."""
         zero = jnp.zeros_like(point[2])
         return [zero, zero, jnp.ones_like(zero)]

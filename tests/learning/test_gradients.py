@@ -47,7 +47,7 @@ def flights():
         _, trajectory = collect.collect(
             jax.random.key(2),
             with_gradient(env, config.gradient, config.surrogate),
-            lambda key, obs: (policy(obs), None),
+            lambda key, memory, obs: (memory, policy(obs), None),
             worlds,
             config.horizon,
             reset=False,

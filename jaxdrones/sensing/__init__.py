@@ -19,6 +19,7 @@ from jaxdrones.sensing.rays import ray
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
+from jaxdrones.sensing.urdf_scene import from_urdf
 
 __all__ = [
     "BEAMS",
@@ -39,6 +40,7 @@ __all__ = [
     "collisions",
     "downward_range",
     "forest",
+    "from_urdf",
     "gate",
     "lidar",
     "multi_ranger",

@@ -22,7 +22,7 @@ from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import ImageSpace, Vision, first_images, next_images, observation
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
-from jaxdrones.sensing.sensor import Sensor, check_sensors, init_sensors, measure_sensors
+from jaxdrones.sensing.sensor import Sensor, check_sensors, hold_between, init_sensors, measure_sensors
 from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
@@ -243,8 +243,10 @@ class Env:
     def _measured(self, key: jax.Array, world: World, rate: State) -> World:
         """The world with new readings of the sensors."""
         given = world.params, world.drones, rate, world.scene, world.sensors
-        memories, readings = measure_sensors(self.sensors, key, *given)
-        return world.replace(sensors=memories, readings=readings)
+        after = measure_sensors(self.sensors, key, *given)
+        if world.readings:
+            after = hold_between(self.sensors, world.step, self.dt, (world.sensors, world.readings), after)
+        return world.replace(sensors=after[0], readings=after[1])
 
     def _command(self, key: Key, world: World, action: Array) -> tuple[World, Array]:
         """The world with the new action and disturbance, and the commanded rotor speeds."""

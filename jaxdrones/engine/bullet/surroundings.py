@@ -14,7 +14,6 @@ import numpy as np
 
 from jaxdrones.engine.bullet.shapes import shape_of
 from jaxdrones.sensing import Scene, Urdf
-from jaxdrones.sensing.files import File
 
 _STATIC = 2  # Bullet's collision group of bodies that do not move, which do not collide with each other
 _GROUND_FRICTION = 1.0  # as in gym-pybullet-drones (2021)
@@ -59,7 +58,7 @@ class Surroundings:
         elif self.ground is not None and not scene.ground:
             self.p.removeBody(self.ground, physicsClientId=self.id)
             self.ground = None
-        obstacles = {number: obstacle for number, obstacle in enumerate(scene.obstacles) if _is_there(obstacle)}
+        obstacles = scene.numbered
         for number in self.obstacles.keys() - obstacles.keys():
             self._remove(number)
         for number, obstacle in obstacles.items():
@@ -107,10 +106,6 @@ class Surroundings:
             shape["length"] = shape.pop("height")  # Bullet has two words for it
         visual = p.createVisualShape(**shape, rgbaColor=obstacle.color, physicsClientId=self.id)
         return p.createMultiBody(0, collision, visual, pos, quat, physicsClientId=self.id)
-
-
-def _is_there(obstacle: Any) -> bool:
-    return isinstance(obstacle, File) or obstacle.active is None or bool(obstacle.active)
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from jaxdrones.dynamics import (
     implicit_midpoint,
     instant_rotors,
     lagging_rotors,
+    obstacle_contact,
     rk4,
     semi_implicit_euler,
 )
@@ -62,6 +63,7 @@ __all__ = [
     "make",
     "make_derivative",
     "make_step",
+    "obstacle_contact",
     "over_worlds",
     "render",
     "repeat",

@@ -1,7 +1,7 @@
 """Wrenches and how they move a drone. The tables below are what the command line knows by name."""
 
 from jaxdrones.dynamics.aero import drag, drag_world_axes, external_force, ground_effect, ground_effect_2021
-from jaxdrones.dynamics.contact import drone_contact, ground_contact
+from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021
 from jaxdrones.dynamics.model import Model
@@ -9,7 +9,16 @@ from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors, rotor_wrench
 
 EFFECTS = {
-    f.__name__: f for f in (drag, drag_world_axes, ground_effect, ground_effect_2021, ground_contact, external_force)
+    f.__name__: f
+    for f in (
+        drag,
+        drag_world_axes,
+        ground_effect,
+        ground_effect_2021,
+        ground_contact,
+        obstacle_contact,
+        external_force,
+    )
 }
 PAIRS = {f.__name__: f for f in (downwash, downwash_2021, drone_contact)}
 ROTORS = {"instant": instant_rotors, "lagging": lagging_rotors}
@@ -35,6 +44,7 @@ __all__ = [
     "instant_rotors",
     "lagging_rotors",
     "newton_euler",
+    "obstacle_contact",
     "quat_rate",
     "rk4",
     "rotor_wrench",

@@ -1,4 +1,4 @@
-"""Compliant contact of a drone with the ground, and of two drones with each other.
+"""Compliant contact of a drone with the ground and with obstacles, and of two drones with each other.
 
 For the explicit backend only: Bullet resolves contacts itself, and with these effects it would do so twice.
 
@@ -17,7 +17,7 @@ overshoots, and at a rate above 2/dt it gains energy. The price of such soft con
 1 m/s sinks in 8 mm, at 5 m/s 3 cm.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,7 @@ _FRICTION_RATE = 400.0  # 1/s: the highest rate at which friction on the ground 
 _FRICTION_RATE_ON_DRONE = 15.0  # 1/s: the same between drones at each of 16 points; more shakes a drone that is carried
 _MAX_SHARE_ON_DRONE = 4.0  # normal force at one point over that of its lever; three loaded points then stay below 2/dt
 _STICTION_SPEED = 0.01  # m/s: friction is viscous below; with the weight of a cf2x below 0.05 m/s
-_GROUND_FRICTION = 0.5  # coefficient: gym-pybullet-drones gives its drones 0.5 and its plane 1.0
+_GROUND_FRICTION = 0.5  # coefficient, also of obstacles: gym-pybullet-drones gives its drones 0.5 and its plane 1.0
 _DRONE_FRICTION = 0.25  # coefficient: 0.5 times 0.5
 _ROUNDING = 1e-4  # m: rounds off the distance of two points that coincide
 
@@ -66,15 +66,49 @@ def ground_contact(params: Params, state: State) -> Wrench:
 
     _, _, height = around(state.pos + p, x, y)
     vx, vy, vz = around(state.vel + cross(omega, p), cross(omega, x), cross(omega, y))
-    normal_force = params.mass / _SPHERES * _normal_force_per_mass(-height, -vz)
-    max_viscosity = _FRICTION_RATE * _sliding_mass(params) / _SPHERES
-    viscosity = _friction_per_slip(_GROUND_FRICTION * normal_force, vx**2 + vy**2, max_viscosity)
+    normal_force, viscosity = _load(params, -height, -vz, vx**2 + vy**2)
     forces = [-viscosity * vx, -viscosity * vy, normal_force]
 
     force = jnp.stack([total(f) for f in forces])
     torque = cross(p, force)
     torque += cross(x, jnp.stack([dot(cos, f) for f in forces])) + cross(y, jnp.stack([dot(sin, f) for f in forces]))
     return Wrench(rotation.rotate_inverse(state.quat, force), rotation.rotate_inverse(state.quat, torque))
+
+
+def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
+    """Normal force and friction of the obstacles of a scene on a drone that touches them, by the law of the ground.
+
+    Each of the eight spheres touches the obstacle that is nearest to it, or in which it is deepest. What fits between
+    two spheres, such as a thin pole, or a corner, reaches into the disc. Not for the Bullet backend, which resolves
+    these contacts itself.
+
+    Args:
+        params: of the drone.
+        state: of the drone.
+        scene: obstacles as a `jaxdrones.Scene`; its ground is that of `ground_contact`.
+    """
+    if not scene.has_obstacles:
+        zero = jnp.zeros_like(state.pos)
+        return Wrench(zero, zero)
+    radius, ring = _rim(params)
+    obstacles = scene.replace(ground=False)
+    x_axis, y_axis, z_axis = rotation.axes(state.quat)
+    omega = rotation.rotate(state.quat, state.omega)
+
+    def at_sphere(cos: Float[Array, ""], sin: Float[Array, ""]) -> Wrench:
+        center = params.collision_offset * z_axis + ring * (cos * x_axis + sin * y_axis)
+        surface = obstacles.nearest(state.pos + center)
+        point = center - radius * surface.normal
+        vel = state.vel + cross(omega, point)
+        depth_rate = -dot(vel, surface.normal)
+        slip = vel + depth_rate * surface.normal
+        normal_force, viscosity = _load(params, radius - surface.distance, depth_rate, dot(slip, slip))
+        force = normal_force * surface.normal - viscosity * slip
+        return Wrench(force, cross(point, force))
+
+    cos, sin = (jnp.asarray(f(_ANGLES), radius.dtype) for f in (np.cos, np.sin))
+    wrench = jax.tree.map(lambda x: jax.vmap(total)(x.T), jax.vmap(at_sphere)(cos, sin))
+    return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), wrench)
 
 
 def drone_contact(params: Params, state: State, other: Params, other_state: State) -> Wrench:
@@ -171,6 +205,13 @@ def _contacts(spheres: _Body, disc: _Body) -> _Contact:
 def _normal_force_per_mass(depth: Array, depth_rate: Array) -> Array:
     """Normal force per mass at a penetration depth (m) that grows at a rate (m/s): N/kg, never negative."""
     return jnp.maximum(_onset(depth) * (_PRELOAD + _DAMPING * depth_rate) + _STIFFNESS * jnp.maximum(depth, 0), 0)
+
+
+def _load(params: Params, depth: Array, depth_rate: Array, slip_squared: Array) -> tuple[Array, Array]:
+    """Normal force (N) and friction over slip velocity (N s/m) at one sphere on what does not move."""
+    normal_force = params.mass / _SPHERES * _normal_force_per_mass(depth, depth_rate)
+    max_viscosity = _FRICTION_RATE * _sliding_mass(params) / _SPHERES
+    return normal_force, _friction_per_slip(_GROUND_FRICTION * normal_force, slip_squared, max_viscosity)
 
 
 def _onset(depth: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -10,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.envs.env import RESET, Env, Obs
+from jaxdrones.envs.vision import observation, renewed_images
 from jaxdrones.tasks.task import World
-
-_WORLDS_PER_RESET = 64  # if more than one in so many worlds ends in a step, all worlds are drawn
 
 
 class Episode(flax.struct.PyTreeNode):
@@ -56,7 +55,7 @@ class AutoReset:
         ended = terminated | truncated
         key = jax.random.fold_in(key, RESET)
         vector = obs["state"] if isinstance(obs, dict) else obs
-        fresh_obs, fresh = _where_needed(self._fresh)(ended, key)
+        fresh_obs, fresh = where_needed(self._fresh)(ended, key)
         fresh = fresh.replace(**{name: getattr(world, name) for name in self._kept})
         fresh = Episode(fresh, jnp.zeros_like(episode_return), jnp.zeros_like(length))
         vector, episode = jax.tree.map(
@@ -65,8 +64,8 @@ class AutoReset:
             (vector, Episode(world, episode_return, length)),
         )
         if self.env.vision:
-            episode = episode.replace(world=self.env.with_images(_renewed_images, key, episode.world, ended))
-        return self.env.observed(vector, episode.world), episode, reward, terminated, truncated, info
+            episode = episode.replace(world=self.env.with_images(renewed_images, key, episode.world, ended))
+        return observation(vector, episode.world), episode, reward, terminated, truncated, info
 
     @property
     def _kept(self) -> tuple[str, ...]:
@@ -77,39 +76,3 @@ class AutoReset:
         """A reset, without images and without the fields that are the same in every episode."""
         obs, world = self.env.begin(key)
         return obs, world.replace(**dict.fromkeys(self._kept))
-
-
-def _renewed_images(env: Env, key: Any, world: World, ended: Array) -> World:
-    return env.vision.renewed(ended, key, world)
-
-
-def _where_needed(draw: Callable) -> Callable:
-    """`(ended, key) -> draw(key)`, whose result matters only where an episode has ended.
-
-    Few of many worlds end in the same step, so only those are drawn; the others get zeros. If many end at once, all are
-    drawn.
-    """
-
-    @jax.custom_batching.custom_vmap
-    def drawn(ended: Array, key: jax.Array):
-        return draw(key)
-
-    @drawn.def_vmap
-    def drawn_of_many(worlds: int, batched: tuple[bool, bool], ended: Array, key: jax.Array):
-        if not all(batched):
-            raise ValueError("AutoReset is mapped over worlds without a key of its own for each; split the key")
-        every = jax.vmap(draw)
-        few = max(worlds // _WORLDS_PER_RESET, 1)
-
-        def ended_ones():
-            index = jnp.nonzero(ended, size=few, fill_value=worlds)[0]
-            fresh = every(key[jnp.minimum(index, worlds - 1)])
-            blank = jax.eval_shape(every, key)
-            return jax.tree.map(
-                lambda all, x: jnp.zeros(all.shape, all.dtype).at[index].set(x, mode="drop"), blank, fresh
-            )
-
-        out = jax.lax.cond(jnp.sum(ended) <= few, ended_ones, lambda: every(key))
-        return out, jax.tree.map(lambda _: True, out)
-
-    return drawn

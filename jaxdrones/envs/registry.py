@@ -45,7 +45,7 @@ from jaxdrones.envs.randomize import (
     sensor_noise,
 )
 from jaxdrones.envs.surroundings import DrawScene
-from jaxdrones.envs.vision import make_vision
+from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
@@ -109,9 +109,9 @@ def make(
         action: a name of `ACTIONS` or an action type; the task's own when left out.
         observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
             out.
-        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, images of a camera on every drone;
-            the task's own when left out.
-        camera: that camera, with its rate, latency and noise; the task's own, or else a `Camera()`, when left out.
+        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, as images of a camera on every
+            drone; the task's own when left out.
+        camera: that camera, with its rate, latency and noise; the task's own when left out, or else a `Camera()`.
         realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
@@ -178,7 +178,6 @@ def make(
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
-    vision = task.vision if vision is None else vision
     observation = task.observation if observation is None else observation
     known = _known_terms(task, sensors)
     observation = check_sequence("observation", observation, "'position_error'")
@@ -196,7 +195,7 @@ def make(
         noise=preset["noise"] if noise is None else noise,
         disturbance=disturbance,
         delay=preset["delay"] if delay is None else delay,
-        vision=make_vision(step, vision, camera or (task.camera if vision else None), dt, scene),
+        vision=_vision(task, step, vision, camera, dt, scene),
         sensors=sensors,
         scene=scene,
         vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
@@ -261,3 +260,17 @@ def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, Observation
         if sensor.name in terms:
             raise ValueError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
     return terms | {sensor.name: reading(sensor.name, sensor.bound) for sensor in sensors}
+
+
+def _vision(
+    task: Task, step: Step, images: Sequence[str] | None, camera: Camera | None, dt: float, scene: Scene | DrawScene
+) -> Vision | None:
+    """The vision of an environment; `None` where no image is asked for."""
+    images = check_sequence("vision", task.vision if images is None else images, "'depth'")
+    if images:
+        return make_vision(step, images, camera or task.camera or Camera(), dt, scene)
+    if camera is not None:
+        raise ValueError(
+            "camera is given, but vision asks for no image; give for example vision=('depth',), or leave it out"
+        )
+    return None

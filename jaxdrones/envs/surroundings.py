@@ -30,11 +30,11 @@ def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> int:
     if not isinstance(example, Scene):
         returned = shown(scene(jax.random.key(0)))
         raise ValueError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
-    honored = isinstance(step, HostStep) or step.physics.takes_scene
-    if example.has_obstacles and not (honored or (task.obstacles_terminate and scene is task.scene)):
+    honored = isinstance(step, HostStep) or step.physics.takes_scene or task.obstacles_terminate
+    if example.has_obstacles and not honored:
         raise ValueError(
             "the scene has obstacles and on the explicit backend drones would fly through them; give an effect "
-            "(params, state, scene) -> Wrench, a task whose terminations find its obstacles (obstacles_terminate), no "
+            "(params, state, scene) -> Wrench, a task whose terminations find obstacles (obstacles_terminate), no "
             "obstacles, or take the bullet backend"
         )
     return example.count

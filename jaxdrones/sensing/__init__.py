@@ -1,9 +1,10 @@
 """What stands around, who touches it, and what the drones measure."""
 
-from jaxdrones.sensing.builders import forest, gate, obstacles_2021, room, track
+from jaxdrones.sensing.builders import BEAMS, forest, gate, obstacles_2021, room, track
 from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
-from jaxdrones.sensing.distances import contains, distance
+from jaxdrones.sensing.depth_noise import DepthNoise
+from jaxdrones.sensing.distances import Surface
 from jaxdrones.sensing.files import Mesh, Urdf
 from jaxdrones.sensing.images import Images, render
 from jaxdrones.sensing.rays import ray
@@ -12,21 +13,22 @@ from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
 __all__ = [
+    "BEAMS",
     "Box",
     "Camera",
     "Capsule",
     "Collisions",
     "Cylinder",
+    "DepthNoise",
     "Images",
     "Mesh",
     "Scene",
     "Sensor",
     "Sphere",
+    "Surface",
     "Urdf",
     "camera_2021",
     "collisions",
-    "contains",
-    "distance",
     "forest",
     "gate",
     "obstacles_2021",

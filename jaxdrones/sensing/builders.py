@@ -6,28 +6,22 @@ any number of worlds with a scene each.
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_key, check_number, check_positive, check_shape, check_whole, shown
+from jaxdrones.sensing import clutter
 from jaxdrones.sensing.scene import Scene
-from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle, Sphere
+from jaxdrones.sensing.shapes import Box, Sphere
 from jaxdrones.vector import sin_cos
 
-Kind = TypeVar("Kind", bound=Obstacle)
-
-_WOOD, _GREEN = (0.4, 0.28, 0.18, 1.0), (0.2, 0.5, 0.2, 1.0)  # red, green, blue, opacity
-_STONE, _WALL = (0.5, 0.5, 0.55, 1.0), (0.8, 0.8, 0.75, 1.0)
-_SPHERE_RADIUS = (0.2, 0.5)  # m
-_BOX_EDGE = (0.3, 1.0)  # m
+_WALL = (0.8, 0.8, 0.75, 1.0)  # red, green, blue, opacity
+BEAMS = 4
+"""Boxes of a gate."""
 _MAX_TREES = 10_000
-_UNDERGROUND = -1000.0  # m
 _HEIGHT_OF_FLIGHT = 1.5  # m; height of the points that are kept free unless others are given
 
 
@@ -82,12 +76,12 @@ def forest(
     corners = jnp.array([[0, -width / 2, 0], [length, width / 2, height]])
 
     count = jnp.round(jax.random.uniform(count_key, minval=low, maxval=high) * length * width)
-    trunks = _trunks(tree_key, trees, corners, _range("radius of a forest", radius, "m", above=0), tilt)
+    trunks = clutter.trunks(tree_key, trees, corners, _range("radius of a forest", radius, "m", above=0), tilt)
     alive = jnp.arange(trees) < count
-    others = _spheres(sphere_key, spheres, corners), _boxes(box_key, boxes, corners)
+    others = clutter.spheres(sphere_key, spheres, corners), clutter.boxes(box_key, boxes, corners)
     return Scene.of(
-        _kept(trunks, alive & _is_free(trunks, free, clearance)),
-        *(_kept(solids, _is_free(solids, free, clearance)) for solids in others),
+        clutter.kept(trunks, alive & clutter.is_free(trunks, free, clearance)),
+        *(clutter.kept(solids, clutter.is_free(solids, free, clearance)) for solids in others),
     )
 
 
@@ -140,15 +134,17 @@ def room(
     )
     if not pillars + spheres + boxes:
         return Scene.of(shell)
-    check_key("key of a room with pillars or clutter", key)
+    if key is None:
+        raise ValueError("a room with pillars or clutter is drawn from a key; give key=jax.random.key(0)")
+    check_key("key", key)
     pillar_key, sphere_key, box_key = jax.random.split(key, 3)
     free, corners = _points(keep_free), jnp.array([[-x / 2, -y / 2, 0], [x / 2, y / 2, z]])
     inside = (
-        _trunks(pillar_key, pillars, corners, _range("radius of a room", radius, "m", above=0)),
-        _spheres(sphere_key, spheres, corners),
-        _boxes(box_key, boxes, corners),
+        clutter.trunks(pillar_key, pillars, corners, _range("radius of a room", radius, "m", above=0)),
+        clutter.spheres(sphere_key, spheres, corners),
+        clutter.boxes(box_key, boxes, corners),
     )
-    return Scene.of(shell, *(_kept(solids, _is_free(solids, free, clearance)) for solids in inside))
+    return Scene.of(shell, *(clutter.kept(solids, clutter.is_free(solids, free, clearance)) for solids in inside))
 
 
 def track(gates: ArrayLike, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:
@@ -191,9 +187,9 @@ def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: floa
     lying, standing = (depth, outer, frame), (depth, frame, opening)
     return Box(
         pos=pos[None] + jnp.stack([-sin * left, cos * left, up], axis=-1),
-        quat=jnp.tile(jnp.stack([0 * yaw, 0 * yaw, half_sin, half_cos])[None], (4, 1)),
+        quat=jnp.tile(jnp.stack([0 * yaw, 0 * yaw, half_sin, half_cos])[None], (BEAMS, 1)),
         size=jnp.array([lying, lying, standing, standing], pos.dtype),
-        color=jnp.tile(jnp.array([[0.9, 0.35, 0.1, 1.0]], pos.dtype), (4, 1)),
+        color=jnp.tile(jnp.array([[0.9, 0.35, 0.1, 1.0]], pos.dtype), (BEAMS, 1)),
     )
 
 
@@ -213,58 +209,6 @@ def obstacles_2021() -> Scene:
     )
 
 
-def _trunks(
-    key: jax.Array, count: int, corners: Float[Array, "2 3"], radius: tuple[float, float], tilt: float = 0.0
-) -> Cylinder:
-    """Cylinders at random places between two corners, which reach from the ground to the height of the second one."""
-    place_key, radius_key, tilt_key, axis_key = jax.random.split(key, 4)
-    height = corners[1, 2]
-    foot = _places(place_key, count, corners) * jnp.array([[1, 1, 0]])
-    sin, cos = sin_cos(jax.random.uniform(axis_key, (count,), maxval=2 * jnp.pi))
-    angle = jnp.radians(jax.random.uniform(tilt_key, (count, 1), maxval=tilt))
-    quat = jax.vmap(rotation.exp)(angle * jnp.stack([cos, sin, 0 * sin], axis=-1))
-    return Cylinder(
-        pos=foot + height / 2 * jax.vmap(rotation.z_axis)(quat),
-        quat=quat,
-        radius=jax.random.uniform(radius_key, (count,), minval=radius[0], maxval=radius[1]),
-        height=jnp.full(count, height),
-        color=jnp.tile(jnp.array([_WOOD]), (count, 1)),
-    )
-
-
-def _spheres(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Sphere:
-    place_key, radius_key = jax.random.split(key)
-    pos = _places(place_key, count, corners)
-    low, high = _SPHERE_RADIUS
-    return Sphere(
-        pos=pos,
-        quat=_level(jnp.zeros(count)),
-        radius=jax.random.uniform(radius_key, (count,), minval=low, maxval=high),
-        color=jnp.tile(jnp.array([_GREEN]), (count, 1)),
-    )
-
-
-def _boxes(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Box:
-    place_key, size_key, yaw_key = jax.random.split(key, 3)
-    low, high = _BOX_EDGE
-    return Box(
-        pos=_places(place_key, count, corners),
-        quat=_level(jax.random.uniform(yaw_key, (count,), maxval=2 * jnp.pi)),
-        size=jax.random.uniform(size_key, (count, 3), minval=low, maxval=high),
-        color=jnp.tile(jnp.array([_STONE]), (count, 1)),
-    )
-
-
-def _places(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Float[Array, "k 3"]:
-    return jax.random.uniform(key, (count, 3), minval=corners[:1], maxval=corners[1:])
-
-
-def _level(yaw: Float[Array, " k"]) -> Float[Array, "k 4"]:
-    """Quaternions of headings, rad."""
-    sin, cos = sin_cos(yaw / 2)
-    return jnp.stack([0 * sin, 0 * sin, sin, cos], axis=-1)
-
-
 def _points(points: ArrayLike) -> Float[Array, "k 3"]:
     array = jnp.asarray(points, float)
     array = array.reshape(0, 3) if array.size == 0 else array
@@ -274,27 +218,13 @@ def _points(points: ArrayLike) -> Float[Array, "k 3"]:
     return array
 
 
-def _is_free(solids: Obstacle, points: Float[Array, "k 3"], clearance: float) -> Bool[Array, " n"]:
-    """Whether each obstacle of a kind is far enough from all points."""
-
-    def gap(solid: Obstacle, point: Array) -> Array:
-        return solid.distance(solid.to_local(point))
-
-    gaps = jax.vmap(jax.vmap(gap, (None, 0)), (0, None))(solids, points)
-    return jnp.all(gaps >= clearance, axis=1)
-
-
-def _kept(solids: Kind, kept: Bool[Array, " n"]) -> Kind:
-    """The obstacles of a kind, of which some are left out."""
-    away = jnp.array([0, 0, _UNDERGROUND], solids.pos.dtype)
-    return solids.replace(pos=jnp.where(kept[:, None], solids.pos, away[None]))
-
-
-def _range(name: str, bounds: ArrayLike, unit: str, **limits: float) -> tuple[float, float]:
+def _range(
+    name: str, bounds: ArrayLike, unit: str, at_least: float | None = None, above: float | None = None
+) -> tuple[float, float]:
     """The two ends of an interval, of which one number is both."""
     if np.shape(bounds) not in ((), (2,)):
         raise ValueError(f"{name} is {shown(bounds)}; give a number or (smallest, largest) ({unit})")
     low, high = np.broadcast_to(np.asarray(bounds), (2,)).tolist()
-    check_number(name, low, unit, **limits)
+    check_number(name, low, unit, at_least=at_least, above=above)
     check_number(f"the largest {name}", high, unit, at_least=low)
     return low, high

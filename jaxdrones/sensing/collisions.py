@@ -89,7 +89,7 @@ def _touch_any(bodies: Cylinder, obstacles: Obstacle, margin: ArrayLike) -> Bool
     """Whether each drone touches any of the obstacles of a kind."""
 
     def touches(body: Cylinder, obstacle: Obstacle) -> Array:
-        return _gap(body, obstacle) <= obstacle.rounding + margin
+        return obstacle.active & (_gap(body, obstacle) <= obstacle.rounding + margin)
 
     return jnp.any(jax.vmap(jax.vmap(touches, (None, 0)), (0, None))(bodies, obstacles), axis=1)
 

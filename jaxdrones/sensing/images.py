@@ -69,35 +69,39 @@ def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT
 def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Images:
     n, dtype = len(state.pos), state.pos.dtype
     drones = jnp.arange(n)
-    kinds: list[Any] = scene.shapes(dtype)
-    count = sum(len(kind.pos) for kind in kinds)
+    obstacles = scene.shapes(dtype)
+    count = sum(len(kind.pos) for kind in obstacles)
     numbers = [1 + n + jnp.arange(count)]  # labels of the segmentation, solid by solid
     own = [jnp.full(count, -1)]  # the drone of which a solid is a part
     if n > 1 or camera.sees_self:
-        kinds += drone_solids(params, state)
+        obstacles += drone_solids(params, state)
         parts = [drones, jnp.repeat(drones, ROTORS)]
         numbers += [1 + part for part in parts]
         own += parts
+    there = [kind.active for kind in obstacles]
+    kinds: list[Any] = [kind.replace(active=None) for kind in obstacles]  # what is left has derivatives
     colors = [kind.color[:, :3] for kind in kinds]
     ground = None
     if scene.ground:
         ground = sum(map(len, numbers))
         kinds.append(Ground.of(dtype))
+        there.append(jnp.ones(1, bool))
         numbers.append(jnp.zeros(1, int))
         own.append(jnp.full(1, -1))
         colors.append(jnp.zeros((1, 3), dtype))
     labels = jnp.concatenate([*numbers, jnp.full(1, -1)]).astype(jnp.int32)
     of_drone = jnp.concatenate(own)
+    active = jnp.concatenate([*there, jnp.ones(0, bool)])
     lengths = np.cumsum([len(kind.pos) for kind in kinds])[:-1]
 
     def one(params: Params, state: State, drone: Array) -> Images:
         view = view_of(camera, params, state)
-        seen = jnp.ones_like(of_drone, bool) if camera.sees_self else of_drone != drone
+        seen = active if camera.sees_self else active & (of_drone != drone)
         seen_kinds = jnp.split(seen, lengths)
         depths = depth(view, kinds, seen_kinds)
-        still, there, depths_there = jax.lax.stop_gradient((view, kinds, depths))
-        index = visible(still, there, seen_kinds)
-        rgb = shade(still, there, jnp.concatenate(colors), ground, index, depths_there)
+        still, solids, still_depths = jax.lax.stop_gradient((view, kinds, depths))
+        index = visible(still, solids, seen_kinds)
+        rgb = shade(still, solids, jnp.concatenate(colors), ground, index, still_depths)
         return Images(rgb=rgb, depth=depths, segmentation=labels[index])
 
     return jax.vmap(one)(params, state, drones)
@@ -146,6 +150,7 @@ def drone_solids(params: Params, state: State) -> list[Obstacle]:
             radius=jnp.broadcast_to(params.prop_radius, (ROTORS,)),
             height=jnp.broadcast_to(params.collision_height / 5, (ROTORS,)),
             color=colors,
+            active=jnp.ones(ROTORS, bool),
         )
         return hub, disc
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -10,9 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array
+from jaxtyping import Array, Bool
+from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_finite, check_quaternion, check_shape, check_switch, is_known, shown
+from jaxdrones.checks import (
+    check_choice,
+    check_finite,
+    check_quaternion,
+    check_shape,
+    check_switch,
+    check_whole,
+    is_known,
+    shown,
+)
+from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of
 from jaxdrones.sensing.files import File, Mesh, Urdf
 from jaxdrones.sensing.shapes import LENGTHS, Box, Capsule, Cylinder, Obstacle, Sphere, single
 
@@ -66,7 +78,7 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         for name, kind in KINDS.items():
             rows = [_rows(obstacle) for obstacle in obstacles if isinstance(obstacle, kind)]
             if sum(len(row.pos) for row in rows):  # an array without entries stands for nothing
-                arrays[name] = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
+                arrays[name] = _joined(rows)
         meshes = tuple(obstacle for obstacle in obstacles if isinstance(obstacle, Mesh))
         urdfs = tuple(obstacle for obstacle in obstacles if isinstance(obstacle, Urdf))
         return cls(**arrays, meshes=meshes, urdfs=urdfs, ground=ground)
@@ -91,7 +103,74 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
     def shapes(self, dtype: DTypeLike) -> list[Obstacle]:
         """The kinds of obstacles in the scene, each with a leading axis over its obstacles, as arrays of this type."""
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
-        return [jax.tree.map(lambda x: jnp.asarray(x, dtype), stack) for stack in stacks]
+        return [_as_arrays(stack, dtype) for stack in stacks]
+
+    def distance(self, point: ArrayLike) -> Array:
+        """Signed distance of a point from the nearest surface, m; negative inside an obstacle or underground.
+
+        It is differentiable in the point and in the scene. Of obstacles that overlap, the one in which the point is
+        deepest counts.
+
+        Args:
+            point: (3,) m, world; for many points use `jax.vmap`.
+
+        Returns:
+            () m; infinity in a scene without anything.
+
+        Raises:
+            ValueError: a wrong shape, or a mesh or URDF file in the scene.
+        """
+        point = self._point(point)
+        return distance_of(self.shapes(point.dtype), self.ground, point)
+
+    def nearest(self, point: ArrayLike) -> Surface:
+        """The nearest surface: its signed distance, its point and its outward normal there, also from inside.
+
+        It is differentiable in the point and in the scene. Where several surfaces are equally near, it is one of them.
+
+        Args:
+            point: (3,) m, world; for many points use `jax.vmap`.
+
+        Raises:
+            ValueError: a wrong shape, or a mesh or URDF file in the scene.
+        """
+        point = self._point(point)
+        return nearest_of(self.shapes(point.dtype), self.ground, point)
+
+    def contains(self, point: ArrayLike) -> Bool[Array, ""]:
+        """Whether a point (3,) (m, world) is inside an obstacle or underground."""
+        return self.distance(point) < 0
+
+    def padded(self, **capacity: int) -> Scene:
+        """The same scene in arrays of given lengths, filled up with obstacles that are not active.
+
+        Worlds with different numbers of obstacles so have one structure, and can be stacked and mapped.
+
+        Args:
+            capacity: length of the arrays by their names, for example `boxes=8, cylinders=30`.
+
+        Raises:
+            ValueError: an unknown kind, or more obstacles than the array holds.
+        """
+        arrays: dict[str, Any] = {}
+        for name, length in capacity.items():
+            check_choice("kind of obstacles", name, KINDS)
+            check_whole(f"capacity of {name}", length)
+            stack = getattr(self, name)
+            count = 0 if stack is None else len(stack.pos)
+            if count > length:
+                raise ValueError(
+                    f"the scene has {count} {name} and the array holds {length}; give {name}={count} or more"
+                )
+            rest = _inactive(KINDS[name], length - count)
+            arrays[name] = _joined([rest] if stack is None else [stack, rest])
+        return self.replace(**arrays)
+
+    def _point(self, point: ArrayLike) -> Array:
+        check_scene(self)
+        point = as_floats(point)
+        check_shape("point", point, (3,), "x, y, z of one point; for many use jax.vmap")
+        return point
 
 
 def check_scene(scene: Any, files: bool = False) -> None:
@@ -110,12 +189,38 @@ def check_scene(scene: Any, files: bool = False) -> None:
         if stack is not None:
             check_shape(f"scene.{name}.pos", stack.pos, ("k", 3), "of one world; for many worlds use jax.vmap")
     if not files and (scene.meshes or scene.urdfs):
-        kind = type((*scene.meshes, *scene.urdfs)[0]).__name__
+        file = (*scene.meshes, *scene.urdfs)[0]
+        builder = "mesh.bounding_box()" if isinstance(file, Mesh) else "jaxdrones.sensing.from_urdf(path)"
         known = ", ".join(kind.__name__ for kind in KINDS.values())
         raise ValueError(
-            f"the scene has a {kind}, which only Bullet reads; give {known}, or ask the Bullet backend, for example "
-            "step.contacts(params, state)"
+            f"the scene has a {type(file).__name__}, which only Bullet reads; give {known}, for example "
+            f"{builder} in its place, or ask the Bullet backend, for example step.contacts(params, state)"
         )
+
+
+def _as_arrays(obstacles: Obstacle, dtype: DTypeLike) -> Obstacle:
+    """The same obstacles, with numbers of this type and a mask."""
+    active = jnp.asarray(_mask(obstacles), bool)
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), obstacles.replace(active=None)).replace(active=active)
+
+
+def _mask(obstacles: Obstacle) -> Any:
+    """Which of many obstacles are there."""
+    return jnp.ones(len(obstacles.pos), bool) if obstacles.active is None else obstacles.active
+
+
+def _inactive(kind: type[Obstacle], count: int) -> Obstacle:
+    """Obstacles of a kind that are not there, with a leading axis."""
+    own = {field.name for field in dataclasses.fields(kind)} - {field.name for field in dataclasses.fields(Obstacle)}
+    sizes: dict[str, Any] = {name: jnp.ones(LENGTHS.get(name, ())) for name in own}
+    return _rows(kind(pos=jnp.zeros((count, 3)), active=False, **sizes))
+
+
+def _joined(rows: list[Any]) -> Any:
+    """All obstacles of some arrays in one; with a mask if one of them has it."""
+    if any(row.active is not None for row in rows):
+        rows = [row.replace(active=_mask(row)) for row in rows]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
 
 
 def _rows(obstacle: Obstacle) -> Obstacle:
@@ -123,12 +228,16 @@ def _rows(obstacle: Obstacle) -> Obstacle:
     kind = type(obstacle).__name__
     arrays: dict[str, Array] = {}
     for name, value in vars(obstacle).items():
-        arrays[name] = array = jnp.asarray(value, float)
+        if name == "active" and value is None:
+            continue
+        arrays[name] = array = jnp.asarray(value, bool if name == "active" else float)
+        if name == "active" and jnp.asarray(value).dtype.kind != "b":
+            raise ValueError(f"active of {kind} is {shown(value)}; give True or False")
         length = LENGTHS.get(name)
         if length and array.shape[-1:] != (length,):
             raise ValueError(f"{name} of {kind} is {shown(value)}; give {length} numbers")
         check_finite(f"{name} of {kind}", value)
-        if name not in ("pos", "quat", "color") and is_known(value) and not (np.asarray(value) > 0).all():
+        if name not in ("pos", "quat", "color", "active") and is_known(value) and not (np.asarray(value) > 0).all():
             raise ValueError(f"{name} of {kind} is {shown(value)}; give positive numbers (m)")
     check_quaternion(f"quat of {kind}", obstacle.quat)
     arrays["quat"] = arrays["quat"] / jnp.linalg.norm(arrays["quat"], axis=-1, keepdims=True)

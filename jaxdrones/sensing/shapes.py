@@ -8,23 +8,29 @@ from __future__ import annotations
 
 import abc
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.vector import components, cross, dot, safe_sqrt
-
-Point = Float[Array, "3"]
-Number = Float[Array, ""]
-Interval = tuple[Array, Array]
-Components = Sequence[Array]
-"""x, y and z of one vector, or of many, as three arrays that broadcast with each other."""
+from jaxdrones.sensing.geometry import (
+    Components,
+    Interval,
+    Number,
+    Point,
+    around_z,
+    between_planes,
+    direction,
+    length,
+    outward,
+    signed_distance,
+    within_radius,
+)
+from jaxdrones.vector import components, dot
 
 _NUMBERS = (int, float, np.ndarray, np.generic, jax.Array)
 GREY = (0.6, 0.6, 0.6, 1.0)
@@ -41,6 +47,9 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
     """(4,) attitude, unit quaternion (x, y, z, w), obstacle to world."""
     color: Any = GREY
     """(4,) red, green, blue, opacity, each 0 to 1."""
+    active: Any = None
+    """() bool: whether the obstacle is there; it is when left out. One that is not keeps its number, and nothing sees
+    or touches it."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -61,6 +70,13 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
         """Signed distance of a point from the surface, m; negative inside."""
 
     @abc.abstractmethod
+    def normal(self, point: Point) -> Point:
+        """Outward unit normal of the surface where it is nearest to a point: the gradient of the distance.
+
+        Where several points of the surface are equally near, it is that of one of them.
+        """
+
+    @abc.abstractmethod
     def interval(self, origin: Components, direction: Components) -> Interval:
         """The multiples of `direction`, first and last, at which lines through `origin` are inside.
 
@@ -68,8 +84,8 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
         """
 
     @abc.abstractmethod
-    def normal(self, point: Components) -> Components:
-        """Vectors of any length that point outward where a point is on the surface."""
+    def normals(self, point: Components) -> Components:
+        """Vectors of any length that point outward, of many points that are on the surface."""
 
     @abc.abstractmethod
     def nearest(self, point: Point) -> Point:
@@ -92,15 +108,20 @@ class Box(Obstacle, kw_only=True):
 
     def distance(self, point: Point) -> Number:
         """Signed distance of a point from the surface, m."""
-        return _distance(jnp.abs(point) - self.size / 2)
+        return signed_distance(jnp.abs(point) - self.size / 2)
+
+    def normal(self, point: Point) -> Point:
+        """Outward unit normal of the surface where it is nearest to a point."""
+        side = jnp.where(point < 0, -1, 1).astype(point.dtype)
+        return side * outward(jnp.abs(point) - self.size / 2)
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are between all three pairs of faces."""
         faces = zip(origin, direction, components(self.size / 2), strict=True)
-        first, last = zip(*(_between_planes(*face) for face in faces), strict=True)
+        first, last = zip(*(between_planes(*face) for face in faces), strict=True)
         return functools.reduce(jnp.maximum, first), functools.reduce(jnp.minimum, last)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The normal of the face that a point is on."""
         x, y, z = (p / half for p, half in zip(point, components(self.size / 2), strict=True))
         largest = functools.reduce(jnp.maximum, map(jnp.abs, (x, y, z)))
@@ -132,13 +153,17 @@ class Sphere(Obstacle, kw_only=True):
 
     def distance(self, point: Point) -> Number:
         """Signed distance of a point from the surface, m."""
-        return _length(point) - self.radius
+        return length(point) - self.radius
+
+    def normal(self, point: Point) -> Point:
+        """Outward unit normal of the surface where it is nearest to a point."""
+        return direction(point)
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are within the radius."""
-        return _within_radius(origin, direction, self.radius)
+        return within_radius(origin, direction, self.radius)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The direction from the center."""
         return point
 
@@ -161,16 +186,22 @@ class Cylinder(Obstacle, kw_only=True):
 
     def distance(self, point: Point) -> Number:
         """Signed distance of a point from the surface, m."""
+        return signed_distance(self._beyond(point))
+
+    def normal(self, point: Point) -> Point:
+        """Outward unit normal of the surface where it is nearest to a point."""
+        x, y = components(direction(point[:2]))
         _, _, z = components(point)
-        return _distance(jnp.stack([_length(point[:2]) - self.radius, jnp.abs(z) - self.height / 2]))
+        radial, along = components(outward(self._beyond(point)))
+        return jnp.stack([radial * x, radial * y, jnp.where(z < 0, -along, along)])
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are within the radius and between the two ends."""
-        first, last = _within_radius(origin[:2], direction[:2], self.radius)
-        bottom, top = _between_planes(origin[2], direction[2], self.height / 2)
+        first, last = within_radius(origin[:2], direction[:2], self.radius)
+        bottom, top = between_planes(origin[2], direction[2], self.height / 2)
         return jnp.maximum(first, bottom), jnp.minimum(last, top)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The direction from the axis, or along the axis at the ends."""
         x, y, z = point
         at_end = (z * self.radius) ** 2 > (x * x + y * y) * (self.height / 2) ** 2
@@ -179,17 +210,22 @@ class Cylinder(Obstacle, kw_only=True):
     def nearest(self, point: Point) -> Point:
         """The point of the cylinder that is nearest to a point, m."""
         x, y, z = components(point)
-        inward = jnp.minimum(1, self.radius / jnp.maximum(_length(point[:2]), self.radius))
+        inward = jnp.minimum(1, self.radius / jnp.maximum(length(point[:2]), self.radius))
         return jnp.stack([inward * x, inward * y, jnp.clip(z, -self.height / 2, self.height / 2)])
 
     def extent(self, direction: Point) -> Number:
         """How far the cylinder extends from its center along a unit vector, m."""
         _, _, z = components(direction)
-        return self.height / 2 * jnp.abs(z) + self.radius * _length(direction[:2])
+        return self.height / 2 * jnp.abs(z) + self.radius * length(direction[:2])
+
+    def _beyond(self, point: Point) -> Array:
+        """How far a point is beyond the radius and beyond the ends, m."""
+        _, _, z = components(point)
+        return jnp.stack([length(point[:2]) - self.radius, jnp.abs(z) - self.height / 2])
 
     def separating(self, center: Point, axis: Point) -> list[Point]:
         """The axis, the radius towards the other cylinder, and the common normal of the two axes."""
-        return _around_z(center, axis)
+        return around_z(center, axis)
 
 
 class Capsule(Obstacle, kw_only=True):
@@ -207,7 +243,11 @@ class Capsule(Obstacle, kw_only=True):
 
     def distance(self, point: Point) -> Number:
         """Signed distance of a point from the surface, m."""
-        return _length(point - self.nearest(point)) - self.radius
+        return length(point - self.nearest(point)) - self.radius
+
+    def normal(self, point: Point) -> Point:
+        """Outward unit normal of the surface where it is nearest to a point."""
+        return direction(point - self.nearest(point))
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are in the cylinder or in a ball: one interval, as the capsule is convex."""
@@ -215,14 +255,14 @@ class Capsule(Obstacle, kw_only=True):
         cylinder = Cylinder(pos=self.pos, radius=self.radius, height=self.height)
         parts = [
             cylinder.interval(origin, direction),
-            _within_radius((x, y, z - self.height / 2), direction, self.radius),
-            _within_radius((x, y, z + self.height / 2), direction, self.radius),
+            within_radius((x, y, z - self.height / 2), direction, self.radius),
+            within_radius((x, y, z + self.height / 2), direction, self.radius),
         ]
         first = (jnp.where(first <= last, first, jnp.inf) for first, last in parts)
         last = (jnp.where(first <= last, last, -jnp.inf) for first, last in parts)
         return functools.reduce(jnp.minimum, first), functools.reduce(jnp.maximum, last)
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The direction from the nearest point of the axis."""
         x, y, z = point
         return [x, y, z - jnp.clip(z, -self.height / 2, self.height / 2)]
@@ -240,51 +280,10 @@ class Capsule(Obstacle, kw_only=True):
 
     def separating(self, center: Point, axis: Point) -> list[Point]:
         """The axis, the radius towards the other cylinder, and the common normal of the two axes."""
-        return _around_z(center, axis)
-
-
-def _length(v: Float[Array, " n"]) -> Number:
-    return safe_sqrt(dot(v, v))
-
-
-def _distance(beyond: Float[Array, " n"]) -> Number:
-    """Signed distance from a product of intervals, of how far each coordinate is beyond its interval."""
-    return _length(jnp.maximum(beyond, 0)) + jnp.minimum(jnp.max(beyond), 0)
-
-
-def _around_z(center: Point, axis: Point) -> list[Point]:
-    x, y, _ = components(center)
-    z_axis = jnp.array([0, 0, 1], center.dtype)
-    return [z_axis, jnp.stack([x, y, jnp.zeros_like(x)]), cross(axis, z_axis)]
-
-
-def _between_planes(origin: Array, direction: Array, half: Array) -> Interval:
-    """Where lines are between two planes at +-`half`."""
-    per_unit = 1 / nonzero(direction)
-    middle, reach = -origin * per_unit, half * jnp.abs(per_unit)
-    return middle - reach, middle + reach
-
-
-def _within_radius(origin: Components, direction: Components, radius: Number) -> Interval:
-    """Where lines are within `radius` of zero; the empty interval [inf, -inf] where they are never."""
-    square = nonzero(_dot(direction, direction))
-    middle = -_dot(origin, direction) / square
-    closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
-    slack = radius**2 - _dot(closest, closest)
-    reach = jnp.where(slack >= 0, safe_sqrt(slack / square), -jnp.inf)
-    return middle - reach, middle + reach
-
-
-def _dot(a: Components, b: Components) -> Array:
-    return functools.reduce(jnp.add, (x * y for x, y in zip(a, b, strict=True)))
-
-
-def nonzero(x: Array) -> Array:
-    """The same number, but no smaller than one whose inverse has finite derivatives."""
-    smallest = jnp.finfo(x.dtype).tiny ** 0.25
-    return jnp.where(jnp.abs(x) < smallest, smallest, x)
+        return around_z(center, axis)
 
 
 def single(obstacles: Obstacle, i: int) -> Any:
     """One of many obstacles of a kind."""
-    return jax.tree.map(lambda x: x[i], obstacles)
+    obstacle = jax.tree.map(lambda x: x[i], obstacles)
+    return obstacle.replace(active=True) if obstacle.active is None else obstacle

@@ -20,7 +20,8 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxdrones import rotation
-from jaxdrones.sensing.shapes import Components, Interval, Obstacle, nonzero
+from jaxdrones.sensing.geometry import Components, Interval, nonzero
+from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import components
 
 _UNROLL = 2  # solids per turn of the loop; all of them in one turn would make compilers keep each one's image
@@ -62,7 +63,7 @@ class Placed(flax.struct.PyTreeNode):
         """Components to the left and up, over that along the ray, of the normals where the rays of pixels hit."""
         axes = [components(axis) for axis in components(self.axes)]
         ray = [x + u * y + v * z for x, y, z in zip(*axes, strict=True)]
-        normal = self.solid.normal([o + depth * d for o, d in zip(components(self.origin), ray, strict=True)])
+        normal = self.solid.normals([o + depth * d for o, d in zip(components(self.origin), ray, strict=True)])
         forward, left, up = (sum(n * x for n, x in zip(normal, axis, strict=True)) for axis in axes)
         along = nonzero(forward + u * left + v * up)
         return left / along, up / along
@@ -85,7 +86,7 @@ class Ground(flax.struct.PyTreeNode):
         """The same point."""
         return point
 
-    def normal(self, point: Components) -> Components:
+    def normals(self, point: Components) -> Components:
         """The vertical."""
         zero = jnp.zeros_like(point[2])
         return [zero, zero, jnp.ones_like(zero)]

@@ -10,12 +10,13 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing import Camera, Scene, collisions
+from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, norm, out_of_control
+from jaxdrones.tasks.touching import touches
 
 HEIGHT = 1.5  # m, of flight
 REACHED = 1.0  # m: a drone that is nearer to its goal has reached it
@@ -161,13 +162,13 @@ def forest(
 def _advance(task: Task, world: World) -> dict[str, Array]:
     variables, pos = world.variables, world.drones.pos
     goal = variables["goal"]
-    touches = collisions(world.params, world.drones, world.scene)
+    found = touches(world)
     return variables | {
         "pos": pos,
         "progress": norm(variables["pos"] - goal) - norm(pos - goal),
         "path": variables["path"] + norm(pos - variables["pos"]),
         "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
-        "touched": variables["touched"] | touches.ground | touches.drones | touches.scene,
+        "touched": variables["touched"] | found.ground | found.drones | found.scene,
         "reached": variables["reached"] | (norm(pos - goal) < REACHED),
     }
 

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_keywords, check_number, check_switch, check_whole, shown
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing import Cylinder, Scene, gate
+from jaxdrones.sensing import BEAMS, Cylinder, Scene, gate, track
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import hovering, standing_height
-from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control, square
+from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control
+from jaxdrones.tasks.touching import touches
+from jaxdrones.vector import atan2
 
 # x, y, z (m) and heading (rad) in which each gate is crossed, in this order
 GATES = np.array([(0.5, 0.25, 0.7, -0.78), (1.05, 0.75, 1.2, 2.35), (-1.0, -0.25, 0.7, 3.14), (0.0, -0.75, 1.2, 0.0)])
 POLES = np.array([(0.0, 0.75), (1.0, 0.25), (-1.5, -0.25), (-0.5, -0.75)])  # x, y, m
 START = np.array([-1.5, 0.75])
-OPENING, OUTER = 0.40, 0.72  # m, edges of the square hole and of the frame
+OPENING, FRAME = 0.40, 0.16  # m, edge of the square hole and width of the beams around it
 POLE_RADIUS, POLE_HEIGHT = 0.015, 1.52  # m
 LEVELS = (0, 1, 2, 3)
 _START_SPACING = 0.5  # m in y between drones at the start
@@ -29,6 +34,7 @@ _MAX_DRONES = 5  # so that all start inside the arena
 
 _GATE_RANGE = np.array([0.15, 0.15, 0.1, 0.2])  # m, m, m, rad: level 2 moves gates by U(-range, range)
 _POLE_RANGE = 0.15  # m
+_NOWHERE = 100.0  # m: outside the arena
 _SIGHT = 3.0  # m, at which the observed positions of poles are clipped
 _INERTIA_RANGE = 0.2  # share: level 1 on
 
@@ -37,7 +43,8 @@ _INERTIA_RANGE = 0.2  # share: level 1 on
 def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start: bool = False) -> Task:
     """One lap through four gates.
 
-    In Bullet gates and poles are solid on levels 0 and 1; on the others hits are found by geometry alone.
+    Gates and poles are obstacles of the scene: solid in Bullet, visible to cameras, and hit as `sensing.collisions`
+    tells. Another scene may be given that begins with four gates, such as one of `sensing.track`.
 
     Args:
         drones: number of drones, at most 5; they start 0.5 m apart in y and do not observe each other.
@@ -53,10 +60,10 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
     if level not in LEVELS:
         raise ValueError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
 
-    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
-        track_key, pole_key, gate_key, place_key = jax.random.split(key, 4)
+    def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
+        gate_key, place_key = jax.random.split(key)
         n, dtype = len(params.mass), params.mass.dtype
-        variables = {"gates": _track(track_key, level, dtype), "poles": _poles(pole_key, level, dtype)}
+        variables = {"gates": _gates_of(scene, dtype), "poles": _poles_of(scene, dtype)}
         x, y = START
         pos = jnp.stack(
             [jnp.full(n, x, dtype), y + _START_SPACING * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1
@@ -116,7 +123,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
         success=lambda metrics, dt: metrics["gates"][-1] == len(GATES),
         randomize=() if level == 0 else (_random_inertia,),
         observations={"gates": ObservationTerm(_observe_gates, 20.0), "poles": ObservationTerm(_observe_poles, _SIGHT)},
-        scene=_scene() if level < 2 else Scene(),
+        scene=_scene(level) if level < 2 else functools.partial(_scene, level),
         obstacles_terminate=True,
         contact=("ground",),
         observation=("position", "gates", "poles", "rotation_matrix", "velocity", "omega", "last_action"),
@@ -124,50 +131,79 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
 
 
 def _advance(task: Task, world: World) -> dict[str, Array]:
-    """Which gates are passed and what is hit on the straight line from the last position to this one."""
-    variables, params, pos = world.variables, world.params, world.drones.pos
-    gate = _gate(variables)
-    before, after = _in_gate(gate, variables["pos"]), _in_gate(gate, pos)
+    """Which gates are passed on the straight line from the last position to this one, and what is hit."""
+    variables, pos = world.variables, world.drones.pos
+    ahead = _gate(variables)
+    before, after = _in_gate(ahead, variables["pos"]), _in_gate(ahead, pos)
     crosses = (before[:, 0] < 0) & (after[:, 0] >= 0)
     share = -before[:, 0] / jnp.where(crosses, after[:, 0] - before[:, 0], 1)
     _, y, z = jnp.abs(before + share[:, None] * (after - before)).T
-    radius, half = params.collision_radius, params.collision_height / 2
-    inside = (y < OPENING / 2 - radius) & (z < OPENING / 2 - half)
-    frame = (y < OUTER / 2 + radius) & (z < OUTER / 2 + half) & ~inside
-
-    away = square((pos[:, None, :2] - variables["poles"][None]).reshape(-1, 2)).reshape(len(pos), -1)
-    pole = jnp.any(away < (POLE_RADIUS + radius[:, None]) ** 2, axis=-1) & (pos[:, 2] < POLE_HEIGHT + half)
+    passes = crosses & (y < OPENING / 2) & (z < OPENING / 2)
 
     index = variables["index"]
     racing = index < len(GATES)
     target = task.target_now(world).pos  # before the gate is passed
     return variables | {
-        "index": index + (racing & crosses & inside),
+        "index": index + (racing & passes),
         "before": index,
-        "hit": pole | (racing & crosses & frame),
+        "hit": touches(world, world.scene.replace(ground=False)).scene,
         "pos": pos,
         "progress": racing * (norm(variables["pos"] - target) - norm(pos - target)),
         "lap_time": jnp.where(racing, world.time, variables["lap_time"]),
     }
 
 
-def _track(key: jax.Array, level: int, dtype) -> Float[Array, "4 4"]:
-    u = jax.random.uniform(key, GATES.shape, dtype, -1, 1)
-    if level < 2:
-        return jnp.asarray(GATES, dtype)
-    if level == 2:
-        return jnp.asarray(GATES, dtype) + jnp.asarray(_GATE_RANGE, dtype)[None] * u
-    quarter = jnp.asarray([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype)  # one gate in each, so that they stay apart
-    place = quarter * jnp.asarray([[1.3, 0.9]], dtype) + 0.25 * u[:, :2]
+def _scene(level: int, key: jax.Array | None = None) -> Scene:
+    """Gates and poles of a level; those of levels 2 and 3 are drawn from the key."""
+    if key is None:
+        return _solids(GATES, POLES)
+    gate_key, pole_key = jax.random.split(key)
+    u = jax.random.uniform(gate_key, GATES.shape, minval=-1, maxval=1)
+    if level == 3:
+        return _solids(_random_track(u))
+    moved = jax.random.uniform(pole_key, POLES.shape, minval=-_POLE_RANGE, maxval=_POLE_RANGE)
+    return _solids(GATES + jnp.asarray(_GATE_RANGE)[None] * u, POLES + moved)
+
+
+def _random_track(u: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+    """A round of four gates, from random numbers in [-1, 1]."""
+    quarter = jnp.array([(1, 0), (0, 1), (-1, 0), (0, -1)], u.dtype)  # one gate in each, so that they stay apart
+    place = quarter * jnp.array([[1.3, 0.9]]) + 0.25 * u[:, :2]
     heading = jnp.arctan2(quarter[:, 0], -quarter[:, 1]) + 0.6 * u[:, 3]  # counter-clockwise, 34 degrees off
     return jnp.concatenate([place, 0.95 + 0.25 * u[:, 2:3], heading[:, None]], axis=-1)
 
 
-def _poles(key: jax.Array, level: int, dtype) -> Float[Array, "4 2"]:
-    poles = jnp.asarray(POLES, dtype)
-    if level == 2:
-        return poles + jax.random.uniform(key, POLES.shape, dtype, -_POLE_RANGE, _POLE_RANGE)
-    return poles + (100.0 if level == 3 else 0.0)  # m: outside the arena
+def _solids(gates: ArrayLike, poles: ArrayLike | None = None) -> Scene:
+    """The scene of gates (4, 4) and of poles (k, 2)."""
+    if poles is None:
+        return track(gates, OPENING, FRAME)
+    gates, poles = jnp.asarray(gates, float), jnp.asarray(poles, float)
+    pos = jnp.concatenate([poles, jnp.full((len(poles), 1), POLE_HEIGHT / 2)], axis=-1)
+    beams = jax.vmap(lambda pose: gate(pose[:3], pose[3], OPENING, FRAME))(gates)
+    return Scene.of(beams, Cylinder(pos=pos, radius=POLE_RADIUS, height=POLE_HEIGHT))
+
+
+def _gates_of(scene: Scene, dtype) -> Float[Array, "4 4"]:
+    """The gates of a scene: x, y, z of the centers (m) and headings (rad)."""
+    beams = BEAMS * len(GATES)
+    if scene.boxes is None or len(scene.boxes.pos) < beams:
+        found = 0 if scene.boxes is None else len(scene.boxes.pos)
+        raise ValueError(
+            f"the task gates needs a scene whose first {beams} boxes are the beams of its {len(GATES)} gates; this one "
+            f"has {found} boxes; give one of jaxdrones.sensing.track"
+        )
+    pos, quat = (
+        jnp.asarray(x[:beams], dtype).reshape(len(GATES), BEAMS, -1) for x in (scene.boxes.pos, scene.boxes.quat)
+    )
+    heading = 2 * atan2(quat[:, 0, 2], quat[:, 0, 3])
+    return jnp.concatenate([jnp.mean(pos, axis=1), heading[:, None]], axis=-1)
+
+
+def _poles_of(scene: Scene, dtype) -> Float[Array, "4 2"]:
+    """X and y of the first four cylinders of a scene, m; far away where it has fewer."""
+    pos = jnp.zeros((0, 2)) if scene.cylinders is None else scene.cylinders.pos[: len(POLES), :2]
+    missing = len(POLES) - len(pos)
+    return jnp.pad(jnp.asarray(pos, dtype), ((0, missing), (0, 0)), constant_values=_NOWHERE)
 
 
 def _random_inertia(key: jax.Array, params: Params) -> Params:
@@ -203,10 +239,3 @@ def _observe_poles(task: Task, world: World) -> Float[Array, "n 8"]:
     """Positions of all poles relative to the drone, x and y in world axes, m; clipped at 3 m."""
     away = world.variables["poles"][None] - world.drones.pos[:, None, :2]
     return jnp.clip(away, -_SIGHT, _SIGHT).reshape(len(away), -1)
-
-
-def _scene() -> Scene:
-    poles = np.column_stack([POLES, np.full(len(POLES), POLE_HEIGHT / 2)])
-    return Scene.of(
-        jax.vmap(gate)(GATES[:, :3], GATES[:, 3]), Cylinder(pos=poles, radius=POLE_RADIUS, height=POLE_HEIGHT)
-    )

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.sensing import distance
 from jaxdrones.tasks.task import Task, Term, World, square
 
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
@@ -43,7 +42,7 @@ def body_rates(task: Task, world: World) -> Float[Array, " n"]:
 
 def gap(world: World) -> Float[Array, " n"]:
     """Distance of every drone's center from the nearest obstacle or the ground, less its collision radius, m."""
-    return jax.vmap(distance, (None, 0))(world.scene, world.drones.pos) - world.params.collision_radius
+    return jax.vmap(world.scene.distance)(world.drones.pos) - world.params.collision_radius
 
 
 def clearance(task: Task, world: World) -> Float[Array, " n"]:
@@ -54,7 +53,7 @@ def clearance(task: Task, world: World) -> Float[Array, " n"]:
     """
 
     def of_drone(radius: Array, pos: Array, vel: Array) -> Array:
-        away, rate = jax.jvp(lambda pos: distance(world.scene, pos), (pos,), (vel,))
+        away, rate = jax.jvp(world.scene.distance, (pos,), (vel,))
         closing = jnp.maximum(-rate, 0)
         inside = _MARGIN + _MARGIN_TIME * closing - (away - radius)
         return (1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS)

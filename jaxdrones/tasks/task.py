@@ -122,7 +122,7 @@ class Task:
     scene: Scene | Callable[[jax.Array], Scene] = dataclasses.field(default_factory=Scene)
     """Obstacles and ground; or a function `(key) -> Scene` that draws them for every episode."""
     obstacles_terminate: bool = False
-    """Whether the task's terminations find hits of its scene's obstacles, so that no force needs to do it."""
+    """Whether the task's terminations find hits of obstacles, so that no force needs to do it."""
     camera: Camera | None = None
     """The camera of every drone, unless the environment says otherwise; `Camera()` when left out."""
     vision: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from helpers import assert_close, assert_finite, flying
 import jaxdrones as jd
 from jaxdrones.engine import bullet
 from jaxdrones.envs import make
-from jaxdrones.sensing import Box, Scene, Sphere, distance
+from jaxdrones.sensing import Box, Scene, Sphere
 from jaxdrones.sensing.sensor import init_sensors, measure_sensors
 
 KEY = jax.random.key(0)
@@ -205,7 +205,7 @@ def test_environments_carry_users_sensors(backend):
 
 def touch(params, state, scene):
     """A stiff damped spring along the gradient of the distance, at the center of mass."""
-    away, normal = jax.value_and_grad(distance, argnums=1)(scene, state.pos)
+    away, normal = jax.value_and_grad(Scene.distance, argnums=1)(scene, state.pos)
     depth, speed = params.collision_height / 2 - away, jd.vector.dot(normal, state.vel)
     force = jnp.where(depth > 0, jnp.maximum(params.mass * (4e3 * depth - 80 * speed), 0), 0) * normal
     return jd.Wrench.of_force(jd.rotation.rotate_inverse(state.quat, force))

@@ -1,5 +1,7 @@
 """Distances and rays: laws of geometry, central differences, and Bullet's answers."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from helpers import assert_close, assert_finite
 
 import jaxdrones as jd
 from jaxdrones.engine import bullet
-from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere, Urdf, distance, ray
+from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere, Urdf, ray
 
 RNG = np.random.default_rng(0)
 UP, DOWN = (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
@@ -19,8 +21,8 @@ POLE = Cylinder(pos=(0, 0, 2), radius=0.5, height=2.0)
 PILL = Capsule(pos=(0, 0, 2), radius=0.5, height=2.0)
 SOLIDS = [BRICK, BALL, POLE, PILL]
 
-distances = jax.jit(jax.vmap(distance, (None, 0)))
-distances_and_slopes = jax.jit(jax.vmap(jax.value_and_grad(distance, argnums=1), (None, 0)))
+distances = jax.jit(jax.vmap(Scene.distance, (None, 0)))
+distances_and_slopes = jax.jit(jax.vmap(jax.value_and_grad(Scene.distance, argnums=1), (None, 0)))
 rays = jax.jit(jax.vmap(ray, (None, 0, 0)))
 
 
@@ -69,13 +71,13 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
     ],
 )
 def test_distances_that_are_worked_out_by_hand(solid, point, expected):
-    np.testing.assert_allclose(distance(Scene.of(solid, ground=False), point), expected, atol=1e-12)
+    np.testing.assert_allclose(Scene.of(solid, ground=False).distance(point), expected, atol=1e-12)
 
 
 def test_the_ground_is_a_surface_and_nothing_is_infinitely_far():
-    assert distance(Scene(), (3, 4, 5)) == 5 and distance(Scene(), (3, 4, -1)) == -1
-    assert distance(Scene.of(BALL), (0, 0, 0.1)) == 0.1
-    assert distance(Scene(ground=False), (0, 0, 1)) == jnp.inf
+    assert Scene().distance((3, 4, 5)) == 5 and Scene().distance((3, 4, -1)) == -1
+    assert Scene.of(BALL).distance((0, 0, 0.1)) == 0.1
+    assert Scene(ground=False).distance((0, 0, 1)) == jnp.inf
     assert ray(Scene(), (3, 4, 5), DOWN) == 5 and ray(Scene(), (3, 4, 5), (0.8, 0, -0.6)) == pytest.approx(5 / 0.6)
     assert ray(Scene(), (3, 4, 5), UP) == ray(Scene(), (3, 4, 5), (1, 0, 0)) == jnp.inf
     assert ray(Scene(ground=False), (3, 4, 5), DOWN) == jnp.inf
@@ -90,6 +92,56 @@ def test_the_nearest_point_of_the_surface_is_a_distance_down_the_gradient(solid)
     assert np.sum(found < 0) > 10 and np.sum(found > 0) > 10
     np.testing.assert_allclose(np.linalg.norm(slopes, axis=1), 1, rtol=1e-9)
     np.testing.assert_allclose(distances(scene, points - found[:, None] * slopes), 0, atol=1e-9)
+
+
+surfaces = jax.jit(jax.vmap(Scene.nearest, (None, 0)))
+
+
+def test_the_nearest_surface_is_a_distance_away_along_its_normal():
+    """Inside and outside; the normal is the gradient of the distance."""
+    points = np.concatenate([POINTS, RNG.uniform([-2, -2, -0.2], [2, 2, 3], (300, 3))])
+    found, (far, slopes) = surfaces(SCENE, points), distances_and_slopes(SCENE, points)
+    assert np.sum(far < 0) > 50 and np.sum(far > 0) > 50
+    np.testing.assert_allclose(found.distance, far, atol=1e-12)
+    np.testing.assert_allclose(found.normal, slopes, atol=1e-9)
+    np.testing.assert_allclose(found.point + far[:, None] * found.normal, points, atol=1e-12)
+
+
+def test_normals_have_unit_length_and_finite_gradients_also_at_centers_and_on_faces_and_edges():
+    places = np.array([(0, 0, 2), (1, 0, 2), (1, 2, 2), (1, 2, 2.5), (0.5, 0, 2), (0, 0, 3), (0.5, 0, 3), (0, 0, 3.5)])
+    scenes = [Scene.of(solid, ground=False) for solid in SOLIDS]
+
+    @jax.jit
+    @jax.vmap
+    def normals(point):
+        return [scene.nearest(point).normal for scene in scenes]
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(None, 0))
+    @partial(jax.grad, argnums=(0, 1))
+    def slopes(scenes, point):
+        found = [scene.nearest(point) for scene in scenes]
+        return sum(jnp.sum(x * jnp.arange(1.0, 1 + x.size)) for x in jax.tree.leaves(found))
+
+    np.testing.assert_allclose(np.linalg.norm(normals(places), axis=-1), 1, rtol=1e-12)
+    assert_finite(slopes(scenes, places))
+    nothing = Scene(ground=False).nearest((0, 0, 1))
+    assert nothing.distance == jnp.inf and np.all(nothing.normal == 0) and np.all(nothing.point == jnp.inf)
+
+
+def test_an_obstacle_that_is_not_active_is_not_there():
+    """For distances, surfaces and rays; the others are as they were."""
+    mask = np.arange(14) % 3 > 0
+    of_kinds = np.split(mask, [4, 7, 11])
+    kinds = ("boxes", "spheres", "cylinders", "capsules")
+    some = SCENE.replace(**{k: getattr(SCENE, k).replace(active=m) for k, m in zip(kinds, of_kinds, strict=True)})
+    few = Scene.of(*(obstacle for obstacle in some.obstacles if obstacle.active))
+    assert [bool(obstacle.active) for obstacle in some.obstacles] == mask.tolist()
+    np.testing.assert_allclose(distances(some, POINTS), distances(few, POINTS), rtol=1e-12)
+    np.testing.assert_allclose(rays(some, POINTS, DIRECTIONS), rays(few, POINTS, DIRECTIONS), rtol=1e-9)
+    assert_close(surfaces(some, POINTS), surfaces(few, POINTS), 1e-12)
+    none = Scene.of(BALL.replace(active=False), ground=False)
+    assert none.distance((0, 0, 2)) == none.nearest((0, 0, 2)).distance == ray(none, (5, 0, 2), (-1, 0, 0)) == jnp.inf
 
 
 def test_a_ray_ends_at_the_first_surface():
@@ -128,7 +180,7 @@ def central_differences(function, x, step=1e-6):
 
 @jax.jit
 def total_distance(scene, points):
-    return jnp.sum(jax.vmap(distance, (None, 0))(scene, points))
+    return jnp.sum(jax.vmap(Scene.distance, (None, 0))(scene, points))
 
 
 @jax.jit
@@ -154,7 +206,7 @@ def test_gradients_are_central_differences(name, kind):
         of_scene, arguments = total_ray, (POINTS[:50], DIRECTIONS[:50])
         assert np.isfinite(rays(at(), POINTS, DIRECTIONS))[:50].sum() > 3
     slope, *others = jax.jit(jax.grad(of_scene, argnums=tuple(range(1 + len(arguments)))))(at(), *arguments)
-    for field in set(vars(solids)) - {"color"}:
+    for field in set(vars(solids)) - {"color", "active"}:
         numbers = central_differences(lambda x, f=field: of_scene(at(**{f: x}), *arguments), getattr(solids, field))
         np.testing.assert_allclose(getattr(getattr(slope, kind), field), numbers, rtol=1e-5, atol=1e-6, err_msg=field)
     for i, other in enumerate(others):
@@ -172,7 +224,7 @@ def test_gradients_are_finite_everywhere():
     places = jnp.array(
         [(0, 0, 2), (0, 0, 3), (0.5, 0, 3), (1, 2, 2.5), (1, 0, 2), (0, 0, 0), (5, 5, 5), (1, -9, 2)], float
     )
-    assert_finite(jax.jit(jax.vmap(jax.grad(distance, argnums=(0, 1)), (None, 0)))(scene, places))
+    assert_finite(jax.jit(jax.vmap(jax.grad(Scene.distance, argnums=(0, 1)), (None, 0)))(scene, places))
     directions = jnp.array([UP, DOWN, (1, 0, 0), (0, -1, 0), (0.6, 0.8, 0)], float)
     of_rays = jax.jit(jax.vmap(jax.vmap(jax.grad(ray, argnums=(0, 1, 2)), (None, None, 0)), (None, 0, None)))
     assert_finite(of_rays(scene, places, directions))
@@ -185,7 +237,7 @@ def test_rays_through_drawn_scenes_are_the_same_over_worlds_as_mapped():
     def seen(key, origin, direction):
         pos = jax.random.uniform(key, (6, 3), minval=-2.0, maxval=2.0)
         scene = Scene.of(Sphere(pos=pos, radius=0.3), Box(pos=pos[:2], size=(0.5, 0.5, 2.0)), ground=False)
-        return ray(scene, origin, direction), distance(scene, origin)
+        return ray(scene, origin, direction), scene.distance(origin)
 
     arguments = jax.random.split(jax.random.key(0), len(POINTS)), jnp.asarray(POINTS), jnp.asarray(DIRECTIONS)
     assert_close(jax.jit(jd.over_worlds(seen))(*arguments), jax.jit(jax.vmap(seen))(*arguments), 1e-12)
@@ -233,7 +285,7 @@ def test_distances_are_bullets_distances(client):
         ball = dict(bodyB=-1, collisionShapeB=client._point, collisionShapePositionB=point.tolist())
         pairs = (
             client.p.getClosestPoints(bodyA=body, distance=9.0, physicsClientId=client.id, **ball)
-            for body in (*client.obstacles.values(), client.ground)
+            for body in (*client.surroundings.obstacles.values(), client.surroundings.ground)
         )
         return min(pair[8] for found in pairs for pair in found)
 
@@ -246,15 +298,15 @@ def test_what_has_no_geometry_is_refused(tmp_path):
     file = tmp_path / "body.urdf"
     file.write_text("")
     scene = Scene.of(Urdf(pos=(0, 0, 0), path=file))
-    for call in (lambda s: distance(s, UP), lambda s: ray(s, UP, DOWN)):
+    for call in (lambda s: Scene.distance(s, UP), lambda s: ray(s, UP, DOWN)):
         with pytest.raises(ValueError, match="the scene has a Urdf, which only Bullet reads; give Box, Sphere"):
             call(scene)
         with pytest.raises(ValueError, match=r"scene\.spheres\.pos has shape \(2, 1, 3\); .*jax\.vmap"):
             call(jax.tree.map(lambda x: jnp.stack([x, x]), Scene.of(BALL)))
-        with pytest.raises(ValueError, match="scene is 3"):
-            call(3)
+    with pytest.raises(ValueError, match="scene is 3"):
+        ray(3, UP, DOWN)
     with pytest.raises(ValueError, match=r"point has shape \(2, 3\); .*jax\.vmap"):
-        distance(SCENE, np.zeros((2, 3)))
+        SCENE.distance(np.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"direction has shape \(2,\)"):
         ray(SCENE, UP, (1, 0))
 

@@ -13,15 +13,13 @@ from jaxdrones.sensing import (
     Scene,
     Sphere,
     Urdf,
-    contains,
-    distance,
     gate,
     obstacles_2021,
 )
 
 QUARTER_TURN = (0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4))  # about z
 BALL = Sphere(pos=(1, 1, 1), radius=0.5)
-is_inside = jax.jit(contains)
+is_inside = jax.jit(Scene.contains)
 
 
 def test_a_gate_leaves_its_opening_free_and_closes_the_rest():
@@ -55,7 +53,7 @@ def test_the_obstacles_of_2021_leave_its_flights_their_room():
     scene = obstacles_2021()
     angle = np.linspace(0, 2 * np.pi, 60)
     places = np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle) - 0.3, 0 * angle + 0.1], axis=-1)
-    assert not jax.jit(jax.vmap(contains, (None, 0)))(scene, places).any()
+    assert not jax.jit(jax.vmap(Scene.contains, (None, 0)))(scene, places).any()
 
 
 def test_obstacles_are_numbered_kind_by_kind_and_a_kind_without_any_is_nothing(tmp_path):
@@ -90,11 +88,21 @@ def test_a_scene_is_drawn_in_a_compiled_program_and_mapped():
         return Scene.of(jax.vmap(gate)(pos + 5.0, pos[:, 0]), Sphere(pos=pos, radius=0.1), ground=False)
 
     keys = jax.random.split(jax.random.key(0), 4)
-    scenes, found = jax.jit(jax.vmap(lambda key: (drawn(key), distance(drawn(key), jnp.zeros(3)))))(keys)
+    scenes, found = jax.jit(jax.vmap(lambda key: (drawn(key), drawn(key).distance(jnp.zeros(3)))))(keys)
     assert scenes.boxes.pos.shape == (4, 20, 3) and scenes.spheres.radius.shape == (4, 5)
     nearest = np.min(np.linalg.norm(scenes.spheres.pos, axis=2), axis=1) - 0.1  # the gates are farther away
     np.testing.assert_allclose(found, nearest, rtol=1e-12)
-    np.testing.assert_allclose(jax.jit(jax.vmap(distance, (0, None)))(scenes, jnp.zeros(3)), nearest, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.vmap(Scene.distance, (0, None)))(scenes, jnp.zeros(3)), nearest, rtol=1e-12)
+
+
+def test_worlds_with_different_numbers_of_obstacles_are_stacked_and_mapped():
+    ball, box = BALL.replace(pos=(0.0, 0.0, 1.0)), Box(pos=(3, 0, 1), size=(1, 1, 1))
+    scenes = [Scene.of(ground=False), Scene.of(ball, ground=False), Scene.of(box, ball, BALL, ground=False)]
+    together = jax.tree.map(lambda *x: jnp.stack(x), *(scene.padded(boxes=1, spheres=3) for scene in scenes))
+    for point in (0, 0, 1), (3, 0, 2):
+        expected = [scene.distance(point) for scene in scenes]
+        np.testing.assert_array_equal(jax.vmap(Scene.distance, (0, None))(together, jnp.array(point)), expected)
+    assert together.spheres.active.tolist() == [[False] * 3, [True, False, False], [True, True, False]]
 
 
 def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
@@ -116,6 +124,10 @@ def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
         (lambda: Mesh(pos=(0, 0, 0), path="missing.obj"), r"missing\.obj: there is no such file"),
         (lambda: Urdf(pos=(0, 0, 0), path="missing.urdf"), r"missing\.urdf: there is no such file"),
         (lambda: Urdf(pos=(0, 0), path="missing.urdf"), r"pos of Urdf has shape \(2,\); give 3 numbers"),
+        (lambda: Scene.of(Sphere(pos=(0, 0, 0), quat=(0, 0, 0, 0), radius=1)), "quat of Sphere has length 0"),
+        (lambda: Scene.of(BALL.replace(active=0.5)), "active of Sphere is 0.5; give True or False"),
+        (lambda: Scene.of(BALL, BALL).padded(spheres=1), "has 2 spheres and the array holds 1; give spheres=2 or more"),
+        (lambda: Scene.of(BALL).padded(balls=1), "unknown kind of obstacles 'balls'"),
         (lambda: Scene.of("box"), "'box' is not an obstacle"),
         (lambda: Scene.of((BALL, BALL)), "give each as an argument of its own"),
         (lambda: Scene.of(BALL, ground=3), "ground is 3; give True or False"),

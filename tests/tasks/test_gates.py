@@ -1,24 +1,31 @@
 """What counts as passing a gate, what as hitting it, and where a race starts."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxdrones.envs import make
-from jaxdrones.tasks.gates import GATES, OPENING, OUTER, POLES
+from jaxdrones.sensing import Scene, track
+from jaxdrones.tasks.gates import FRAME, GATES, OPENING, POLES
 
 ENV = make("gates")
 RADIUS = float(ENV.params.collision_radius[0])
 THROUGH, LEFT = np.array([0.1, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
 
+advance = jax.jit(lambda world: ENV.task.advance(ENV.task, world))
+start_of_race = functools.cache(lambda: ENV.reset(jax.random.key(0))[1])
+
+
 def moved(start, end, index=0):
     """The task's variables after a drone went from one place to another within a step."""
-    _, world = ENV.reset(jax.random.key(0))
+    world = start_of_race()
     variables = world.variables | {"pos": jnp.array([start]), "index": jnp.array([index])}
     world = world.replace(drones=world.drones.replace(pos=jnp.array([end])), variables=variables)
-    return ENV.task.advance(ENV.task, world)
+    return advance(world)
 
 
 def in_gate(offset, gate=GATES[0]):
@@ -32,14 +39,18 @@ def in_gate(offset, gate=GATES[0]):
     [
         (0.0, 1, False),
         (OPENING / 2 - RADIUS - 0.01, 1, False),
-        (OPENING / 2 - RADIUS + 0.01, 0, True),
-        (-OUTER / 2, 0, True),
-        (OUTER / 2 + RADIUS + 0.01, 0, False),
+        (OPENING / 2 - RADIUS + 0.01, 1, True),
+        (-OPENING / 2 - FRAME / 2, 0, True),
+        (OPENING / 2 + FRAME + RADIUS + 0.01, 0, False),
     ],
 )
 def test_a_gate_is_passed_by_its_opening_hit_by_its_frame_and_missed_beside_it(aside, passes, hits):
-    after = moved(in_gate(aside * LEFT - THROUGH), in_gate(aside * LEFT + THROUGH))
+    after = moved(in_gate(aside * LEFT - THROUGH), in_gate(aside * LEFT + 0.05 * THROUGH))
     assert after["index"][0] == passes and bool(after["hit"][0]) == hits
+
+
+def test_other_gates_than_the_next_one_are_hit_too():
+    assert moved(in_gate(-THROUGH, GATES[2]), in_gate((OPENING / 2) * LEFT, GATES[2]))["hit"][0]
 
 
 def test_a_gate_counts_in_its_direction_and_in_its_turn():
@@ -50,7 +61,7 @@ def test_a_gate_counts_in_its_direction_and_in_its_turn():
 
 def test_after_the_last_gate_nothing_counts():
     after = moved(in_gate(-THROUGH, GATES[-1]), in_gate(THROUGH, GATES[-1]), index=len(GATES))
-    assert after["index"][0] == len(GATES) and not after["hit"][0] and after["progress"][0] == 0
+    assert after["index"][0] == len(GATES) and after["progress"][0] == 0
 
 
 def test_poles_are_hit_as_high_as_they_are():
@@ -88,10 +99,18 @@ def test_levels_move_gates_and_poles_within_their_ranges_and_keep_random_gates_a
         return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 200))[1].variables
 
     for level in (0, 1):
-        assert jnp.all(drawn(level)["gates"] == GATES[None])
-    off = np.abs(np.asarray(drawn(2)["gates"]) - GATES)
+        np.testing.assert_allclose(drawn(level)["gates"], np.broadcast_to(GATES, (200, 4, 4)), atol=1e-12)
+    off = np.abs((np.asarray(drawn(2)["gates"]) - GATES + np.pi) % (2 * np.pi) - np.pi)  # headings are a circle
     assert np.all(off <= [0.15, 0.15, 0.1, 0.2]) and np.all(off.max((0, 1)) > [0.14, 0.14, 0.09, 0.19])
     assert np.max(np.abs(np.asarray(drawn(2)["poles"]) - POLES)) <= 0.15
     centres = np.asarray(drawn(3)["gates"])[..., :3]
     apart = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) + 10 * np.eye(4)
-    assert apart.min() > OUTER
+    assert apart.min() > OPENING + 2 * FRAME
+
+
+def test_a_track_of_ones_own_is_flown_and_a_scene_without_gates_says_what_to_give():
+    own = np.array([(0.0, 0.5 * i, 1.0, 0.3) for i in range(4)])
+    variables = make("gates", scene=track(own)).reset(jax.random.key(0))[1].variables
+    np.testing.assert_allclose(variables["gates"], own, atol=1e-12)
+    with pytest.raises(ValueError, match=r"whose first 16 boxes .* has 0 boxes; give one of jaxdrones.sensing.track"):
+        make("gates", scene=Scene())

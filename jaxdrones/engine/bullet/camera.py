@@ -68,7 +68,8 @@ def drone_pictures(
             continue
         if not camera.sees_self:
             p.resetBasePositionAndOrientation(drone, _AWAY, [0, 0, 0, 1], physicsClientId=client.id)
-        frames.append(_picture(client, *np.round([look[_EYE], look[_FORWARD], look[_UP]], _DIGITS), camera, near))
+        eye, forward, up = (np.round(look[columns], _DIGITS) for columns in (_EYE, _FORWARD, _UP))
+        frames.append(_picture(client, eye, forward, up, camera, near))
         if not camera.sees_self:
             p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], physicsClientId=client.id)
     rgb, depth, segmentation = zip(*frames, strict=True)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.envs.vision import observation
 from jaxdrones.learning import bptt, ppo, shac
 
 SMALL = {
@@ -23,30 +24,20 @@ class Point(flax.struct.PyTreeNode):
 class PointWorld(flax.struct.PyTreeNode):
     drones: Point
     step: jax.Array
-    images: None = None
+    images: dict = flax.struct.field(default_factory=dict)
     poses: None = None
 
 
-class Vectors:
-    """What an environment without images is to `AutoReset`."""
-
-    vision = None
-
-    def begin(self, key):
-        return self.reset(key)
-
-    def observed(self, vector, world):
-        return vector
-
-
-class DoubleIntegrator(Vectors):
+class DoubleIntegrator:
     """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
 
-    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 50, ()
+    drones, action_size, observation_size, dt, steps, constant_fields, vision = 1, 1, 2, 0.1, 50, (), None
 
     def reset(self, key):
         x = jax.random.uniform(key, (1, 2), minval=-0.1, maxval=0.1)
         return x, PointWorld(Point(x), jnp.zeros((), jnp.int32))
+
+    begin = reset
 
     def step(self, key, world, action):
         a, b = dynamics()
@@ -58,7 +49,7 @@ class DoubleIntegrator(Vectors):
         return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
 
 
-class Cue(Vectors):
+class Cue:
     """Cost (u - cue)^2 in every step, for a cue of 0.5 or -0.5 that is observed in the first step only, or in all.
 
     The cue is a number of the observation or the depth that an image shows. Who does not remember it pays at least 0.25
@@ -68,7 +59,7 @@ class Cue(Vectors):
     drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 1, 0.1, 6, ()
 
     def __init__(self, shown: int = 1, image: bool = False):
-        self.shown, self.image = shown, image
+        self.shown, self.vision = shown, image
 
     def begin(self, key):
         cue = jax.random.choice(key, jnp.array([-0.5, 0.5]), (1, 1))
@@ -76,25 +67,26 @@ class Cue(Vectors):
         return self.vector(world), world
 
     def reset(self, key):
-        vector, world = self.begin(key)
-        return self.observed(vector, world), world
+        _, world = self.begin(key)
+        world = self.with_images(None, key, world)
+        return observation(self.vector(world), world), world
 
     def step(self, key, world, action):
         cost = (action[:, 0] - world.drones.pos[:, 0]) ** 2
-        world = world.replace(step=world.step + 1)
+        world = self.with_images(None, key, world.replace(step=world.step + 1))
         info = {"metrics": {"error": jnp.sqrt(cost)}}
-        obs = self.observed(self.vector(world), world)
+        obs = observation(self.vector(world), world)
         return obs, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
 
     def visible(self, world):
         return jnp.where(world.step < self.shown, world.drones.pos, 0)
 
     def vector(self, world):
-        return jnp.zeros_like(world.drones.pos) if self.image else self.visible(world)
+        return jnp.zeros_like(world.drones.pos) if self.vision else self.visible(world)
 
-    def observed(self, vector, world):
+    def with_images(self, look, key, world, *ended):
         depth = 3 + 4 * jnp.tile(self.visible(world)[..., None], (1, 3, 4))
-        return {"state": vector, "depth": depth} if self.image else vector
+        return world.replace(images={"depth": depth} if self.vision else {})
 
 
 def dynamics():

@@ -69,6 +69,8 @@ class Config:
     """Factor on the gradient per control step with `gradient="decay"`."""
     surrogate: Surrogate = None
     """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+    image_gradient: Switch = True
+    """Whether the gradient goes through the images of cameras, or takes them for constants."""
 
     def __post_init__(self):
         check_settings(self)
@@ -109,7 +111,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     check_config(config, Config)
     key, restart_key, collect_key = jax.random.split(state.key, 3)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
-    env = with_gradient(env, config.gradient, config.surrogate)
+    env = with_gradient(env, config.gradient, config.surrogate, config.image_gradient)
     between_steps = gradient_between_steps(config.gradient, config.gradient_decay)
 
     def loss(params):

@@ -15,7 +15,7 @@ from jaxdrones.training.recipe import Recipe
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
 KEY = jax.random.key(0)
 WORDS = {"hidden_sizes", "critic_hidden_sizes", "gradient", "surrogate"}
-SWITCHES = {"per_agent", "centralized_critic", "privileged_critic"}
+SWITCHES = {"per_agent", "centralized_critic", "privileged_critic", "image_gradient"}
 ZERO_MAKES_SENSE = {
     *("obs_stats_freeze", "restart_fraction", "anneal_fraction", "gradient_decay"),
     *("gamma", "gae_lambda", "adam_b2", "entropy_coef", "value_coef", "recurrent_size"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -276,8 +276,8 @@ class Env:
             {name: jnp.any(condition(task, world)) for name, condition in conditions.items()}
             for conditions in (task.terminations, task.truncations)
         )
-        terminated = _any(terminations.values())
-        truncated = _any(truncations.values()) | (world.step >= self.steps)
+        terminated = functools.reduce(jnp.logical_or, terminations.values(), jnp.zeros((), bool))
+        truncated = functools.reduce(jnp.logical_or, truncations.values(), world.step >= self.steps)
         info = dict(rewards=rewards, metrics=task.measure(world), terminations=terminations, truncations=truncations)
         obs = self._noisy_observation(key, world)
         return obs, world, sum(rewards.values()), terminated, truncated, info
@@ -296,7 +296,3 @@ class Env:
             return [term.observe(self.task, world) for term in self._terms]
 
         return [x.shape[-1] for x in jax.eval_shape(terms, jax.random.key(0))]
-
-
-def _any(conditions: Iterable[Array]) -> Array:
-    return functools.reduce(jnp.logical_or, conditions, jnp.zeros((), bool))

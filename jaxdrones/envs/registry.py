@@ -179,7 +179,7 @@ def make(
     else:
         if "ground" in task.contact:
             effects = [*effects, ground_contact]
-        if are_solid(scene, task) and not any(takes_scene(effect) for effect in effects):
+        if are_solid(scene, task) and not any(map(takes_scene, effects)):
             effects = [*effects, obstacle_contact]
         physics["effects"] = effects
         if "drones" in task.contact:

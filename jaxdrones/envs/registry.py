@@ -49,7 +49,7 @@ from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
-from jaxdrones.tasks import forest, gates, gym_pybullet_drones, hover, swap, tracking
+from jaxdrones.tasks import follow, forest, gates, gym_pybullet_drones, hover, room, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
 
@@ -60,6 +60,8 @@ TASKS: dict[str, Callable[..., Task]] = {
     "tracking": tracking.tracking,
     "gates": gates.gates,
     "forest": forest.forest,
+    "room": room.room,
+    "follow": follow.follow,
     "swap-goals": swap.swap_goals,
     "hover-2021": gym_pybullet_drones.hover,
     "takeoff": gym_pybullet_drones.takeoff,

@@ -52,6 +52,8 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("gates", "ppo"): dict(
         updates=1500, gae_lambda=0.95, final_std=0.05, hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64)
     ),
+    ("room", "bptt"): dict(updates=300, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
+    ("follow", "bptt"): dict(updates=200, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
     ("hover-2021", "bptt"): _ONE_D,
     ("hover-2021", "ppo"): _ONE_D_PPO,
     ("leader-follower", "bptt"): _ONE_D | dict(per_agent=True),

@@ -79,7 +79,7 @@ def test_the_clearance_term_grows_with_the_closing_speed_and_is_free_far_away():
     costs = jax.jit(jax.vmap(cost))
     near = costs(jnp.full(3, 9.4), jnp.array([-3.0, 0.0, 3.0]))
     assert near[0] == near[1] < near[2]
-    assert costs(jnp.array([5.0]), jnp.array([3.0]))[0] < 1e-9
+    assert costs(jnp.array([5.0]), jnp.array([3.0]))[0] < 1e-6  # the ground is 1.5 m below
     assert jax.jit(jax.grad(cost))(9.4, 3.0) > 0
 
 

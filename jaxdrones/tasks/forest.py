@@ -10,7 +10,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.sensing import Camera, Scene
+from jaxdrones.sensing import Camera, Cylinder, Scene
 from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
@@ -125,10 +125,12 @@ def forest(
 
         It follows the measure of Nous et al. (2016). The flights are level and parallel to x.
         """
-        trees, radius = world.scene.cylinders, world.params.collision_radius
+        radius = world.params.collision_radius
         lanes = jnp.linspace(-width / 2, width / 2, _LANES, dtype=radius.dtype)
         free = jnp.full((drones, _LANES), length, radius.dtype)
-        if trees is not None:
+        for trees in world.scene.shapes(radius.dtype):
+            if not isinstance(trees, Cylinder):
+                continue
             reach = (trees.radius[None] + radius[:, None])[:, :, None]
             chord = reach**2 - (lanes[None] - trees.pos[:, 1:2])[None] ** 2
             hit = trees.active[None, :, None] & (chord > 0)

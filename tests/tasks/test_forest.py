@@ -1,0 +1,105 @@
+"""The forest: who starts and arrives where, what counts as touching and reaching, and what a policy is told."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones.envs import make
+from jaxdrones.sensing import Cylinder, Scene, collisions
+
+ENV = make("forest", vision=())
+TASK = ENV.task
+advance = jax.jit(lambda world: TASK.advance(TASK, world))
+first_world = functools.cache(lambda: ENV.reset(jax.random.key(0))[1])
+
+
+def moved_to(pos):
+    world = first_world()
+    return advance(world.replace(drones=world.drones.replace(pos=jnp.asarray([pos]))))
+
+
+@jax.jit
+@jax.vmap
+def starts(key):
+    """Gaps (m) of start and goal from the obstacles of a forest."""
+    scene_key, start_key = jax.random.split(key)
+    scene = TASK.scene(scene_key)
+    state, variables = TASK.begin(start_key, ENV.params, scene)
+    return jnp.stack([scene.distance(state.pos[0]), scene.distance(variables["goal"][0])])
+
+
+def test_starts_and_goals_are_never_in_an_obstacle():
+    assert jnp.min(starts(jax.random.split(jax.random.key(1), 10_000))) > 0.9  # m
+
+
+def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
+    assert moved_to((19.1, 0, 1.5))["reached"][0] and not moved_to((18.9, 0, 1.5))["reached"][0]
+    trees = first_world().scene.cylinders
+    i = int(jnp.argmax(trees.active))
+    beside = trees.pos[i].at[0].add(-trees.radius[i] - ENV.params.collision_radius[0])
+    beside = beside.at[2].set(1.5)
+    assert moved_to(beside + jnp.array([0.01, 0, 0]))["touched"][0]
+    assert moved_to((5.0, 0.0, 0.01))["touched"][0]  # the ground
+
+
+def test_what_is_touched_is_what_collisions_tell_in_one_world_and_in_many():
+    world = first_world()
+    pos = jax.random.uniform(jax.random.key(2), (512, 1, 3), minval=0, maxval=jnp.array([20, 5, 2.0]))
+    worlds = jax.vmap(lambda pos: world.replace(drones=world.drones.replace(pos=pos)))(pos)
+
+    def by_geometry(world):
+        found = collisions(world.params, world.drones, world.scene)
+        return found.ground | found.scene
+
+    expected = jax.jit(jax.vmap(by_geometry))(worlds)
+    assert 3 < jnp.sum(expected) < 100
+    np.testing.assert_array_equal(jax.jit(jax.vmap(lambda world: advance(world)["touched"]))(worlds), expected)
+
+
+def test_the_policy_is_told_the_desired_velocity_in_body_axes_and_nothing_of_its_place():
+    world = first_world()
+    term = TASK.observations["desired_velocity"].observe(TASK, world)
+    np.testing.assert_allclose(jnp.linalg.norm(term), 3.0)
+    assert not {"position", "position_error"} & set(TASK.observation)
+
+
+def test_the_clearance_term_grows_with_the_closing_speed_and_is_free_far_away():
+    scene = Scene.of(Cylinder(pos=(10.0, 0.0, 2.5), radius=0.2, height=5.0))
+    _, clearance = TASK.rewards["clearance"]
+
+    world = first_world()
+
+    def cost(x, speed):
+        drones = world.drones.replace(pos=jnp.array([[x, 0, 1.5]]), vel=jnp.array([[speed, 0, 0]]))
+        return clearance(TASK, world.replace(drones=drones, scene=scene))[0]
+
+    costs = jax.jit(jax.vmap(cost))
+    near = costs(jnp.full(3, 9.4), jnp.array([-3.0, 0.0, 3.0]))
+    assert near[0] == near[1] < near[2]
+    assert costs(jnp.array([5.0]), jnp.array([3.0]))[0] < 1e-6  # the ground is 1.5 m below
+    assert jax.jit(jax.grad(cost))(9.4, 3.0) > 0
+
+
+def test_traversability_is_the_free_way_in_widths_of_the_drone():
+    width = 2 * ENV.params.collision_radius[0]
+    metric = TASK.metrics["traversability"]
+    world = first_world()
+    np.testing.assert_allclose(metric(TASK, world.replace(scene=Scene()))[0], 20 / width)
+    wall = Scene.of(Cylinder(pos=(60.0, 0.0, 0.0), radius=50.0 - width / 2, height=1.0))  # nearly flat, 10 m ahead
+    assert 10 < metric(TASK, world.replace(scene=wall))[0] * width < 10.2
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (dict(speed=0), "speed is 0; give"),
+        (dict(drones=12), "width is 10.0; give a number above 13"),
+        (dict(density=-1), "density"),
+    ],
+)
+def test_options_out_of_range_say_so(options, error):
+    with pytest.raises(ValueError, match=error):
+        make("forest", **options)

@@ -9,14 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-_WORLDS_PER_CALL = 64  # if the result matters in more than one of so many worlds, all are computed
 
-
-def where_needed(function: Callable[..., Any]) -> Callable[..., Any]:
+def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[..., Any]:
     """`(needed, *args) -> function(*args)`, whose result matters only where `needed` () is true.
 
-    Of many worlds, by `jax.vmap`, only those are computed in which it matters; the others get zeros. If there are many
-    of them, all worlds are computed. It is not differentiable.
+    Of many worlds, by `jax.vmap`, only those are computed in which it matters; the others get zeros. If it matters in
+    more than one of `one_in` worlds, all are computed. It is not differentiable.
     """
 
     @jax.custom_batching.custom_vmap
@@ -37,7 +35,7 @@ def where_needed(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(*jax.tree.unflatten(structure, leaves))
 
         every = jax.vmap(of, ([0 if m else None for m in mapped],))
-        few = max(worlds // _WORLDS_PER_CALL, 1)
+        few = max(worlds // one_in, 1)
 
         def needed_ones() -> Any:
             index = jnp.nonzero(needed, size=few, fill_value=worlds)[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -22,7 +22,7 @@ from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import ImageSpace, Vision, first_images, next_images, observation
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
-from jaxdrones.sensing.sensor import Sensor, check_sensors, init_sensors, measure_sensors
+from jaxdrones.sensing.sensor import Sensor, check_sensors, hold_between, init_sensors, measure_sensors
 from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
@@ -243,8 +243,10 @@ class Env:
     def _measured(self, key: jax.Array, world: World, rate: State) -> World:
         """The world with new readings of the sensors."""
         given = world.params, world.drones, rate, world.scene, world.sensors
-        memories, readings = measure_sensors(self.sensors, key, *given)
-        return world.replace(sensors=memories, readings=readings)
+        after = measure_sensors(self.sensors, key, *given)
+        if world.readings:
+            after = hold_between(self.sensors, world.step, self.dt, (world.sensors, world.readings), after)
+        return world.replace(sensors=after[0], readings=after[1])
 
     def _command(self, key: Key, world: World, action: Array) -> tuple[World, Array]:
         """The world with the new action and disturbance, and the commanded rotor speeds."""
@@ -274,8 +276,8 @@ class Env:
             {name: jnp.any(condition(task, world)) for name, condition in conditions.items()}
             for conditions in (task.terminations, task.truncations)
         )
-        terminated = _any(terminations.values())
-        truncated = _any(truncations.values()) | (world.step >= self.steps)
+        terminated = functools.reduce(jnp.logical_or, terminations.values(), jnp.zeros((), bool))
+        truncated = functools.reduce(jnp.logical_or, truncations.values(), world.step >= self.steps)
         info = dict(rewards=rewards, metrics=task.measure(world), terminations=terminations, truncations=truncations)
         obs = self._noisy_observation(key, world)
         return obs, world, sum(rewards.values()), terminated, truncated, info
@@ -294,7 +296,3 @@ class Env:
             return [term.observe(self.task, world) for term in self._terms]
 
         return [x.shape[-1] for x in jax.eval_shape(terms, jax.random.key(0))]
-
-
-def _any(conditions: Iterable[Array]) -> Array:
-    return functools.reduce(jnp.logical_or, conditions, jnp.zeros((), bool))

@@ -17,6 +17,7 @@ from jaxdrones.checks import (
     check_whole,
     hint,
     shown,
+    takes_scene,
 )
 from jaxdrones.dynamics import (
     EFFECTS,
@@ -28,6 +29,7 @@ from jaxdrones.dynamics import (
     external_force,
     ground_contact,
     lagging_rotors,
+    obstacle_contact,
 )
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
@@ -44,12 +46,12 @@ from jaxdrones.envs.randomize import (
     Randomization,
     sensor_noise,
 )
-from jaxdrones.envs.surroundings import DrawScene
+from jaxdrones.envs.surroundings import DrawScene, are_solid
 from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
-from jaxdrones.tasks import forest, gates, gym_pybullet_drones, hover, swap, tracking
+from jaxdrones.tasks import follow, forest, gates, gym_pybullet_drones, hover, room, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
 
@@ -60,6 +62,8 @@ TASKS: dict[str, Callable[..., Task]] = {
     "tracking": tracking.tracking,
     "gates": gates.gates,
     "forest": forest.forest,
+    "room": room.room,
+    "follow": follow.follow,
     "swap-goals": swap.swap_goals,
     "hover-2021": gym_pybullet_drones.hover,
     "takeoff": gym_pybullet_drones.takeoff,
@@ -127,7 +131,8 @@ def make(
         delay: delay between action and command, s.
         sensors: sensors of every drone; their names are observations too.
         scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's own
-            when left out. On the explicit backend an effect must take it if it has obstacles.
+            when left out. On the explicit backend `obstacle_contact` makes obstacles solid, unless another effect
+            takes the scene or the task ends where they are touched.
         **options: options of the task, for example `drones`.
 
     Raises:
@@ -173,7 +178,10 @@ def make(
         step = bullet.make_step(**physics, scene=scene if isinstance(scene, Scene) else None)
     else:
         if "ground" in task.contact:
-            physics["effects"] = [*effects, ground_contact]
+            effects = [*effects, ground_contact]
+        if are_solid(scene, task) and not any(map(takes_scene, effects)):
+            effects = [*effects, obstacle_contact]
+        physics["effects"] = effects
         if "drones" in task.contact:
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))

@@ -7,10 +7,19 @@ from jaxdrones.sensing.depth_noise import DepthNoise
 from jaxdrones.sensing.distances import Surface
 from jaxdrones.sensing.files import Mesh, Urdf
 from jaxdrones.sensing.images import Images, render
+from jaxdrones.sensing.range_finders import (
+    downward_range,
+    lidar,
+    multi_ranger,
+    optical_flow,
+    range_finder,
+    time_of_flight,
+)
 from jaxdrones.sensing.rays import ray
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
+from jaxdrones.sensing.urdf_scene import from_urdf
 
 __all__ = [
     "BEAMS",
@@ -29,11 +38,18 @@ __all__ = [
     "Urdf",
     "camera_2021",
     "collisions",
+    "downward_range",
     "forest",
+    "from_urdf",
     "gate",
+    "lidar",
+    "multi_ranger",
     "obstacles_2021",
+    "optical_flow",
+    "range_finder",
     "ray",
     "render",
     "room",
+    "time_of_flight",
     "track",
 ]

@@ -80,8 +80,8 @@ def forest(
     alive = jnp.arange(trees) < count
     others = clutter.spheres(sphere_key, spheres, corners), clutter.boxes(box_key, boxes, corners)
     return Scene.of(
-        clutter.kept(trunks, alive & clutter.is_free(trunks, free, clearance)),
-        *(clutter.kept(solids, clutter.is_free(solids, free, clearance)) for solids in others),
+        trunks.replace(active=alive & clutter.is_free(trunks, free, clearance)),
+        *(solids.replace(active=clutter.is_free(solids, free, clearance)) for solids in others),
     )
 
 
@@ -144,7 +144,7 @@ def room(
         clutter.spheres(sphere_key, spheres, corners),
         clutter.boxes(box_key, boxes, corners),
     )
-    return Scene.of(shell, *(clutter.kept(solids, clutter.is_free(solids, free, clearance)) for solids in inside))
+    return Scene.of(shell, *(solids.replace(active=clutter.is_free(solids, free, clearance)) for solids in inside))
 
 
 def track(gates: ArrayLike, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -12,12 +10,9 @@ from jaxdrones import rotation
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle, Sphere
 from jaxdrones.vector import sin_cos
 
-Kind = TypeVar("Kind", bound=Obstacle)
-
 _WOOD, _GREEN, _STONE = (0.4, 0.28, 0.18, 1.0), (0.2, 0.5, 0.2, 1.0), (0.5, 0.5, 0.55, 1.0)  # red, green, blue, opacity
 _SPHERE_RADIUS = (0.2, 0.5)  # m
 _BOX_EDGE = (0.3, 1.0)  # m
-_UNDERGROUND = -1000.0  # m
 
 
 def trunks(
@@ -81,9 +76,3 @@ def is_free(solids: Obstacle, points: Float[Array, "k 3"], clearance: float) -> 
 
     gaps = jax.vmap(jax.vmap(gap, (None, 0)), (0, None))(solids, points)
     return jnp.all(gaps >= clearance, axis=1)
-
-
-def kept(solids: Kind, keep: Bool[Array, " n"]) -> Kind:
-    """The obstacles of a kind, of which some are left out."""
-    away = jnp.array([0, 0, _UNDERGROUND], solids.pos.dtype)
-    return solids.replace(pos=jnp.where(keep[:, None], solids.pos, away[None]))

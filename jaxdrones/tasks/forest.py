@@ -15,8 +15,9 @@ from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, norm, out_of_control
+from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control
 from jaxdrones.tasks.touching import touches
+from jaxdrones.vector import safe_sqrt
 
 HEIGHT = 1.5  # m, of flight
 REACHED = 1.0  # m: a drone that is nearer to its goal has reached it
@@ -27,6 +28,7 @@ _CLEARANCE = 1.5  # m between a tree and where a drone starts or arrives
 _REACH = (0.0, 0.5, 0.2)  # m: drones start within this of their places
 _BEHIND = 2.0  # m before the start and beyond the goal that still belong to the strip
 _MAX_SPEED = 20.0  # m/s
+_LANES = 32  # straight flights that tell the traversability
 
 camera = Camera(resolution=(16, 12), field_of_view=90.0, far=24.0)
 """The camera of the task, fixed to the body; 24 m are more than from one side of the forest to the other."""
@@ -96,8 +98,7 @@ def forest(
 
     def desired(task: Task, world: World) -> Float[Array, "n 3"]:
         """The velocity towards the goal, m/s, world; slower only where the goal is reached."""
-        away = task.target_now(world).pos - world.drones.pos
-        return speed * away / jnp.maximum(norm(away), REACHED)[:, None]
+        return shaping.velocity_to_target(task, world, speed, REACHED)
 
     def velocity(task: Task, world: World) -> Float[Array, " n"]:
         """Magnitude of the velocity error as a share of the commanded speed."""
@@ -119,6 +120,22 @@ def forest(
         x, y, z = world.drones.pos.T
         return ~((jnp.abs(x - length / 2) < length / 2 + _BEHIND) & (jnp.abs(y) < width / 2) & (z < _HIGHEST))
 
+    def traversability(task: Task, world: World) -> Float[Array, " n"]:
+        """Mean distance of straight flights through the forest until they touch a tree, in widths of the drone.
+
+        It follows the measure of Nous et al. (2016). The flights are level and parallel to x.
+        """
+        trees, radius = world.scene.cylinders, world.params.collision_radius
+        lanes = jnp.linspace(-width / 2, width / 2, _LANES, dtype=radius.dtype)
+        free = jnp.full((drones, _LANES), length, radius.dtype)
+        if trees is not None:
+            reach = (trees.radius[None] + radius[:, None])[:, :, None]
+            chord = reach**2 - (lanes[None] - trees.pos[:, 1:2])[None] ** 2
+            hit = trees.active[None, :, None] & (chord > 0)
+            entry = jnp.maximum(trees.pos[None, :, :1] - safe_sqrt(chord), 0)
+            free = jnp.minimum(free, jnp.min(jnp.where(hit, entry, length), axis=1))
+        return jnp.mean(free, axis=1) / (2 * radius)
+
     return Task(
         name="forest",
         summary="fly through a forest to a goal 20 m away",
@@ -135,8 +152,8 @@ def forest(
             "heading": (-0.2, heading),
             "omega": (-0.02, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
-            "touched": (-10.0, _variable("touched")),
-            "reached": (10.0, _variable("reached")),
+            "touched": (-10.0, shaping.variable("touched")),
+            "reached": (10.0, shaping.variable("reached")),
         },
         terminations={
             "touched": lambda task, world: world.variables["touched"],
@@ -145,7 +162,8 @@ def forest(
             "spinning": out_of_control(length)["spinning"],
         },
         advance=_advance,
-        metrics={name: _variable(name) for name in ("touched", "reached", "clearance")} | {"detour": _detour},
+        metrics={name: shaping.variable(name) for name in ("touched", "reached", "clearance")}
+        | {"detour": _detour, "traversability": traversability},
         success=lambda metrics, dt: (metrics["reached"][-1] > 0) & (metrics["touched"][-1] == 0),
         observations={"desired_velocity": ObservationTerm(observe_desired, _MAX_SPEED)},
         control_hz=50.0,
@@ -182,7 +200,3 @@ def _detour(task: Task, world: World) -> Float[Array, " n"]:
     """Length of the path over the straight line."""
     straight = norm(world.drones.pos - world.variables["start"])
     return world.variables["path"] / jnp.where(straight > 0, straight, 1)
-
-
-def _variable(name: str) -> Term:
-    return lambda task, world: world.variables[name].astype(world.drones.pos.dtype)

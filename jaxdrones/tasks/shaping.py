@@ -1,14 +1,17 @@
 """Reward terms that several tasks share; all are smooth, for policies that are optimised by gradient."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.tasks.task import Task, Term, World, square
+from jaxdrones.tasks.task import Task, Term, World, norm, square
 
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
 _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
+_CROWDED = 0.4  # m, distance of the nearest drone below which the reward falls
 _MARGIN = 0.2  # m between a drone and an obstacle beside it
 _MARGIN_TIME = 0.1  # s: by how much the margin grows with the closing speed
 _SOFTNESS = 0.1  # m, over which the margin begins
@@ -59,6 +62,28 @@ def clearance(task: Task, world: World) -> Float[Array, " n"]:
         return (1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS)
 
     return jax.vmap(of_drone)(world.params.collision_radius, world.drones.pos, world.drones.vel)
+
+
+def velocity_to_target(task: Task, world: World, speed: float, slow_within: float) -> Float[Array, "n 3"]:
+    """The velocity straight to the target, m/s, world: at a given speed, slower within `slow_within` (m) of it."""
+    away = task.target_now(world).pos - world.drones.pos
+    return speed * away / jnp.maximum(norm(away), slow_within)[:, None]
+
+
+def nearest_drone(pos: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Distance of the nearest other drone, m; infinity of a drone that is alone."""
+    apart = [norm(jnp.roll(pos, k, axis=0) - pos) for k in range(1, len(pos))]
+    return functools.reduce(jnp.minimum, apart, jnp.full_like(pos[:, 0], jnp.inf))
+
+
+def crowding(task: Task, world: World) -> Float[Array, " n"]:
+    """Squared penetration of the 0.4 m around a drone by its nearest neighbor, as a share of 0.4 m."""
+    return jnp.maximum(1 - nearest_drone(world.drones.pos) / _CROWDED, 0) ** 2
+
+
+def variable(name: str) -> Term:
+    """One of the task's variables as a number: a metric, or a term that is paid."""
+    return lambda task, world: world.variables[name].astype(world.drones.pos.dtype)
 
 
 def action_change(task: Task, world: World) -> Float[Array, " n"]:

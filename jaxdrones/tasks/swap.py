@@ -1,12 +1,11 @@
 """A swarm in which drones exchange places without touching."""
 
-import functools
 import math
 from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jaxdrones.checks import check_keywords, check_whole
 from jaxdrones.control import Setpoint
@@ -14,11 +13,10 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, Term, World, norm, out_of_control
+from jaxdrones.tasks.task import Task, World, out_of_control
 
 HEIGHT = 2.0  # m
 _MIN_SPACING = 0.6  # m between neighboring places on the ring
-_CROWDED = 0.4  # m; distance of the nearest drone below which the reward falls
 
 
 @check_keywords
@@ -40,19 +38,19 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         ring = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.full_like(angle, HEIGHT)], axis=-1)
         state = thrown(start_key, params, ring, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
         goal = jnp.roll(ring, jax.random.randint(order_key, (), 1, drones), axis=0)
-        return state, {"goal": goal, "nearest": _nearest(state.pos), "collisions": jnp.zeros(drones, goal.dtype)}
+        return state, {
+            "goal": goal,
+            "nearest": shaping.nearest_drone(state.pos),
+            "collisions": jnp.zeros(drones, goal.dtype),
+        }
 
     def target(variables, t) -> Setpoint:
         return Setpoint.at(variables["goal"])
 
     def advance(task: Task, world: World) -> dict[str, Array]:
-        nearest = _nearest(world.drones.pos)
+        nearest = shaping.nearest_drone(world.drones.pos)
         touching = nearest < 2 * world.params.collision_radius
         return world.variables | {"nearest": nearest, "collisions": world.variables["collisions"] + touching}
-
-    def crowding(task: Task, world: World) -> Float[Array, " n"]:
-        """Squared penetration of the 0.4 m around a drone by its nearest neighbor, as a share of 0.4 m."""
-        return jnp.maximum(1 - world.variables["nearest"] / _CROWDED, 0) ** 2
 
     return Task(
         name="swap-goals",
@@ -61,23 +59,13 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         duration=duration,
         start=start,
         target=target,
-        rewards=shaping.REACH_AND_STAY | {"crowding": (-5.0, crowding)},
+        rewards=shaping.REACH_AND_STAY | {"crowding": (-5.0, shaping.crowding)},
         terminations=out_of_control(2 * radius + 4.0),
         advance=advance,
-        metrics={name: _variable(name) for name in ("collisions", "nearest")},
+        metrics={name: shaping.variable(name) for name in ("collisions", "nearest")},
         success=_arrived_untouched,
         observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "neighbors"),
     )
-
-
-def _nearest(pos: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Distance of the nearest other drone, m."""
-    apart = [norm(jnp.roll(pos, k, axis=0) - pos) for k in range(1, len(pos))]
-    return functools.reduce(jnp.minimum, apart)
-
-
-def _variable(name: str) -> Term:
-    return lambda task, world: world.variables[name]
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:

@@ -69,6 +69,7 @@ def test_an_image_shows_the_state_of_its_time_until_the_next_one_comes(env):
     assert len(np.unique(np.asarray(expected), axis=0)) == len(at)
 
 
+@pytest.mark.slow  # its quick sibling is in test_exposures.py
 def test_the_gradient_of_a_held_image_is_that_of_the_state_that_it_shows(env):
     blind = make(TASK, vision=())
 

@@ -58,7 +58,7 @@ class Surroundings:
         elif self.ground is not None and not scene.ground:
             self.p.removeBody(self.ground, physicsClientId=self.id)
             self.ground = None
-        obstacles = dict(enumerate(scene.obstacles))
+        obstacles = scene.numbered
         for number in self.obstacles.keys() - obstacles.keys():
             self._remove(number)
         for number, obstacle in obstacles.items():

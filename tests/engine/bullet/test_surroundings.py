@@ -64,6 +64,19 @@ def test_many_worlds_have_a_scene_each_in_a_compiled_program():
             assert {c.other for c in step.contacts(TEAM, start, forest(key))} <= {f"obstacle {j}" for j in range(11)}
 
 
+def test_an_obstacle_that_is_not_active_is_not_there_and_the_others_keep_their_numbers():
+    place = jnp.array([[0.0, 0.0, 0.705], [5.0, 5.0, 0.705]])
+    state = State.at_rest(place + jnp.array([[0.0, 0.0, 0.295]]))
+    with bullet.make_step() as step:
+        for active in ([True, True], [False, True], [True, False], [False, False]):
+            scene = Scene.of(Sphere(pos=place, radius=0.3, active=jnp.array(active)))
+            touching = {(c.body, c.other) for c in step.contacts(TEAM, state, scene)}
+            assert touching == {(f"drone {i}", f"obstacle {i}") for i in range(2) if active[i]}
+            below = State.at_rest(place)
+            inside = step.camera(TEAM, below, scene=scene).segmentation == jnp.array([3, 4])[:, None, None]
+            np.testing.assert_array_equal(jnp.all(inside, axis=(1, 2)), active)
+
+
 def test_a_moved_obstacle_is_touched_where_it_is_and_the_camera_sees_it_there():
     ball = Sphere(pos=(0.0, 0.0, 0.0), radius=0.3)
     with bullet.make_step() as step:

@@ -1,0 +1,196 @@
+"""Follow another drone and keep it in view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.sensing import Camera
+from jaxdrones.state import State
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.curves import RANDOM_NUMBERS, lissajous, setpoint_on
+from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control
+from jaxdrones.vector import unit
+
+HEIGHT = 4.0  # m of the center of the leader's curve
+_MAX_DISTANCE = 10.0  # m
+_MIN_PERIOD = 2.0  # s
+_TOUCHING = 2.0  # collision radii between the centers of two drones
+_MAX_SPEED = 30.0  # m/s, bound of an observation
+_SETTLED = 2.0  # s: from then on the leader has to be in view
+_IN_VIEW = 0.95  # share of the time
+_TOLERANCE = 0.3  # share of the distance
+
+camera = Camera(resolution=(32, 24), field_of_view=60.0)
+"""The camera of the task, fixed to the body. A drone that is out of its field of view is lost from sight."""
+
+
+@check_keywords
+def follow(
+    drones: int = 2, distance: float = 1.5, size: float = 1.5, period: float = 12.0, duration: float = 12.0
+) -> Task:
+    """Drone 0 flies along a random curve; every other drone follows the one before it and keeps it in view.
+
+    A drone is in view when the direction to it is within the field of view of the camera, which looks along body x.
+
+    Args:
+        drones: number of drones, at least two.
+        distance: distance that a drone is to keep from the one that it follows, m.
+        size: amplitude of the leader's curve, a Lissajous figure, m.
+        period: period of that curve, s.
+        duration: duration of an episode, s.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+    check_whole("number of drones of follow", drones, 2)
+    check_number("distance", distance, "m", at_least=0.3, at_most=_MAX_DISTANCE)
+    check_number("size", size, "m", above=0, at_most=HEIGHT)
+    check_number("period", period, "s", at_least=_MIN_PERIOD)
+    check_positive("duration", duration, "s")
+
+    def leader(variables: dict[str, Array], t: Array) -> Setpoint:
+        """Where the first drone should be."""
+        center = jnp.array([0, 0, HEIGHT], variables["random"].dtype)
+        return setpoint_on(lambda t: center + size * lissajous(variables["random"], variables["phase"] + t / period), t)
+
+    def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        first = leader(variables, t)
+        pos, vel = variables["pos"], variables["vel"]
+        return Setpoint.at(
+            jnp.concatenate([first.pos[None], pos[:-1] + distance * _level(pos[1:] - pos[:-1])]),
+            vel=jnp.concatenate([first.vel[None], vel[:-1]]),
+            acc=jnp.zeros_like(vel).at[0].set(first.acc),
+        )
+
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        curve_key, phase_key, bearing_key, start_key = jax.random.split(key, 4)
+        dtype = params.mass.dtype
+        variables = {
+            "random": jax.random.uniform(curve_key, (RANDOM_NUMBERS,), dtype, -1, 1),
+            "phase": jax.random.uniform(phase_key, (), dtype),
+        }
+        first = leader(variables, jnp.zeros((), dtype))
+        bearing = jax.random.uniform(bearing_key, (), dtype, -math.pi, math.pi)
+        behind = jnp.stack([-jnp.cos(bearing), -jnp.sin(bearing), 0 * bearing])
+        pos = first.pos[None] + distance * jnp.arange(drones, dtype=dtype)[:, None] * behind[None]
+        state = thrown(start_key, params, pos, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
+        facing = jnp.stack([0 * bearing, 0 * bearing, jnp.sin(bearing / 2), jnp.cos(bearing / 2)])
+        quat = jax.vmap(rotation.multiply, (None, 0))(facing, state.quat)
+        state = state.replace(quat=quat, vel=state.vel + first.vel[None])
+        false = jnp.zeros(drones, bool)
+        return state, variables | {"pos": state.pos, "vel": state.vel, "touched": false}
+
+    def distance_error(task: Task, world: World) -> Float[Array, " n"]:
+        """Difference of the distance from the drone that is followed from the one to keep, m; zero of the leader."""
+        apart = norm(_to_followed(world))
+        return jnp.where(_is_leader(world), 0, jnp.abs(apart - distance))
+
+    return Task(
+        name="follow",
+        summary="follow another drone and keep it in view",
+        drones=drones,
+        duration=duration,
+        start=start,
+        target=target,
+        rewards=shaping.REACH_AND_STAY
+        | {
+            "view": (-1.0, _out_of_sight),
+            "crowding": (-5.0, shaping.crowding),
+            "touched": (-10.0, shaping.variable("touched")),
+        },
+        terminations={"touched": lambda task, world: world.variables["touched"]}
+        | out_of_control(2 * HEIGHT + distance * drones, center=(0, 0, HEIGHT)),
+        advance=_advance,
+        metrics={
+            "distance_error": distance_error,
+            "in_view": lambda task, world: _in_view(world).astype(world.drones.pos.dtype),
+            "touched": shaping.variable("touched"),
+        },
+        success=lambda metrics, dt: _followed(metrics, dt, distance),
+        observations={
+            "velocity_error_body": ObservationTerm(_observe_velocity_error, _MAX_SPEED),
+            "line_of_sight": ObservationTerm(_observe_line_of_sight, 1.0 + 1e-6),
+        },
+        control_hz=50.0,
+        substeps=2,
+        camera=camera,
+        action="thrust_and_rates",
+        observation=(
+            "position_error_body",
+            "velocity_error_body",
+            "velocity_body",
+            "line_of_sight",
+            "gravity",
+            "omega",
+            "last_action",
+        ),
+    )
+
+
+def _advance(task: Task, world: World) -> dict[str, Array]:
+    pos = world.drones.pos
+    touching = shaping.nearest_drone(pos) < _TOUCHING * world.params.collision_radius
+    fell = pos[:, 2] < world.params.collision_radius
+    return world.variables | {
+        "pos": pos,
+        "vel": world.drones.vel,
+        "touched": world.variables["touched"] | touching | fell,
+    }
+
+
+def _is_leader(world: World) -> Bool[Array, " n"]:
+    return jnp.arange(len(world.drones.pos)) == 0
+
+
+def _to_followed(world: World) -> Float[Array, "n 3"]:
+    """Vector from every drone to the one that it follows, m, world; zero of the leader."""
+    pos = world.drones.pos
+    return jnp.concatenate([pos[:1], pos[:-1]]) - pos
+
+
+def _observe_line_of_sight(task: Task, world: World) -> Float[Array, "n 3"]:
+    """Direction of the drone that is followed, body axes; zero of the leader."""
+    return jax.vmap(rotation.rotate_inverse)(world.drones.quat, jax.vmap(unit)(_to_followed(world)))
+
+
+def _observe_velocity_error(task: Task, world: World) -> Float[Array, "n 3"]:
+    """Velocity of the target relative to the drone, m/s, body axes."""
+    error = task.target_now(world).vel - world.drones.vel
+    return jax.vmap(rotation.rotate_inverse)(world.drones.quat, error)
+
+
+def _out_of_sight(task: Task, world: World) -> Float[Array, " n"]:
+    """One minus the cosine of the angle from the camera's axis to the drone that is followed; zero of the leader."""
+    return jnp.where(_is_leader(world), 0, 1 - _observe_line_of_sight(task, world)[:, 0])
+
+
+def _in_view(world: World) -> Bool[Array, " n"]:
+    """Whether the drone that is followed is within the field of view; true of the leader."""
+    to_followed = jax.vmap(rotation.rotate_inverse)(world.drones.quat, _to_followed(world))
+    ahead, left, up = to_followed.T
+    horizontal, vertical = camera.slopes
+    seen = (ahead > 0) & (jnp.abs(left) < horizontal * ahead) & (jnp.abs(up) < vertical * ahead)
+    return seen | _is_leader(world)
+
+
+def _level(v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Level directions of vectors."""
+    return jax.vmap(unit)(v * jnp.array([[1, 1, 0]], v.dtype))
+
+
+def _followed(metrics: Mapping[str, Array], dt: float, distance: float) -> Array:
+    """Whether a drone kept the distance on average and the other drone in view, and touched nothing."""
+    settled = round(_SETTLED / dt)
+    close = jnp.mean(metrics["distance_error"][settled:], axis=0) < _TOLERANCE * distance
+    in_view = jnp.mean(metrics["in_view"][settled:], axis=0) >= _IN_VIEW
+    return close & in_view & (metrics["touched"][-1] == 0)

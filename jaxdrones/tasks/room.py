@@ -1,0 +1,133 @@
+"""Drones that exchange places in a room with pillars."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_keywords, check_number, check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.sensing import room as build_room
+from jaxdrones.state import State
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.task import ObservationTerm, Task, World, out_of_control
+from jaxdrones.tasks.touching import touches
+
+HEIGHT = 1.5  # m, of starts and goals
+ROOM_HEIGHT = 3.0  # m
+_BESIDE = 1.0  # m between the places and the walls
+_SPACING = 1.0  # m between neighboring places on the ring
+_CLEARANCE = 0.6  # m between a pillar and a place
+_SIGHT = 2.0  # m, at which the observed vector to the nearest surface is clipped
+_ARRIVED = 0.2  # m
+_SPEED = 1.5  # m/s, to the goal
+_SLOW_WITHIN = 1.0  # m of the goal
+
+
+@check_keywords
+def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float = 8.0) -> Task:
+    """Drones on a ring in a room exchange places, and touch neither each other nor walls or pillars.
+
+    Args:
+        drones: number of drones; they start 1 m or more apart.
+        pillars: number of pillars, which stand at random places; those too close to a start or a goal are left out.
+        size: length and width of the room, m.
+        duration: duration of an episode, s.
+
+    Raises:
+        ValueError: a number out of range, or more drones than fit on the ring.
+    """
+    check_whole("number of drones of room", drones)
+    check_whole("number of pillars of room", pillars, minimum=0)
+    check_number("size", size, "m", at_least=2 * _BESIDE + _SPACING)
+    radius = size / 2 - _BESIDE
+    check_number("number of drones of room", drones, at_most=int(2 * math.pi * radius / _SPACING))
+    angles = [2 * math.pi * i / drones for i in range(drones)]
+    ring = [(radius * math.cos(angle), radius * math.sin(angle), HEIGHT) for angle in angles]
+
+    def scene(key: jax.Array) -> Scene:
+        return build_room((size, size, ROOM_HEIGHT), key=key, pillars=pillars, keep_free=ring, clearance=_CLEARANCE)
+
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        start_key, order_key = jax.random.split(key)
+        places = jnp.asarray(ring, params.mass.dtype)
+        state = thrown(start_key, params, places, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
+        goal = jnp.roll(places, jax.random.randint(order_key, (), 1, max(drones, 2)), axis=0)
+        goal = -places + jnp.array([[0, 0, 2 * HEIGHT]], goal.dtype) if drones == 1 else goal
+        return state, {
+            "goal": goal,
+            "clearance": jnp.full(drones, _CLEARANCE, goal.dtype),
+            "touched": goal[:, 0] < -jnp.inf,
+        }
+
+    def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        return Setpoint.at(variables["goal"])
+
+    def velocity(task: Task, world: World) -> Float[Array, " n"]:
+        """Magnitude of the velocity error as a share of the speed of flight."""
+        desired = shaping.velocity_to_target(task, world, _SPEED, _SLOW_WITHIN)
+        return shaping.length(world.drones.vel - desired, 0.1 * _SPEED) / _SPEED
+
+    return Task(
+        name="room",
+        summary="exchange places in a room with pillars without touching",
+        drones=drones,
+        duration=duration,
+        start=start,
+        target=target,
+        rewards={
+            "alive": (2.0, shaping.alive),
+            "position": (-0.5, shaping.position),
+            "velocity": (-1.0, velocity),
+            "clearance": (-2.0, shaping.clearance),
+            "crowding": (-5.0, shaping.crowding),
+            "omega": (-0.02, shaping.body_rates),
+            "action_change": (-0.02, shaping.action_change),
+            "touched": (-10.0, shaping.variable("touched")),
+        },
+        terminations={"touched": lambda task, world: world.variables["touched"]}
+        | out_of_control(size, center=(0, 0, HEIGHT)),
+        advance=_advance,
+        metrics={name: shaping.variable(name) for name in ("touched", "clearance")},
+        success=_arrived_untouched,
+        observations={"nearest_surface": ObservationTerm(_observe_nearest_surface, _SIGHT)},
+        control_hz=50.0,
+        substeps=2,
+        scene=scene if pillars else build_room((size, size, ROOM_HEIGHT)),
+        obstacles_terminate=True,
+        action="thrust_and_rates",
+        observation=(
+            "position_error",
+            "rotation_matrix",
+            "velocity",
+            "omega",
+            "nearest_surface",
+            "neighbors",
+            "last_action",
+        ),
+    )
+
+
+def _advance(task: Task, world: World) -> dict[str, Array]:
+    variables = world.variables
+    found = touches(world)
+    return variables | {
+        "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
+        "touched": variables["touched"] | found.ground | found.drones | found.scene,
+    }
+
+
+def _observe_nearest_surface(task: Task, world: World) -> Float[Array, "n 3"]:
+    """Vector from the drone to the nearest surface, m, world axes."""
+    return jax.vmap(lambda pos: world.scene.nearest(pos).point - pos)(world.drones.pos)
+
+
+def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+    return (metrics["error"][-1] < _ARRIVED) & (metrics["touched"][-1] == 0)

@@ -1,0 +1,86 @@
+"""Scenes that are drawn: the same for the same key, of the same shapes for every key, and free where asked for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones.sensing import BEAMS, forest, gate, room, track
+
+KEYS = jax.random.split(jax.random.key(0), 4096)
+ENDS = jnp.array([[0.0, 0.0, 1.5], [20.0, 0.0, 1.5]])
+
+
+@jax.jit
+@jax.vmap
+def mixed_forests(key):
+    """A forest of everything, and the distances of its obstacles alone from the two points that are kept free."""
+    scene = forest(key, density=(0.05, 0.2), tilt=20.0, spheres=3, boxes=3)
+    return scene, jax.vmap(scene.replace(ground=False).distance)(ENDS)
+
+
+def test_one_program_draws_a_forest_for_each_of_4096_worlds_and_no_two_are_the_same():
+    scenes, distances = mixed_forests(KEYS)
+    trees = scenes.cylinders
+    assert jnp.all(distances >= 1.5 - 1e-9)
+    assert len(np.unique(np.asarray(trees.pos[:, 0, 0]))) == len(KEYS)
+    assert trees.pos.shape == (len(KEYS), 40, 3) and scenes.spheres.radius.shape == (len(KEYS), 3)
+    again = mixed_forests(KEYS)[0]
+    assert all(jnp.array_equal(a, b) for a, b in zip(jax.tree.leaves(scenes), jax.tree.leaves(again), strict=True))
+
+
+def test_trees_are_as_many_as_the_density_says_but_for_those_left_out():
+    trees = mixed_forests(KEYS)[0].cylinders
+    count = jnp.sum(trees.active, axis=1)
+    area, kept_free = 20 * 10, np.pi * (1.5 + 0.2) ** 2  # m^2; half a disc at either end, of a trunk's mean radius more
+    np.testing.assert_allclose(jnp.mean(count), 0.125 * (area - kept_free), rtol=0.02)
+    assert 5 <= jnp.min(count) < 10 and 35 < jnp.max(count) <= 40
+    assert jnp.all((trees.radius >= 0.1) & (trees.radius <= 0.3))
+
+
+def test_trunks_stand_on_the_ground_and_tilt_as_far_as_they_may():
+    trunks = mixed_forests(KEYS)[0].cylinders
+    x, y, *_ = jnp.moveaxis(trunks.quat, -1, 0)
+    cosine = 1 - 2 * (x**2 + y**2)
+    assert jnp.min(cosine) >= np.cos(np.radians(20)) - 1e-9 and jnp.min(cosine) < np.cos(np.radians(19))
+    np.testing.assert_allclose(trunks.pos[..., 2], 2.5 * cosine, atol=1e-9)
+
+
+def test_a_room_is_closed_and_its_pillars_keep_away_from_places():
+    places = jnp.array([[1.0, 1.0, 1.0], [-1.0, 0.5, 1.0]])
+    scene = room((6.0, 4.0, 3.0), key=jax.random.key(1), pillars=20, keep_free=places, clearance=0.7)
+    clear = jax.vmap(scene.distance)(places)
+    assert jnp.all(clear >= 0.7) and 0 < jnp.sum(scene.cylinders.active) < 20
+    bare = room((6.0, 4.0, 3.0))
+    for outside in (3.1, 0, 1.5), (-3.1, 0, 1.5), (0, 2.1, 1.5), (0, -2.1, 1.5), (0, 0, 3.1), (3.1, 2.1, 1.5):
+        assert bare.distance(jnp.array(outside)) < 0
+    np.testing.assert_allclose(bare.distance(jnp.array([2.0, 0.0, 1.5])), 1.0)
+
+
+def test_a_track_is_its_gates_in_their_order():
+    poses = np.array([(0.0, 0.0, 1.0, 0.3), (2.0, 1.0, 1.5, -2.0)])
+    beams = track(poses).boxes
+    own = gate(poses[1, :3], poses[1, 3])
+    np.testing.assert_allclose(beams.pos[BEAMS:], own.pos)
+    np.testing.assert_allclose(beams.quat[BEAMS:], own.quat)
+
+
+@pytest.mark.parametrize(
+    ("build", "error"),
+    [
+        (lambda: forest(3), "key is 3"),
+        (lambda: forest(KEYS[0], density=-1), r"density of a forest is -1.*at least 0 \(trees/m\^2\)"),
+        (
+            lambda: forest(KEYS[0], radius=(0.3, 0.1)),
+            "largest radius of a forest is 0.1; give a number of at least 0.3",
+        ),
+        (lambda: forest(KEYS[0], density=1e6), "give a number of at most 10000"),
+        (lambda: forest(KEYS[0], keep_free=(0, 0)), r"keep_free has shape \(2,\); give points \(k, 3\), m"),
+        (lambda: room((1.0, -2.0, 3.0)), "an edge of a room is -2.0; give a positive number"),
+        (lambda: room(pillars=2), "a room with pillars or clutter is drawn from a key"),
+        (lambda: track([(0, 0, 1)]), r"gates of a track has shape \(1, 3\); expected \(k, 4\)"),
+    ],
+)
+def test_bad_input_says_what_to_give(build, error):
+    with pytest.raises(ValueError, match=error):
+        build()

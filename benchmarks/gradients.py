@@ -68,7 +68,7 @@ def norms(env, config, policy, worlds: int, horizons) -> tuple[jax.Array, jax.Ar
         _, trajectory = collect.collect(
             fly_key,
             with_gradient(env, config.gradient, config.surrogate),
-            lambda key, obs: (flown(obs), None),
+            collect.deterministic(flown),
             world,
             max(horizons),
             reset=False,

@@ -1,10 +1,11 @@
-"""A double integrator as an environment, and small settings of every learner for it."""
+"""Environments with a known answer, a double integrator and a cue, and small settings of every learner for them."""
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.envs.vision import observation
 from jaxdrones.learning import bptt, ppo, shac
 
 SMALL = {
@@ -23,16 +24,20 @@ class Point(flax.struct.PyTreeNode):
 class PointWorld(flax.struct.PyTreeNode):
     drones: Point
     step: jax.Array
+    images: dict = flax.struct.field(default_factory=dict)
+    poses: None = None
 
 
 class DoubleIntegrator:
     """x'' = u from x, v in [-0.1, 0.1], cost 100 x^2 + 10 v^2 + 10 u^2; all that a learner needs."""
 
-    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 50, ()
+    drones, action_size, observation_size, dt, steps, constant_fields, vision = 1, 1, 2, 0.1, 50, (), None
 
     def reset(self, key):
         x = jax.random.uniform(key, (1, 2), minval=-0.1, maxval=0.1)
         return x, PointWorld(Point(x), jnp.zeros((), jnp.int32))
+
+    begin = reset
 
     def step(self, key, world, action):
         a, b = dynamics()
@@ -42,6 +47,46 @@ class DoubleIntegrator:
         world = PointWorld(Point(x), world.step + 1)
         info = {"metrics": {"error": jnp.abs(x[:, 0])}}
         return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+
+class Cue:
+    """Cost (u - cue)^2 in every step, for a cue of 0.5 or -0.5 that is observed in the first step only, or in all.
+
+    The cue is a number of the observation or the depth that an image shows. Who does not remember it pays at least 0.25
+    in every step in which it is not shown.
+    """
+
+    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 1, 0.1, 6, ()
+
+    def __init__(self, shown: int = 1, image: bool = False):
+        self.shown, self.vision = shown, image
+
+    def begin(self, key):
+        cue = jax.random.choice(key, jnp.array([-0.5, 0.5]), (1, 1))
+        world = PointWorld(Point(cue), jnp.zeros((), jnp.int32))
+        return self.vector(world), world
+
+    def reset(self, key):
+        _, world = self.begin(key)
+        world = self.with_images(None, key, world)
+        return observation(self.vector(world), world), world
+
+    def step(self, key, world, action):
+        cost = (action[:, 0] - world.drones.pos[:, 0]) ** 2
+        world = self.with_images(None, key, world.replace(step=world.step + 1))
+        info = {"metrics": {"error": jnp.sqrt(cost)}}
+        obs = observation(self.vector(world), world)
+        return obs, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+
+    def visible(self, world):
+        return jnp.where(world.step < self.shown, world.drones.pos, 0)
+
+    def vector(self, world):
+        return jnp.zeros_like(world.drones.pos) if self.vision else self.visible(world)
+
+    def with_images(self, look, key, world, *ended):
+        depth = 3 + 4 * jnp.tile(self.visible(world)[..., None], (1, 3, 4))
+        return world.replace(images={"depth": depth} if self.vision else {})
 
 
 def dynamics():

@@ -56,4 +56,4 @@ def test_a_step_and_an_environment_of_bullet_say_so():
     pytest.importorskip("pybullet")
     with make("hover", backend="bullet", vision=("rgb",)) as env:
         assert repr(env.physics) == "<step: Bullet at 100 Hz x 5>"
-        assert "22 observations and rgb a drone, bullet backend>" in repr(env)
+        assert "22 observations and rgb of 64 x 48 pixels a drone, bullet backend>" in repr(env)

@@ -30,6 +30,7 @@ try:
 except ImportError as error:
     raise ImportError('brax is not installed; pip install "jaxdrones[brax]"') from error
 
+_COLORED = 4  # axes of the images of a team that have colors
 _NEXT = np.uint32(2**32 - 1)  # what the key is folded with for the next episode: no episode has that many steps
 
 
@@ -42,25 +43,23 @@ class BraxEnv(base.Env):
     """One world with one agent: actions and observations of the drones are concatenated, the reward is their mean.
 
     As in all of brax's environments, the time limit is the trainer's `episode_length`; take `env.steps`.
-    `info["time_out"]` is 1 where the task truncated the episode.
+    `info["time_out"]` is 1 where the task truncated the episode. With images, observations are dictionaries, as brax's
+    networks for vision take them: `state`, and `pixels/rgb`, `pixels/depth`, `pixels/segmentation` (h, w, channels),
+    where the images of all drones are channels of one image.
     """
 
     def __init__(self, env: envs.Env):
-        """Wrap an environment.
-
-        Raises:
-            ValueError: the environment has cameras.
-        """
-        if env.vision is not None:
-            raise ValueError(
-                "the environment has cameras, whose images brax's trainers do not take; make it without vision"
-            )
+        """Wrap an environment."""
         self.env = env
 
     @property
-    def observation_size(self) -> int:
-        """Length of the concatenated observation of all drones."""
-        return self.env.drones * self.env.observation_size
+    def observation_size(self) -> Any:
+        """Length of the concatenated observation of all drones; with images the shape of every array by name."""
+        size = self.env.drones * self.env.observation_size
+        if not self.env.image_spaces:
+            return size
+        obs, _ = jax.eval_shape(self.env.reset, jax.random.key(0))
+        return jax.tree.map(jnp.shape, jax.eval_shape(self._flat, obs))
 
     @property
     def action_size(self) -> int:
@@ -96,8 +95,11 @@ class BraxEnv(base.Env):
             info=state.info | {"time_out": _float(cut & ~terminated)},
         )
 
-    def _flat(self, obs: jax.Array) -> jax.Array:
-        return jnp.ravel(obs).astype(jnp.float32)
+    def _flat(self, obs: Any) -> Any:
+        if not isinstance(obs, dict):
+            return jnp.ravel(obs).astype(jnp.float32)
+        images = {f"pixels/{name}": _channels(x) for name, x in obs.items() if name != "state"}
+        return {"state": self._flat(obs["state"])} | images
 
     def _metrics(self, info: dict[str, Any], mean) -> dict[str, jax.Array]:
         rewards = {f"reward_{name}": mean(x) for name, x in info["rewards"].items()}
@@ -203,6 +205,12 @@ def _device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
         return jax.device_put(copies, sharding)
 
     return jax.tree.map(put, x)
+
+
+def _channels(image: jax.Array) -> jax.Array:
+    """Images (n, h, w) or (n, h, w, c) of a team as one, (h, w, n c)."""
+    image = image if image.ndim == _COLORED else image[..., None]
+    return jnp.moveaxis(image, 0, -2).reshape(*image.shape[1:3], -1).astype(jnp.float32)
 
 
 def _mean(x: jax.Array) -> jax.Array:

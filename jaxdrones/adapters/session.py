@@ -12,7 +12,6 @@ from jax.typing import ArrayLike
 
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
-from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Task, World
 
 SEEDS = 2**32  # seeds are taken modulo this
@@ -33,8 +32,6 @@ class Session:
         """Start an episode; returns the observation."""
         self._key, self.world, obs = self._compiled(self.env, begin)(np.uint32(seed % SEEDS))
         self.running = True
-        if not isinstance(self.env.scene, Scene):
-            self._close_renderer()  # of the scene of the last episode
         return _numpy(obs)
 
     def step(self, action: np.ndarray) -> tuple[Any, np.ndarray, bool, bool, dict[str, Any]]:
@@ -65,18 +62,14 @@ class Session:
         center = pos.mean(axis=0)
         reach = 1.0 + np.abs(pos - center).max()  # m
         eye = center + reach * np.array([0.9, -1.2, 0.6])
-        return self._renderer.photo(self.world.params, self.world.drones, eye, center)
+        return self._renderer.photo(self.world.params, self.world.drones, eye, center, scene=self.world.scene)
 
     def close(self) -> None:
         """End the connections to Bullet; the session cannot go on."""
         self.running = False
         self.env.close()
-        self._close_renderer()
-
-    def _close_renderer(self) -> None:
         if "_renderer" in vars(self):
             self._renderer.close()
-            del self._renderer
 
     @functools.cached_property
     def _renderer(self):
@@ -84,7 +77,7 @@ class Session:
             return self.env.physics
         from jaxdrones.engine import bullet  # an optional library behind it
 
-        return bullet.make_step(scene=self.world.scene)
+        return bullet.make_step()
 
 
 def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:

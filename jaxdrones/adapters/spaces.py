@@ -17,10 +17,9 @@ from jaxdrones.envs import Env
 def observation_of_drone(env: Env) -> spaces.Space:
     """The observation space of one drone."""
     state = spaces.Box(-env.observation_bound, env.observation_bound, dtype=np.float32)
-    if env.vision is None:
-        return state
     images = {name: spaces.Box(x.low, x.high, x.shape, x.dtype) for name, x in env.image_spaces.items()}
-    return spaces.Dict({"state": state} | images)
+    known: dict[str, spaces.Space] = {"state": state, **images}
+    return spaces.Dict(known) if images else state
 
 
 def action_of_drone(env: Env) -> spaces.Box:

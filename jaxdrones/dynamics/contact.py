@@ -91,13 +91,12 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
         zero = jnp.zeros_like(state.pos)
         return Wrench(zero, zero)
     radius, ring = _rim(params)
-    obstacles = scene.replace(ground=False)
     x_axis, y_axis, z_axis = rotation.axes(state.quat)
     omega = rotation.rotate(state.quat, state.omega)
+    cos, sin = (jnp.asarray(f(_ANGLES), radius.dtype)[:, None] for f in (np.cos, np.sin))
+    centers = (params.collision_offset * z_axis)[None] + ring * (cos * x_axis[None] + sin * y_axis[None])
 
-    def at_sphere(cos: Float[Array, ""], sin: Float[Array, ""]) -> Wrench:
-        center = params.collision_offset * z_axis + ring * (cos * x_axis + sin * y_axis)
-        surface = obstacles.nearest(state.pos + center)
+    def at_sphere(center: Float[Array, "3"], surface: Any) -> Wrench:
         point = center - radius * surface.normal
         vel = state.vel + cross(omega, point)
         depth_rate = -dot(vel, surface.normal)
@@ -106,8 +105,8 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
         force = normal_force * surface.normal - viscosity * slip
         return Wrench(force, cross(point, force))
 
-    cos, sin = (jnp.asarray(f(_ANGLES), radius.dtype) for f in (np.cos, np.sin))
-    wrench = jax.tree.map(lambda x: jax.vmap(total)(x.T), jax.vmap(at_sphere)(cos, sin))
+    surfaces = scene.touched(state.pos[None] + centers, radius)
+    wrench = jax.tree.map(lambda x: jax.vmap(total)(x.T), jax.vmap(at_sphere)(centers, surfaces))
     return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), wrench)
 
 

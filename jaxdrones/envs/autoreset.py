@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.envs.env import RESET, Env, Obs
+from jaxdrones.envs.vision import observation, renewed_images
 from jaxdrones.tasks.task import World
 
 
@@ -63,8 +64,8 @@ class AutoReset:
             (vector, Episode(world, episode_return, length)),
         )
         if self.env.vision:
-            episode = episode.replace(world=self.env.with_images(_renewed_images, key, episode.world, ended))
-        return self.env.observed(vector, episode.world), episode, reward, terminated, truncated, info
+            episode = episode.replace(world=self.env.with_images(renewed_images, key, episode.world, ended))
+        return observation(vector, episode.world), episode, reward, terminated, truncated, info
 
     @property
     def _kept(self) -> tuple[str, ...]:
@@ -75,7 +76,3 @@ class AutoReset:
         """A reset, without images and without the fields that are the same in every episode."""
         obs, world = self.env.begin(key)
         return obs, world.replace(**dict.fromkeys(self._kept))
-
-
-def _renewed_images(env: Env, key: Any, world: World, ended: Array) -> World:
-    return env.vision.renewed(ended, key, world)

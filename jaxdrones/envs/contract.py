@@ -11,6 +11,8 @@ import numpy as np
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs.env import Env
 
+_IMAGE_AXES = 4  # of images of an episode: time, drones, rows, columns
+
 
 class ContractError(AssertionError):
     """An environment violates its contract; the message says how and where."""
@@ -56,6 +58,11 @@ def _random_actions(env: Env, steps: int) -> tuple[jax.Array, jax.Array]:
 
 def _check_obs(env: Env, obs: Any, where: str) -> None:
     state = obs["state"] if isinstance(obs, dict) else obs
+    for name, space in env.image_spaces.items():
+        image = np.asarray(obs[name])
+        shape = (env.drones, *space.shape)
+        _require(image.shape == shape, f"{name} has shape {image.shape} {where}; expected {shape}")
+        _require(np.all((image >= space.low) & (image <= space.high)), f"{name} is beyond its bounds {where}")
     _require(state.shape == (env.drones, env.observation_size), f"obs has shape {state.shape} {where}")
     _require(np.all(np.isfinite(state)), f"obs is not finite {where}: {state}")
     _require(np.all(np.abs(state) <= env.observation_bound), f"obs is beyond observation_bound {where}: {state}")
@@ -95,7 +102,7 @@ def _check_transformations(env: Env, keys: jax.Array, actions: jax.Array, flown:
         return jax.lax.scan(advance, env.reset(key)[1], (keys, actions))[1]
 
     key = jax.random.key(0)
-    expected = (jnp.stack([answer[0] for answer in flown]), jnp.stack([answer[2] for answer in flown]))
+    expected = jax.tree.map(lambda *x: jnp.stack(x), *[(answer[0], answer[2]) for answer in flown])
     _check_close(jax.jit(episode)(key), expected, "an episode in jit and out")
     pair = jax.jit(jax.vmap(episode))(jnp.stack([jax.random.key(7), key]))
     _check_close(jax.tree.map(lambda x: x[1], pair), expected, "an episode in vmap and alone")
@@ -109,7 +116,9 @@ def _check_equal(actual, expected, what: str) -> None:
 def _check_close(actual, expected, what: str) -> None:
     for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         tolerance = 1e-3 if a.dtype == np.float32 else 1e-9
-        _require(np.allclose(a, b, rtol=tolerance, atol=tolerance), f"{what} differ by {np.max(np.abs(a - b))}")
+        close = np.isclose(a, b, rtol=tolerance, atol=tolerance)
+        needed = 1 if a.ndim < _IMAGE_AXES else 0.98  # rounding may move an edge in an image by a pixel
+        _require(np.mean(close) >= needed, f"{what} differ by {np.max(np.abs(a - b))}")
 
 
 def _plain(x):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -19,10 +19,10 @@ from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
 from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
-from jaxdrones.envs.vision import ImageSpace, Vision
+from jaxdrones.envs.vision import ImageSpace, Vision, first_images, next_images, observation
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
-from jaxdrones.sensing.sensor import Sensor, check_sensors, init_sensors, measure_sensors
+from jaxdrones.sensing.sensor import Sensor, check_sensors, hold_between, init_sensors, measure_sensors
 from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
@@ -93,7 +93,7 @@ class Env:
         self.task, self.params, self.dt, self.drones = task, params, dt, task.drones
         self.action, self.action_size = action.fitted(params), action.size
         self.physics, self.vision, self._vehicle = step, vision, vehicle
-        self.image_spaces: dict[str, ImageSpace] = {} if vision is None else vision.spaces(task.drones, obstacles)
+        self.image_spaces: dict[str, ImageSpace] = vision.spaces(task.drones, obstacles) if vision else {}
         """Shape, dtype and bounds of every image of a drone, by name."""
         self.steps = episode_steps(task, dt)
         """Number of control steps after which an episode is truncated."""
@@ -115,11 +115,9 @@ class Env:
 
     def __repr__(self) -> str:
         backend = "bullet" if isinstance(self.physics, HostStep) else "explicit"
-        images = f" and {self.vision}" if self.vision else ""
-        return (
-            f"<Env {self.task.name}: {self.drones} x {self._vehicle}, dt {self.dt:.4g} s, {self.steps} steps, "
-            f"{self.action_size} actions and {self.observation_size} observations{images} a drone, {backend} backend>"
-        )
+        seen = f"{self.observation_size} observations" + (f" and {self.vision}" if self.vision else "")
+        team = f"{self.drones} x {self._vehicle}, dt {self.dt:.4g} s, {self.steps} steps"
+        return f"<Env {self.task.name}: {team}, {self.action_size} actions and {seen} a drone, {backend} backend>"
 
     @property
     def constant_fields(self) -> tuple[str, ...]:
@@ -141,11 +139,11 @@ class Env:
         """
         obs, world = self.begin(key)
         if self.vision:
-            world = self.with_images(_first_images, key, world)
-        return self.observed(obs, world), world
+            world = self.with_images(first_images, key, world)
+        return observation(obs, world), world
 
     def begin(self, key: jax.Array) -> tuple[Float[Array, "n d"], World]:
-        """The same as `reset` without images: what needs them waits for `observed`."""
+        """The same as `reset`, but without images."""
         check_key("key", key)
         world = self.compiled(Env._start)(key)
         rate = self._rate(world, world.drones.rpm)
@@ -156,10 +154,6 @@ class Env:
         assert self.vision is not None
         noise = jax.random.fold_in(key, VISION) if self.vision.camera.noise else None
         return (functools.partial(look, self) if self.vision.on_host else self.compiled(look))(noise, world, *args)
-
-    def observed(self, obs: Float[Array, "n d"], world: World) -> Obs:
-        """The observation: its vector, with the images of the world beside it if there are any."""
-        return {"state": obs, **world.images} if self.vision else obs
 
     def step(
         self, key: jax.Array, world: World, action: Float[ArrayLike, "n a"]
@@ -182,15 +176,15 @@ class Env:
         check_key("key", key)
         check_shape("action", action, (self.drones, self.action_size), "one row of the action type's size per drone")
         check_finite("action", action)
-        random = self._noise or self._disturbance or self.sensors
-        key_of_draws: Key = key if random else None  # a program without random keys can be a single kernel
+        # A program without random keys can be a single kernel.
+        key_of_draws: Key = key if self._noise or self._disturbance or self.sensors else None
         world, rpm = self.compiled(Env._command)(key_of_draws, world, action)
         drones = self.physics(world.params, world.drones, rpm, scene_for_step(self.physics, self.scene, world))
         world = world.replace(drones=drones)
         obs, world, *outcome = self.compiled(Env._outcome)(key_of_draws, world, self._rate(world, rpm))
         if self.vision:
-            world = self.with_images(_next_images, key, world)
-        return self.observed(obs, world), world, *outcome
+            world = self.with_images(next_images, key, world)
+        return observation(obs, world), world, *outcome
 
     def privileged_observation(self, world: World) -> PrivilegedObservation:
         """What a critic may know in training: the observation without noise, and the drawn parameters."""
@@ -248,10 +242,11 @@ class Env:
 
     def _measured(self, key: jax.Array, world: World, rate: State) -> World:
         """The world with new readings of the sensors."""
-        memories, readings = measure_sensors(
-            self.sensors, key, world.params, world.drones, rate, world.scene, world.sensors
-        )
-        return world.replace(sensors=memories, readings=readings)
+        given = world.params, world.drones, rate, world.scene, world.sensors
+        after = measure_sensors(self.sensors, key, *given)
+        if world.readings:
+            after = hold_between(self.sensors, world.step, self.dt, (world.sensors, world.readings), after)
+        return world.replace(sensors=after[0], readings=after[1])
 
     def _command(self, key: Key, world: World, action: Array) -> tuple[World, Array]:
         """The world with the new action and disturbance, and the commanded rotor speeds."""
@@ -261,13 +256,12 @@ class Env:
         if self._disturbance:
             params = self._disturbance(jax.random.fold_in(key, DISTURBANCE), params, self.dt)
         world = world.replace(actions=actions, params=params)
-        target = self.task.target_now(world)
 
         def of_drone(params, memory, state, action, setpoint):
             return self.action.rpm(params, memory, state, action, setpoint, self.dt)
 
-        action_in_force = delayed(actions, self._delay)
-        memory, rpm = jax.vmap(of_drone)(self.params, world.memory, world.drones, action_in_force, target)
+        flown = delayed(actions, self._delay), self.task.target_now(world)
+        memory, rpm = jax.vmap(of_drone)(self.params, world.memory, world.drones, *flown)
         return world.replace(memory=memory), rpm
 
     def _outcome(self, key: Key, world: World, rate: State | None):
@@ -282,10 +276,9 @@ class Env:
             {name: jnp.any(condition(task, world)) for name, condition in conditions.items()}
             for conditions in (task.terminations, task.truncations)
         )
-        terminated = _any(terminations.values())
-        truncated = _any(truncations.values()) | (world.step >= self.steps)
-        info = {"rewards": rewards, "metrics": task.measure(world)}
-        info |= {"terminations": terminations, "truncations": truncations}
+        terminated = functools.reduce(jnp.logical_or, terminations.values(), jnp.zeros((), bool))
+        truncated = functools.reduce(jnp.logical_or, truncations.values(), world.step >= self.steps)
+        info = dict(rewards=rewards, metrics=task.measure(world), terminations=terminations, truncations=truncations)
         obs = self._noisy_observation(key, world)
         return obs, world, sum(rewards.values()), terminated, truncated, info
 
@@ -303,15 +296,3 @@ class Env:
             return [term.observe(self.task, world) for term in self._terms]
 
         return [x.shape[-1] for x in jax.eval_shape(terms, jax.random.key(0))]
-
-
-def _first_images(env: Env, key: Key, world: World) -> World:
-    return env.vision.first(key, world)
-
-
-def _next_images(env: Env, key: Key, world: World) -> World:
-    return env.vision.next(key, world)
-
-
-def _any(conditions: Iterable[Array]) -> Array:
-    return functools.reduce(jnp.logical_or, conditions, jnp.zeros((), bool))

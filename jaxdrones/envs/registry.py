@@ -17,6 +17,7 @@ from jaxdrones.checks import (
     check_whole,
     hint,
     shown,
+    takes_scene,
 )
 from jaxdrones.dynamics import (
     EFFECTS,
@@ -28,6 +29,7 @@ from jaxdrones.dynamics import (
     external_force,
     ground_contact,
     lagging_rotors,
+    obstacle_contact,
 )
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
@@ -44,8 +46,8 @@ from jaxdrones.envs.randomize import (
     Randomization,
     sensor_noise,
 )
-from jaxdrones.envs.surroundings import DrawScene
-from jaxdrones.envs.vision import make_vision
+from jaxdrones.envs.surroundings import DrawScene, are_solid
+from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
@@ -111,9 +113,9 @@ def make(
         action: a name of `ACTIONS` or an action type; the task's own when left out.
         observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
             out.
-        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, images of a camera on every drone;
-            the task's own when left out.
-        camera: that camera, with its rate, latency and noise; the task's own, or else a `Camera()`, when left out.
+        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, as images of a camera on every
+            drone; the task's own when left out.
+        camera: that camera, with its rate, latency and noise; the task's own when left out, or else a `Camera()`.
         realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
@@ -129,7 +131,8 @@ def make(
         delay: delay between action and command, s.
         sensors: sensors of every drone; their names are observations too.
         scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's own
-            when left out. On the explicit backend an effect must take it if it has obstacles.
+            when left out. On the explicit backend `obstacle_contact` makes obstacles solid, unless another effect
+            takes the scene or the task ends where they are touched.
         **options: options of the task, for example `drones`.
 
     Raises:
@@ -175,12 +178,14 @@ def make(
         step = bullet.make_step(**physics, scene=scene if isinstance(scene, Scene) else None)
     else:
         if "ground" in task.contact:
-            physics["effects"] = [*effects, ground_contact]
+            effects = [*effects, ground_contact]
+        if are_solid(scene, task) and not any(map(takes_scene, effects)):
+            effects = [*effects, obstacle_contact]
+        physics["effects"] = effects
         if "drones" in task.contact:
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))
 
-    vision = task.vision if vision is None else vision
     observation = task.observation if observation is None else observation
     known = _known_terms(task, sensors)
     observation = check_sequence("observation", observation, "'position_error'")
@@ -198,7 +203,7 @@ def make(
         noise=preset["noise"] if noise is None else noise,
         disturbance=disturbance,
         delay=preset["delay"] if delay is None else delay,
-        vision=make_vision(step, vision, camera or (task.camera if vision else None), dt, scene),
+        vision=_vision(task, step, vision, camera, dt, scene),
         sensors=sensors,
         scene=scene,
         vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
@@ -263,3 +268,17 @@ def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, Observation
         if sensor.name in terms:
             raise ValueError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
     return terms | {sensor.name: reading(sensor.name, sensor.bound) for sensor in sensors}
+
+
+def _vision(
+    task: Task, step: Step, images: Sequence[str] | None, camera: Camera | None, dt: float, scene: Scene | DrawScene
+) -> Vision | None:
+    """The vision of an environment; `None` where no image is asked for."""
+    images = check_sequence("vision", task.vision if images is None else images, "'depth'")
+    if images:
+        return make_vision(step, images, camera or task.camera or Camera(), dt, scene)
+    if camera is not None:
+        raise ValueError(
+            "camera is given, but vision asks for no image; give for example vision=('depth',), or leave it out"
+        )
+    return None

@@ -15,27 +15,40 @@ DrawScene = Callable[[jax.Array], Scene]
 """(key) -> the scene of an episode."""
 
 
+def example_of(scene: Scene | DrawScene) -> Scene:
+    """A scene as it may be in an episode, of shapes and types if it is drawn.
+
+    Raises:
+        ValueError: it is neither a scene nor a function that draws one.
+    """
+    if isinstance(scene, Scene):
+        return scene
+    if not callable(scene):
+        raise ValueError(f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
+    example = jax.eval_shape(scene, jax.random.key(0))
+    if not isinstance(example, Scene):
+        returned = shown(scene(jax.random.key(0)))
+        raise ValueError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
+    return example
+
+
+def are_solid(scene: Scene | DrawScene, task: Task) -> bool:
+    """Whether obstacles act on drones by forces: those of a scene, unless touching them ends an episode of the task."""
+    return example_of(scene).has_obstacles and ("obstacles" in task.contact or not task.obstacles_terminate)
+
+
 def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> int:
     """The number of obstacles in a scene.
 
     Raises:
         ValueError: it is none, or neither the step nor the terminations of the task honor its obstacles.
     """
-    if isinstance(scene, Scene):
-        example = scene
-    elif callable(scene):
-        example = jax.eval_shape(scene, jax.random.key(0))
-    else:
-        raise ValueError(f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
-    if not isinstance(example, Scene):
-        returned = shown(scene(jax.random.key(0)))
-        raise ValueError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
-    honored = isinstance(step, HostStep) or step.physics.takes_scene or task.obstacles_terminate
-    if example.has_obstacles and not honored:
+    example = example_of(scene)
+    if are_solid(scene, task) and not (isinstance(step, HostStep) or step.physics.takes_scene):
         raise ValueError(
-            "the scene has obstacles and on the explicit backend drones would fly through them; give an effect "
-            "(params, state, scene) -> Wrench, a task whose terminations find obstacles (obstacles_terminate), no "
-            "obstacles, or take the bullet backend"
+            "the scene has obstacles and on the explicit backend drones would fly through them; give an effect that "
+            "takes the scene, such as obstacle_contact, a task whose terminations find obstacles "
+            "(obstacles_terminate), no obstacles, or take the bullet backend"
         )
     return example.count
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice, check_sequence
+from jaxdrones.checks import check_choice
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.envs.exposures import where_due
 from jaxdrones.envs.surroundings import DrawScene
@@ -102,7 +103,7 @@ class Vision:
         args = key, world.params, pose, world.scene
         if self.on_host and not is_traced((due, world.images, args)):
             return self._exposed(*args) if due else world.images
-        worlds = 1 if self.on_host else max(1, _PIXELS // (len(pose) * np.prod(self.camera.resolution)))
+        worlds = 1 if self.on_host else max(1, _PIXELS // (len(pose) * math.prod(self.camera.resolution)))
         return where_due(self._exposed, worlds)(due, world.images, *args)
 
     def _exposed(self, key: Any, params: Params, pose: Float[Array, "n 7"], scene: Scene) -> dict[str, Array]:
@@ -113,31 +114,41 @@ class Vision:
         return images
 
 
-def make_vision(
-    step: Step, images: Sequence[str], camera: Camera | None, dt: float, scene: Scene | DrawScene
-) -> Vision | None:
-    """The vision of an environment; `None` where no image is asked for.
+def observation(vector: Float[Array, "n d"], world: World) -> Any:
+    """An observation: its vector, or a dictionary of `state` and the images of the world if there are any."""
+    return {"state": vector, **world.images} if world.images else vector
+
+
+def first_images(env: Any, key: Any, world: World) -> World:
+    """`Vision.first` of an environment."""
+    return env.vision.first(key, world)
+
+
+def next_images(env: Any, key: Any, world: World) -> World:
+    """`Vision.next` of an environment."""
+    return env.vision.next(key, world)
+
+
+def renewed_images(env: Any, key: Any, world: World, ended: Array) -> World:
+    """`Vision.renewed` of an environment."""
+    return env.vision.renewed(ended, key, world)
+
+
+def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, scene: Scene | DrawScene) -> Vision:
+    """The vision of an environment.
 
     Args:
         step: of either backend; that of Bullet renders the images itself.
         images: which of `rgb`, `depth`, `segmentation`.
-        camera: on every drone; a `Camera()` when left out.
+        camera: on every drone.
         dt: control period, s.
         scene: of the environment; a step of Bullet was built with it unless it is drawn.
 
     Raises:
-        ValueError: an unknown image, a camera without images, or more images than control steps.
+        ValueError: an unknown image, something else than a camera, or more images than control steps.
     """
-    images = check_sequence("vision", images, "'depth'")
     for image in images:
         check_choice("image", image, IMAGES)
-    if not images:
-        if camera is not None:
-            raise ValueError(
-                "camera is given, but vision asks for no image; give for example vision=('depth',), or leave it out"
-            )
-        return None
-    camera = Camera() if camera is None else camera
     check_camera(camera)
     every = 1 if camera.rate is None else 1 / (camera.rate * dt)
     if every < 1 - 1e-6:
@@ -152,7 +163,7 @@ def make_vision(
             return step.camera(params, drones, camera, scene if drawn else None)
         return render(scene, params, drones, camera)
 
-    return Vision(images, camera, take, isinstance(step, HostStep), round(every), round(camera.latency / dt))
+    return Vision(tuple(images), camera, take, isinstance(step, HostStep), round(every), round(camera.latency / dt))
 
 
 def _pose(drones: State) -> Float[Array, "n 7"]:

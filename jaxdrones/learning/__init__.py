@@ -3,6 +3,7 @@
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.evaluation import Report, evaluate
 from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.recurrence import RecurrentPolicy
 from jaxdrones.learning.result import Diverged, Result
 
-__all__ = ["Diverged", "Policy", "Report", "Result", "bptt", "evaluate", "ppo", "shac"]
+__all__ = ["Diverged", "Policy", "RecurrentPolicy", "Report", "Result", "bptt", "evaluate", "ppo", "shac"]

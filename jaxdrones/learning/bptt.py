@@ -21,6 +21,7 @@ from jaxdrones.learning.returns import discounted_rewards
 from jaxdrones.learning.settings import (
     BelowOne,
     Count,
+    CountOrNone,
     Fraction,
     Gradient,
     HiddenSizes,
@@ -44,6 +45,8 @@ class Config:
     horizon: Count = 64
     """Control steps that the gradient goes back through."""
     hidden_sizes: HiddenSizes = (32, 32)
+    recurrent_size: CountOrNone = 0
+    """Size of the memory that each drone's policy has, of a gated recurrent unit (GRU); 0 for none."""
     obs_stats_window: PositiveOrInfinite = 1e9
     """Number of trajectories whose observations the statistics remember."""
     obs_stats_freeze: Fraction = 0.2
@@ -66,6 +69,8 @@ class Config:
     """Factor on the gradient per control step with `gradient="decay"`."""
     surrogate: Surrogate = None
     """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+    image_gradient: Switch = True
+    """Whether the gradient goes through the images of cameras, or takes them for constants."""
 
     def __post_init__(self):
         check_settings(self)
@@ -91,13 +96,13 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key = jax.random.split(key)
-    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent)
+    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent, config.recurrent_size)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,
         policy=policy,
         opt_state=_optimizer(config).init(policy.params),
-        worlds=collect.empty_worlds(env, config.worlds),
+        worlds=collect.empty_worlds(env, config.worlds, policy),
     )
 
 
@@ -106,7 +111,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     check_config(config, Config)
     key, restart_key, collect_key = jax.random.split(state.key, 3)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
-    env = with_gradient(env, config.gradient, config.surrogate)
+    env = with_gradient(env, config.gradient, config.surrogate, config.image_gradient)
     between_steps = gradient_between_steps(config.gradient, config.gradient_decay)
 
     def loss(params):

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.learning.files import ADVICE, load_bytes, one_line, read_sidecar, save_bytes
-from jaxdrones.learning.networks import MLP, Policy, VisionMLP
+from jaxdrones.learning.networks import MLP, Network, Policy
 from jaxdrones.learning.normalize import RunningStatistics
 
 
@@ -54,7 +54,7 @@ def load(path: str | os.PathLike) -> Policy:
         settings: dict[str, Any] = {
             name: tuple(x) if isinstance(x, list) else x for name, x in sidecar["policy"]["network"].items()
         }
-        network = VisionMLP(**settings) if "channels" in settings else MLP(**settings)
+        network = Network(**settings) if "recurrent_size" in settings else MLP(**settings)
         obs_stats = RunningStatistics(**{name: jnp.asarray(x) for name, x in arrays["obs_stats"].items()})
         params = jax.tree.map(jnp.asarray, arrays["params"])
         policy = Policy(params, obs_stats, network, sidecar["policy"]["per_agent"])
@@ -105,7 +105,7 @@ def load_tree(path: str | os.PathLike, like: Any) -> Any:
     return jax.tree.map(restored, arrays, like)
 
 
-def _settings(network: MLP | VisionMLP) -> dict[str, Any]:
+def _settings(network: MLP | Network) -> dict[str, Any]:
     names = {field.name for field in dataclasses.fields(network)} - {"parent", "name"}  # flax adds these fields
     return {name: getattr(network, name) for name in names}
 

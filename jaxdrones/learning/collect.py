@@ -20,9 +20,9 @@ from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
 from jaxdrones.learning.settings import Scalar
 
-Act = Callable[[jax.Array, Obs], tuple[Array, Any]]
-"""(a key for each world (w,), observations (w, n, d)) -> actions (w, n, a), and extras for the learner, such as log
-probabilities."""
+Act = Callable[[jax.Array, Any, Obs], tuple[Any, Array, Any]]
+"""(a key for each world (w,), memory, observations (w, n, d)) -> memory, actions (w, n, a), and extras for the learner,
+such as log probabilities."""
 
 
 class Worlds(flax.struct.PyTreeNode):
@@ -33,6 +33,8 @@ class Worlds(flax.struct.PyTreeNode):
     """(w, n, d) current observations; here and below, with cameras, a dictionary of such an array and of images."""
     done: Array
     """(w,) whether the episode has ended and a new one has to be started."""
+    memory: Array | None = None
+    """(w, n, m) memory of the policy before the observations, zero at the start of an episode; `None` without one."""
 
 
 class Trajectory(flax.struct.PyTreeNode):
@@ -62,6 +64,8 @@ class Trajectory(flax.struct.PyTreeNode):
     """(t, w, n, ...) privileged observations after the step, before a new episode starts."""
     was_done: Array
     """(t, w) whether the episode had ended before the step; such a step does not count. Always false with `reset`."""
+    memory: Array | None = None
+    """(t, w, n, m) memory of the policy after the observations before the step; `None` without one."""
 
     @property
     def done(self) -> Array:
@@ -69,11 +73,12 @@ class Trajectory(flax.struct.PyTreeNode):
         return self.terminated | self.truncated
 
 
-def empty_worlds(env: Env, count: int) -> Worlds:
-    """Worlds in which no episode has begun; `restart` starts one in each."""
+def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
+    """Worlds in which no episode has begun, for a policy that may have a memory; `restart` starts one in each."""
     obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), count))
     episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
-    return Worlds(episodes, obs, done=jnp.ones(count, bool))
+    memory = None if policy is None else policy.initial_memory((count, env.drones))
+    return Worlds(episodes, obs, jnp.ones(count, bool), memory)
 
 
 def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) -> Worlds:
@@ -90,7 +95,8 @@ def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) ->
     count = len(worlds.done)
     chosen = worlds.done | jax.random.bernoulli(choice_key, fraction, (count,))
     obs, episodes = jax.vmap(AutoReset(env).reset)(jax.random.split(start_key, count))
-    return _select(chosen, Worlds(episodes, obs, jnp.zeros_like(chosen)), worlds)
+    memory = jax.tree.map(jnp.zeros_like, worlds.memory)
+    return _select(chosen, Worlds(episodes, obs, jnp.zeros_like(chosen), memory), worlds)
 
 
 def collect(
@@ -123,7 +129,7 @@ def collect(
     def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Trajectory]:
         act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
         worlds = between_steps(worlds)
-        action, extras = act(act_keys, worlds.obs)
+        memory, action, extras = act(act_keys, worlds.memory, worlds.obs)
         obs, episodes, reward, terminated, truncated, info = step(step_keys, worlds.episodes, action)
         recorded = Trajectory(
             obs=worlds.obs,
@@ -138,10 +144,13 @@ def collect(
             privileged=privileged_of(worlds.episodes.world),
             final_privileged=privileged_of(info["final_world"]),
             was_done=worlds.done,
+            memory=memory,
         )
+        ended = terminated | truncated
         if reset:
-            return Worlds(episodes, obs, worlds.done), recorded
-        after = Worlds(episodes, obs, worlds.done | terminated | truncated)
+            memory = jax.tree.map(lambda x: jnp.where(ended[:, None, None], 0, x), memory)
+            return Worlds(episodes, obs, worlds.done, memory), recorded
+        after = Worlds(episodes, obs, worlds.done | ended, memory)
         return _select(worlds.done, worlds, after), recorded  # without this, a lost drone would fly on to infinity
 
     def control_steps(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Trajectory]:
@@ -158,7 +167,7 @@ def collect(
 
 def deterministic(policy: Policy) -> Act:
     """Actions of the policy without exploration noise, and no extras."""
-    return jax.tree_util.Partial(lambda policy, keys, obs: (policy(obs), None), policy)
+    return jax.tree_util.Partial(lambda policy, keys, memory, obs: (*policy.act(memory, obs), None), policy)
 
 
 class _NoReset(AutoReset):

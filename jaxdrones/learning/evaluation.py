@@ -13,6 +13,7 @@ import numpy as np
 from jaxdrones.checks import check_key
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation
+from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 
 _CHUNK = 1000  # episodes simulated at a time
@@ -43,12 +44,13 @@ class Report(flax.struct.PyTreeNode):
     """Mean over drones of each of the task's metrics at the end of an episode."""
 
 
-def evaluate(env: Env, policy: Callable, key: jax.Array, episodes: int = 1000) -> Report:
+def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) -> Report:
     """Simulate whole episodes; after an episode has ended, its metrics keep their last values.
 
     Args:
         env: environment of either backend.
-        policy: observations (n, d), or a dictionary with images, -> actions (n, a); a pytree, or any function.
+        policy: observations (n, d), or a dictionary with images, -> actions (n, a): a pytree, or any function; or a
+            policy with a memory, see `learning.recurrence`.
         key: random key.
         episodes: number of episodes.
 
@@ -76,12 +78,12 @@ def _compiled_outcomes() -> Callable:
     return compilation.jit(lambda env, policy, keys: _outcomes(env.value, policy, keys), static_argnums=0)
 
 
-def _outcomes(env: Env, policy: Callable, keys: jax.Array) -> dict:
+def _outcomes(env: Env, policy: AnyPolicy, keys: jax.Array) -> dict:
     """Outcomes of one episode per key, along a leading axis."""
     return jax.lax.map(functools.partial(_outcome, env, policy), keys, batch_size=min(_CHUNK, len(keys)))
 
 
-def _outcome(env: Env, policy: Callable, key: jax.Array) -> dict:
+def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:
     """The outcome of one episode; an episode in which a position is ever not finite is no success."""
     start_key, key = jax.random.split(key)
     obs, world = env.reset(start_key)
@@ -89,19 +91,20 @@ def _outcome(env: Env, policy: Callable, key: jax.Array) -> dict:
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), _metrics_and_ends(info))
 
     def control_step(carry, key):
-        obs, world, diverged, done, last, episode_return, length = carry
-        obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
+        memory, obs, world, diverged, done, last, episode_return, length = carry
+        memory, action = act(policy, memory, obs)
+        obs, world, reward, terminated, truncated, info = env.step(key, world, action)
         last = jax.tree.map(lambda new, old: jnp.where(done, old, new), _metrics_and_ends(info), last)
         episode_return = episode_return + jnp.where(done, 0, reward)
         length = length + ~done
         diverged = diverged | ~jnp.all(jnp.isfinite(world.drones.pos))
-        return (obs, world, diverged, done | terminated | truncated, last, episode_return, length), last[0]
+        return (memory, obs, world, diverged, done | terminated | truncated, last, episode_return, length), last[0]
 
     zero = jnp.zeros(env.drones, world.drones.pos.dtype)
     false = jnp.zeros((), bool)
-    carry = (obs, world, false, false, zeros, zero, jnp.zeros((), jnp.int32))
+    carry = (initial_memory(policy, env.drones), obs, world, false, false, zeros, zero, jnp.zeros((), jnp.int32))
     carry, metrics = jax.lax.scan(control_step, carry, jax.random.split(key, env.steps))
-    _, _, diverged, _, (final_metrics, ends), episode_return, length = carry
+    _, _, _, diverged, _, (final_metrics, ends), episode_return, length = carry
     success = false if env.task.success is None else jnp.all(env.task.success(metrics, env.dt)) & ~diverged
     rms_error = jnp.sqrt(jnp.mean(metrics["error"][env.steps // 5 :] ** 2, axis=0))
     return {

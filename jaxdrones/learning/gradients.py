@@ -1,4 +1,4 @@
-"""Three ways to differentiate a simulated flight.
+"""Four ways to differentiate a simulated flight.
 
 The gradients of a long flight of an unstable vehicle grow or shrink with every control step.
 
@@ -7,18 +7,28 @@ The gradients of a long flight of an unstable vehicle grow or shrink with every 
   contribute little.
 - `surrogate`: the physics is simulated as it is, but differentiated as a simpler step, by default one rigid body step
   per control period. This is cheaper, and smooth where the simulated physics is not; the gradient is biased.
+- `point_mass`: the physics is simulated as it is, but differentiated as a point mass whose acceleration is commanded;
+  attitudes have no gradient. See `point_mass`.
+
+With each of them, the gradient may go through the images of cameras or leave them out. It is that of the visible
+surface: a depth jumps at the edge of an obstacle, and the derivative does not show it.
 """
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
+from jaxtyping import Array
 
+from jaxdrones import vector
+from jaxdrones.dynamics import rotors
+from jaxdrones.dynamics.rigid_body import newton_euler
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
@@ -26,20 +36,26 @@ from jaxdrones.learning.settings import Scalar
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
+from jaxdrones.wrench import Wrench
 
 
-def with_gradient(env: Env, gradient: str, surrogate: Step | None = None) -> Env:
+def with_gradient(env: Env, gradient: str, surrogate: Step | None = None, image_gradient: bool = True) -> Env:
     """The environment whose physics is differentiated in the way that `gradient` names.
 
     Args:
         env: environment.
-        gradient: exact, decay or surrogate.
+        gradient: exact, decay, surrogate or point_mass.
         surrogate: step whose derivatives are taken with `surrogate`; a rigid body with instant rotors when left out.
+        image_gradient: whether the images of cameras have a gradient; otherwise they are constants.
     """
-    if gradient != "surrogate":
-        return env
     changed = copy.copy(env)
-    changed.physics = SurrogateStep(env.physics, surrogate or make_step(dt=env.dt))
+    if gradient == "surrogate":
+        changed.physics = SurrogateStep(env.physics, surrogate or make_step(dt=env.dt))
+    if gradient == "point_mass":
+        changed.physics = SurrogateStep(env.physics, point_mass(env.dt))
+    if env.vision and not image_gradient:
+        render = env.vision.render
+        changed.vision = dataclasses.replace(env.vision, render=lambda *seen: render(*jax.lax.stop_gradient(seen)))
     return changed
 
 
@@ -61,10 +77,36 @@ def scale_gradient(tree: Any, factor: Scalar) -> Any:
     return jax.tree.map(scale, tree)
 
 
+def point_mass(dt: float, response: float = 0.1) -> Callable[[Params, State, Array], State]:
+    """A step of a team as points, for `SurrogateStep`: only its derivatives have a meaning.
+
+    The rotors command an acceleration: their thrust along the axis to which their torque turns the body. A torque that
+    changes the body rates by dw in a control period turns the thrust by dw times `response` at once. Position and
+    velocity are differentiated with respect to that acceleration and to each other, attitude and rotors not at all.
+
+    Args:
+        dt: control period, s.
+        response: time in which a change of the body rates turns the body before it is corrected, s.
+    """
+
+    def step(params: Params, state: State, rpm: Array) -> State:
+        fixed = jax.lax.stop_gradient(state)
+        turning = fixed.replace(rpm=rotors.limited(params, rpm))
+        wrench = rotors.rotor_wrench(params, turning)
+        _, angular_acc = newton_euler(params, turning, wrench)
+        turn = angular_acc * dt * response
+        force = wrench.force + vector.cross(turn - jax.lax.stop_gradient(turn), wrench.force)
+        acc, _ = newton_euler(params, fixed, Wrench(force, wrench.torque))
+        vel = state.vel + acc * dt
+        return fixed.replace(pos=state.pos + vel * dt, vel=vel)
+
+    return jax.vmap(step)
+
+
 class SurrogateStep(Step):
     """A step with the values of `step` and the derivatives of `surrogate` at the same state."""
 
-    def __init__(self, step: Step, surrogate: Step):
+    def __init__(self, step: Step, surrogate: Callable[[Params, State, Array], State]):
         self.physics, self._step = step.physics, step
 
         @jax.custom_vjp

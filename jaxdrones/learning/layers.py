@@ -1,10 +1,12 @@
-"""The layers of networks: multilayer perceptrons, and convolutions of images of any resolution."""
+"""The layers of networks: multilayer perceptrons, convolutions of images of any resolution, gated recurrent units."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -74,6 +76,48 @@ def _patches(image: Float[Array, "*batch h w c"], stride: int) -> Array:
     return jnp.moveaxis(squares, -4, -3).reshape(*batch, rows, columns, -1)
 
 
+class GRU(nn.Module):
+    """A gated recurrent unit (Cho et al. 2014): a memory, and gates that decide how much of it to keep."""
+
+    size: int
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "*batch d"], memory: Array | None = None, starts: Array | None = None
+    ) -> Float[Array, "*batch size"]:
+        """The memory after each input.
+
+        Args:
+            x: inputs; with `starts` sequences of them, along the leading axis.
+            memory: (..., size) memory before the (first) input; zero, as at the start of an episode, when left out.
+            starts: (t, ...) whether an episode starts at this input, so that the memory before it is zero.
+        """
+        # At first the memory keeps three quarters in every step, so that what was seen long ago has a gradient.
+        bias = jnp.repeat(jnp.array([0.0, 1.0, 0.0]), self.size)
+        gates = nn.Dense(3 * self.size, kernel_init=_kernel_init(1.0), bias_init=lambda k, s, dtype: bias.astype(dtype))
+        inputs, kernel = gates(x), self.param("recurrent_kernel", _orthogonal_gates, self.size, gates.param_dtype)
+
+        def step(memory: Array, inputs: Array) -> Array:
+            reset_in, keep_in, new_in = jnp.split(inputs, 3, axis=-1)
+            reset_mem, keep_mem, new_mem = jnp.split(memory @ kernel, 3, axis=-1)
+            keep = nn.sigmoid(keep_in + keep_mem)
+            new = nn.tanh(new_in + nn.sigmoid(reset_in + reset_mem) * new_mem)
+            return (keep * memory + (1 - keep) * new).astype(memory.dtype)
+
+        if memory is None:
+            memory = jnp.zeros((*x.shape[starts is not None : -1], self.size), x.dtype)
+        if starts is None:
+            return step(memory, inputs)
+
+        def restarted_step(memory: Array, step_inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+            inputs, start = step_inputs
+            start = start.reshape(start.shape + (1,) * (memory.ndim - start.ndim))
+            memory = step(jnp.where(start, 0, memory), inputs)
+            return memory, memory
+
+        return jax.lax.scan(restarted_step, memory, (inputs, starts))[1]
+
+
 def image_channels(images: Mapping[str, Array], depth_scale: float) -> Float[Array, "*batch h w c"]:
     """The images of an observation as channels in [0, 1], side by side in the order of their names.
 
@@ -105,3 +149,9 @@ IMAGE_CHANNELS: dict[str, Callable[[Array, float], Array]] = {"rgb": _normalize_
 def _kernel_init(scale: float):
     """Normally distributed weights, with which the variance of the outputs is `scale`^2 times that of the inputs."""
     return nn.initializers.variance_scaling(scale**2, "fan_in", "normal")
+
+
+def _orthogonal_gates(key: jax.Array, size: int, dtype: Any) -> Float[Array, "size 3*size"]:
+    """An orthogonal matrix for each of the three gates, side by side."""
+    orthogonal = nn.initializers.orthogonal()
+    return jnp.concatenate([orthogonal(key, (size, size), dtype) for key in jax.random.split(key, 3)], axis=1)

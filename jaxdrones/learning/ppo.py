@@ -15,14 +15,16 @@ from jaxtyping import Array
 from jaxdrones.checks import check_key, check_keywords, check_number, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
-from jaxdrones.learning import collect, networks
-from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.normalize import map_state_vector, state_vector
+from jaxdrones.learning import collect
+from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
+from jaxdrones.learning.networks import Policy, init_params
+from jaxdrones.learning.normalize import state_vector
 from jaxdrones.learning.result import Result, clip_gradient, count_nonfinite, run_training
 from jaxdrones.learning.returns import trajectory_advantages
 from jaxdrones.learning.settings import (
     BelowOne,
     Count,
+    CountOrNone,
     Fraction,
     HiddenSizes,
     NotNegative,
@@ -54,6 +56,8 @@ class Config:
     minibatches: Count = 8
     """Minibatches of an epoch, each with all steps of some of the worlds."""
     hidden_sizes: HiddenSizes = (32, 32)
+    recurrent_size: CountOrNone = 0
+    """Size of the memory that each drone's policy has, of a gated recurrent unit (GRU); 0 for none."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
     obs_stats_window: PositiveOrInfinite = 1e9
     """Number of trajectories whose observations the statistics remember."""
@@ -122,7 +126,7 @@ class TrainState(flax.struct.PyTreeNode):
 
 
 class Batch(flax.struct.PyTreeNode):
-    """Transitions to learn from; leading axes (t, w, n)."""
+    """Trajectories to learn from; leading axes (t, w, n)."""
 
     obs: Obs
     action: Array
@@ -131,6 +135,10 @@ class Batch(flax.struct.PyTreeNode):
     critic_obs: Obs
     advantage: Array
     value_target: Array
+    memory: Array | None = None
+    """(1, w, n, m) memory of the policy at the start of the trajectories; `None` without one."""
+    starts: Array | None = None
+    """(t, w) whether a new episode starts, with an empty memory; `None` for a policy without one."""
 
 
 def init(key: jax.Array, env: Env, config: Config) -> TrainState:
@@ -142,14 +150,12 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent)
+    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent, config.recurrent_size)
     n, a = env.drones, env.action_size
-    d = env.observation_size + (env.privileged_size if config.privileged_critic else 0)
-    log_std = jnp.full((n, a) if config.per_agent else (a,), jnp.log(config.init_std))
-    critic_inputs = n * d + (n - 1) * a if config.centralized_critic else d
-    critic_obs = map_state_vector(lambda _: jnp.zeros(critic_inputs), networks.example_observation(env))
-    agents = n if config.per_agent else None
-    critic = networks.init_params(critic_key, _critic_network(config, critic_obs), critic_obs, agents)
+    log_std = jnp.full((n, a) if config.per_agent else (a,), jnp.log(config.init_std), float)
+    critic_obs = critic_example(env, policy, config.privileged_critic, config.centralized_critic)
+    network = critic_network(critic_obs, config.critic_hidden_sizes)
+    critic = init_params(critic_key, network, critic_obs, n if config.per_agent else None)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,
@@ -158,7 +164,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
         critic=critic,
         opt_state=_optimizer(config).init((policy.params, log_std, critic)),
         learning_rate=jnp.asarray(config.learning_rate, log_std.dtype),
-        worlds=collect.empty_worlds(env, config.worlds),
+        worlds=collect.empty_worlds(env, config.worlds, policy),
     )
 
 
@@ -168,18 +174,18 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     key, restart_key, collect_key, optimize_key = jax.random.split(state.key, 4)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
 
-    def act(policy, log_std, keys, obs):
-        mean = policy(obs)
+    def act(policy, log_std, keys, memory, obs):
+        memory, mean = policy.act(memory, obs)
         std = jnp.broadcast_to(jnp.exp(log_std), mean.shape)
         noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(keys)
         action = mean + std * noise
-        return action, log_prob(action, mean, log_std)
+        return memory, action, log_prob(action, mean, log_std)
 
     explore = jax.tree_util.Partial(act, state.policy, state.log_std)
-    worlds, trajectory = collect.collect(
+    after, trajectory = collect.collect(
         collect_key, env, explore, worlds, config.horizon, privileged=config.privileged_critic
     )
-    batch = _batch(config, state, trajectory)
+    batch = _batch(config, state, worlds.memory, trajectory)
     (params, log_std, critic), opt_state, learning_rate, metrics = _optimize(optimize_key, config, state, batch)
     max_std = _annealed(config, state.step, config.init_std, config.final_std)
     log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.min_std, max_std)), jnp.log(max_std))
@@ -187,7 +193,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     policy = state.policy.replace(params=params, obs_stats=obs_stats)
     metrics |= collect.trajectory_metrics(trajectory)
     metrics |= {"action_std": jnp.mean(jnp.exp(log_std)), "learning_rate": learning_rate}
-    return TrainState(state.step + 1, key, policy, log_std, critic, opt_state, learning_rate, worlds), metrics
+    return TrainState(state.step + 1, key, policy, log_std, critic, opt_state, learning_rate, after), metrics
 
 
 def train(key: jax.Array, env: Env, config: Config) -> Result:
@@ -206,7 +212,8 @@ def log_prob(action: Array, mean: Array, log_std: Array) -> Array:
 
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
     """The clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy."""
-    log_ratio = log_prob(batch.action, policy(batch.obs), log_std) - batch.log_prob
+    mean = policy.replay(jax.tree.map(lambda x: x[0], batch.memory), batch.obs, batch.starts)
+    log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
     clipped = jnp.clip(ratio, 1 - config.clip_epsilon, 1 + config.clip_epsilon)
     surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
@@ -218,35 +225,34 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Bat
     return total, {"value_loss": value_loss, "kl": kl}
 
 
-def _batch(config: Config, state: TrainState, trajectory: collect.Trajectory) -> Batch:
-    """The transitions of a trajectory with their advantages, normalized, and the targets of their values."""
+def _batch(config: Config, state: TrainState, memory: Array | None, trajectory: collect.Trajectory) -> Batch:
+    """The transitions of a trajectory with their advantages, normalized, and the targets of their values.
+
+    `memory` (w, n, m) is that of the policy before the trajectory, or `None`.
+    """
     policy = state.policy
-
-    def critic_input(obs, privileged, action):
-        """Observations of the critic where the policy observes `obs`."""
-        if config.privileged_critic:
-            obs = map_state_vector(lambda _: privileged.obs, obs)
-        obs = map_state_vector(policy.obs_stats.normalize, obs)
-        if config.privileged_critic:
-            obs = map_state_vector(lambda x: jnp.concatenate([x, privileged.params], axis=-1), obs)
-        return (
-            map_state_vector(lambda x: networks.centralized_input(x, action), obs) if config.centralized_critic else obs
-        )
-
-    critic_obs = critic_input(trajectory.obs, trajectory.privileged, trajectory.action)
-    final_action = policy(trajectory.final_obs) if config.centralized_critic else None
-    final_obs = critic_input(trajectory.final_obs, trajectory.final_privileged, final_action)
+    final_memory, final_action = policy.act(trajectory.memory, trajectory.final_obs)
+    actions = (trajectory.action, final_action) if config.centralized_critic else (None, None)
+    critic_obs = critic_observation(policy, trajectory.obs, trajectory.memory, trajectory.privileged, actions[0])
+    final_obs = critic_observation(policy, trajectory.final_obs, final_memory, trajectory.final_privileged, actions[1])
     value = _value(config, state.critic, critic_obs)
     next_value = _value(config, state.critic, final_obs)
     advantage = trajectory_advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
-    value_target = value + advantage
-    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
-    return Batch(trajectory.obs, trajectory.action, trajectory.extras, critic_obs, advantage, value_target)
+    return Batch(
+        obs=trajectory.obs,
+        action=trajectory.action,
+        log_prob=trajectory.extras,
+        critic_obs=critic_obs,
+        advantage=(advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6),
+        value_target=value + advantage,
+        memory=jax.tree.map(lambda x: x[None], memory),
+        starts=None if memory is None else jnp.roll(trajectory.done, 1, axis=0).at[0].set(False),
+    )
 
 
 def _optimize(key: jax.Array, config: Config, state: TrainState, batch: Batch):
     """Some epochs of gradient steps: (policy parameters, log_std, critic), optimizer state, learning rate, metrics."""
-    t, w = batch.advantage.shape[:2]
+    w = batch.advantage.shape[1]
 
     def cost(variables, minibatch):
         params, log_std, critic = variables
@@ -261,7 +267,7 @@ def _optimize(key: jax.Array, config: Config, state: TrainState, batch: Batch):
         lower, raise_ = metrics["kl"] > 2 * config.target_kl, metrics["kl"] < config.target_kl / 2
         factor = jnp.where(lower, 1 / _RATE_FACTOR, jnp.where(raise_, _RATE_FACTOR, 1))
         learning_rate = jnp.clip(learning_rate * factor, config.min_learning_rate, max_learning_rate)
-        variables = jax.tree.map(lambda x, s: x - learning_rate.astype(x.dtype) * s, variables, step)
+        variables = jax.tree.map(lambda x, s: x - (learning_rate * s).astype(x.dtype), variables, step)
         return (variables, opt_state, learning_rate), (metrics, optax.tree.norm(gradient))
 
     def epoch(carry, key):
@@ -270,7 +276,7 @@ def _optimize(key: jax.Array, config: Config, state: TrainState, batch: Batch):
         order = jnp.argsort(jax.random.uniform(key, (w // config.minibatches, config.minibatches)), axis=1)
 
         def minibatches(x):
-            x = x.reshape(t, *order.shape, *x.shape[2:])
+            x = x.reshape(len(x), *order.shape, *x.shape[2:])
             return jax.vmap(lambda group, order: group[:, order], (1, 0), 2)(x, order).swapaxes(0, 1)
 
         return jax.lax.scan(step, carry, jax.tree.map(minibatches, batch))
@@ -286,14 +292,8 @@ def _annealed(config: Config, step: Array, high: Scalar, low: Scalar) -> Array:
     return low * (high / low) ** remaining
 
 
-def _critic_network(config: Config, critic_obs: Obs) -> networks.MLP | networks.VisionMLP:
-    return networks.make_network(critic_obs, config.critic_hidden_sizes, 1, output_scale=0.01)
-
-
 def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
-    """(*batch, n) discounted sum of future rewards; the network's output is that sum times one minus gamma."""
-    output = networks.apply(_critic_network(config, critic_obs), critic, critic_obs, config.per_agent)[..., 0]
-    return output / (1 - config.gamma)
+    return discounted_value(critic, critic_obs, config.critic_hidden_sizes, config.gamma, config.per_agent)
 
 
 def _optimizer(config: Config) -> optax.GradientTransformation:

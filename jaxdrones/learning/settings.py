@@ -18,7 +18,7 @@ import jax
 from jaxdrones.checks import check_callable, check_choice, check_number, check_switch, check_whole, is_known, shown
 from jaxdrones.engine.step import Step
 
-GRADIENTS = ("exact", "decay", "surrogate")
+GRADIENTS = ("exact", "decay", "surrogate", "point_mass")
 """Names of the gradients that `learning.gradients` explains."""
 
 Scalar = float | jax.Array
@@ -57,9 +57,11 @@ Count = Annotated[int, check_whole]
 TracedCount = Annotated[int | jax.Array, _check_whole_if_known]
 """A whole number that may be traced."""
 Switch = Annotated[bool, check_switch]
+CountOrNone = Annotated[int, partial(check_whole, minimum=0)]
+"""A whole number, 0 where the thing that is counted is left out."""
 HiddenSizes = Annotated[tuple[int, ...], _check_layers]
 """Sizes of the hidden layers of a network."""
-Gradient = Annotated[Literal["exact", "decay", "surrogate"], _check_gradient]
+Gradient = Annotated[Literal["exact", "decay", "surrogate", "point_mass"], _check_gradient]
 Surrogate = Annotated[Step | None, _check_surrogate]
 
 

@@ -13,15 +13,18 @@ from jaxtyping import Array
 
 from jaxdrones.checks import check_key, check_keywords
 from jaxdrones.envs import Env
+from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect
+from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
 from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
-from jaxdrones.learning.networks import MLP, Policy, init_params
+from jaxdrones.learning.networks import Policy, init_params
 from jaxdrones.learning.normalize import state_vector
 from jaxdrones.learning.result import Result, cosine_adam, count_nonfinite, run_training
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
 from jaxdrones.learning.settings import (
     BelowOne,
     Count,
+    CountOrNone,
     Fraction,
     Gradient,
     HiddenSizes,
@@ -48,6 +51,8 @@ class Config:
     horizon: Count = 64
     """Control steps that the gradient goes back through."""
     hidden_sizes: HiddenSizes = (32, 32)
+    recurrent_size: CountOrNone = 0
+    """Size of the memory that each drone's policy has, of a gated recurrent unit (GRU); 0 for none."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
     obs_stats_window: PositiveOrInfinite = 1e9
     """Number of trajectories whose observations the statistics remember."""
@@ -55,6 +60,8 @@ class Config:
     """Fraction of the updates after which the statistics of observations no longer change."""
     per_agent: Switch = False
     """Whether every drone has a policy of its own; otherwise all drones share one."""
+    privileged_critic: Switch = False
+    """Whether the critic takes what the policy does not observe: observations without noise, and drawn parameters."""
     learning_rate: Positive = 2e-2
     """Learning rate of the policy at the start; it falls to zero along a cosine."""
     critic_learning_rate: Positive = 5e-3
@@ -81,6 +88,8 @@ class Config:
     """Factor on the gradient per control step with `gradient="decay"`."""
     surrogate: Surrogate = None
     """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+    image_gradient: Switch = True
+    """Whether the gradient goes through the images of cameras, or takes them for constants."""
 
     def __post_init__(self):
         check_settings(self)
@@ -111,8 +120,9 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
     check_key("key", key)
     check_config(config, Config)
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent)
-    critic = init_params(critic_key, _critic_network(config), jnp.zeros(env.observation_size))
+    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent, config.recurrent_size)
+    critic_obs = critic_example(env, policy, config.privileged_critic)
+    critic = init_params(critic_key, critic_network(critic_obs, config.critic_hidden_sizes), critic_obs)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,
@@ -121,7 +131,7 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
         critic=critic,
         target_critic=critic,
         critic_opt_state=_critic_optimizer(config).init(critic),
-        worlds=collect.empty_worlds(env, config.worlds),
+        worlds=collect.empty_worlds(env, config.worlds, policy),
     )
 
 
@@ -130,29 +140,32 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     check_config(config, Config)
     key, restart_key, collect_key, critic_key = jax.random.split(state.key, 4)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
-    env = with_gradient(env, config.gradient, config.surrogate)
+    env = with_gradient(env, config.gradient, config.surrogate, config.image_gradient)
     between_steps = gradient_between_steps(config.gradient, config.gradient_decay)
     weight = jnp.minimum(state.step / (config.terminal_value_warmup * config.updates), 1)
 
-    def value(params, obs):
-        """Discounted sum of future rewards; the network's output is that sum times one minus gamma."""
-        normalized = state.policy.obs_stats.normalize(obs)
-        return _critic_network(config).apply(params, normalized)[..., 0] / (1 - config.gamma)
-
     def loss(params):
-        act = collect.deterministic(state.policy.replace(params=params))
+        policy = state.policy.replace(params=params)
         after, trajectory = collect.collect(
-            collect_key, env, act, worlds, config.horizon, reset=False, between_steps=between_steps
+            collect_key,
+            env,
+            collect.deterministic(policy),
+            worlds,
+            config.horizon,
+            reset=False,
+            between_steps=between_steps,
+            privileged=config.privileged_critic,
         )
-        terminal_value = weight * config.gamma * value(state.target_critic, trajectory.final_obs)
-        bootstrap = trajectory.truncated.at[-1].set(~trajectory.terminated[-1])
-        reward = trajectory.reward + jnp.where(bootstrap[..., None], terminal_value, 0)
+        bootstrap = trajectory.truncated.at[-1].set(~trajectory.terminated[-1]) & ~trajectory.was_done
+        final_obs = _final_observation(policy, _at(bootstrap, trajectory))
+        terminal_value = weight * config.gamma * _value(config, state.target_critic, final_obs)
+        reward = trajectory.reward + jnp.where(bootstrap[..., None], terminal_value[None], 0)
         returns = jnp.sum(discounted_rewards(trajectory.replace(reward=reward), config.gamma), axis=0)
         return -jnp.mean(returns) / config.horizon, (after, trajectory)
 
     (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     step, opt_state = _policy_optimizer(config).update(gradient, state.opt_state)
-    critic, critic_opt_state, critic_metrics = _fit_critic(critic_key, config, state, value, trajectory)
+    critic, critic_opt_state, critic_metrics = _fit_critic(critic_key, config, state, trajectory)
     target_critic = optax.incremental_update(critic, state.target_critic, config.target_update_rate)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
@@ -176,16 +189,35 @@ def train(key: jax.Array, env: Env, config: Config) -> Result:
     return run_training(init, update, key, env, config)
 
 
-def _fit_critic(key: jax.Array, config: Config, state: TrainState, value, trajectory: collect.Trajectory):
+def _at(chosen: Array, trajectory: collect.Trajectory) -> collect.Trajectory:
+    """What the critic needs of one step (w, ...) of each world's trajectory, that which is chosen (t, w)."""
+
+    def select(x: Array) -> Array:  # not by an index, with which devices would exchange worlds
+        condition = chosen.reshape(chosen.shape + (1,) * (x.ndim - 2))
+        return jnp.sum(jnp.where(condition, x, 0), axis=0, dtype=x.dtype)
+
+    names = ("memory", "final_obs", "final_privileged")
+    return trajectory.replace(**{name: jax.tree.map(select, getattr(trajectory, name)) for name in names})
+
+
+def _final_observation(policy: Policy, trajectory: collect.Trajectory) -> Obs:
+    """Observations of the critic after the steps of a trajectory."""
+    memory, _ = policy.act(trajectory.memory, trajectory.final_obs)
+    return critic_observation(policy, trajectory.final_obs, memory, trajectory.final_privileged)
+
+
+def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: collect.Trajectory):
     """Parameters, optimizer state and metrics of the critic after some steps towards the TD(lambda) returns."""
-    now, later = value(state.target_critic, trajectory.obs), value(state.target_critic, trajectory.final_obs)
+    obs = critic_observation(state.policy, trajectory.obs, trajectory.memory, trajectory.privileged)
+    now = _value(config, state.target_critic, obs)
+    later = _value(config, state.target_critic, _final_observation(state.policy, trajectory))
     target = now + trajectory_advantages(trajectory, now, later, config.gamma, config.gae_lambda)
     mask = jnp.broadcast_to(~trajectory.was_done[..., None], now.shape)
-    data = jax.lax.stop_gradient((trajectory.obs, target, mask.astype(target.dtype)))
+    data = jax.lax.stop_gradient((obs, target, mask.astype(target.dtype)))
     length = min(_CRITIC_BATCH, config.horizon)
 
     def loss(params, obs, target, mask):
-        error = (1 - config.gamma) * (value(params, obs) - target)
+        error = (1 - config.gamma) * (_value(config, params, obs) - target)
         return jnp.mean(mask * error**2)
 
     def step(carry, key):
@@ -201,8 +233,8 @@ def _fit_critic(key: jax.Array, config: Config, state: TrainState, value, trajec
     return critic, opt_state, {"loss": jnp.mean(costs), "nonfinite_gradients": count_nonfinite(norms)}
 
 
-def _critic_network(config: Config) -> MLP:
-    return MLP(config.critic_hidden_sizes, 1, output_scale=0.01)
+def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
+    return discounted_value(critic, critic_obs, config.critic_hidden_sizes, config.gamma)
 
 
 def _policy_optimizer(config: Config) -> optax.GradientTransformation:

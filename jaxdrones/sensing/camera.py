@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import (
+    check_callable,
     check_finite,
     check_number,
     check_positive,
@@ -58,7 +59,8 @@ class Camera:
     sees_self: bool = False
     """Whether the drone that carries the camera is visible."""
     noise: Any = None
-    """A model of the noise of the depth; see `jaxdrones.sensing.depth_noise`."""
+    """A model of the noise of the depth in environments, a `jaxdrones.sensing.DepthNoise` or another object with a
+    method `apply(key, depth, camera) -> depth`."""
 
     def __post_init__(self):
         if not isinstance(self.resolution, tuple | list) or len(self.resolution) != 2:
@@ -84,6 +86,10 @@ class Camera:
             check_finite(f"{name} of a camera", value)
             object.__setattr__(self, name, tuple(map(float, value)))
         check_quaternion("orientation of a camera", self.orientation)
+        if self.noise is not None:
+            check_callable(
+                "apply of the noise of a camera", getattr(self.noise, "apply", None), "that of a DepthNoise()"
+            )
 
     @property
     def slopes(self) -> tuple[float, float]:

@@ -8,11 +8,11 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.sensing.geometry import Number, Point
+from jaxdrones.sensing.geometry import Number, Point, length
 from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import along_z
 
@@ -54,6 +54,18 @@ def nearest_of(kinds: list[Any], ground: bool, point: Point) -> Surface:
     return functools.reduce(_nearer, surfaces)
 
 
+def touched_of(kinds: list[Any], points: Float[Array, "m 3"], within: Number) -> Surface:
+    """The nearest surface of each of some points near each other, as far as it is nearer than `within`.
+
+    Args:
+        kinds: obstacles, each kind with a leading axis; at least one kind.
+        points: m, world.
+        within: m; where nothing is nearer, the surface is that of any obstacle.
+    """
+    surfaces = [_touched_of_kind(kind, points, within) for kind in kinds]
+    return functools.reduce(jax.vmap(_nearer), surfaces)
+
+
 def as_floats(x: ArrayLike) -> Array:
     """An array of real numbers, in the precision that it has."""
     x = jnp.asarray(x)
@@ -71,10 +83,43 @@ def _distances(kind: Obstacle, point: Point) -> Array:
 
 def _nearest_of_kind(kind: Any, point: Point) -> Surface:
     index = jnp.argmin(jax.lax.stop_gradient(_distances(kind, point)))
-    obstacle = jax.tree.map(lambda x: x[index], kind)
+    return _surface(jax.tree.map(lambda x: x[index], kind), point)
+
+
+def _touched_of_kind(kind: Any, points: Float[Array, "m 3"], within: Number) -> Surface:
+    index = _nearest_within(*jax.lax.stop_gradient((kind, points, within)))
+    return jax.vmap(_surface)(jax.tree.map(lambda x: x[index], kind), points)
+
+
+def _nearest_within(kind: Any, points: Float[Array, "m 3"], within: Number) -> Int[Array, " m"]:
+    """The index of the obstacle that is nearest to each point; any, where none is nearer than `within`.
+
+    A distance changes by no more than the way that a point is moved. So all obstacles that matter are found by their
+    distances from the center of the points, and only those are looked at: of many obstacles, mostly none.
+    """
+    center = jnp.mean(points, axis=0)
+    reach = within + jnp.max(jax.vmap(length)(points - center[None]))
+
+    def is_left(carry: tuple) -> Bool[Array, ""]:
+        return jnp.min(carry[0]) < reach
+
+    def look(carry: tuple) -> tuple:
+        away, nearest, index = carry
+        i = jnp.argmin(away)
+        obstacle = jax.tree.map(lambda x: x[i], kind)
+        distances = jax.vmap(lambda point: obstacle.distance(obstacle.to_local(point)))(points)
+        nearer = distances < nearest
+        return away.at[i].set(jnp.inf), jnp.where(nearer, distances, nearest), jnp.where(nearer, i, index)
+
+    nearest = jnp.full(len(points), jnp.inf, points.dtype)
+    index = jnp.zeros(len(points), jnp.argmin(nearest).dtype)
+    return jax.lax.while_loop(is_left, look, (_distances(kind, center), nearest, index))[2]
+
+
+def _surface(obstacle: Any, point: Point) -> Surface:
     local = obstacle.to_local(point)
     distance = obstacle.distance(local)
-    normal = rotation.rotate(obstacle.quat, obstacle.normal(local))
+    normal = rotation.rotate(obstacle.quat, obstacle.outward(local))
     there = obstacle.active
     return Surface(
         jnp.where(there, distance, jnp.inf),

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_positive, check_quaternion
-from jaxdrones.sensing.shapes import GREY, LENGTHS
+from jaxdrones.sensing.shapes import GREY, LENGTHS, Box
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,7 +48,41 @@ class Mesh(File):
         super().__post_init__()
         check_positive("scale of Mesh", self.scale, "m")
 
+    def bounding_box(self) -> Box:
+        """The smallest box along the mesh's own axes that holds it: an obstacle for both backends.
+
+        Raises:
+            ValueError: the file is neither .obj nor .stl, or holds no points.
+        """
+        points = self.scale * _points(Path(self.path))
+        low, high = points.min(axis=0), points.max(axis=0)
+        pos = np.asarray(self.pos) + np.asarray(rotation.rotate(jnp.asarray(self.quat), jnp.asarray((low + high) / 2)))
+        size = np.maximum(high - low, _THINNEST)
+        return Box(pos=tuple(pos.tolist()), quat=self.quat, size=tuple(size.tolist()), color=self.color)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Urdf(File):
     """A body from a URDF, which keeps its own colors."""
+
+
+_THINNEST = 1e-3  # m: a flat mesh becomes a thin box
+_STL_HEADER = 84  # bytes: a text and the number of triangles
+_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def _points(path: Path) -> np.ndarray:
+    """The corners (k, 3) of a mesh, in units of its file."""
+    data, kind = path.read_bytes(), path.suffix.lower()
+    if kind not in (".obj", ".stl"):
+        raise ValueError(f"{path}: the bounding box of {kind or 'such a'} file is not known; give an .obj or .stl")
+    count = int.from_bytes(data[80:_STL_HEADER], "little")
+    if kind == ".stl" and len(data) == _STL_HEADER + count * _STL_TRIANGLE.itemsize:
+        points = np.frombuffer(data, _STL_TRIANGLE, count, _STL_HEADER)["corners"].reshape(-1, 3).astype(float)
+    else:
+        word = "v" if kind == ".obj" else "vertex"
+        lines = (line.split() for line in data.decode(errors="replace").splitlines())
+        points = np.array([line[1:4] for line in lines if line and line[0] == word], float).reshape(-1, 3)
+    if not len(points):
+        raise ValueError(f"{path}: it holds no points; give a mesh of triangles")
+    return points

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import (
@@ -24,8 +24,9 @@ from jaxdrones.checks import (
     is_known,
     shown,
 )
-from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of
+from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of, touched_of
 from jaxdrones.sensing.files import File, Mesh, Urdf
+from jaxdrones.sensing.geometry import Number
 from jaxdrones.sensing.shapes import LENGTHS, Box, Capsule, Cylinder, Obstacle, Sphere, single
 
 __all__ = ["Box", "Capsule", "Cylinder", "Mesh", "Scene", "Sphere", "Urdf"]
@@ -100,6 +101,11 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
         return (*(single(stack, i) for stack in stacks for i in range(len(stack.pos))), *self.meshes, *self.urdfs)
 
+    @property
+    def numbered(self) -> dict[int, Any]:
+        """Single obstacles that are active, by their numbers; of a scene with values."""
+        return {i: solid for i, solid in enumerate(self.obstacles) if isinstance(solid, File) or solid.active}
+
     def shapes(self, dtype: DTypeLike) -> list[Obstacle]:
         """The kinds of obstacles in the scene, each with a leading axis over its obstacles, as arrays of this type."""
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
@@ -136,6 +142,23 @@ class Scene(flax.struct.PyTreeNode, kw_only=True):
         """
         point = self._point(point)
         return nearest_of(self.shapes(point.dtype), self.ground, point)
+
+    def touched(self, points: Float[Array, "m 3"], within: Number) -> Surface:
+        """The nearest surface of an obstacle for each of some points of one body.
+
+        It is found faster than by `nearest`, as only obstacles within reach of the body are looked at.
+
+        Args:
+            points: m, world, near each other.
+            within: m; where no obstacle is nearer to a point, the surface is that of any obstacle.
+
+        Raises:
+            ValueError: there is no obstacle, a wrong shape, or a mesh or URDF file in the scene.
+        """
+        check_scene(self)
+        if not self.has_obstacles:
+            raise ValueError("the scene has no obstacles that could be touched; look at scene.has_obstacles before")
+        return touched_of(self.shapes(points.dtype), points, within)
 
     def contains(self, point: ArrayLike) -> Bool[Array, ""]:
         """Whether a point (3,) (m, world) is inside an obstacle or underground."""

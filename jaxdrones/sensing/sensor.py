@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_arguments, check_callable, check_number, check_sequence, shown
+from jaxdrones.checks import check_arguments, check_callable, check_number, check_positive, check_sequence, shown
 from jaxdrones.params import Params
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
+
+_ROUNDING = 1e-4  # of a measurement; a rate that divides that of the control steps is met in spite of rounding
 
 
 def no_memory(key: jax.Array, params: Params) -> None:
@@ -48,6 +50,8 @@ class Sensor:
     """`init(key, params) -> memory`: the memory at the start of an episode, a pytree of arrays of one drone."""
     bound: float = np.inf
     """The largest absolute value that a reading can have, in units of the reading."""
+    rate: float | None = None
+    """Measurements per second, between which the reading stays; one every control step when left out."""
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
@@ -58,6 +62,22 @@ class Sensor:
         check_callable(begun, self.init, "lambda key, params: jax.numpy.zeros(3)")
         check_arguments(begun, self.init, ("key", "params"))
         check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
+        if self.rate is not None:
+            check_positive(f"rate of sensor {self.name!r}", self.rate, "1/s")
+
+    def is_due(self, step: jax.Array, dt: float) -> jax.Array:
+        """Whether there is a measurement after so many control steps of an episode.
+
+        The k-th one is in the first step that does not begin before k / rate.
+
+        Args:
+            step: () number of control steps since the start.
+            dt: control period, s.
+        """
+        if self.rate is None or self.rate * dt >= 1:
+            return jnp.ones((), bool)
+        count, before = (jnp.floor((step - i) * (self.rate * dt) + _ROUNDING) for i in (0, 1))
+        return count > before
 
 
 def check_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
@@ -129,6 +149,30 @@ def measure_sensors(
             keys[i], params, state, rate, memories[sensor.name]
         )
     return after, readings
+
+
+def hold_between(
+    sensors: Sequence[Sensor], step: jax.Array, dt: float, before: tuple[Any, Any], after: tuple[Any, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The memories and readings of sensors that measure at rates of their own.
+
+    Args:
+        sensors: with names that differ.
+        step: () number of control steps since the start of the episode.
+        dt: control period, s.
+        before: memories and readings before this step.
+        after: those after a measurement of every sensor at this step.
+    """
+
+    def held(sensor: Sensor, before: Any, after: Any) -> Any:
+        due = sensor.is_due(step, dt)
+        return jax.tree.map(lambda a, b: jnp.where(due, a, b), after, before)
+
+    memories, readings = (
+        {s.name: new[s.name] if s.rate is None else held(s, old[s.name], new[s.name]) for s in sensors}
+        for old, new in zip(before, after, strict=True)
+    )
+    return memories, readings
 
 
 def _checked(sensor: Sensor, memory: Any, result: Any) -> tuple[Any, Any]:

@@ -14,6 +14,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jaxdrones import rotation
 from jaxdrones.sensing.geometry import (
@@ -53,7 +54,8 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
     def __post_init__(self):
         for name, value in vars(self).items():
             if isinstance(value, tuple | list) and all(isinstance(x, _NUMBERS) for x in jax.tree.leaves(value)):
-                object.__setattr__(self, name, jnp.asarray(value, float))  # JAX would take each number for an array
+                array = jnp.asarray(value, None if name == "active" else float)
+                object.__setattr__(self, name, array)  # JAX would take each number for an array
 
     @property
     def rounding(self) -> Any:
@@ -69,7 +71,7 @@ class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
         """Signed distance of a point from the surface, m; negative inside."""
 
     @abc.abstractmethod
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point: the gradient of the distance.
 
         Where several points of the surface are equally near, it is that of one of them.
@@ -109,7 +111,7 @@ class Box(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return signed_distance(jnp.abs(point) - self.size / 2)
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         side = jnp.where(point < 0, -1, 1).astype(point.dtype)
         return side * outward(jnp.abs(point) - self.size / 2)
@@ -154,7 +156,7 @@ class Sphere(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return length(point) - self.radius
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         return direction(point)
 
@@ -187,7 +189,7 @@ class Cylinder(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return signed_distance(self._beyond(point))
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         x, y = components(direction(point[:2]))
         _, _, z = components(point)
@@ -244,7 +246,7 @@ class Capsule(Obstacle, kw_only=True):
         """Signed distance of a point from the surface, m."""
         return length(point - self.nearest(point)) - self.radius
 
-    def normal(self, point: Point) -> Point:
+    def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point."""
         return direction(point - self.nearest(point))
 

@@ -60,7 +60,7 @@ class World(flax.struct.PyTreeNode):
 
 
 MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
-CONTACTS = ("ground", "drones")
+CONTACTS = ("ground", "drones", "obstacles")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,7 +128,8 @@ class Task:
     vision: tuple[str, ...] = ()
     """Names of the images that are observed, unless the environment says otherwise."""
     contact: tuple[str, ...] = ()
-    """What drones touch on purpose, `ground` or `drones`: adds those forces to the explicit backend."""
+    """What drones touch on purpose, `ground`, `drones` or `obstacles`: adds those forces to the explicit backend. It
+    has the forces of obstacles anyway, unless the task ends where they are touched."""
     action: str = "rpm"
     """Name of the default action type."""
     observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")

@@ -15,6 +15,7 @@ from jaxdrones import rotation
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.record import Record
+from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
 from jaxdrones.state import State
 
 _LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
@@ -82,23 +83,29 @@ def to_record(log: EpisodeLog, conditions: EpisodeConditions) -> Record:
 
 
 def fly_episode(
-    env: Env, policy: Callable, key: jax.Array, on_progress: Callable[[float], Any] = lambda fraction: None
+    env: Env, policy: AnyPolicy, key: jax.Array, on_progress: Callable[[float], Any] = lambda fraction: None
 ) -> EpisodeLog:
     """Fly one episode with a policy.
 
     Args:
         env: environment of either backend.
-        policy: observations (n, d), or a dictionary with images, -> actions (n, a).
+        policy: observations (n, d), or a dictionary with images, -> actions (n, a); or a policy with a memory, see
+            `learning.recurrence`.
         key: random key of the start and of the noise.
         on_progress: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)
     obs, world = env.reset(start_key)
+    memory = initial_memory(policy, env.drones)
+
+    def decide(memory, obs):
+        return act(policy, memory, obs)
 
     def step(carry, key):
-        obs, world = carry
-        obs, world, reward, terminated, truncated, info = env.step(key, world, policy(obs))
+        memory, obs, world = carry
+        memory, action = decide(memory, obs)
+        obs, world, reward, terminated, truncated, info = env.step(key, world, action)
         row = (
             world.drones,
             env.task.target_now(world).pos,
@@ -106,20 +113,19 @@ def fly_episode(
             info["metrics"],
             info["terminations"] | info["truncations"],
         )
-        return (obs, world), (row, terminated | truncated)
+        return (memory, obs, world), (row, terminated | truncated)
 
     if isinstance(env.physics, HostStep):
-        act, rows = policy, []
-        policy = jax.jit(lambda obs: act(obs))
+        decide, rows = jax.jit(decide), []
         for k in range(env.steps):
-            (obs, world), (row, done) = step((obs, world), keys[k])
+            (memory, obs, world), (row, done) = step((memory, obs, world), keys[k])
             rows.append(jax.device_get(row))
             on_progress((k + 1) / env.steps)
             if done:
                 break
         log = jax.tree.map(lambda *x: np.stack(x), *rows)
     else:
-        _, (log, done) = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys))(obs, world)
+        _, (log, done) = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys))(memory, obs, world)
         length = int(np.argmax(done)) + 1 if np.any(done) else env.steps
         log = jax.tree.map(lambda x: np.asarray(x)[:length], log)
     drones, target, reward, metrics, ends = log

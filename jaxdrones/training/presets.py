@@ -44,6 +44,16 @@ _ONE_D_PPO = {
 }
 """The tasks of (2021) are slow: all rotor speeds are within 5 % of hover, so that an action shows after seconds."""
 
+_FOREST = dict(
+    worlds=128,
+    horizon=75,
+    hidden_sizes=(128, 64),
+    learning_rate=3e-3,
+    gradient="decay",
+    gradient_decay=0.98,
+)
+"""One and a half seconds of flight: an obstacle is seen in time at the commanded speed."""
+
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     # The exact gradient fails for 1 of 10 seeds.
     ("hover", "bptt"): dict(gradient="decay", gradient_decay=0.99, learning_rate=1.5e-2, restart_fraction=0.3),
@@ -51,6 +61,11 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("recovery", "bptt"): dict(updates=250),
     ("gates", "ppo"): dict(
         updates=1500, gae_lambda=0.95, final_std=0.05, hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64)
+    ),
+    ("forest", "bptt"): _FOREST | dict(updates=600),
+    ("forest", "shac"): _FOREST | dict(updates=600, horizon=50, critic_hidden_sizes=(128, 64)),
+    ("forest", "ppo"): dict(
+        updates=600, worlds=256, horizon=64, hidden_sizes=(128, 64), critic_hidden_sizes=(128, 64), gae_lambda=0.95
     ),
     ("room", "bptt"): dict(updates=300, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
     ("follow", "bptt"): dict(updates=200, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),

@@ -85,8 +85,9 @@ class Trainer:
     def _check_memory(self) -> None:
         """Raise if the worlds, with their observations and actions in an update, need more memory than there is."""
         config, env = self.recipe.config, self.env
-        numbers = config.worlds * config.horizon * env.drones * (env.observation_size + env.action_size)
-        size = size_of(self.shapes) + numbers * jnp.zeros(()).dtype.itemsize
+        actions = config.worlds * env.drones * env.action_size * jnp.zeros(()).dtype.itemsize
+        step = actions + size_of((self.shapes.worlds.obs, self.shapes.worlds.memory))
+        size = size_of(self.shapes) + config.horizon * step
         what = f"a training of {config.worlds} worlds x {config.horizon} control steps x {env.drones} drones"
         check_memory(what, size // jax.process_count(), "give fewer worlds, a shorter horizon or smaller networks")
 

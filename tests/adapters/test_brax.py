@@ -28,7 +28,8 @@ def test_a_step_returns_what_it_was_given_as_the_trainers_scan_over_it(task, env
     keys = jax.ShapeDtypeStruct((3, 2), jnp.uint32)
     start = jax.eval_shape(batch.reset, keys)
     after = jax.eval_shape(batch.step, start, jax.ShapeDtypeStruct((3, env.action_size), jnp.float32))
-    assert start.obs.shape == (3, env.observation_size)
+    sizes = jax.tree.leaves(env.observation_size, is_leaf=lambda x: isinstance(x, tuple))
+    assert [x.shape[1:] for x in jax.tree.leaves(start.obs)] == [np.shape(np.empty(size)) for size in sizes]
     assert jax.tree.structure(start) == jax.tree.structure(after)
     assert jax.tree.map(lambda x: (x.shape, x.dtype), start) == jax.tree.map(lambda x: (x.shape, x.dtype), after)
     assert all(x.shape == (3,) and x.dtype == jnp.float32 for x in (after.reward, after.done))

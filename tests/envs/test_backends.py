@@ -1,7 +1,5 @@
 """Environments on Bullet: the same contract, the same numbers in free flight, pictures, no gradients."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,38 +36,6 @@ def fly(env):
         obs, world, reward, *_ = env.step(KEY, world, action)
         seen.append((np.asarray(obs), np.asarray(reward)))
     return seen
-
-
-@pytest.mark.needs("pybullet")
-def test_pictures_come_beside_the_state_at_their_own_rate():
-    with make("hover", backend="bullet", vision=("rgb", "depth"), vision_hz=25) as env:
-        obs, world = env.reset(KEY)
-        assert obs["rgb"].shape == (1, 48, 64, 4) and obs["rgb"].dtype == np.uint8
-        assert obs["depth"].shape == (1, 48, 64) and obs["state"].shape == (1, env.observation_size)
-        depths = []
-        for _ in range(8):
-            obs, world, *_ = env.step(KEY, world, jnp.full((1, 4), -0.5))
-            depths.append(obs["depth"])
-        changes = [not np.array_equal(a, b) for a, b in itertools.pairwise(depths)]
-        assert changes == [False, False, True, False, False, False, True]
-
-
-@pytest.mark.needs("pybullet")
-def test_pictures_are_the_same_in_a_compiled_program():
-    with make("hover", backend="bullet", vision=("segmentation",), vision_hz=50) as env:
-        _, world = env.reset(KEY)
-        action = jnp.zeros((1, 4))
-        step = jax.jit(env.step)
-        for _ in range(2):
-            plain, compiled = env.step(KEY, world, action), step(KEY, world, action)
-            np.testing.assert_array_equal(plain[0]["segmentation"], compiled[0]["segmentation"])
-            world = plain[1]
-
-
-@pytest.mark.needs("pybullet")
-def test_a_rate_of_pictures_that_does_not_divide_the_control_rate_is_refused():
-    with pytest.raises(ValueError, match="vision_hz is 30; give a divisor of the control rate, 100"):
-        make("hover", backend="bullet", vision=("rgb",), vision_hz=30)
 
 
 @pytest.mark.needs("pybullet")

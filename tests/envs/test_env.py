@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers import assert_close, mostly_slow
 
+import jaxdrones as jd
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS, AutoReset, ContractError, check_env, make
 from jaxdrones.tasks.starts import standing_height
 
@@ -232,7 +233,12 @@ MISTAKES = [
     (dict(task="hover", delay=-0.1), "delay is -0.1; give a number of at least 0"),
     (dict(task="hover", control_hz=0), "control_hz is 0; give a positive number"),
     (dict(task="hover", substeps=2.5), "substeps is 2.5; give a whole number"),
-    (dict(task="hover", vision=("rgb",)), "the explicit backend has no cameras"),
+    (dict(task="hover", vision=("rgb",), camera=3), r"camera is 3; give a jaxdrones\.Camera"),
+    (dict(task="hover", camera=jd.Camera()), r"camera is given, but vision asks for no image; give .*vision="),
+    (
+        dict(task="hover", vision=("rgb",), camera=jd.Camera(rate=200.0)),
+        r"rate of the camera is 200 images/s; give at most the control rate, 100",
+    ),
     (dict(task="hover", vision=("grey",)), "unknown image 'grey'"),
     (dict(task="hover", effects=("drga",)), "unknown effect 'drga'; did you mean 'drag'"),
     (

@@ -9,6 +9,7 @@ import pytest
 
 import jaxdrones as jd
 from jaxdrones.envs import TASKS, AutoReset, check_env, make
+from jaxdrones.envs.surroundings import check_scene
 from jaxdrones.sensing import Scene, Sensor, Sphere
 
 KEY = jax.random.key(5)
@@ -31,13 +32,15 @@ def random_ball(key):
 RANGE = Sensor("range", lambda key, params, state, rate, scene, memory: (None, scene.distance(state.pos)), bound=20.0)
 
 
-def test_obstacles_that_nothing_honors_are_refused_on_the_explicit_backend():
-    with pytest.raises(ValueError, match=r"the scene has obstacles .* an effect \(params, state, scene\)"):
-        make("hover", scene=BALL)
-    with pytest.raises(ValueError, match=r"the scene has obstacles .*obstacles_terminate"):
-        make(dataclasses.replace(TASKS["hover"](), scene=BALL))
-    assert make("hover", scene=Scene(ground=False)).scene == Scene(ground=False)
-    make(dataclasses.replace(TASKS["hover"](), scene=BALL, obstacles_terminate=True))
+def test_obstacles_are_solid_unless_the_task_ends_where_they_are_touched():
+    ends = dataclasses.replace(TASKS["hover"](), scene=BALL, obstacles_terminate=True)
+    touches = dataclasses.replace(ends, contact=("obstacles",))
+    expected = [("hover", BALL, True), ("hover", random_ball, True), ("hover", Scene(ground=False), False)]
+    for task, scene, solid in (*expected, (ends, None, False), (touches, None, True)):
+        assert make(task, scene=scene).physics.physics.contains(jd.obstacle_contact) == solid
+    assert not make("hover", scene=BALL, effects=(repelled,)).physics.physics.contains(jd.obstacle_contact)
+    with pytest.raises(ValueError, match=r"the scene has obstacles .*obstacle_contact, .*obstacles_terminate"):
+        check_scene(BALL, jd.make_step(), TASKS["hover"]())
 
 
 @pytest.mark.parametrize("scene", [3, lambda key: 3])
@@ -90,9 +93,9 @@ def test_a_fixed_scene_is_not_copied_at_the_end_of_an_episode():
     assert make("hover", scene=random_ball, effects=(repelled,)).constant_fields == ("params",)
 
 
-@pytest.mark.needs("pybullet")
-def test_on_bullet_obstacles_are_solid_and_the_same_in_every_episode():
-    with make("hover", backend="bullet", scene=BALL, sensors=(RANGE,), **STILL) as env:
+@pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.needs("pybullet"))])
+def test_a_drone_rests_on_a_ball(backend):
+    with make("hover", backend=backend, scene=BALL, sensors=(RANGE,), **STILL) as env:
         _, world = env.reset(KEY)
         np.testing.assert_allclose(world.readings["range"], [0.5], atol=1e-6)
         world = world.replace(drones=world.drones.replace(pos=jnp.array([[0.0, 0.0, 1.6]])))
@@ -100,5 +103,3 @@ def test_on_bullet_obstacles_are_solid_and_the_same_in_every_episode():
             _, world, *_ = env.step(KEY, world, -jnp.ones((1, 4)))
         assert 1.5 < world.drones.pos[0, 2] < 1.6  # it rests on the ball
         assert env.scene == BALL
-    with pytest.raises(ValueError, match="Bullet builds it once"):
-        make("hover", backend="bullet", scene=random_ball)

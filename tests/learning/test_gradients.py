@@ -9,7 +9,13 @@ import pytest
 import jaxdrones as jd
 from jaxdrones import envs
 from jaxdrones.learning import bptt, collect
-from jaxdrones.learning.gradients import SurrogateStep, gradient_between_steps, scale_gradient, with_gradient
+from jaxdrones.learning.gradients import (
+    SurrogateStep,
+    gradient_between_steps,
+    point_mass,
+    scale_gradient,
+    with_gradient,
+)
 
 CONFIG = bptt.Config(updates=2, worlds=2, horizon=6, hidden_sizes=(4,))
 
@@ -47,7 +53,7 @@ def flights():
         _, trajectory = collect.collect(
             jax.random.key(2),
             with_gradient(env, config.gradient, config.surrogate),
-            lambda key, obs: (policy(obs), None),
+            lambda key, memory, obs: (memory, policy(obs), None),
             worlds,
             config.horizon,
             reset=False,
@@ -64,6 +70,7 @@ def flights():
         "no decay": both(gradient="decay", gradient_decay=1.0),
         "decay": both(gradient="decay", gradient_decay=0.5),
         "surrogate": both(gradient="surrogate"),
+        "point mass": both(gradient="point_mass"),
     }
 
 
@@ -84,6 +91,40 @@ def test_a_surrogate_points_nearly_where_the_exact_gradient_does(flights):
     a, b = flights["surrogate"][1], flights["exact"][1]
     cosine = a @ b / jnp.linalg.norm(a) / jnp.linalg.norm(b)
     assert 0.9 < cosine < 1 - 1e-9
+
+
+def test_a_point_mass_is_pushed_by_thrust_and_by_turning_the_thrust_and_its_attitude_has_no_gradient():
+    dt, response = 0.02, 0.1
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    hover = jnp.full((1, 4), params.hover_rpm[0])
+    state = jd.State.at_rest(jnp.zeros((1, 3))).replace(rpm=hover)
+    derivatives = jax.jacrev(lambda state, rpm: point_mass(dt, response)(params, state, rpm), (0, 1))
+    after = jax.jit(derivatives)(state, hover)
+    (pos_of_state, pos_of_rpm), (vel_of_state, vel_of_rpm) = after.pos, after.vel
+    thrust = 2 * params.kf[0] * hover[0]  # of each rotor per RPM
+    np.testing.assert_allclose(vel_of_rpm[0, 2, 0], thrust / params.mass[0] * dt, rtol=1e-9)
+    pitch_acc = -params.rotor_pos[0, :, 0] * thrust / params.inertia[0, 1]  # about y
+    np.testing.assert_allclose(vel_of_rpm[0, 0, 0], pitch_acc * dt * response * params.gravity[0] * dt, rtol=1e-9)
+    np.testing.assert_allclose(pos_of_rpm, vel_of_rpm * dt, rtol=1e-12)
+    np.testing.assert_allclose(pos_of_state.vel[0, :, 0], dt * np.eye(3))
+    assert not jnp.any(vel_of_state.quat) and not jnp.any(vel_of_state.omega) and not jnp.any(after.quat[1])
+
+
+def test_images_may_be_constants_for_the_gradient_and_are_the_same():
+    down = jd.Camera(resolution=(3, 3), orientation=(0.0, 0.5**0.5, 0.0, 0.5**0.5))
+    env = envs.make("hover", tilt=0.0, omega=0.0, vision=("depth",), camera=down)
+    _, world = env.reset(jax.random.key(0))
+
+    def depth(pos, image_gradient):
+        drones = world.drones.replace(pos=pos)
+        seeing = with_gradient(env, "exact", image_gradient=image_gradient)
+        obs, *_ = seeing.step(jax.random.key(0), world.replace(drones=drones), jnp.zeros((1, 4)))
+        return obs["depth"][0, 1, 1]
+
+    both = jax.jit(lambda pos: [jax.value_and_grad(depth)(pos, switch) for switch in (True, False)])
+    (seen, slope), (same, none) = both(jnp.array([[0.0, 0.0, 1.0]]))
+    assert seen == same and not jnp.any(none)
+    np.testing.assert_allclose(slope, [[0, 0, 1]], atol=1e-6)  # of the ground below
 
 
 def test_unknown_options_are_named():

@@ -146,8 +146,8 @@ def test_episodes_that_ended_stay_as_they_are_and_do_not_count_until_they_are_re
     env = envs.make("hover", duration=0.05)  # five steps
     worlds = collect.restart(jax.random.key(0), env, collect.empty_worlds(env, 2))
 
-    def hover(key, obs):
-        return jnp.zeros((2, 1, 4)), None
+    def hover(key, memory, obs):
+        return memory, jnp.zeros((2, 1, 4)), None
 
     worlds, trajectory = jax.jit(lambda w: collect.collect(jax.random.key(1), env, hover, w, 7, reset=False))(worlds)
     np.testing.assert_array_equal(trajectory.was_done[:, 0], [False] * 5 + [True] * 2)

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
+from jaxdrones.learning.critic import centralized_input
 from jaxdrones.learning.layers import CNN, IMAGE_CHANNELS, convolutions
-from jaxdrones.learning.networks import Policy, centralized_input
+from jaxdrones.learning.networks import Policy
 
 
 @pytest.fixture(scope="module")

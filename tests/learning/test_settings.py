@@ -15,10 +15,10 @@ from jaxdrones.training.recipe import Recipe
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
 KEY = jax.random.key(0)
 WORDS = {"hidden_sizes", "critic_hidden_sizes", "gradient", "surrogate"}
-SWITCHES = {"per_agent", "centralized_critic", "privileged_critic"}
+SWITCHES = {"per_agent", "centralized_critic", "privileged_critic", "image_gradient"}
 ZERO_MAKES_SENSE = {
     *("obs_stats_freeze", "restart_fraction", "anneal_fraction", "gradient_decay"),
-    *("gamma", "gae_lambda", "adam_b2", "entropy_coef", "value_coef"),
+    *("gamma", "gae_lambda", "adam_b2", "entropy_coef", "value_coef", "recurrent_size"),
 }
 FRACTIONS = {
     *("obs_stats_freeze", "restart_fraction", "anneal_fraction", "gradient_decay"),
@@ -103,7 +103,7 @@ def test_arrays_of_one_number_and_numbers_of_numpy_are_numbers():
 
 @pytest.mark.parametrize("learner", LEARNERS)
 def test_numbers_that_are_not_shapes_may_be_traced(learner):
-    shapes = {"worlds", "horizon", "epochs", "minibatches", "critic_steps"}
+    shapes = {"worlds", "horizon", "recurrent_size", "epochs", "minibatches", "critic_steps"}
     traced = [name for name in numbers(LEARNERS[learner]) if name not in shapes]
 
     def made(x):

@@ -133,9 +133,12 @@ def bullets_distances(client) -> dict[str, list[float]]:
         return min((point[8] for point in points), default=1.0)
 
     return dict(
-        ground=[distance(body, client.ground) for body in client.drones],
+        ground=[distance(body, client.surroundings.ground) for body in client.drones],
         drones=[distance(*client.drones)] * 2,
-        scene=[min(distance(body, obstacle) for obstacle in client.obstacles.values()) for body in client.drones],
+        scene=[
+            min(distance(body, obstacle) for obstacle in client.surroundings.obstacles.values())
+            for body in client.drones
+        ],
     )
 
 

@@ -281,11 +281,13 @@ def test_distances_are_bullets_distances(client):
     """To 1 mm, the collision margin by which Bullet rounds edges and rims off."""
     far, points = np.asarray(distances(SCENE, POINTS))[:100], POINTS[:100]
 
+    dot = client.p.createCollisionShape(client.p.GEOM_SPHERE, radius=1e-6, physicsClientId=client.id)
+
     def theirs(point):
-        ball = dict(bodyB=-1, collisionShapeB=client._point, collisionShapePositionB=point.tolist())
+        ball = dict(bodyB=-1, collisionShapeB=dot, collisionShapePositionB=point.tolist())
         pairs = (
             client.p.getClosestPoints(bodyA=body, distance=9.0, physicsClientId=client.id, **ball)
-            for body in (*client.obstacles.values(), client.ground)
+            for body in (*client.surroundings.obstacles.values(), client.surroundings.ground)
         )
         return min(pair[8] for found in pairs for pair in found)
 
@@ -309,6 +311,13 @@ def test_what_has_no_geometry_is_refused(tmp_path):
         SCENE.distance(np.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"direction has shape \(2,\)"):
         ray(SCENE, UP, (1, 0))
+
+
+@pytest.mark.needs("pybullet")
+def test_obstacles_that_are_not_active_are_not_in_bullet_and_the_others_keep_their_numbers():
+    balls = Scene.of(Sphere(pos=RNG.uniform(1, 2, (3, 3)), radius=0.1, active=[False, True, False]), ground=False)
+    with bullet.make_step(scene=balls) as step:
+        assert list(step.client.names().values()) == ["obstacle 1"]
 
 
 @pytest.mark.needs("pybullet")

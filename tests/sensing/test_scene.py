@@ -13,6 +13,7 @@ from jaxdrones.sensing import (
     Scene,
     Sphere,
     Urdf,
+    from_urdf,
     gate,
     obstacles_2021,
 )
@@ -138,6 +139,82 @@ def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
 def test_a_wrong_obstacle_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+CUBE = "v -1 -2 0\nv 1 2 3\nf 1 2 1\n"
+
+
+def test_the_bounding_box_of_a_mesh_holds_its_points_whatever_way_it_is_turned(tmp_path):
+    obj, text, binary = tmp_path / "a.obj", tmp_path / "b.stl", tmp_path / "c.STL"
+    obj.write_text(CUBE)
+    text.write_text("solid\nouter loop\n vertex -1 -2 0\n vertex 1 2 3\n vertex 0 0 0\nendloop\n")
+    corners = np.array([0, 0, 1, -1, -2, 0, 1, 2, 3, 0, 0, 0], "<f4")
+    binary.write_bytes(bytes(80) + (1).to_bytes(4, "little") + corners.tobytes() + bytes(2))
+    for file in obj, text, binary:
+        box = Mesh(path=file, pos=(1, 0, 0), quat=QUARTER_TURN, scale=0.5).bounding_box()
+        np.testing.assert_allclose(box.size, [1, 2, 1.5])
+        np.testing.assert_allclose(box.pos, [1, 0, 0.75], atol=1e-12)
+        scene = Scene.of(box)
+        assert is_inside(scene, (1.9, 0.4, 1.4)) and not is_inside(scene, (1.4, 0.9, 1.4))
+    empty, other = tmp_path / "d.obj", tmp_path / "e.dae"
+    for file, message in (empty, "holds no points"), (other, r"\.dae file is not known; give an \.obj or \.stl"):
+        file.write_text("")
+        with pytest.raises(ValueError, match=message):
+            Mesh(path=file, pos=(0, 0, 0)).bounding_box()
+    with pytest.raises(ValueError, match=r"the scene has a Mesh, .* mesh\.bounding_box\(\) in its place"):
+        Scene.of(Mesh(path=obj, pos=(0, 0, 0))).distance((0, 0, 1))
+
+
+ARM = """<robot name="arm">
+  <material name="red"><color rgba="1 0 0 1"/></material>
+  <link name="base"><visual><material name="red"/></visual>
+    <collision><origin xyz="0 0 0.5"/><geometry><box size="1 1 1"/></geometry></collision></link>
+  <link name="tip">
+    <collision><origin xyz="0 0 1" rpy="1.5707963 0 0"/>
+      <geometry><cylinder radius="0.1" length="2"/></geometry></collision>
+    <collision><geometry><sphere radius="0.2"/></geometry></collision>
+    <collision><geometry><capsule radius="0.1" length="1"/></geometry></collision>
+    <collision><geometry><mesh filename="a.obj" scale="2 2 2"/></geometry></collision></link>
+  <joint name="j" type="revolute"><parent link="base"/><child link="tip"/>
+    <origin xyz="0 0 1" rpy="0 0 1.5707963"/></joint>
+</robot>"""
+
+
+def test_a_scene_from_a_urdf_has_its_shapes_where_its_links_are(tmp_path):
+    (tmp_path / "a.obj").write_text(CUBE)
+    file = tmp_path / "arm.urdf"
+    file.write_text(ARM)
+    scene = from_urdf(file, pos=(5, 0, 0), ground=False)
+    assert [type(solid) for solid in scene.obstacles] == [Box, Sphere, Cylinder, Capsule, Mesh]
+    assert scene.boxes.color[0].tolist() == [1, 0, 0, 1]
+    np.testing.assert_allclose(scene.boxes.pos[0], [5, 0, 0.5])
+    np.testing.assert_allclose(scene.cylinders.pos[0], [5, 0, 2], atol=1e-6)
+    without = scene.replace(meshes=())
+    assert is_inside(without, (5.9, 0, 2)) and not is_inside(without, (5, 0.9, 2))  # the cylinder lies along x
+    assert scene.meshes[0].scale == 2 and scene.meshes[0].pos == pytest.approx((5, 0, 1))
+    turned = from_urdf(file, quat=QUARTER_TURN).replace(meshes=())
+    assert turned.ground and is_inside(turned, (0, 0.9, 2)) and not is_inside(turned, (0.9, 0, 2))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("sphere", "torus", "a collision has the shape <torus>; give box"),
+        ('size="1 1 1"', 'size="1 1"', r"size of <box> is '1 1'; give 3 numbers"),
+        ('radius="0.2"', 'radius="-1"', "radius of Sphere is -1"),
+        ('scale="2 2 2"', 'scale="2 2 1"', "give the same number along each axis"),
+        ('child link="tip"', 'child link="nose"', "joint 'j' connects .*nose"),
+        ('parent link="base"', 'parent link="tip"', "circle of tip"),
+        ("</robot>", "", "it is no XML"),
+        ("a.obj", "b.obj", r"b\.obj: there is no such file"),
+    ],
+)
+def test_a_wrong_urdf_is_refused(tmp_path, old, new, message):
+    (tmp_path / "a.obj").write_text(CUBE)
+    file = tmp_path / "arm.urdf"
+    file.write_text(ARM.replace(old, new))
+    with pytest.raises(ValueError, match=message):
+        from_urdf(file)
 
 
 def test_a_scene_can_be_rebuilt_with_anything_in_place_of_its_arrays():

@@ -18,9 +18,9 @@ from jaxdrones.training import distributed
 CONFIG = dict(worlds=16, horizon=5)
 
 
-def trained(learner) -> tuple[dict, list[str]]:
+def trained(learner, recurrent_size: int) -> tuple[dict, list[str]]:
     """The numbers of a training state, and the operations of an update in which devices talk, those in loops marked."""
-    env, config = DoubleIntegrator(), dataclasses.replace(SMALL[learner], **CONFIG)
+    env, config = DoubleIntegrator(), dataclasses.replace(SMALL[learner], **CONFIG, recurrent_size=recurrent_size)
     mesh = sharding.make_mesh(config.worlds)
 
     def init(key):
@@ -60,7 +60,8 @@ if __name__ == "__main__":
     with distributed.join_hosts(int(others[0]), int(others[1]), others[2]) if others else contextlib.nullcontext():
         result = {}
         for learner in SMALL:
-            name = learner.__name__.rpartition(".")[2]
-            numbers, found = trained(learner)
-            result |= {f"{name}{path}": x for path, x in numbers.items()} | {f"{name} talks": found}
+            for recurrent_size in (0, 3):
+                name = f"{learner.__name__.rpartition('.')[2]}, memory of {recurrent_size}"
+                numbers, found = trained(learner, recurrent_size)
+                result |= {f"{name}{path}": x for path, x in numbers.items()} | {f"{name} talks": found}
         np.savez(file, **result)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from jaxdrones.engine.bullet.client import GROUND, Client
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Scene
+from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.state import State
 
 _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the body; those above name the link
@@ -36,7 +37,11 @@ def views(params: Params, state: State, scene: Scene, camera: Camera) -> Float[A
 
     def one(params: Params, state: State) -> Array:
         eye, axes = camera.pose(params, state)
-        distances = [jax.vmap(lambda shape: shape.distance(shape.to_local(eye)))(kind) for kind in scene.shapes(dtype)]
+
+        def distance(solid: Obstacle) -> Array:
+            return jnp.where(solid.active, solid.distance(solid.to_local(eye)), jnp.inf)
+
+        distances = [jax.vmap(distance)(kind) for kind in scene.shapes(dtype)]
         solids = jnp.concatenate([eye[2:] if scene.ground else jnp.ones(1, dtype), *distances])
         first = jnp.argmax(solids < 0)
         label = jnp.where(solids[first] < 0, jnp.where(first == 0, GROUND, n + first), _NOWHERE)
@@ -68,7 +73,8 @@ def drone_pictures(
             continue
         if not camera.sees_self:
             p.resetBasePositionAndOrientation(drone, _AWAY, [0, 0, 0, 1], physicsClientId=client.id)
-        frames.append(_picture(client, *np.round([look[_EYE], look[_FORWARD], look[_UP]], _DIGITS), camera, near))
+        eye, forward, up = (np.round(look[columns], _DIGITS) for columns in (_EYE, _FORWARD, _UP))
+        frames.append(_picture(client, eye, forward, up, camera, near))
         if not camera.sees_self:
             p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], physicsClientId=client.id)
     rgb, depth, segmentation = zip(*frames, strict=True)

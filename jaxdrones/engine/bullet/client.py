@@ -1,22 +1,17 @@
 """A Bullet world: its connection and its bodies; the only import of pybullet."""
 
 import contextlib
-import ctypes
-import dataclasses
 import importlib.util
 import os
 import sys
 import weakref
 from types import ModuleType
-from typing import Any
 
-import jax
 import numpy as np
 
 from jaxdrones.checks import check_choice
-from jaxdrones.engine.bullet.shapes import shape_of
-from jaxdrones.sensing.files import Urdf
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.engine.bullet.surroundings import Surroundings, quiet
+from jaxdrones.sensing import Scene
 
 BALLS, CYLINDER = "balls", "cylinder"
 TINY, EGL = "tiny", "egl"
@@ -25,7 +20,7 @@ _BALLS = 8
 _DISC = 0.1  # thickness of the disc as a share of the height of the collision cylinder
 _HUB, _FRONT, _BACK = [0.15, 0.15, 0.2, 1], [0.8, 0.15, 0.1, 1], [0.35, 0.35, 0.4, 1]  # colors
 _SHAPE, _INERTIAL = slice(0, 16), slice(16, 20)  # columns of a team
-_DRONE_FRICTION, _GROUND_FRICTION = 0.5, 1.0  # as in gym-pybullet-drones (2021)
+_DRONE_FRICTION = 0.5  # as in gym-pybullet-drones (2021)
 
 
 def import_pybullet() -> ModuleType:
@@ -36,7 +31,7 @@ def import_pybullet() -> ModuleType:
     """
     if "pybullet" in sys.modules:
         return sys.modules["pybullet"]
-    with _quiet():
+    with quiet():
         try:
             import pybullet
         except ImportError:
@@ -55,12 +50,6 @@ class Client:
         check_choice("renderer", renderer, (TINY, EGL))
         self.p = import_pybullet()
         self.drones: list[int] = []
-        self.ground: int | None = None
-        self.obstacles: dict[int, int] = {}  # number of an obstacle -> body
-        self._placed: dict[int, _Placed] = {}  # by number
-        self._scene: Scene | None = None
-        self._structure = jax.tree.structure(None)
-        self._numbers = np.zeros(0)
         self._damping = float(np.float32(damping))  # Bullet's default of 0.04 is in single precision
         self._collision = collision
         self._team = np.empty((0, 20))
@@ -69,7 +58,9 @@ class Client:
         self.id = self.p.connect(self.p.GUI if gui else self.p.DIRECT)
         self._disconnect = weakref.finalize(self, _disconnect, self.p, self.id)
         self.p.setTimeStep(dt, physicsClientId=self.id)
+        self.p.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=self.id)
         self.p.setGravity(0, 0, 0, physicsClientId=self.id)  # every drone's weight is part of its wrench
+        self.surroundings = Surroundings(self.p, self.id)
         self.renderer = self.p.ER_BULLET_HARDWARE_OPENGL if gui or renderer == EGL else self.p.ER_TINY_RENDERER
         if renderer == EGL:
             self._load_egl()
@@ -90,46 +81,15 @@ class Client:
 
     def names(self) -> dict[int, str]:
         """Name of every body: `ground`, `drone i`, `obstacle i`; the order is that of segmentations."""
-        ground = {} if self.ground is None else {self.ground: "ground"}
+        around = self.surroundings
+        ground = {} if around.ground is None else {around.ground: "ground"}
         drones = {body: f"drone {i}" for i, body in enumerate(self.drones)}
-        return ground | drones | {body: f"obstacle {i}" for i, body in self.obstacles.items()}
+        return ground | drones | {body: f"obstacle {i}" for i, body in around.obstacles.items()}
 
     def set_scene(self, scene: Scene) -> None:
-        """Let this scene, of NumPy arrays, stand around: obstacles of the same shape are moved, others built anew."""
-        if scene is self._scene:
-            return
-        leaves, structure = jax.tree.flatten(scene)
-        numbers = np.concatenate([np.zeros(0), *map(np.ravel, leaves)])
-        same = structure == self._structure and np.array_equal(numbers, self._numbers)
-        self._scene, self._structure, self._numbers = scene, structure, numbers
-        if same:
-            return
-        if scene.ground != (self.ground is not None):
-            if self.ground is None:
-                self.ground = self._add_ground()
-            else:
-                self.p.removeBody(self.ground, physicsClientId=self.id)
-                self.ground = None
-        obstacles = dict(enumerate(scene.obstacles))
-        for number in self.obstacles.keys() - obstacles.keys():
-            self._remove_obstacle(number)
-        for number, obstacle in obstacles.items():
-            self._place_obstacle(number, obstacle)
-        self.labels = self._labels()
-
-    def _place_obstacle(self, number: int, obstacle: Any) -> None:
-        new, old = _Placed.of(obstacle), self._placed.get(number)
-        if old is None or new.shape != old.shape:
-            if old is not None:
-                self._remove_obstacle(number)
-            self.obstacles[number] = self._add_obstacle(obstacle)
-        elif new.pose != old.pose:
-            self.p.resetBasePositionAndOrientation(self.obstacles[number], *new.pose, self.id)
-        self._placed[number] = new
-
-    def _remove_obstacle(self, number: int) -> None:
-        self.p.removeBody(self.obstacles.pop(number), physicsClientId=self.id)
-        del self._placed[number]
+        """Let this scene, of NumPy arrays, stand around."""
+        if self.surroundings.set(scene):
+            self.labels = self._labels()
 
     def set_team(self, team: np.ndarray) -> None:
         """Give the drones these bodies.
@@ -158,12 +118,13 @@ class Client:
 
     def _labels(self) -> np.ndarray:
         """Bullet's body -> segmentation label; the last entry, at -1, is the background."""
-        labels = np.full(max([0, *self.drones, *self.obstacles.values()]) + 2, BACKGROUND, np.int32)
+        around = self.surroundings
+        labels = np.full(max(self.names(), default=0) + 2, BACKGROUND, np.int32)
         labels[self.drones] = 1 + np.arange(len(self.drones))
-        for number, body in self.obstacles.items():
+        for number, body in around.obstacles.items():
             labels[body] = 1 + len(self.drones) + number
-        if self.ground is not None:
-            labels[self.ground] = GROUND
+        if around.ground is not None:
+            labels[around.ground] = GROUND
         return labels
 
     def matrices(self, quats: np.ndarray) -> np.ndarray:
@@ -252,61 +213,7 @@ class Client:
             physicsClientId=self.id,
         )
 
-    def _add_ground(self) -> int:
-        p = self.p
-        plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=self.id)
-        ground = p.createMultiBody(0, plane, physicsClientId=self.id)
-        p.changeDynamics(ground, -1, lateralFriction=_GROUND_FRICTION, physicsClientId=self.id)
-        return ground
-
-    def _add_obstacle(self, obstacle: Any) -> int:
-        p = self.p
-        if isinstance(obstacle, Urdf):
-            with _quiet():
-                return p.loadURDF(
-                    str(obstacle.path), obstacle.pos, obstacle.quat, useFixedBase=True, physicsClientId=self.id
-                )
-        shape = shape_of(p, obstacle)
-        collision = p.createCollisionShape(**shape, physicsClientId=self.id)
-        if "height" in shape:
-            shape["length"] = shape.pop("height")  # Bullet has two words for it
-        visual = p.createVisualShape(**shape, rgbaColor=obstacle.color, physicsClientId=self.id)
-        return p.createMultiBody(0, collision, visual, obstacle.pos, obstacle.quat, physicsClientId=self.id)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Placed:
-    """An obstacle of numbers in Bullet's world."""
-
-    shape: Any
-    """Everything but the pose; where that is equal, a body can be moved."""
-    pose: tuple[list[float], list[float]]
-    """Position (3,), m, and attitude (4,)."""
-
-    @classmethod
-    def of(cls, obstacle: Any) -> "_Placed":
-        fields = {name: np.asarray(x).tolist() for name, x in vars(obstacle).items() if name not in ("pos", "quat")}
-        return cls((type(obstacle), fields), (list(map(float, obstacle.pos)), list(map(float, obstacle.quat))))
-
 
 def _disconnect(p: ModuleType, client: int) -> None:
     with contextlib.suppress(p.error):
         p.disconnect(client)
-
-
-@contextlib.contextmanager
-def _quiet():
-    """Keep what Bullet's C code prints off stdout, where a caller may be writing JSON, and off stderr."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    with open(os.devnull, "w") as nowhere:
-        kept = {number: os.dup(number) for number in (1, 2)}
-        try:
-            for number in kept:
-                os.dup2(nowhere.fileno(), number)
-            yield
-        finally:
-            ctypes.CDLL(None).fflush(None)
-            for number, copy in kept.items():
-                os.dup2(copy, number)
-                os.close(copy)

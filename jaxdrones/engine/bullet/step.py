@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,17 +13,14 @@ import numpy.typing as npt
 from jax.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_finite, check_number, check_params, check_positive, check_quaternion, check_whole
-from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors, obstacle_contact
+from jaxdrones.checks import check_finite, check_params, check_quaternion
 from jaxdrones.engine.bullet import arrays
 from jaxdrones.engine.bullet.camera import drone_pictures, photo, views
-from jaxdrones.engine.bullet.client import BALLS, TINY, Client
+from jaxdrones.engine.bullet.client import Client
 from jaxdrones.engine.bullet.contacts import Contact, contacts_of_last_step
-from jaxdrones.engine.neighbors import NeighborGrid
-from jaxdrones.engine.physics import Physics, Rotors
+from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import HostStep, is_traced
 from jaxdrones.engine.team import Layout, check_team, pack
-from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene
 from jaxdrones.sensing.camera import check_camera
@@ -33,70 +30,6 @@ from jaxdrones.state import State
 _BARE = Scene()
 _DEFAULT_CAMERA = Camera()
 _FILM_CAMERA = Camera(resolution=(640, 480), near=0.1)
-
-
-def make_step(
-    effects: Sequence[Effect] = (),
-    pairs: Sequence[Pair] = (),
-    rotors: Rotors = instant_rotors,
-    dt: float = 1 / 240,
-    substeps: int = 1,
-    *,
-    team_effects: Sequence[TeamEffect] = (),
-    models: Sequence[Model] = (),
-    neighbors: NeighborGrid | None = None,
-    scene: Scene | None = None,
-    damping: float = 0.0,
-    collision: str = BALLS,
-    renderer: str = TINY,
-    gui: bool = False,
-) -> BulletStep:
-    """Build the step of a world in which Bullet integrates and resolves contacts.
-
-    Args:
-        effects: as for the explicit backend, but for `ground_contact` and `obstacle_contact`.
-        pairs: as for the explicit backend, but for `drone_contact`.
-        rotors: as for the explicit backend.
-        dt: physics step, s.
-        substeps: physics steps per call, with the command held.
-        team_effects: as for the explicit backend.
-        models: as for the explicit backend; their states take explicit Euler steps of `dt`, as rotors do.
-        neighbors: as for the explicit backend.
-        scene: ground and obstacles; a bare ground plane when left out. It can be another one at every call.
-        damping: Bullet's linear and angular damping, 1/s; that of gym-pybullet-drones is 0.04.
-        collision: `balls`, a ring of balls on a disc, which rests and rebounds stably, or `cylinder`, the shape in
-            gym-pybullet-drones.
-        renderer: of the cameras: `tiny`, on the CPU, or `egl`, on a GPU.
-        gui: open a window, in which the cameras render too.
-
-    Returns:
-        `step(params, state, rpm) -> state`, a context manager that closes the connection. The rotors limit the
-        commanded speeds to [0, `params.max_rpm`].
-
-    Raises:
-        ValueError: an argument out of range, or contact as an effect: Bullet resolves it already.
-        ImportError: pybullet is not installed.
-        OSError: a window is asked for and there is no display.
-    """
-    check_positive("dt", dt, "s")
-    check_whole("substeps", substeps)
-    check_number("damping", damping, "1/s", at_least=0)
-    physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
-    for contact in ground_contact, obstacle_contact, drone_contact:
-        if physics.contains(contact):
-            raise ValueError(
-                f"{contact.__name__} is given and Bullet resolves contacts by itself, so drones would touch twice; "
-                "leave it out"
-            )
-    scene = Scene() if scene is None else scene
-    check_scene(scene, files=True)
-    if is_traced(scene):
-        raise ValueError(
-            "the scene is traced by jit, vmap or grad and has no values yet; make the step outside, of a scene of "
-            "numbers, and give the traced one to its calls"
-        )
-    client = Client(dt, damping, collision, renderer, gui)
-    return BulletStep(client, physics, substeps, dt, jax.device_get(scene))
 
 
 class BulletStep(HostStep):
@@ -192,7 +125,7 @@ class BulletStep(HostStep):
         team = self._place(params, state)
         looks = np.asarray(views(params, state, scene, camera), float)
         rgb, depth, segmentation = drone_pictures(self.client, team, looks, camera)
-        return Images(rgb, depth.astype(self._flat_params.dtype), segmentation)
+        return Images(*map(jnp.asarray, (rgb, depth.astype(self._flat_params.dtype), segmentation)))
 
     def photo(
         self,

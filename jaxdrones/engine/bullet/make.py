@@ -1,0 +1,82 @@
+"""Building a step of Bullet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+
+from jaxdrones.checks import check_number, check_positive, check_whole
+from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors, obstacle_contact
+from jaxdrones.engine.bullet.client import BALLS, TINY, Client
+from jaxdrones.engine.bullet.step import BulletStep
+from jaxdrones.engine.neighbors import NeighborGrid
+from jaxdrones.engine.physics import Physics, Rotors
+from jaxdrones.engine.step import is_traced
+from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
+from jaxdrones.sensing import Scene
+from jaxdrones.sensing.scene import check_scene
+
+
+def make_step(
+    effects: Sequence[Effect] = (),
+    pairs: Sequence[Pair] = (),
+    rotors: Rotors = instant_rotors,
+    dt: float = 1 / 240,
+    substeps: int = 1,
+    *,
+    team_effects: Sequence[TeamEffect] = (),
+    models: Sequence[Model] = (),
+    neighbors: NeighborGrid | None = None,
+    scene: Scene | None = None,
+    damping: float = 0.0,
+    collision: str = BALLS,
+    renderer: str = TINY,
+    gui: bool = False,
+) -> BulletStep:
+    """Build the step of a world in which Bullet integrates and resolves contacts.
+
+    Args:
+        effects: as for the explicit backend, but for `ground_contact` and `obstacle_contact`.
+        pairs: as for the explicit backend, but for `drone_contact`.
+        rotors: as for the explicit backend.
+        dt: physics step, s.
+        substeps: physics steps per call, with the command held.
+        team_effects: as for the explicit backend.
+        models: as for the explicit backend; their states take explicit Euler steps of `dt`, as rotors do.
+        neighbors: as for the explicit backend.
+        scene: ground and obstacles; a bare ground plane when left out. It can be another one at every call.
+        damping: Bullet's linear and angular damping, 1/s; that of gym-pybullet-drones is 0.04.
+        collision: `balls`, a ring of balls on a disc, which rests and rebounds stably, or `cylinder`, the shape in
+            gym-pybullet-drones.
+        renderer: of the cameras: `tiny`, on the CPU, or `egl`, on a GPU.
+        gui: open a window, in which the cameras render too.
+
+    Returns:
+        `step(params, state, rpm) -> state`, a context manager that closes the connection. The rotors limit the
+        commanded speeds to [0, `params.max_rpm`].
+
+    Raises:
+        ValueError: an argument out of range, or contact as an effect: Bullet resolves it already.
+        ImportError: pybullet is not installed.
+        OSError: a window is asked for and there is no display.
+    """
+    check_positive("dt", dt, "s")
+    check_whole("substeps", substeps)
+    check_number("damping", damping, "1/s", at_least=0)
+    physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
+    for contact in ground_contact, obstacle_contact, drone_contact:
+        if physics.contains(contact):
+            raise ValueError(
+                f"{contact.__name__} is given and Bullet resolves contacts by itself, so drones would touch twice; "
+                "leave it out"
+            )
+    scene = Scene() if scene is None else scene
+    check_scene(scene, files=True)
+    if is_traced(scene):
+        raise ValueError(
+            "the scene is traced by jit, vmap or grad and has no values yet; make the step outside, of a scene of "
+            "numbers, and give the traced one to its calls"
+        )
+    client = Client(dt, damping, collision, renderer, gui)
+    return BulletStep(client, physics, substeps, dt, jax.device_get(scene))

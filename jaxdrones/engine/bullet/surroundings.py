@@ -1,0 +1,126 @@
+"""Ground and obstacles in a Bullet world, which change with the scene."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import sys
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxdrones.engine.bullet.shapes import shape_of
+from jaxdrones.sensing import Scene, Urdf
+
+_STATIC = 2  # Bullet's collision group of bodies that do not move, which do not collide with each other
+_GROUND_FRICTION = 1.0  # as in gym-pybullet-drones (2021)
+
+
+class _Placed(NamedTuple):
+    """An obstacle in Bullet's world."""
+
+    shape: Any
+    """Everything but the pose; where that is equal, a body can be moved."""
+    pose: tuple[list[float], list[float]]
+    """Position (3,), m, and attitude (4,)."""
+
+
+class Surroundings:
+    """The bodies that do not move by themselves."""
+
+    def __init__(self, p: ModuleType, client: int):
+        self.p, self.id = p, client
+        self.ground: int | None = None
+        self.obstacles: dict[int, int] = {}  # number -> body
+        self._placed: dict[int, _Placed] = {}  # by number
+        self._scene: Scene | None = None
+        self._structure: Any = jax.tree.structure(None)
+        self._numbers = np.zeros(0)
+
+    def set(self, scene: Scene) -> bool:
+        """Let a scene of NumPy arrays stand here; returns whether anything changed.
+
+        Obstacles of the same shape are moved, others are built anew.
+        """
+        if scene is self._scene:
+            return False
+        leaves, structure = jax.tree.flatten(scene)
+        numbers = np.concatenate([np.zeros(0), *map(np.ravel, leaves)])
+        same = structure == self._structure and np.array_equal(numbers, self._numbers)
+        self._scene, self._structure, self._numbers = scene, structure, numbers
+        if same:
+            return False
+        if self.ground is None and scene.ground:
+            self.ground = self._add_ground()
+        elif self.ground is not None and not scene.ground:
+            self.p.removeBody(self.ground, physicsClientId=self.id)
+            self.ground = None
+        obstacles = scene.numbered
+        for number in self.obstacles.keys() - obstacles.keys():
+            self._remove(number)
+        for number, obstacle in obstacles.items():
+            self._place(number, obstacle)
+        for body in self.obstacles.values() if self.ground is None else (self.ground, *self.obstacles.values()):
+            self._register(body)
+        return True
+
+    def _register(self, body: int) -> None:
+        """Let Bullet meet a body anew: contacts are resolved in the order in which it met the bodies."""
+        self.p.setCollisionFilterGroupMask(body, -1, 0, 0, self.id)
+        self.p.setCollisionFilterGroupMask(body, -1, _STATIC, ~_STATIC, self.id)
+
+    def _place(self, number: int, obstacle: Any) -> None:
+        fields = {name: np.asarray(x).tolist() for name, x in vars(obstacle).items() if name not in ("pos", "quat")}
+        pose = np.asarray(obstacle.pos, float).tolist(), np.asarray(obstacle.quat, float).tolist()
+        new, old = _Placed((type(obstacle), fields), pose), self._placed.get(number)
+        if old is None or new.shape != old.shape:
+            if old is not None:
+                self._remove(number)
+            self.obstacles[number] = self._add(obstacle, *pose)
+        elif new.pose != old.pose:
+            self.p.resetBasePositionAndOrientation(self.obstacles[number], *pose, self.id)
+        self._placed[number] = new
+
+    def _remove(self, number: int) -> None:
+        self.p.removeBody(self.obstacles.pop(number), physicsClientId=self.id)
+        del self._placed[number]
+
+    def _add_ground(self) -> int:
+        p = self.p
+        plane = p.createCollisionShape(p.GEOM_PLANE, physicsClientId=self.id)
+        ground = p.createMultiBody(0, plane, physicsClientId=self.id)
+        p.changeDynamics(ground, -1, lateralFriction=_GROUND_FRICTION, physicsClientId=self.id)
+        return ground
+
+    def _add(self, obstacle: Any, pos: list[float], quat: list[float]) -> int:
+        p = self.p
+        if isinstance(obstacle, Urdf):
+            with quiet():
+                return p.loadURDF(str(obstacle.path), pos, quat, useFixedBase=True, physicsClientId=self.id)
+        shape = shape_of(p, obstacle)
+        collision = p.createCollisionShape(**shape, physicsClientId=self.id)
+        if "height" in shape:
+            shape["length"] = shape.pop("height")  # Bullet has two words for it
+        visual = p.createVisualShape(**shape, rgbaColor=obstacle.color, physicsClientId=self.id)
+        return p.createMultiBody(0, collision, visual, pos, quat, physicsClientId=self.id)
+
+
+@contextlib.contextmanager
+def quiet():
+    """Keep what Bullet's C code prints off stdout, where a caller may be writing JSON, and off stderr."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with open(os.devnull, "w") as nowhere:
+        kept = {number: os.dup(number) for number in (1, 2)}
+        try:
+            for number in kept:
+                os.dup2(nowhere.fileno(), number)
+            yield
+        finally:
+            ctypes.CDLL(None).fflush(None)
+            for number, copy in kept.items():
+                os.dup2(copy, number)
+                os.close(copy)

@@ -1,0 +1,160 @@
+"""Contact with obstacles: walls hold, energy never grows, and a box is as good as the ground."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, assert_finite
+
+import jaxdrones as jd
+from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
+
+VEHICLES = {name: jd.load_params(name) for name in ("cf2x", "hb", "racer")}
+CRAZYFLIE = VEHICLES["cf2x"]
+WALL = Scene.of(Box(pos=(1.15, 0, 0), size=(0.3, 100, 100)), ground=False)  # its face is at x = 1 m
+SCENE = Scene.of(
+    Box(pos=(0, 0, 0), quat=(0, 0, np.sin(0.2), np.cos(0.2)), size=(0.5, 0.4, 0.3), active=True),
+    Sphere(pos=(0.4, 0, 0), radius=0.2, active=True),
+    Cylinder(pos=(0, 0.5, 0), quat=(np.sin(0.5), 0, 0, np.cos(0.5)), radius=0.2, height=0.4, active=True),
+    Capsule(pos=(-0.5, 0, 0), radius=0.2, height=0.3, active=True),
+    ground=False,
+)
+step = jd.make_step(effects=(jd.obstacle_contact,))
+
+
+def random_states(n, seed=0):
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=(n, 4))
+    return jd.State(
+        pos=jnp.array(rng.uniform([-0.7, -0.3, -0.3], [0.6, 0.7, 0.3], (n, 3))),
+        quat=jnp.array(quat / np.linalg.norm(quat, axis=1, keepdims=True)),
+        vel=jnp.array(rng.uniform(-3, 3, (n, 3))),
+        omega=jnp.array(rng.uniform(-10, 10, (n, 3))),
+        rpm=jnp.zeros((n, 4)),
+    )
+
+
+@partial(jax.jit, static_argnames="length")
+def fly(params, starts, scene, rpm, length):
+    """The trajectories of single drones in worlds of one scene."""
+    team = jd.repeat(params, 1)
+
+    def trajectory(start):
+        def advance(state, _):
+            after = step(team, state, jnp.full((1, 4), rpm), scene)
+            return after, after
+
+        return jax.lax.scan(advance, jax.tree.map(lambda x: x[None], start), length=length)[1]
+
+    return jax.tree.map(lambda x: x[:, :, 0], jax.vmap(trajectory)(starts))
+
+
+@jax.jit
+def wrenches(scene, states):
+    return jax.vmap(jd.obstacle_contact, (None, 0, None))(CRAZYFLIE, states, scene)
+
+
+@pytest.mark.parametrize("vehicle", VEHICLES)
+def test_a_wall_holds_at_5_meters_per_second_and_gives_no_energy(vehicle):
+    """Level and tilted, for half a second without gravity or thrust; the center sinks in by less than 6 cm."""
+    params = VEHICLES[vehicle].replace(gravity=jnp.array(0.0))
+    speed, yaw, tilt = (x.ravel() for x in np.meshgrid([1.0, 3.0, 5.0], [0.0, 0.2, 0.4], [-0.5, 0.0, 0.5]))
+    n = len(speed)
+    zero = jnp.zeros((n, 3))
+    quat = jax.vmap(jd.rotation.from_rpy)(jnp.stack([0 * yaw, tilt, yaw], axis=-1))
+    start = zero.at[:, 0].set(1 - params.collision_radius - 0.5 * params.collision_height)
+    vel = zero.at[:, 0].set(speed)
+    states = fly(params, jd.State(start, quat, vel, zero, jnp.zeros((n, 4))), WALL, 0.0, 120)
+    assert np.all(states.pos[..., 0] < 1.06) and np.all(np.min(states.vel[..., 0], axis=1) < 0.3)
+    energy = 0.5 * params.mass * jnp.sum(states.vel**2, -1) + 0.5 * states.omega**2 @ params.inertia
+    before = 0.5 * params.mass * speed**2
+    assert np.all(energy <= before[:, None] * (1 + 1e-3))  # 0.1 %: the integrator's explicit gyroscopic term
+    assert np.all(energy[:, -1] < 0.6 * before)
+
+
+def test_a_box_is_as_good_as_the_ground():
+    """The same wrench to rounding, whatever the drone does, wherever the top of the box is."""
+    states = random_states(200)
+    states = states.replace(pos=states.pos * jnp.array([[1, 1, 0.15]]))
+    low = Scene.of(Box(pos=(0, 0, -50), size=(300, 300, 100)), ground=False)
+    of_ground = jax.jit(jax.vmap(jd.ground_contact, (None, 0)))(CRAZYFLIE, states)
+    assert np.mean(np.any(of_ground.force != 0, axis=1)) > 0.5
+    assert_close(wrenches(low, states), of_ground, 1e-12)
+    raised, up = Scene.of(Box(pos=(0, 0, -48), size=(300, 300, 100)), ground=False), jnp.array([[0, 0, 2]])
+    assert_close(wrenches(raised, states.replace(pos=states.pos + up)), of_ground, 1e-9)
+
+
+def test_forces_push_out_within_the_cone_of_friction_and_take_energy():
+    """Their power on a drone that does not turn and moves inward is never positive."""
+    states = random_states(300)
+    still = states.replace(omega=0 * states.omega, vel=0 * states.vel)
+    pushed = wrenches(SCENE, still)
+    force = jax.vmap(jd.rotation.rotate)(states.quat, pushed.force)
+    assert np.mean(np.any(force != 0, axis=1)) > 0.3
+    slope = jax.vmap(lambda p: SCENE.nearest(p).normal)(states.pos)
+    assert np.mean(jnp.sum(force * slope, -1)[np.any(force != 0, axis=1)] > 0) > 0.9
+    moving = states.replace(
+        omega=0 * states.omega, vel=-force / jnp.maximum(jnp.linalg.norm(force, axis=1), 1e-9)[:, None]
+    )
+    against = jax.vmap(jd.rotation.rotate)(states.quat, wrenches(SCENE, moving).force)
+    assert np.all(jnp.sum(against * moving.vel, -1) <= 1e-9)
+
+
+def test_what_is_not_active_or_out_of_reach_is_not_touched():
+    states = random_states(50)
+    nothing = jax.tree.map(lambda x: x & False if x.dtype == bool else x, SCENE)
+    assert all(np.all(x == 0) for x in jax.tree.leaves(wrenches(nothing, states)))
+    assert all(np.all(x == 0) for x in jax.tree.leaves(jd.obstacle_contact(CRAZYFLIE, states, Scene())))
+    far = states.replace(pos=states.pos + 2.0)
+    assert all(np.all(x == 0) for x in jax.tree.leaves(wrenches(SCENE, far)))
+
+
+def test_looking_only_at_what_is_within_reach_changes_nothing():
+    """In a heap of overlapping obstacles, every sphere meets the surface that is nearest to it."""
+    rng = np.random.default_rng(1)
+    heap = Scene.of(
+        Box(pos=rng.uniform(-1, 1, (20, 3)), size=rng.uniform(0.1, 0.5, (20, 3))),
+        Sphere(pos=rng.uniform(-1, 1, (20, 3)), radius=rng.uniform(0.1, 0.3, 20)),
+        ground=False,
+    )
+    centers = jnp.array(rng.uniform(-1, 1, (100, 1, 3)))
+    points = centers + jnp.array(0.05 * rng.normal(size=(100, 8, 3)))
+    found = jax.jit(jax.vmap(lambda points: heap.touched(points, 0.02)))(points)
+    nearest = jax.jit(jax.vmap(jax.vmap(heap.nearest)))(points)
+    near = np.asarray(nearest.distance) < 0.02
+    assert 0.1 < near.mean() < 0.9
+    assert np.all(found.distance[~near] >= 0.02)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(nearest), strict=True):
+        np.testing.assert_allclose(a[near], b[near], atol=1e-12)
+
+
+def test_the_gradient_through_a_collision_is_that_of_central_differences():
+    """Of the place after a hit of a sphere, in the start and in the sphere's place."""
+    team, rpm = jd.repeat(CRAZYFLIE, 1), jnp.zeros((1, 4))
+
+    @jax.jit
+    def end(x, place):
+        scene = Scene.of(Sphere(pos=jnp.stack([place, 0.01, 1.0]), radius=0.3), ground=False)
+        start = jd.State.at_rest(jnp.stack([x, 0.0, 1.0])[None]).replace(vel=jnp.array([[2.0, 0.1, 0.5]]))
+        return jax.lax.scan(lambda s, _: (step(team, s, rpm, scene), None), start, length=40)[0].pos[0].sum()
+
+    slope = jax.jit(jax.grad(end, (0, 1)))(0.0, 0.5)
+    numbers = [(end(1e-7, 0.5) - end(-1e-7, 0.5)) / 2e-7, (end(0.0, 0.5 + 1e-7) - end(0.0, 0.5 - 1e-7)) / 2e-7]
+    np.testing.assert_allclose(slope, numbers, rtol=1e-5)
+    assert abs(slope[1]) > 0.1
+
+
+@pytest.mark.float32
+def test_gradients_are_finite_wherever_a_drone_is():
+    with jax.enable_x64(True):
+        states = random_states(100)
+        special = jnp.array([(0.4, 0, 0), (0, 0, 0), (9, 9, 9), (0, 0.5, 0)])
+        states = states.replace(pos=states.pos.at[:4].set(special))
+    states, params, scene = jax.tree.map(lambda x: np.asarray(x, np.float32), (states, CRAZYFLIE, SCENE))
+
+    def push(scene, state):
+        return sum(jnp.sum(x) for x in jax.tree.leaves(jd.obstacle_contact(params, state, scene)))
+
+    assert_finite(jax.jit(jax.vmap(jax.grad(push, (0, 1)), (None, 0)))(scene, states))

@@ -1,0 +1,170 @@
+"""Range finders and optical flow measure what geometry says, as far and as often as they can."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_finite
+
+import jaxdrones as jd
+from jaxdrones.sensing import (
+    Box,
+    Scene,
+    Sensor,
+    Sphere,
+    downward_range,
+    lidar,
+    multi_ranger,
+    optical_flow,
+    range_finder,
+    time_of_flight,
+)
+from jaxdrones.sensing.sensor import measure_sensors
+
+TEAM = jd.repeat(jd.load_params("cf2x"), 1)
+ROOM = Scene.of(  # walls at x = 2, x = -1, y = 1.5, y = -0.5 and a ceiling at z = 2.5
+    Box(pos=(2.5, 0, 1), size=(1, 20, 20)),
+    Box(pos=(-1.5, 0, 1), size=(1, 20, 20)),
+    Box(pos=(0, 2.0, 1), size=(20, 1, 20)),
+    Box(pos=(0, -1.0, 1), size=(20, 1, 20)),
+    Box(pos=(0, 0, 3.0), size=(20, 20, 1)),
+)
+WALL = Scene.of(Box(pos=(2.5, 0, 1), size=(1, 20, 20)), ground=False)
+HERE = jnp.array([0.0, 0.0, 1.0])
+
+
+def at(pos=HERE, rpy=(0.0, 0.0, 0.0), vel=(0.0, 0.0, 0.0), omega=(0.0, 0.0, 0.0)):
+    quat = jd.rotation.from_rpy(jnp.asarray(rpy, float))[None]
+    return jd.State.at_rest(jnp.asarray(pos, float)[None]).replace(
+        quat=quat, vel=jnp.asarray(vel, float)[None], omega=jnp.asarray(omega, float)[None]
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def reading(sensor, state, scene=ROOM, key=None):
+    key = jax.random.key(0) if key is None else key
+    return measure_sensors((sensor,), key, TEAM, state, state, scene, {sensor.name: None})[1][sensor.name][0]
+
+
+def test_a_multi_ranger_measures_to_the_front_back_left_right_and_up():
+    deck = multi_ranger()
+    np.testing.assert_allclose(reading(deck, at()), [2, 1, 1.5, 0.5, 1.5])
+    np.testing.assert_allclose(reading(deck, at(rpy=(0, 0, np.pi / 2))), [1.5, 0.5, 1, 2, 1.5])
+    np.testing.assert_allclose(reading(multi_ranger(max_range=1.2), at()), [1.2, 1, 1.2, 0.5, 1.2])
+    assert deck.bound == 4.0 and deck.rate == 10.0
+
+
+def test_a_tilted_drone_measures_a_longer_way_to_the_ground():
+    for roll, pitch in (0.3, 0.0), (-0.2, 0.4):
+        range_ = reading(downward_range(), at(rpy=(roll, pitch, 1.0)))
+        np.testing.assert_allclose(range_, [1 / (np.cos(roll) * np.cos(pitch))])
+
+
+def test_a_lidar_sees_the_walls_around_it_and_turns_with_the_drone():
+    scanner = lidar(beams=8)
+    scan = np.minimum([2, 1.5 * np.sqrt(2), 1.5, np.sqrt(2), 1, 0.5 * np.sqrt(2), 0.5, 0.5 * np.sqrt(2)], 12)
+    np.testing.assert_allclose(reading(scanner, at()), scan)
+    np.testing.assert_allclose(reading(scanner, at(rpy=(0, 0, np.pi / 4))), np.roll(scan, -1))
+
+
+def test_a_grid_looks_up_in_its_first_row_and_left_in_its_first_column():
+    grid = reading(time_of_flight(), at(), WALL)
+    angle = np.radians(45 / 8 * (3.5 - np.arange(8)))
+    up, left = np.meshgrid(np.tan(angle), np.tan(angle), indexing="ij")
+    np.testing.assert_allclose(grid, 2 * np.sqrt(1 + up**2 + left**2))
+    ball = Scene.of(Sphere(pos=(1.0, 0.3, 1.3), radius=0.1), ground=False)
+    grid = reading(time_of_flight(), at(), ball)
+    seen = np.argwhere(grid < 4)
+    assert len(seen) and np.all(seen < 4)
+
+
+def test_a_device_is_turned_and_placed_on_the_body():
+    backwards = range_finder(
+        "tail", np.array([1.0, 0, 0]), max_range=9.0, offset=(-0.1, 0, 0), orientation=(0, 0, 1, 0)
+    )
+    np.testing.assert_allclose(reading(backwards, at()), 0.9)
+    np.testing.assert_allclose(reading(backwards, at(rpy=(0, 0, np.pi))), 1.9)
+
+
+def test_optical_flow_is_the_velocity_over_the_height_and_the_turn():
+    """It vanishes where the drone turns about a point of the ground below."""
+    flow = optical_flow()
+    np.testing.assert_allclose(reading(flow, at((0, 0, 2), vel=(1, -0.5, 3)), Scene()), [0.5, -0.25])
+    turned = at((0, 0, 2), rpy=(0, 0, np.pi / 2), vel=(1, 0, 0))
+    np.testing.assert_allclose(reading(flow, turned, Scene()), [0, -0.5], atol=1e-9)
+    np.testing.assert_allclose(reading(flow, at(omega=(0.3, 0.2, 5)), Scene()), [-0.2, 0.3])
+    omega = np.array([0.3, 0.2, 0.0])
+    about_ground = np.cross(omega, [0, 0, 2.0])
+    np.testing.assert_allclose(reading(flow, at((0, 0, 2), vel=about_ground, omega=omega), Scene()), 0, atol=1e-12)
+    np.testing.assert_allclose(reading(flow, at(vel=(1, 1, 1)), Scene(ground=False)), 0)
+
+
+def test_noise_has_its_deviation_and_dropouts_read_the_limit():
+    scanner = lidar(beams=4000, noise=0.05, dropout=0.1)
+    middle = reading(scanner, at(), Scene.of(Sphere(pos=HERE + 0.0, radius=0.01), ground=False))
+    assert np.all((middle == 12) | (middle <= 0.3))
+    around = Scene.of(*(Box(pos=(x, y, 1), size=(1, 1, 9)) for x, y in ((9, 0),)), ground=False)
+    ahead = range_finder("many", np.tile([1.0, 0, 0], (4000, 1)), max_range=12.0, noise=0.05, dropout=0.1)
+    ranges = np.asarray(reading(ahead, at(), around))
+    lost = ranges == 12
+    np.testing.assert_allclose(lost.mean(), 0.1, atol=0.02)
+    np.testing.assert_allclose([ranges[~lost].mean(), ranges[~lost].std()], [8.5, 0.05], rtol=0.05)
+
+
+def test_the_gradient_of_a_range_is_that_of_the_way_to_the_wall():
+    @jax.jit
+    @jax.grad
+    def slope(state):
+        return jnp.sum(reading(time_of_flight(), state, WALL)) + jnp.sum(reading(optical_flow(), state, WALL))
+
+    found = slope(at())
+    assert_finite(found)
+    angle = np.radians(45 / 8 * (3.5 - np.arange(8)))
+    up, left = np.meshgrid(np.tan(angle), np.tan(angle), indexing="ij")
+    np.testing.assert_allclose(found.pos[0], [-np.sum(np.sqrt(1 + up**2 + left**2)), 0, 0], atol=1e-9)
+
+
+EVERY = list(range(13))
+
+
+@pytest.mark.parametrize(
+    ("rate", "expected"), [(25.0, [0, 4, 8, 12]), (30.0, [0, 4, 7, 10]), (None, EVERY), (500.0, EVERY)]
+)
+def test_a_measurement_is_due_in_the_first_step_that_is_late_enough(rate, expected):
+    """At 100 control steps per second."""
+    clock = Sensor("clock", lambda key, params, state, rate, scene, memory: (None, 0.0), rate=rate)
+    assert [k for k in range(13) if k == 0 or clock.is_due(k, 0.01)] == expected
+
+
+def test_in_an_environment_a_sensor_measures_at_its_rate():
+    env = jd.make("hover", sensors=(downward_range(rate=25.0),), observation=("downward_range",), speed=1.0)
+    step = jax.jit(env.step)
+    key = jax.random.key(0)
+    obs, world = env.reset(key)
+    seen = [float(obs[0, 0])]
+    for _ in range(8):
+        obs, world, *_ = step(key, world, jnp.zeros((1, 4)))
+        seen.append(float(obs[0, 0]))
+    changes = np.flatnonzero(np.diff(seen)) + 1
+    assert changes.tolist() == [4, 8]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: lidar(beams=0), "beams of a lidar is 0"),
+        (lambda: multi_ranger(max_range=-1), "max_range of multi_ranger is -1"),
+        (lambda: multi_ranger(noise=-1), "noise of multi_ranger is -1"),
+        (lambda: optical_flow(dropout=2), "dropout of optical_flow is 2"),
+        (lambda: lidar(rate=0), "rate of sensor 'lidar' is 0"),
+        (lambda: time_of_flight(field_of_view=180), "field_of_view of a time-of-flight sensor is 180"),
+        (lambda: time_of_flight(orientation=(0, 0, 0, 2)), "orientation of time_of_flight has length 2"),
+        (lambda: lidar(offset=(0, 0)), r"offset of lidar is \(0, 0\); give 3 numbers"),
+        (lambda: range_finder("x", np.zeros((2, 2)), max_range=1.0), r"directions of x have shape \(2, 2\)"),
+    ],
+)
+def test_nonsense_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -151,7 +151,6 @@ def drone_solids(params: Params, state: State) -> list[Obstacle]:
             radius=jnp.broadcast_to(params.prop_radius, (ROTORS,)),
             height=jnp.broadcast_to(params.collision_height / 5, (ROTORS,)),
             color=colors,
-            active=jnp.ones(ROTORS, bool),
         )
         return hub, disc
 

@@ -121,8 +121,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
     )
     record = to_record(episode, conditions)
     title = f"{recipe.task}: {env.task.summary} ({recipe.trained_by}, {options.backend})"
-    assert isinstance(env.scene, Scene), "tasks that have a name have a fixed scene"
-    files = _write(record, options, output, title, plots.POLICY_PANELS, env.scene)
+    files = _write(record, options, output, title, plots.POLICY_PANELS, episode.scene)
     results = record.results(_SETTLING_SHARE * float(record.t[-1]))
     end = {
         "success": episode.success,

@@ -16,6 +16,7 @@ from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.record import Record
 from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 
 _LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
@@ -36,6 +37,8 @@ class EpisodeLog(flax.struct.PyTreeNode):
     """(K, n) for each of the task's metrics."""
     ended_by: tuple[str, ...]
     """Names of the terminations and truncations that ended the episode; none if its time was up."""
+    scene: Scene
+    """What stood around, as drawn for this episode."""
     success: bool | None
     """Whether all drones met the task's criterion of success; `None` if the task has none."""
 
@@ -137,6 +140,7 @@ def fly_episode(
         reward=reward,
         metrics=metrics,
         ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
+        scene=jax.device_get(world.scene),
         success=_success(env, drones, metrics),
     )
 

@@ -25,5 +25,5 @@ def test_what_is_needed_equals_vmap_and_what_is_not_may_be_zero(count):
 
 
 def test_many_worlds_that_are_given_the_same_key_are_refused():
-    with pytest.raises(ValueError, match="one and the same key.*split the key"):
+    with pytest.raises(ValueError, match=r"one and the same key.*split the key"):
         jax.vmap(where_needed(jax.random.normal), (0, None))(X > 3, jax.random.key(0))

@@ -66,6 +66,8 @@ TRAININGS = {
     ),
     "train gates --set level=2": Short(f"gates by ppo, level 2: ... {TRAINED}", TRAINING),
     "train tracking --realistic --set period=5 --set worlds=512": Short(TRAINED, TRAINING),
+    "train forest": Short(f"forest by bptt ... {TRAINED}", TRAINING),
+    "train recovery --set recurrent_size=32": Short(f"recovery by bptt ... {TRAINED}", TRAINING),
     "train hover --resume": Short(TRAINED),
     "train hover --resume --budget 100": Short("updates: 102, 2 of them made ... " + TRAINED.split(" ... ", 1)[1]),
     "train hover --overwrite": Short(TRAINED, TRAINING),

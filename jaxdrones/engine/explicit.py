@@ -94,7 +94,7 @@ def make_step(
 
     Args:
         effects: wrenches on a drone by itself, `(params, state) -> Wrench`: `drag`, `ground_effect`, your own. One
-            that has a third argument called `scene` is given what stands around.
+            that has a third argument called `scene` is given what stands around: `obstacle_contact`.
         pairs: wrenches on a drone because of another, `(params, state, other, other_state) -> Wrench`: `downwash`.
         rotors: `instant_rotors`, `lagging_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
         integrator: `semi_implicit_euler`, `euler`, `rk4` or `implicit_midpoint`.
@@ -188,6 +188,7 @@ class ExplicitStep(Step):
             raise ValueError(f"scene is {scene!r}; give a jaxdrones.sensing.Scene")
         if scene.has_obstacles and not self.physics.takes_scene:
             raise ValueError(
-                "the scene has obstacles and no effect takes it, so drones would fly through them; give an effect "
-                "(params, state, scene) -> Wrench, leave the obstacles out, or take the bullet backend"
+                "the scene has obstacles and no effect takes it, so drones would fly through them; give "
+                "jaxdrones.obstacle_contact or another effect (params, state, scene) -> Wrench, leave the obstacles "
+                "out, or take the bullet backend"
             )

@@ -242,11 +242,9 @@ class Env:
 
     def _measured(self, key: jax.Array, world: World, rate: State) -> World:
         """The world with new readings of the sensors."""
-        given = world.params, world.drones, rate, world.scene, world.sensors
-        after = measure_sensors(self.sensors, key, *given)
-        if world.readings:
-            after = hold_between(self.sensors, world.step, self.dt, (world.sensors, world.readings), after)
-        return world.replace(sensors=after[0], readings=after[1])
+        after = measure_sensors(self.sensors, key, world.params, world.drones, rate, world.scene, world.sensors)
+        sensors, readings = hold_between(self.sensors, world.step, self.dt, (world.sensors, world.readings), after)
+        return world.replace(sensors=sensors, readings=readings)
 
     def _command(self, key: Key, world: World, action: Array) -> tuple[World, Array]:
         """The world with the new action and disturbance, and the commanded rotor speeds."""

@@ -17,7 +17,6 @@ from jaxdrones.checks import (
     check_whole,
     hint,
     shown,
-    takes_scene,
 )
 from jaxdrones.dynamics import (
     EFFECTS,
@@ -32,6 +31,7 @@ from jaxdrones.dynamics import (
     obstacle_contact,
 )
 from jaxdrones.engine.explicit import make_step
+from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import TeamEffect
 from jaxdrones.envs.actions import ACTIONS, Action, check_loop
@@ -178,10 +178,9 @@ def make(
         step = bullet.make_step(**physics, scene=scene if isinstance(scene, Scene) else None)
     else:
         if "ground" in task.contact:
-            effects = [*effects, ground_contact]
-        if are_solid(scene, task) and not any(map(takes_scene, effects)):
-            effects = [*effects, obstacle_contact]
-        physics["effects"] = effects
+            physics["effects"] = [*physics["effects"], ground_contact]
+        if are_solid(scene, task) and not Physics(physics["effects"]).takes_scene:
+            physics["effects"] = [*physics["effects"], obstacle_contact]
         if "drones" in task.contact:
             physics["pairs"] = [*pairs, drone_contact]
         step = make_step(**physics, integrator=_named("integrator", integrator, INTEGRATORS))

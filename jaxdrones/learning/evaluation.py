@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.checks import check_key
+from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation
 from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
@@ -80,7 +81,9 @@ def _compiled_outcomes() -> Callable:
 
 def _outcomes(env: Env, policy: AnyPolicy, keys: jax.Array) -> dict:
     """Outcomes of one episode per key, along a leading axis."""
-    return jax.lax.map(functools.partial(_outcome, env, policy), keys, batch_size=min(_CHUNK, len(keys)))
+    on_host = isinstance(env.physics, HostStep)  # which flies one world after the other, and rebuilds each one's scene
+    chunk = None if on_host else min(_CHUNK, len(keys))
+    return jax.lax.map(functools.partial(_outcome, env, policy), keys, batch_size=chunk)
 
 
 def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:

@@ -70,16 +70,17 @@ def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Image
     n, dtype = len(state.pos), state.pos.dtype
     drones = jnp.arange(n)
     obstacles = scene.shapes(dtype)
-    count = sum(len(kind.pos) for kind in obstacles)
+    there = [kind.active for kind in obstacles]
+    kinds: list[Any] = [kind.replace(active=None) for kind in obstacles]  # what is left has derivatives
+    count = sum(len(kind.pos) for kind in kinds)
     numbers = [1 + n + jnp.arange(count)]  # labels of the segmentation, solid by solid
     own = [jnp.full(count, -1)]  # the drone of which a solid is a part
     if n > 1 or camera.sees_self:
-        obstacles += drone_solids(params, state)
+        kinds += drone_solids(params, state)
         parts = [drones, jnp.repeat(drones, ROTORS)]
+        there += [jnp.ones(len(part), bool) for part in parts]
         numbers += [1 + part for part in parts]
         own += parts
-    there = [kind.active for kind in obstacles]
-    kinds: list[Any] = [kind.replace(active=None) for kind in obstacles]  # what is left has derivatives
     colors = [kind.color[:, :3] for kind in kinds]
     ground = None
     if scene.ground:
@@ -150,7 +151,6 @@ def drone_solids(params: Params, state: State) -> list[Obstacle]:
             radius=jnp.broadcast_to(params.prop_radius, (ROTORS,)),
             height=jnp.broadcast_to(params.collision_height / 5, (ROTORS,)),
             color=colors,
-            active=jnp.ones(ROTORS, bool),
         )
         return hub, disc
 

@@ -160,9 +160,11 @@ def hold_between(
         sensors: with names that differ.
         step: () number of control steps since the start of the episode.
         dt: control period, s.
-        before: memories and readings before this step.
+        before: memories and readings before this step; without readings every sensor measures.
         after: those after a measurement of every sensor at this step.
     """
+    if not before[1]:
+        return after
 
     def held(sensor: Sensor, before: Any, after: Any) -> Any:
         due = sensor.is_due(step, dt)

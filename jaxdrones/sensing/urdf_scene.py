@@ -73,7 +73,7 @@ def from_urdf(
 
 def _places(file: Path, robot: ET.Element, links: dict[str, ET.Element], root: Pose) -> dict[str, Pose]:
     """The pose of every link in the world."""
-    joints = {}
+    joints: dict[str, tuple[str, Pose]] = {}
     for joint in robot.findall("joint"):
         ends = [end.get("link", "") for tag in ("parent", "child") if (end := joint.find(tag)) is not None]
         if len(ends) != 2 or any(end not in links for end in ends):

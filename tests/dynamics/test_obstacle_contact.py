@@ -86,6 +86,7 @@ def test_a_box_is_as_good_as_the_ground():
     assert_close(wrenches(raised, states.replace(pos=states.pos + up)), of_ground, 1e-9)
 
 
+@pytest.mark.slow
 def test_forces_push_out_within_the_cone_of_friction_and_take_energy():
     """Their power on a drone that does not turn and moves inward is never positive."""
     states = random_states(300)
@@ -102,6 +103,7 @@ def test_forces_push_out_within_the_cone_of_friction_and_take_energy():
     assert np.all(jnp.sum(against * moving.vel, -1) <= 1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_not_active_or_out_of_reach_is_not_touched():
     states = random_states(50)
     nothing = jax.tree.map(lambda x: x & False if x.dtype == bool else x, SCENE)
@@ -130,6 +132,7 @@ def test_looking_only_at_what_is_within_reach_changes_nothing():
         np.testing.assert_allclose(a[near], b[near], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_gradient_through_a_collision_is_that_of_central_differences():
     """Of the place after a hit of a sphere, in the start and in the sphere's place."""
     team, rpm = jd.repeat(CRAZYFLIE, 1), jnp.zeros((1, 4))

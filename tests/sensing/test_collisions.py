@@ -55,6 +55,12 @@ def test_a_tilted_drone_touches_the_ground_with_its_lowest_edge(roll):
     assert not flags(*team((0, 0, 0)), Scene(ground=False)).ground.any()
 
 
+def test_what_is_not_active_is_not_touched():
+    for active in True, False:
+        ball = Scene.of(Sphere(pos=(0, 0, 1), radius=0.1, active=active))
+        assert flags(*team((0, 0, 1.1)), ball).scene.tolist() == [active]
+
+
 def test_the_cylinder_of_an_hb_is_below_its_centre_of_mass():
     hb = jaxdrones.load_params("hb")
     for height, touches in (0.1505, True), (0.152, False):

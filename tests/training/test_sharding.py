@@ -80,12 +80,15 @@ def test_two_devices_come_to_what_one_comes_to_and_do_not_talk_while_they_fly(tm
     files = [tmp_path / "one.npz", tmp_path / "two.npz"]
     finished(*(start(SCRIPT, file, devices) for devices, file in enumerate(files, 1)))
     assert_same(files)
-    talks = {name: list(numbers(files[1])[f"{name} talks"]) for name in ("bptt", "shac", "ppo")}
-    for found in talks.values():
-        assert {kind.removeprefix("loop ") for kind in found} == {"all-reduce"}  # gradients and means, no worlds
-    assert "loop all-reduce" not in talks["bptt"]
-    assert talks["shac"].count("loop all-reduce") == talks["ppo"].count("loop all-reduce") == 1  # a gradient step's
-    assert not numbers(files[0])["ppo talks"].size
+    for memory in (0, 3):
+        names = {name: f"{name}, memory of {memory} talks" for name in ("bptt", "shac", "ppo")}
+        talks = {name: list(numbers(files[1])[entry]) for name, entry in names.items()}
+        for found in talks.values():
+            assert {kind.removeprefix("loop ") for kind in found} == {"all-reduce"}  # gradients and means, no worlds
+        in_loops = {name: found.count("loop all-reduce") for name, found in talks.items()}
+        replay = int(memory > 0)  # the recurrent kernel's gradient, in every step of a sequence that ppo replays
+        assert in_loops == {"bptt": 0, "shac": 1, "ppo": 1 + replay}  # and that of a gradient step
+        assert not numbers(files[0])[names["ppo"]].size
 
 
 @pytest.mark.slow

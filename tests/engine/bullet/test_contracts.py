@@ -48,6 +48,7 @@ def test_the_rate_of_a_drone_at_rest_on_the_ground_is_zero(step):
     "contact",
     [
         dict(effects=(jd.ground_contact,)),
+        dict(effects=(jd.obstacle_contact,)),
         dict(pairs=(jd.drone_contact,)),
         dict(effects=(functools.partial(jd.ground_contact),)),
     ],

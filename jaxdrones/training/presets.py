@@ -60,7 +60,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("tracking", "bptt"): dict(updates=400, learning_rate=1e-2),
     ("recovery", "bptt"): dict(updates=250),
     ("gates", "ppo"): dict(
-        updates=1500, gae_lambda=0.95, final_std=0.05, hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64)
+        updates=2500, gae_lambda=0.95, final_std=0.05, hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64)
     ),
     ("forest", "bptt"): _FOREST | dict(updates=600),
     ("forest", "shac"): _FOREST | dict(updates=600, horizon=50, critic_hidden_sizes=(128, 64)),

@@ -16,6 +16,7 @@ from jaxdrones.tasks.starts import standing_height
 
 KEY = jax.random.key(3)
 OTHER = jax.random.key(4)
+QUICK_TARGETS = tuple(set(TASKS) - {"forest", "room", "follow"})
 QUICK = ("hover", "gates", "hover-2x")
 make_env = lru_cache(make)
 
@@ -117,7 +118,7 @@ def test_rewards_terminations_and_the_error_follow_the_target_that_a_task_was_gi
     assert moved.step(KEY, world, zeros(moved))[3], "50 m from its target a drone is lost"
 
 
-@pytest.mark.parametrize("name", sorted(set(TASKS) - {"takeoff", "meetup"}))
+@pytest.mark.parametrize("name", mostly_slow(sorted(set(TASKS) - {"takeoff", "meetup"}), QUICK_TARGETS))
 def test_every_reward_that_is_about_the_target_is_about_that_of_the_task(name):
     """That of takeoff is about the height alone, that of meetup about the partner."""
     plain = make_env(name)

@@ -1,0 +1,29 @@
+"""A result that matters in few worlds is that of `vmap` where it matters, however many they are."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones.accelerate.where_needed import where_needed
+
+X = jnp.arange(1.0, 65.0)
+
+
+def double(x, shared):
+    return {"double": 2 * x, "sum": x + shared}
+
+
+@pytest.mark.parametrize("count", [0, 1, 8, 9, 64])
+def test_what_is_needed_equals_vmap_and_what_is_not_may_be_zero(count):
+    needed = jnp.arange(64) < count
+    found = jax.vmap(where_needed(double, one_in=8), (0, 0, None))(needed, X, 3.0)
+    expected = jax.vmap(double, (0, None))(X, 3.0)
+    for name in expected:
+        np.testing.assert_array_equal(found[name][needed], expected[name][needed])
+        assert count > 8 or not jnp.any(found[name][~needed])
+
+
+def test_many_worlds_that_are_given_the_same_key_are_refused():
+    with pytest.raises(ValueError, match=r"one and the same key.*split the key"):
+        jax.vmap(where_needed(jax.random.normal), (0, None))(X > 3, jax.random.key(0))

@@ -10,7 +10,13 @@ import pytest
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SECTIONS = {"tests", "plant", "envs", "swarm", "learning"}
-HELPERS = {"common.py", "figure.py", "published.py", *(path.name for path in BENCHMARKS.glob("rivals_*.py"))}
+HELPERS = {
+    "cameras_scenes.py",
+    "common.py",
+    "figure.py",
+    "published.py",
+    *(path.name for path in BENCHMARKS.glob("rivals_*.py")),
+}
 
 
 def quick(name: str, *options: str) -> dict:
@@ -49,6 +55,14 @@ def test_startup_loads_nothing_optional():
 def test_bullet_reports_four_rates():
     rates = quick("bullet.py")
     assert len(rates) == 4 and min(rates.values()) > 0
+
+
+@pytest.mark.slow
+def test_cameras_report_both_scenes_in_every_way():
+    rows = quick("cameras.py")["rows"]
+    assert {row["scene"] for row in rows} == {"A", "B"}
+    for row in rows:
+        assert len(row["rates"]) == 5 and min(row["rates"].values()) > 0
 
 
 @pytest.mark.slow

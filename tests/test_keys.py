@@ -135,7 +135,7 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
 
     monkeypatch.setattr("jaxdrones.envs.env.draw", draw)
     env = make(dataclasses.replace(plain, start=start), noise=noise, disturbance=disturbance)
-    reset, env.reset = env.reset, lambda key: (tell("reset", key), reset(key))[1]
+    begin, env.begin = env.begin, lambda key: (tell("reset", key), begin(key))[1]
     _, episode = AutoReset(env).reset(KEY)
     episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
     AutoReset(env).step(KEY, episode, jnp.zeros((1, 4)))
@@ -163,11 +163,13 @@ def test_noise_and_pushes_of_a_step_are_independent():
 class Toss:
     """A world that draws in every step; all that a learner needs."""
 
-    drones, action_size, observation_size, dt, steps, constant_fields = 1, 1, 2, 0.1, 2, ()
+    drones, action_size, observation_size, dt, steps, constant_fields, vision = 1, 1, 2, 0.1, 2, (), None
 
     def reset(self, key):
         x = jax.random.uniform(jax.random.fold_in(key, 0), (1, 2))
         return x, TossWorld(Place(x), jnp.zeros((), jnp.int32))
+
+    begin = reset
 
     def step(self, key, world, action):
         x = world.drones.pos + jax.random.normal(jax.random.fold_in(key, 0), (1, 2)) + action
@@ -183,6 +185,8 @@ class Place(flax.struct.PyTreeNode):
 class TossWorld(flax.struct.PyTreeNode):
     drones: Place
     step: jax.Array
+    images: None = None
+    poses: None = None
 
 
 @pytest.mark.float32

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import sys
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -109,7 +110,7 @@ class Surroundings:
 
 
 @contextlib.contextmanager
-def quiet():
+def quiet() -> Iterator[None]:
     """Keep what Bullet's C code prints off stdout, where a caller may be writing JSON, and off stderr."""
     sys.stdout.flush()
     sys.stderr.flush()

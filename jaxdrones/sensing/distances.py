@@ -39,8 +39,8 @@ def distance_of(kinds: list[Any], ground: bool, point: Point) -> Number:
     distances = [jnp.full((), jnp.inf, point.dtype)]
     if ground:
         distances.append(point[2])
-    distances += [jnp.min(_distances(kind, point)) for kind in kinds]
-    return jnp.min(jnp.stack(distances))
+    distances += [_distance_of_kind(kind, point) for kind in kinds]
+    return functools.reduce(lambda a, b: jnp.where(b < a, b, a), distances)
 
 
 def nearest_of(kinds: list[Any], ground: bool, point: Point) -> Surface:
@@ -81,9 +81,23 @@ def _distances(kind: Obstacle, point: Point) -> Array:
     return jax.vmap(one)(kind)
 
 
+def _distance_of_kind(kind: Any, point: Point) -> Number:
+    obstacle = _nearest_obstacle(kind, point)
+    return jnp.where(obstacle.active, obstacle.distance(obstacle.to_local(point)), jnp.inf)
+
+
 def _nearest_of_kind(kind: Any, point: Point) -> Surface:
+    return _surface(_nearest_obstacle(kind, point), point)
+
+
+def _nearest_obstacle(kind: Any, point: Point) -> Any:
+    """The obstacle of a kind that is nearest to a point.
+
+    It is chosen by its index. The gradient of a minimum looks for the number that equals it, and finds none where a
+    compiler rounds that number in two ways.
+    """
     index = jnp.argmin(jax.lax.stop_gradient(_distances(kind, point)))
-    return _surface(jax.tree.map(lambda x: x[index], kind), point)
+    return jax.tree.map(lambda x: x[index], kind)
 
 
 def _touched_of_kind(kind: Any, points: Float[Array, "m 3"], within: Number) -> Surface:

@@ -22,7 +22,8 @@ from jaxdrones.sensing.visibility import Ground, View, depth, visible
 from jaxdrones.state import State
 from jaxdrones.vector import along_z
 
-_HUB, _FRONT, _BACK = (0.15, 0.15, 0.2, 1.0), (0.8, 0.15, 0.1, 1.0), (0.35, 0.35, 0.4, 1.0)  # red, green, blue, opacity
+HUB, FRONT, BACK = (0.15, 0.15, 0.2, 1.0), (0.8, 0.15, 0.1, 1.0), (0.35, 0.35, 0.4, 1.0)
+"""Red, green, blue and opacity of a drone's hub and of the discs of its front and back rotors, on both backends."""
 ROTORS = 4
 
 
@@ -141,10 +142,10 @@ def drone_solids(params: Params, state: State) -> list[Obstacle]:
             pos=at(up),
             quat=state.quat,
             size=jnp.stack([2 * half, 2 * half, params.collision_height / 2]),
-            color=jnp.asarray(_HUB, half.dtype),
+            color=jnp.asarray(HUB, half.dtype),
         )
         front = params.rotor_pos[:, :1] > 1e-6  # m
-        colors = jnp.where(front, jnp.asarray(_FRONT)[None], jnp.asarray(_BACK)[None]).astype(half.dtype)
+        colors = jnp.where(front, jnp.asarray(FRONT)[None], jnp.asarray(BACK)[None]).astype(half.dtype)
         disc = Cylinder(
             pos=jax.vmap(at)(params.rotor_pos + above[None]),
             quat=jnp.broadcast_to(state.quat, (ROTORS, 4)),

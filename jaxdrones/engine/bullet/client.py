@@ -12,13 +12,13 @@ import numpy as np
 from jaxdrones.checks import check_choice
 from jaxdrones.engine.bullet.surroundings import Surroundings, quiet
 from jaxdrones.sensing import Scene
+from jaxdrones.sensing.images import BACK, FRONT, HUB
 
 BALLS, CYLINDER = "balls", "cylinder"
 TINY, EGL = "tiny", "egl"
 BACKGROUND, GROUND = -1, 0  # of a segmentation; drone i is 1 + i, obstacle i is 1 + number of drones + i
 _BALLS = 8
 _DISC = 0.1  # thickness of the disc as a share of the height of the collision cylinder
-_HUB, _FRONT, _BACK = [0.15, 0.15, 0.2, 1], [0.8, 0.15, 0.1, 1], [0.35, 0.35, 0.4, 1]  # colors
 _SHAPE, _INERTIAL = slice(0, 16), slice(16, 20)  # columns of a team
 _DRONE_FRICTION = 0.5  # as in gym-pybullet-drones (2021)
 
@@ -209,7 +209,7 @@ class Client:
             radii=[0.0] + [prop_radius] * 4,
             lengths=[0.0] + [height / 5] * 4,
             visualFramePositions=[[0, 0, offset], *(rotor_pos + np.array([0, 0, offset + height / 3])).tolist()],
-            rgbaColors=[_HUB, *(_FRONT if x > 1e-6 else _BACK for x in rotor_pos[:, 0])],
+            rgbaColors=[HUB, *(FRONT if x > 1e-6 else BACK for x in rotor_pos[:, 0])],
             physicsClientId=self.id,
         )
 

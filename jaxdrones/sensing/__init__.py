@@ -6,7 +6,7 @@ from jaxdrones.sensing.collisions import Collisions, collisions
 from jaxdrones.sensing.depth_noise import DepthNoise
 from jaxdrones.sensing.distances import Surface
 from jaxdrones.sensing.files import Mesh, Urdf
-from jaxdrones.sensing.images import Images, render
+from jaxdrones.sensing.images import Images, photograph, render
 from jaxdrones.sensing.range_finders import (
     downward_range,
     lidar,
@@ -46,6 +46,7 @@ __all__ = [
     "multi_ranger",
     "obstacles_2021",
     "optical_flow",
+    "photograph",
     "range_finder",
     "ray",
     "render",

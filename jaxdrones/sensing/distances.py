@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.geometry import Number, Point, length
 from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import along_z
 
 
-class Surface(flax.struct.PyTreeNode):
+class Surface(PyTreeNode):
     """The point of a surface that is nearest to some point."""
 
     distance: Array
@@ -114,20 +115,40 @@ def _nearest_within(kind: Any, points: Float[Array, "m 3"], within: Number) -> I
     center = jnp.mean(points, axis=0)
     reach = within + jnp.max(jax.vmap(length)(points - center[None]))
 
-    def is_left(carry: tuple) -> Bool[Array, ""]:
-        return jnp.min(carry[0]) < reach
-
-    def look(carry: tuple) -> tuple:
-        away, nearest, index = carry
-        i = jnp.argmin(away)
-        obstacle = jax.tree.map(lambda x: x[i], kind)
+    def look(found: tuple[Array, Array], obstacle: Any, i: Int[Array, ""]) -> tuple[Array, Array]:
+        nearest, index = found
         distances = jax.vmap(lambda point: obstacle.distance(obstacle.to_local(point)))(points)
         nearer = distances < nearest
-        return away.at[i].set(jnp.inf), jnp.where(nearer, distances, nearest), jnp.where(nearer, i, index)
+        return jnp.where(nearer, distances, nearest), jnp.where(nearer, i, index)
 
     nearest = jnp.full(len(points), jnp.inf, points.dtype)
     index = jnp.zeros(len(points), jnp.argmin(nearest).dtype)
-    return jax.lax.while_loop(is_left, look, (_distances(kind, center), nearest, index))[2]
+    return fold_near(kind, center, reach, look, (nearest, index))[1]
+
+
+def fold_near(kind: Any, point: Point, reach: Number, look: Callable[[Any, Any, Any], Any], found: Any) -> Any:
+    """Look at those obstacles of a kind whose surface is nearer to a point than `reach`, the nearest first.
+
+    Of many obstacles these are mostly none. There is no gradient.
+
+    Args:
+        kind: obstacles with a leading axis.
+        point: m, world.
+        reach: m.
+        look: `look(found, obstacle, index)` returns what is found with one obstacle more.
+        found: what is found without any.
+    """
+    kind, point, reach = jax.lax.stop_gradient((kind, point, reach))
+
+    def is_left(carry: tuple) -> Bool[Array, ""]:
+        return jnp.min(carry[0]) < reach
+
+    def look_at_next(carry: tuple) -> tuple:
+        away, found = carry
+        i = jnp.argmin(away)
+        return away.at[i].set(jnp.inf), look(found, jax.tree.map(lambda x: x[i], kind), i)
+
+    return jax.lax.while_loop(is_left, look_at_next, (_distances(kind, point), found))[1]
 
 
 def _surface(obstacle: Any, point: Point) -> Surface:

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.camera import Camera, check_camera
 from jaxdrones.sensing.scene import Scene, check_scene
 from jaxdrones.sensing.shading import shade
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle
 from jaxdrones.sensing.visibility import Ground, View, depth, visible
 from jaxdrones.state import State
-from jaxdrones.vector import along_z
+from jaxdrones.vector import along_z, cross, unit
 
 HUB, FRONT, BACK = (0.15, 0.15, 0.2, 1.0), (0.8, 0.15, 0.1, 1.0), (0.35, 0.35, 0.4, 1.0)
 """Red, green, blue and opacity of a drone's hub and of the discs of its front and back rotors, on both backends."""
 ROTORS = 4
+_PHOTO_NEAR = 0.02  # m, smallest depth that is visible in a photograph
+_NARROW = 32  # pixels: images that are narrower are computed as one long row, as short rows leave vectors half empty
 
 
-class Images(flax.struct.PyTreeNode):
+class Images(PyTreeNode):
     """What the cameras of n drones see; arrays have leading axes over drones, rows and columns."""
 
     rgb: Array
@@ -59,79 +62,177 @@ def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT
     Raises:
         ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
     """
+    _check(scene, params, state, camera)
+    return _render(scene, params, state, camera)
+
+
+def _check(scene: Scene, params: Params, state: State, camera: Camera) -> None:
     check_camera(camera)
     check_scene(scene)
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
     check_shape("params.mass", params.mass, (len(state.pos),), f"state.pos has {len(state.pos)} drones")
-    return _render(scene, params, state, camera)
 
 
-@functools.partial(jax.jit, static_argnames="camera", inline=True)
-def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Images:
+def photograph(
+    scene: Scene,
+    params: Params,
+    state: State,
+    eye: ArrayLike,
+    target: ArrayLike,
+    camera: Camera = _DEFAULT,
+) -> UInt8[Array, "h w 3"]:
+    """A picture of a team from a place in the world, upright: the colors of `view`, which explains the arguments."""
+    return view(scene, params, state, eye, target, camera).rgb[..., :3]
+
+
+def view(
+    scene: Scene,
+    params: Params,
+    state: State,
+    eye: ArrayLike,
+    target: ArrayLike,
+    camera: Camera = _DEFAULT,
+    colors: Float[ArrayLike, "n 3"] | None = None,
+) -> Images:
+    """Images of a team from a place in the world, upright, without an axis over drones.
+
+    Args:
+        scene: of one world.
+        params: of a team of n drones.
+        state: of the team; only its poses matter.
+        eye: (3,) where the camera is, m, world; not right above or below the target.
+        target: (3,) what is in the middle of the picture, m, world.
+        camera: of which the lens matters, not where it is mounted.
+        colors: red, green and blue of every drone, 0 to 1; their rotors are lighter behind. All drones look alike when
+            left out.
+
+    Raises:
+        ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
+    """
+    _check(scene, params, state, camera)
+    eye, target = (jnp.asarray(x, state.pos.dtype) for x in (eye, target))
+    check_shape("eye", eye, (3,), "m, world")
+    check_shape("target", target, (3,), "m, world")
+    forward = unit(target - eye)
+    left = unit(cross(along_z(jnp.ones_like(eye[0])), forward))
+    rays = _view(camera, eye, jnp.stack([forward, left, cross(forward, left)]), _PHOTO_NEAR)
+    around = _surroundings(scene, params, state, with_drones=True, tints=colors)
+    return _picture(camera, rays, around, around.active)
+
+
+class _Surroundings(NamedTuple):
+    """All that cameras may see."""
+
+    kinds: list[Any]
+    """Solids, kind by kind."""
+    active: Array
+    """(k,) bool, which of all solids are there."""
+    owner: Array
+    """(k,) the drone that a solid is a part of; -1 for others."""
+    colors: Array
+    """(k, 3) red, green, blue."""
+    labels: Array
+    """(k + 1,) int32: of the segmentation; the last one is nothing."""
+    ground: int | None
+    """Index of the ground, if there is one."""
+
+
+def _surroundings(
+    scene: Scene, params: Params, state: State, with_drones: bool, tints: ArrayLike | None = None
+) -> _Surroundings:
     n, dtype = len(state.pos), state.pos.dtype
     drones = jnp.arange(n)
     obstacles = scene.shapes(dtype)
     there = [kind.active for kind in obstacles]
     kinds: list[Any] = [kind.replace(active=None) for kind in obstacles]  # what is left has derivatives
     count = sum(len(kind.pos) for kind in kinds)
-    numbers = [1 + n + jnp.arange(count)]  # labels of the segmentation, solid by solid
-    own = [jnp.full(count, -1)]  # the drone of which a solid is a part
-    if n > 1 or camera.sees_self:
-        kinds += drone_solids(params, state)
+    labels = [1 + n + jnp.arange(count)]
+    owner = [jnp.full(count, -1)]
+    if with_drones:
+        kinds += drone_solids(params, state, tints)
         parts = [drones, jnp.repeat(drones, ROTORS)]
         there += [jnp.ones(len(part), bool) for part in parts]
-        numbers += [1 + part for part in parts]
-        own += parts
+        labels += [1 + part for part in parts]
+        owner += parts
     colors = [kind.color[:, :3] for kind in kinds]
     ground = None
     if scene.ground:
-        ground = sum(map(len, numbers))
+        ground = sum(map(len, labels))
         kinds.append(Ground.of(dtype))
         there.append(jnp.ones(1, bool))
-        numbers.append(jnp.zeros(1, int))
-        own.append(jnp.full(1, -1))
+        labels.append(jnp.zeros(1, int))
+        owner.append(jnp.full(1, -1))
         colors.append(jnp.zeros((1, 3), dtype))
-    labels = jnp.concatenate([*numbers, jnp.full(1, -1)]).astype(jnp.int32)
-    of_drone = jnp.concatenate(own)
-    active = jnp.concatenate([*there, jnp.ones(0, bool)])
-    lengths = np.cumsum([len(kind.pos) for kind in kinds])[:-1]
+    return _Surroundings(
+        kinds=kinds,
+        active=jnp.concatenate([*there, jnp.ones(0, bool)]),
+        owner=jnp.concatenate(owner),
+        colors=jnp.concatenate([*colors, jnp.zeros((0, 3), dtype)]),
+        labels=jnp.concatenate([*labels, jnp.full(1, -1)]).astype(jnp.int32),
+        ground=ground,
+    )
+
+
+def _picture(camera: Camera, view: View, around: _Surroundings, seen: Bool[Array, " k"]) -> Images:
+    """The images of one camera, which sees some of the solids; without an axis over drones."""
+    seen_kinds = jnp.split(seen, np.cumsum([len(kind.pos) for kind in around.kinds])[:-1])
+    depths = depth(view, around.kinds, seen_kinds)
+    still, solids, still_depths = jax.lax.stop_gradient((view, around.kinds, depths))
+    index = visible(still, solids, seen_kinds)
+    rgb = shade(still, solids, around.colors, around.ground, index, still_depths)
+    width, height = camera.resolution
+    shape = height, width
+    return Images(
+        rgb=rgb.reshape(*shape, 4), depth=depths.reshape(shape), segmentation=around.labels[index].reshape(shape)
+    )
+
+
+@functools.partial(jax.jit, static_argnames="camera", inline=True)
+def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Images:
+    around = _surroundings(scene, params, state, with_drones=len(state.pos) > 1 or camera.sees_self)
 
     def one(params: Params, state: State, drone: Array) -> Images:
-        view = view_of(camera, params, state)
-        seen = active if camera.sees_self else active & (of_drone != drone)
-        seen_kinds = jnp.split(seen, lengths)
-        depths = depth(view, kinds, seen_kinds)
-        still, solids, still_depths = jax.lax.stop_gradient((view, kinds, depths))
-        index = visible(still, solids, seen_kinds)
-        rgb = shade(still, solids, jnp.concatenate(colors), ground, index, still_depths)
-        return Images(rgb=rgb, depth=depths, segmentation=labels[index])
+        seen = around.active if camera.sees_self else around.active & (around.owner != drone)
+        return _picture(camera, view_of(camera, params, state), around, seen)
 
-    return jax.vmap(one)(params, state, drones)
+    return jax.vmap(one)(params, state, jnp.arange(len(state.pos)))
 
 
 def view_of(camera: Camera, params: Params, state: State) -> View:
     """The rays of the camera on one drone."""
-    eye, axes = camera.pose(params, state)
+    return _view(camera, *camera.pose(params, state), camera.near_of(params))
 
+
+def _view(camera: Camera, eye: Float[Array, "3"], axes: Float[Array, "3 3"], near: float | Array) -> View:
     def centers(axis: int) -> Array:
         pixels = camera.resolution[axis]
         middle = pixels / 2 + camera.principal_point[axis]
         return jnp.asarray(camera.slopes[axis] * (middle - np.arange(pixels) - 0.5) / (pixels / 2), eye.dtype)
 
+    u, v = centers(0)[None], centers(1)[:, None]
+    if u.size < _NARROW:
+        u, v = (x.reshape(1, -1) for x in jnp.broadcast_arrays(u, v))
     return View(
         eye=eye,
         axes=axes,
-        u=centers(0)[None],
-        v=centers(1)[:, None],
-        near=camera.near_of(params),
+        u=u,
+        v=v,
+        pixel=jnp.asarray(2 * camera.slopes[1] / camera.resolution[1], eye.dtype),
+        near=jnp.asarray(near, eye.dtype),
         far=jnp.asarray(camera.far, eye.dtype),
     )
 
 
-def drone_solids(params: Params, state: State) -> list[Obstacle]:
-    """The visible parts of n drones: n hubs, and 4 n rotor discs, red in front."""
+def drone_solids(params: Params, state: State, tints: ArrayLike | None = None) -> list[Obstacle]:
+    """The visible parts of n drones: n hubs, and 4 n rotor discs, red in front, or in the tints (n, 3) of drones."""
+    if tints is None:
+        paints = jnp.asarray([HUB, FRONT, BACK])[:, None]
+    else:
+        paint = jnp.append(jnp.asarray(tints), jnp.ones((len(state.pos), 1)), axis=1)
+        paints = jnp.stack([paint, paint, (paint + 1) / 2])
+    paints = jnp.broadcast_to(paints, (3, len(state.pos), 4))
 
-    def parts(params: Params, state: State) -> tuple[Box, Cylinder]:
+    def parts(params: Params, state: State, hub_color: Array, front_color: Array, back_color: Array):
         def at(place: Array) -> Array:
             return state.pos + rotation.rotate(state.quat, place)
 
@@ -142,10 +243,10 @@ def drone_solids(params: Params, state: State) -> list[Obstacle]:
             pos=at(up),
             quat=state.quat,
             size=jnp.stack([2 * half, 2 * half, params.collision_height / 2]),
-            color=jnp.asarray(HUB, half.dtype),
+            color=hub_color.astype(half.dtype),
         )
         front = params.rotor_pos[:, :1] > 1e-6  # m
-        colors = jnp.where(front, jnp.asarray(FRONT)[None], jnp.asarray(BACK)[None]).astype(half.dtype)
+        colors = jnp.where(front, front_color[None], back_color[None]).astype(half.dtype)
         disc = Cylinder(
             pos=jax.vmap(at)(params.rotor_pos + above[None]),
             quat=jnp.broadcast_to(state.quat, (ROTORS, 4)),
@@ -155,5 +256,5 @@ def drone_solids(params: Params, state: State) -> list[Obstacle]:
         )
         return hub, disc
 
-    hubs, discs = jax.vmap(parts)(params, state)
+    hubs, discs = jax.vmap(parts)(params, state, *paints)
     return [hubs, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), discs)]

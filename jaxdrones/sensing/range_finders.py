@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_number, check_positive, check_quaternion, check_whole, shown
 from jaxdrones.params import Params
+from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.geometry import Number
 from jaxdrones.sensing.rays import ray
 from jaxdrones.sensing.scene import Scene
@@ -84,7 +85,11 @@ def range_finder(
             ranges = jnp.where(jax.random.bernoulli(dropout_key, dropout, ranges.shape), max_range, ranges)
         return memory, ranges
 
-    return Sensor(name, measure, bound=max_range, rate=rate)
+    frame = "body" if tuple(orientation) == _IDENTITY else "device"
+    entries = tuple(
+        Quantity(f"range along ({x:.2f}, {y:.2f}, {z:.2f})", "m", frame) for x, y, z in directions.reshape(-1, 3)
+    )
+    return Sensor(name, measure, bound=max_range, rate=rate, entries=entries)
 
 
 def multi_ranger(max_range: float = 4.0, rate: float | None = 10.0, noise: float = 0.0, dropout: float = 0.0) -> Sensor:
@@ -202,4 +207,5 @@ def optical_flow(rate: float | None = 100.0, noise: float = 0.0, dropout: float 
             flow = jnp.where(jax.random.bernoulli(dropout_key, dropout), 0, flow)
         return memory, flow
 
-    return Sensor("optical_flow", measure, bound=math.inf, rate=rate)
+    entries = tuple(Quantity(f"flow {way}", "rad/s", "body") for way in ("backward", "to the right"))
+    return Sensor("optical_flow", measure, bound=math.inf, rate=rate, entries=entries)

@@ -24,6 +24,7 @@ from jaxdrones.checks import (
     is_known,
     shown,
 )
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of, touched_of
 from jaxdrones.sensing.files import File, Mesh, Urdf
 from jaxdrones.sensing.geometry import Number
@@ -35,7 +36,7 @@ KINDS: dict[str, type[Obstacle]] = {"boxes": Box, "spheres": Sphere, "cylinders"
 """The fields of a scene that hold arrays."""
 
 
-class Scene(flax.struct.PyTreeNode, kw_only=True):
+class Scene(PyTreeNode, kw_only=True):
     """Obstacles, and a ground plane at z = 0 unless left out. `Scene.of` builds one.
 
     Obstacles are numbered kind by kind: boxes, spheres, cylinders, capsules, meshes, URDF files; within a kind as they

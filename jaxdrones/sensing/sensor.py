@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxdrones.checks import check_arguments, check_callable, check_number, check_positive, check_sequence, shown
 from jaxdrones.params import Params
+from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
 
@@ -52,6 +53,8 @@ class Sensor:
     """The largest absolute value that a reading can have, in units of the reading."""
     rate: float | None = None
     """Measurements per second, between which the reading stays; one every control step when left out."""
+    entries: tuple[Quantity, ...] = ()
+    """What each number of the flattened reading stands for, for `jaxdrones.explain`; none where it does not say."""
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float, Int, UInt8
 from jaxdrones.sensing.visibility import Solids, View, normals
 from jaxdrones.vector import safe_sqrt
 
-_SUN = (0.48, 0.36, 0.8)  # unit vector towards the sun, world
+SUN = (-0.48, 0.36, 0.8)
+"""Unit vector towards the sun, world: behind and to the left of a drone that flies along x."""
 _AMBIENT = 0.45  # share of the light that comes from everywhere
 _TILE = 0.5  # m
 _DARK, _BRIGHT = (0.42, 0.46, 0.42), (0.62, 0.66, 0.60)  # red, green, blue of the tiles
@@ -34,7 +35,7 @@ def shade(
         depth: of its surface, m.
     """
     normal = -normals(view, solids, index, depth)  # towards the camera
-    facing = jnp.tensordot(view.axes @ jnp.asarray(_SUN, depth.dtype), normal, 1)
+    facing = jnp.tensordot(view.axes @ jnp.asarray(SUN, depth.dtype), normal, 1)
     cosine = facing / safe_sqrt(jnp.sum(normal**2, axis=0))
     light = _AMBIENT + (1 - _AMBIENT) * jnp.maximum(cosine, 0)
     rays = [x + view.u * y + view.v * z for x, y, z in view.axes.T]  # world
@@ -59,8 +60,7 @@ def _mixed(a: tuple[float, float, float], b: tuple[float, float, float], share: 
 
 def _footprint(view: View, depth: Float[Array, "h w"], rays: list[Array]) -> Float[Array, "h w"]:
     """Edge of the patch of ground that a pixel covers, m; larger where it is seen at a grazing angle."""
-    pixel = jnp.abs(view.v[0, 0] - view.v[-1, 0]) / max(len(view.v) - 1, 1)
-    return depth * pixel * _length(rays) / jnp.maximum(jnp.abs(rays[2]), 1e-3)
+    return depth * view.pixel * _length(rays) / jnp.maximum(jnp.abs(rays[2]), 1e-3)
 
 
 def _checkered(x: Array, y: Array, footprint: Array) -> Array:

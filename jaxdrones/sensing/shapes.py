@@ -10,13 +10,13 @@ import abc
 import functools
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jaxdrones import rotation
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.geometry import (
     Components,
     Interval,
@@ -38,7 +38,7 @@ LENGTHS = {"pos": 3, "quat": 4, "color": 4, "size": 3}
 """Numbers in a field of a single obstacle; a field that is not named here is one number."""
 
 
-class Obstacle(flax.struct.PyTreeNode, abc.ABC, kw_only=True):
+class Obstacle(PyTreeNode, abc.ABC, kw_only=True):
     """A solid that does not move, or many of one kind, with leading axes on the arrays."""
 
     pos: Any

@@ -12,39 +12,66 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxdrones import rotation
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.geometry import Components, Interval, nonzero
 from jaxdrones.sensing.shapes import Obstacle
-from jaxdrones.vector import components
+from jaxdrones.vector import components, safe_sqrt
 
 _UNROLL = 2  # solids per turn of the loop; all of them in one turn would make compilers keep each one's image
+_SLACK = 1e-4  # share by which the view is taken wider and solids larger than they are, for rounding
+_SIDES = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [-1, 0, 0], [1, 0, 0]])
+"""Normals out of what a camera sees, of the left, right, upper, lower, near and far side, in camera axes; the former
+four are those of a view without width and height, of which each unit adds `_WIDTH` or `_HEIGHT`."""
+_WIDTH = np.array([[-1, 0, 0]] * 2 + [[0, 0, 0]] * 4)
+_HEIGHT = np.array([[0, 0, 0]] * 2 + [[-1, 0, 0]] * 2 + [[0, 0, 0]] * 2)
+_NEAR, _FAR = np.array([0, 0, 0, 0, 1, 0]), np.array([0, 0, 0, 0, 0, 1])
 
 
-class View(flax.struct.PyTreeNode):
-    """Where a camera is and the rays of its pixels; the ray of a pixel is axes^T (1, u, v)."""
+@jax.custom_batching.custom_vmap
+def largest_of_worlds(count: Array) -> Array:
+    """The same number; of many worlds, by `jax.vmap`, the largest of theirs.
+
+    A loop of so many turns is one loop for all worlds.
+    """
+    return count
+
+
+@largest_of_worlds.def_vmap
+def _largest(worlds: int, batched: list[bool], count: Array) -> tuple[Array, bool]:
+    return (jnp.max(count) if batched[0] else count), False
+
+
+class View(PyTreeNode):
+    """Where a camera is and the rays of its pixels; the ray of a pixel is axes^T (1, u, v).
+
+    The pixels are those of an image of h rows and w columns, or of such an image as one row.
+    """
 
     eye: Array
     """(3,) m, world."""
     axes: Array
     """(3, 3) forward, left and up, one in each row, world."""
     u: Array
-    """(1, w) how far the ray of a column goes to the left for every meter forward."""
+    """(1, w) how far the ray of a pixel goes to the left for every meter forward."""
     v: Array
-    """(h, 1) how far the ray of a row goes up for every meter forward."""
+    """(h, 1) or, of one row, (1, w) how far the ray of a pixel goes up for every meter forward."""
+    pixel: Array
+    """() height of a pixel at 1 m, m."""
     near: Array
     """() smallest visible depth, m."""
     far: Array
     """() largest visible depth, m."""
 
 
-class Placed(flax.struct.PyTreeNode):
+class Placed(PyTreeNode):
     """Solids of one kind as a camera sees them; arrays have a leading axis over solids."""
 
     solid: Obstacle
@@ -59,6 +86,19 @@ class Placed(flax.struct.PyTreeNode):
         direction = [x + u * y + v * z for x, y, z in zip(forward, left, up, strict=True)]
         return self.solid.interval(components(self.origin), direction)
 
+    def in_view(self, view: View) -> Array:
+        """Whether a part of the solid may be where the camera looks: not all of it beyond one side of the view."""
+        width, height = ((1 + _SLACK) * jnp.max(jnp.abs(x)) for x in (view.u, view.v))
+        # Constants become arrays of JAX first: 0.10 mixes up those of NumPy where a process changes jax_enable_x64.
+        constants = (jnp.asarray(x, view.far.dtype) for x in (_SIDES, _WIDTH, _HEIGHT, _NEAR, _FAR))
+        sides, wider, higher, near, far = constants
+        normals = sides + width * wider + height * higher
+        length = safe_sqrt(jnp.sum(normals**2, axis=1))
+        outward = (normals / length[:, None]) @ self.axes
+        reach = (1 + _SLACK) * (jax.vmap(self.solid.extent)(outward) + self.solid.rounding)
+        offset = view.far * far - view.near * near
+        return jnp.all(outward @ -self.origin - reach <= offset / length)
+
     def normal(self, u: Array, v: Array, depth: Array) -> tuple[Array, Array]:
         """Components to the left and up, over that along the ray, of the normals where the rays of pixels hit."""
         axes = [components(axis) for axis in components(self.axes)]
@@ -69,7 +109,7 @@ class Placed(flax.struct.PyTreeNode):
         return left / along, up / along
 
 
-class Ground(flax.struct.PyTreeNode):
+class Ground(PyTreeNode):
     """All points below z = 0, as a solid."""
 
     pos: Array
@@ -82,9 +122,15 @@ class Ground(flax.struct.PyTreeNode):
         """The ground as the only solid of its kind: with a leading axis of length 1."""
         return cls(jnp.zeros((1, 3), dtype), jnp.array([[0, 0, 0, 1]], dtype))
 
+    rounding = 0.0
+
     def to_local(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
         """The same point."""
         return point
+
+    def extent(self, direction: Float[Array, "3"]) -> Float[Array, ""]:
+        """Infinity."""
+        return jnp.full((), jnp.inf, direction.dtype)
 
     def normals(self, point: Components) -> Components:
         """The vertical."""
@@ -177,12 +223,26 @@ def _first_hit(view: View, solid: Placed, active: Array) -> Array:
 
 
 def _pass(function: Callable[..., Array], start: Array, view: View, solids: Solids, active: list[Array]) -> Array:
-    """Apply `(image, solid, whether it is active, its index) -> image` for one solid after the other."""
+    """Apply `(image, solid, whether it is active, its index) -> image` for the solids in view, one after the other."""
     image, count = start, 0
     for kind, mask in zip(solids, active, strict=True):
-        xs = (_placed(view, kind), mask, count + jnp.arange(len(mask)))
-        image, _ = jax.lax.scan(lambda image, x: (function(image, *x), None), image, xs, unroll=_UNROLL)
-        count += len(mask)
+        placed, size = _placed(view, kind), len(mask)
+        there = mask & jax.vmap(lambda solid: solid.in_view(view))(placed)
+        rank = jnp.sum(there[None] & np.tri(size, k=-1, dtype=bool), axis=1)  # among those that are there
+        place = jnp.arange(size + -size % _UNROLL)
+        found = (rank[None] == place[:, None]) & there[None]
+        index = jnp.max(jnp.where(found, np.arange(size)[None], 0), axis=1)
+        xs = jax.tree.map(lambda x, index=index: x[index], placed), jnp.any(found, axis=1), count + index
+        xs = jax.tree.map(lambda x: x.reshape(-1, _UNROLL, *x.shape[1:]), xs)
+
+        def turn(i: Array, image: Array, xs=xs) -> Array:
+            some = jax.tree.map(lambda x: x[i], xs)
+            for k in range(_UNROLL):
+                image = function(image, *jax.tree.map(lambda x, k=k: x[k], some))
+            return image
+
+        image = jax.lax.fori_loop(0, -(-largest_of_worlds(jnp.sum(there)) // _UNROLL), turn, image)
+        count += size
     return image
 
 

@@ -19,6 +19,7 @@ def mixed_forests(key):
     return scene, jax.vmap(scene.replace(ground=False).distance)(ENDS)
 
 
+@pytest.mark.slow
 def test_one_program_draws_a_forest_for_each_of_4096_worlds_and_no_two_are_the_same():
     scenes, distances = mixed_forests(KEYS)
     trees = scenes.cylinders
@@ -29,6 +30,7 @@ def test_one_program_draws_a_forest_for_each_of_4096_worlds_and_no_two_are_the_s
     assert all(jnp.array_equal(a, b) for a, b in zip(jax.tree.leaves(scenes), jax.tree.leaves(again), strict=True))
 
 
+@pytest.mark.slow
 def test_trees_are_as_many_as_the_density_says_but_for_those_left_out():
     trees = mixed_forests(KEYS)[0].cylinders
     count = jnp.sum(trees.active, axis=1)
@@ -46,6 +48,7 @@ def test_trunks_stand_on_the_ground_and_tilt_as_far_as_they_may():
     np.testing.assert_allclose(trunks.pos[..., 2], 2.5 * cosine, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_room_is_closed_and_its_pillars_keep_away_from_places():
     places = jnp.array([[1.0, 1.0, 1.0], [-1.0, 0.5, 1.0]])
     outside = jnp.array([(3.1, 0, 1.5), (-3.1, 0, 1.5), (0, 2.1, 1.5), (0, -2.1, 1.5), (0, 0, 3.1), (3.1, 2.1, 1.5)])

@@ -148,6 +148,7 @@ def bullets_distances(client) -> dict[str, list[float]]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_flags_agree_with_bullets_distances_whatever_the_margin():
     """To 1 mm, Bullet's own margin; projections that have not converged make it 6 mm for 1 in 200."""

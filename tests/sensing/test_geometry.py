@@ -97,6 +97,7 @@ def test_the_nearest_point_of_the_surface_is_a_distance_down_the_gradient(solid)
 surfaces = jax.jit(jax.vmap(Scene.nearest, (None, 0)))
 
 
+@pytest.mark.slow
 def test_the_nearest_surface_is_a_distance_away_along_its_normal():
     """Inside and outside; the normal is the gradient of the distance."""
     points = np.concatenate([POINTS, RNG.uniform([-2, -2, -0.2], [2, 2, 3], (300, 3))])
@@ -107,6 +108,7 @@ def test_the_nearest_surface_is_a_distance_away_along_its_normal():
     np.testing.assert_allclose(found.point + far[:, None] * found.normal, points, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_normals_have_unit_length_and_finite_gradients_also_at_centers_and_on_faces_and_edges():
     places = np.array([(0, 0, 2), (1, 0, 2), (1, 2, 2), (1, 2, 2.5), (0.5, 0, 2), (0, 0, 3), (0.5, 0, 3), (0, 0, 3.5)])
     scenes = [Scene.of(solid, ground=False) for solid in SOLIDS]
@@ -129,6 +131,7 @@ def test_normals_have_unit_length_and_finite_gradients_also_at_centers_and_on_fa
     assert nothing.distance == jnp.inf and np.all(nothing.normal == 0) and np.all(nothing.point == jnp.inf)
 
 
+@pytest.mark.slow
 def test_an_obstacle_that_is_not_active_is_not_there():
     """For distances, surfaces and rays; the others are as they were."""
     mask = np.arange(14) % 3 > 0
@@ -144,6 +147,7 @@ def test_an_obstacle_that_is_not_active_is_not_there():
     assert none.distance((0, 0, 2)) == none.nearest((0, 0, 2)).distance == ray(none, (5, 0, 2), (-1, 0, 0)) == jnp.inf
 
 
+@pytest.mark.slow
 def test_a_ray_ends_at_the_first_surface():
     """Where it ends the distance is zero, and positive before, so that nothing is jumped over."""
     outside, far = distances(SCENE, POINTS) > 0, np.asarray(rays(SCENE, POINTS, DIRECTIONS))
@@ -190,6 +194,7 @@ def total_ray(scene, origins, directions):
     return jnp.sum(jnp.where(jnp.isfinite(far), far, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["boxes", "spheres", "cylinders", "capsules"])
 @pytest.mark.parametrize("name", ["distance", "ray"])
 def test_gradients_are_central_differences(name, kind):

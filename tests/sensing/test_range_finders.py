@@ -101,6 +101,7 @@ def test_optical_flow_is_the_velocity_over_the_height_and_the_turn():
     np.testing.assert_allclose(reading(flow, at(vel=(1, 1, 1)), Scene(ground=False)), 0)
 
 
+@pytest.mark.slow
 def test_noise_has_its_deviation_and_dropouts_read_the_limit():
     scanner = lidar(beams=4000, noise=0.05, dropout=0.1)
     middle = reading(scanner, at(), Scene.of(Sphere(pos=HERE + 0.0, radius=0.01), ground=False))
@@ -113,6 +114,7 @@ def test_noise_has_its_deviation_and_dropouts_read_the_limit():
     np.testing.assert_allclose([ranges[~lost].mean(), ranges[~lost].std()], [8.5, 0.05], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_range_is_that_of_the_way_to_the_wall():
     @jax.jit
     @jax.grad

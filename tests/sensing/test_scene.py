@@ -96,6 +96,7 @@ def test_a_scene_is_drawn_in_a_compiled_program_and_mapped():
     np.testing.assert_allclose(jax.jit(jax.vmap(Scene.distance, (0, None)))(scenes, jnp.zeros(3)), nearest, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_worlds_with_different_numbers_of_obstacles_are_stacked_and_mapped():
     ball, box = BALL.replace(pos=(0.0, 0.0, 1.0)), Box(pos=(3, 0, 1), size=(1, 1, 1))
     scenes = [Scene.of(ground=False), Scene.of(ball, ground=False), Scene.of(box, ball, BALL, ground=False)]

@@ -26,11 +26,12 @@ from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.rollout import rollout
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
-from jaxdrones.envs import make
+from jaxdrones.envs import explain, make
 from jaxdrones.params import Params, repeat, stack
 from jaxdrones.sensing import Camera, Scene, Sensor, render
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
+from jaxdrones.visualization.viewer import show
 from jaxdrones.wrench import Wrench
 
 __all__ = [
@@ -52,6 +53,7 @@ __all__ = [
     "drag_world_axes",
     "drone_contact",
     "euler",
+    "explain",
     "external_force",
     "ground_contact",
     "ground_effect",
@@ -71,6 +73,7 @@ __all__ = [
     "rollout",
     "rotation",
     "semi_implicit_euler",
+    "show",
     "stack",
     "vector",
 ]

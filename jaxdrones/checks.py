@@ -25,6 +25,11 @@ _MAY_BE_INFINITE = ("max_rpm",)
 _NO_ARRAYS = (list, tuple, dict, str, type(None))
 _UNKNOWN = (jax.core.Tracer, jax.ShapeDtypeStruct)
 
+
+class UnexpectedKeyword(TypeError):
+    """The `TypeError` of Python for a keyword argument that a function does not have, and what to give in its place."""
+
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -138,6 +143,14 @@ def check_choice(kind: str, name: str, known: Iterable[str]) -> None:
         raise ValueError(f"unknown {kind} {name!r}{hint(name, known)} (known: {', '.join(known)})")
 
 
+def check_keyword(function: str, keyword: str, known: Iterable[str]) -> None:
+    """Raise unless `keyword` is one of the `known` keyword arguments of a function; name the closest one."""
+    known = sorted(known)
+    if keyword not in known:
+        said = f"{function}() got an unexpected keyword argument {keyword!r}"
+        raise UnexpectedKeyword(f"{said}{hint(keyword, known)} (known: {', '.join(known)})")
+
+
 def hint(name: str, known: Iterable[str]) -> str:
     """What may have been meant by an unknown name; nothing, if none is close."""
     close = difflib.get_close_matches(str(name), known, n=1)
@@ -189,7 +202,7 @@ def check_keywords(function: Function) -> Function:
     @functools.wraps(called)
     def checked(*args: Any, **kwargs: Any) -> Any:
         for keyword in kwargs:
-            check_choice(f"argument of {name}", keyword, known)
+            check_keyword(name, keyword, known)
         return called(*args, **kwargs)
 
     if isinstance(function, type):

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones.checks import check_params, check_shape, check_whole, shown
+from jaxdrones.pytree import PyTreeNode
 
 
-class Params(flax.struct.PyTreeNode):
+class Params(PyTreeNode):
     """Constants of one drone, or of a team with a leading drone axis on every array.
 
     The surroundings (wind, air density, an external force) are here too and may be set anew at every step.

@@ -10,9 +10,10 @@ from jaxtyping import Array
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_finite, check_shape
+from jaxdrones.pytree import PyTreeNode
 
 
-class State(flax.struct.PyTreeNode):
+class State(PyTreeNode):
     """Rigid body and rotors of one drone, or of a team with a leading drone axis on every array."""
 
     pos: Array

@@ -74,6 +74,15 @@ def load_params(vehicle: str | os.PathLike) -> Params:
     return _params(_Urdf(path))
 
 
+def parse_params(name: str, text: str) -> Params:
+    """The constants of one drone from the text of a URDF; `name` is that of the file, for errors.
+
+    Raises:
+        ValueError: the text lacks something or holds nonsense; says what.
+    """
+    return _params(_Urdf(Path(name), text.encode()))
+
+
 def _params(urdf: "_Urdf") -> Params:
     inertial, cylinder = f"{_BASE}/inertial", f"{_BASE}/collision/geometry/cylinder"
     properties = {name: urdf.property(name) for name in _PROPERTIES}
@@ -176,10 +185,10 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
 class _Urdf:
     """A parsed file whose look-ups raise errors that name the file, the tag and the attribute."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, content: bytes | None = None):
         self.name = path.name
         try:
-            self._root = ET.fromstring(path.read_bytes())
+            self._root = ET.fromstring(path.read_bytes() if content is None else content)
         except OSError as error:
             raise ValueError(f"{path}: cannot be read ({error.strerror}); give the path of a URDF file") from None
         except ET.ParseError as error:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.vector import components, dot
 
 
-class Wrench(flax.struct.PyTreeNode):
+class Wrench(PyTreeNode):
     """Force and torque on one drone at its centre of mass, in its body frame."""
 
     force: Array

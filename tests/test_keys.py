@@ -105,6 +105,7 @@ def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
     keys.check(least=2 * 8 + 3)
 
 
+@pytest.mark.slow
 def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatch):
     """Fake noise, pushes, randomizations, starts and resets record the key they saw, even if all get the same one."""
     seen = {}
@@ -145,6 +146,7 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
     assert len(set().union(*seen.values())) == sum(counts.values())
 
 
+@pytest.mark.slow
 def test_noise_and_pushes_of_a_step_are_independent():
     """Both drawn in the same way; of one key they would be the same numbers."""
 

@@ -258,6 +258,7 @@ def hovered(params):
     return fly(jnp.stack([rpm, 0 * rpm]))
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.parametrize("vehicle", ["cf2x", "racer"])
 def test_whatever_is_changed_in_a_urdf_it_flies_or_one_line_says_why_not(tmp_path, vehicle):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,10 +14,11 @@ from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 
 
-class Gains(flax.struct.PyTreeNode):
+class Gains(PyTreeNode):
     """Gains per unit of mass and inertia, so that one set serves every vehicle."""
 
     pos: Array

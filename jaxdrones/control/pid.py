@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 from jaxdrones.vector import safe_sqrt
@@ -36,7 +36,7 @@ _MAX_POS_INTEGRAL = (2.0, 2.0, 0.15)  # m s
 _MAX_RPY_INTEGRAL = (1.0, 1.0, 1500.0)  # rad s
 
 
-class Gains(flax.struct.PyTreeNode):
+class Gains(PyTreeNode):
     """Gains of the two loops."""
 
     pos_p: Array
@@ -53,7 +53,7 @@ class Gains(flax.struct.PyTreeNode):
     """(3,) PWM s/rad."""
 
 
-class Memory(flax.struct.PyTreeNode):
+class Memory(PyTreeNode):
     """What the controller of one drone keeps between calls; zero before the first."""
 
     pos_integral: Array

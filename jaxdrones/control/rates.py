@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -14,11 +13,12 @@ from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.vector import sin_cos
 
 
-class Gains(flax.struct.PyTreeNode):
+class Gains(PyTreeNode):
     """Gains of the outer loop (those of gym-pybullet-drones for its racer) and of the inner one."""
 
     pos: Array

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
+from jaxdrones.pytree import PyTreeNode
 
-class Setpoint(flax.struct.PyTreeNode):
+
+class Setpoint(PyTreeNode):
     """Target of one drone, or of a team with a leading drone axis on every array."""
 
     pos: Array

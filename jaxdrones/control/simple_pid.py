@@ -5,7 +5,6 @@ Angles follow from a desired force; rotor speeds follow from thrust and torque b
 
 from __future__ import annotations
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,13 +14,14 @@ from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.vector import atan2, safe_sqrt
 
 _MAX_TILT = jnp.pi / 6  # rad, of the roll and pitch targets
 
 
-class Gains(flax.struct.PyTreeNode):
+class Gains(PyTreeNode):
     """Gains of the two loops."""
 
     pos_p: Array
@@ -38,7 +38,7 @@ class Gains(flax.struct.PyTreeNode):
     """(3,) N m s/rad."""
 
 
-class Memory(flax.struct.PyTreeNode):
+class Memory(PyTreeNode):
     """What the controller of one drone keeps between calls; zero before the first."""
 
     pos_integral: Array

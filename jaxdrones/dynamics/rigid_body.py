@@ -19,3 +19,14 @@ def newton_euler(params: Params, state: State, wrench: Wrench) -> tuple[Float[Ar
 def quat_rate(state: State) -> Float[Array, "4"]:
     """Rate of the attitude, q' = q (omega, 0) / 2."""
     return rotation.multiply(state.quat, jnp.append(state.omega / 2, 0.0))
+
+
+def specific_force(params: Params, state: State, acc: Float[Array, "3"]) -> Float[Array, "3"]:
+    """What an accelerometer in the center of mass measures: R^T (a - g), m/s^2, body.
+
+    Args:
+        params: of the drone.
+        state: of the drone.
+        acc: (3,) acceleration of the center of mass, m/s^2, world: `vel` of the state's derivative.
+    """
+    return rotation.rotate_inverse(state.quat, acc + vector.along_z(params.gravity))

@@ -129,9 +129,11 @@ class ExplicitStep(Step):
     """A compiled step that looks at what it is given, where that has values: once at constants and at a start."""
 
     def __init__(self, physics: Physics, integrator: Integrator, dt: float, substeps: int, scene: Scene):
-        self.physics, self._scene = physics, scene
+        self.physics, self._scene, self.dt, self.substeps = physics, scene, dt, substeps
+        self.integrator = describe([integrator])
+        self.period = dt * substeps  # s, of a call
         self._check_scene(scene)
-        self._text = f"{describe([integrator])} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
+        self._text = f"{self.integrator} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
         derivative = _derivative_of(physics)
 
         def substep(params: Params, state: State, command: jax.Array, scene: Scene) -> State:

@@ -18,6 +18,12 @@ class Step(abc.ABC):
     """`step(params, state, rpm) -> state` of a team, and the derivative that it integrates."""
 
     physics: Physics
+    integrator: str
+    """Name of what integrates."""
+    dt: float
+    """Physics step, s."""
+    substeps: int
+    """Physics steps per call."""
 
     @abc.abstractmethod
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:

@@ -57,12 +57,14 @@ BODIES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BODIES)
 def test_a_loop_gives_what_vmap_gives(name):
     fly = looped(BODIES[name])
     assert_same(vmap_apart(fly)(start, pushes), jax.vmap(fly, -1, -1)(start, pushes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in BODIES if name != "while"])
 def test_a_gradient_through_a_loop_gives_what_vmap_gives(name):
     gradient = jax.grad(lambda x, pushes: jnp.sum(looped(BODIES[name])(x, pushes)[0] ** 2), (0, 1))
@@ -88,6 +90,7 @@ def test_what_is_the_same_in_all_worlds_is_given_to_each():
     assert_same(vmap_apart(told)(start), jax.vmap(told, -1, -1)(start))
 
 
+@pytest.mark.slow
 def test_in_loops_of_a_flight_every_array_is_a_number_of_each_world():
     team = jd.repeat(jd.load_params("cf2x"), 1)
     step = jd.make_step((jd.drag, jd.ground_contact), rotors=jd.lagging_rotors)

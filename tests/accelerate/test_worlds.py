@@ -31,12 +31,14 @@ def miss(start, commands):
     return jnp.sum(fly(start, commands).pos ** 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [2, 5, 100], ids=["with a rest", "all", "more than there are"])
 def test_a_flight_in_chunks_is_the_flight_at_once(chunk):
     flown = in_chunks(fly, chunk)(starts, commands)
     assert_close(flown, jax.jit(jax.vmap(fly))(starts, commands), 1e-11)  # RPM of 10,000 to rounding
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [2, 5])
 def test_commands_may_be_given_step_by_step(chunk):
     flown = in_chunks(fly, chunk, in_axes=(0, 1))(starts, commands.swapaxes(0, 1))
@@ -302,6 +304,7 @@ def test_a_chunk_is_a_whole_number(chunk):
         in_chunks(fly, chunk)(starts, commands)
 
 
+@pytest.mark.slow
 def test_two_devices_fly_what_one_flies():
     script = """
 import jax

@@ -177,6 +177,7 @@ def test_rotor_speeds_are_continuous_where_a_wrench_stops_being_feasible(limit):
     assert jnp.max(jnp.abs(jnp.diff(squares, axis=0))) < 5 * 4 * (share[1] - share[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", VEHICLES)
 def test_gradients_of_the_allocation_agree_with_differences_in_and_out_of_reach(vehicle):
     params = jaxdrones.load_params(vehicle)
@@ -201,6 +202,7 @@ def test_gradients_of_the_allocation_are_zero_at_rest(thrust):
         np.testing.assert_array_equal(gradient, 0)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_allocation_are_finite_without_a_limit_and_with_equal_demands():
     params = jaxdrones.load_params("cf2x")
     slopes = jax.jit(jax.jacrev(rpm_from_wrench, argnums=(0, 1, 2)))
@@ -209,6 +211,7 @@ def test_gradients_of_the_allocation_are_finite_without_a_limit_and_with_equal_d
             assert_finite(slopes(params.replace(max_rpm=jnp.asarray(limit, float)), thrust, torque))
 
 
+@pytest.mark.slow
 def test_compiled_and_batched_allocations_equal_single_ones():
     params = jaxdrones.load_params("racer")
     thrust, torque = wild_wrenches(params, seed=4)

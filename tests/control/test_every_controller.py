@@ -48,6 +48,7 @@ each_pair = pytest.mark.parametrize("loop", EVERY_PAIR, ids=repr)
 each_controller = pytest.mark.parametrize("loop", EVERY_CONTROLLER, ids=repr)
 
 
+@pytest.mark.slow
 @each_pair
 def test_a_drone_where_it_should_be_gets_hover_speed(loop):
     team = team_of(*N * [loop.vehicle])
@@ -72,6 +73,7 @@ def test_rotor_speeds_are_within_what_the_motors_can_in_any_state(loop):
         assert jnp.all((rpm >= 0) & (rpm <= team.max_rpm[:, None]))
 
 
+@pytest.mark.slow
 @each_controller
 def test_a_compiled_batch_equals_a_loop_over_drones(loop):
     team, memory, state, target = in_flight(loop)
@@ -93,6 +95,7 @@ def test_turning_the_world_about_the_vertical_changes_no_rotor_speed(loop):
     np.testing.assert_allclose(again, rpm, rtol=0, atol=1e-5)  # RPM; as above
 
 
+@pytest.mark.slow
 @each_controller
 def test_values_and_gradients_are_finite_where_directions_are_lost(loop):
     """No force, no velocity asked for, a target straight below; upside down, nose up or down: poles of roll and yaw."""
@@ -113,6 +116,7 @@ def test_values_and_gradients_are_finite_where_directions_are_lost(loop):
     assert_finite(gradients)
 
 
+@pytest.mark.slow
 @each_controller
 def test_gradients_of_a_call_agree_with_differences(loop):
     """In gains, parameters, state and target at once, along random directions."""
@@ -145,6 +149,7 @@ def test_without_weight_and_error_there_is_nothing_to_do(loop):
     np.testing.assert_allclose(rpm, 9440.3 if loop in (*PID, *VELOCITY) else 0, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", [PID[0], GEOMETRIC[0]], ids=repr)
 def test_gradients_of_a_closed_loop_in_the_gains_agree_with_differences(loop):
     """A quarter of a second from 1 cm off, per relative change of each gain."""
@@ -169,6 +174,7 @@ def test_gradients_of_a_closed_loop_in_the_gains_agree_with_differences(loop):
     np.testing.assert_allclose(cost(np.zeros(n))[1], differences, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @each_pair
 def test_float32_agrees_with_float64(loop):
@@ -199,6 +205,7 @@ def test_arrays_of_a_team_are_refused(loop):
                 loop.control(loop.gains(), *(one_drone | {name: of_a_team}).values(), dt=DT)
 
 
+@pytest.mark.slow
 @each_controller
 @pytest.mark.parametrize("dt", [0, -0.01, np.nan, np.inf])
 def test_the_time_between_calls_is_positive(loop, dt):

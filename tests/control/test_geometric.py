@@ -15,6 +15,7 @@ HZ = 240
 SECONDS = 8  # the same for all flights, so that they are compiled once
 
 
+@pytest.mark.slow
 def test_every_vehicle_reaches_a_place_30_cm_off_in_the_same_way():
     """Gains per mass and inertia: the closed loops are equal as long as no rotor is at its limit."""
     error = reaches(geometric, VEHICLES, (0.3, -0.3, 1.3), seconds=SECONDS, hz=HZ)
@@ -121,7 +122,9 @@ def test_a_mirrored_drone_in_a_mirrored_world_turns_its_rotors_as_fast(vehicle):
 def test_no_rotor_is_asked_for_more_than_its_highest_speed():
     team = team_of(*VEHICLES)
     rpm = call(team, hovering(team), at(len(VEHICLES), (0, 0, 1000)))
-    np.testing.assert_array_equal(rpm, np.broadcast_to(team.max_rpm[:, None], (len(VEHICLES), 4)))
+    highest = np.broadcast_to(team.max_rpm[:, None], (len(VEHICLES), 4))
+    assert (rpm <= highest).all()
+    np.testing.assert_allclose(rpm, highest, rtol=1e-15)  # a compiler may round the last digit
 
 
 def vee(skew):

@@ -60,6 +60,7 @@ def test_the_collective_is_thrust_per_mass():
         np.testing.assert_allclose(jnp.sum(params.kf * rpm**2), 12 * params.mass, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_every_vehicle_reaches_a_place_30_cm_off():
     error = reaches(rates, VEHICLES, (0.3, -0.3, 1.3), seconds=6, hz=240)
     assert np.all(error[3 * 240 - 1] < 0.01)

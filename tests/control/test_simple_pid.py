@@ -24,6 +24,7 @@ def test_recorded_sequences_agree_in_speeds_and_memory(name):
     np.testing.assert_allclose(memory.rpy_error, case.arrays["last_rpy_e"], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_at_60_hz_a_hummingbird_reaches_a_place_30_cm_off():
     """A slow loop: sqrt(P / m) is 0.45 rad/s in x and y."""
     error = fly_30_cm(60, seconds=20)
@@ -31,6 +32,7 @@ def test_at_60_hz_a_hummingbird_reaches_a_place_30_cm_off():
     assert error[-1] < 0.005  # measured: 0.4 mm
 
 
+@pytest.mark.slow
 def test_at_48_hz_a_hummingbird_with_its_own_inertia_is_not_stable():
     """Flights of gym-pybullet-drones at 48 Hz have the fivefold inertia that its engine made of the collision shape.
 

@@ -179,6 +179,7 @@ def test_friction_slows_a_sliding_drone_by_mu_g_and_stops_it_where_bullet_does(v
     np.testing.assert_allclose(states.pos[0, -1, 0, 0], state.pos[0, 0], rtol=0.03)
 
 
+@pytest.mark.slow
 def test_thrust_lifts_a_drone_off_the_ground_as_if_it_were_not_there():
     """With 1.05 times the weight; the ground gives back no more than the work of the 1.5 mm."""
     params = jaxdrones.repeat(CRAZYFLIE, 1)
@@ -224,6 +225,7 @@ def both_ways(couples, vehicle, other):
     return jax.vmap(of_world)(couples)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("vehicle", "other"), [("cf2x", "cf2x"), ("cf2x", "racer")])
 def test_what_a_drone_does_to_another_it_feels_itself(vehicle, other):
     """Force and torque, so that momentum and angular momentum of the two are kept."""
@@ -343,6 +345,7 @@ def test_contact_of_many_drones_is_the_contact_of_each():
         np.testing.assert_allclose(wrench.torque, together.torque[i], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.float32), jnp.float64])
 def test_values_and_gradients_are_finite_wherever_a_drone_is(dtype):
     """Also at rest, just touching, in the same place as the other, metres under the ground."""

@@ -105,6 +105,7 @@ def test_semi_implicit_euler_gains_the_documented_energy(vehicle, gain):
     assert momentum <= 0.07
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS, ids=name_of)
 def test_without_forces_a_drone_flies_straight_on(integrator):
     team = jaxdrones.repeat(params.replace(gravity=jnp.zeros(())), 3)

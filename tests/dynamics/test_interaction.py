@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import jaxdrones
 from jaxdrones import State, downwash, downwash_2021, rotation
 
-README = (Path(__file__).parents[2] / "README.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "physics.md").read_text()
 params = jaxdrones.load_params("cf2x")
 LENGTH = float(np.sqrt(2) * params.arm)  # m, distance of neighbouring motors
 INDUCED = float(np.sqrt(params.weight / (8 * params.air_density * np.pi * params.prop_radius**2)))  # m/s, in hover
@@ -90,12 +90,12 @@ def test_the_jet_is_that_of_bauersfeld_below_the_rotors():
         np.testing.assert_allclose(wrench.force, [0, 0, -np.sum(loss)], rtol=1e-12)
 
 
-def test_half_a_metre_below_another_a_crazyflie_loses_the_share_of_its_weight_that_the_readme_says():
+def test_half_a_metre_below_another_a_crazyflie_loses_the_share_of_its_weight_that_the_page_says():
     upper = hovering((0, 0, 0.5))
     for pair, percent in (downwash, 14.3), (downwash_2021, 115):
         push = -100 * float(on_lower(upper, pair=pair).force[2] / params.weight)
         np.testing.assert_allclose(push, percent, rtol=0, atol=0.5 if percent == 115 else 0.05)
-        assert f"{percent} %" in README
+        assert f"{percent} %" in PAGE
 
 
 def test_at_the_half_width_the_jet_blows_half_as_fast():

@@ -149,6 +149,7 @@ def test_the_gradient_through_a_collision_is_that_of_central_differences():
     assert abs(slope[1]) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_gradients_are_finite_wherever_a_drone_is():
     with jax.enable_x64(True):

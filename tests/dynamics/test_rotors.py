@@ -129,6 +129,7 @@ def test_a_change_of_rotor_speed_turns_the_body_as_angular_momentum_demands(roto
     np.testing.assert_allclose(total_angular_momentum(team, after), 0, atol=1e-9 * 4 * 3e-8 * 2e3)
 
 
+@pytest.mark.slow
 def test_a_tumbling_drone_with_spinning_rotors_keeps_its_angular_momentum():
     """Gyroscopic torque of rotors about a body that turns about all axes; rk4 is exact to 1e-9 here."""
     team, step = spinning(lagging_rotors, jaxdrones.rk4, rotor_spin=[1.0, -1, 1, 1])

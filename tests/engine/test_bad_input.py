@@ -204,6 +204,7 @@ def test_constants_with_which_nothing_flies_are_named_where_they_can_be_looked_a
     jax.eval_shape(lambda params: flown_once(params, start), broken)
 
 
+@pytest.mark.slow
 def test_rotors_without_a_limit_are_no_mistake():
     unlimited = team.replace(max_rpm=jnp.full(2, jnp.inf))
     assert np.isfinite(step(unlimited, start, rpm).pos).all()

@@ -15,6 +15,7 @@ COMMAND = tape(TEAM, 1)[0]
 PHYSICS = dict(effects=(jd.drag,), pairs=(jd.downwash,), rotors=jd.lagging_rotors)
 
 
+@pytest.mark.slow
 def test_a_step_of_euler_is_the_derivative_times_its_length():
     rate = jax.jit(jd.make_derivative(**PHYSICS))(TEAM, START, COMMAND)
     after = make_step(**PHYSICS, integrator=jd.euler, dt=1e-3)(TEAM, START, COMMAND)
@@ -23,11 +24,13 @@ def test_a_step_of_euler_is_the_derivative_times_its_length():
     assert_close(after, moved.replace(quat=moved.quat / length), 1e-15, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_rate_of_a_step_is_its_derivative():
     step = make_step(**PHYSICS)
     assert_close(step.rate(TEAM, START, COMMAND), jd.make_derivative(**PHYSICS)(TEAM, START, COMMAND), 1e-9, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_its_jacobian_about_hover_is_that_of_the_linearized_quadrotor():
     """A tilt about x accelerates along -g y, one about y along g x; thrust lifts by 2 k_F rpm / m."""
     team = jd.repeat(jd.load_params("cf2x"), 1)

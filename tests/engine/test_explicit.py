@@ -63,6 +63,7 @@ def test_a_step_turns_the_rotors_as_commanded():
         np.testing.assert_array_equal(single_step(team, State.at_rest([[0.0, 0, 1]]), rpm).rpm, rpm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [single_step, full_step], ids=["instant", "lagging"])
 def test_a_command_out_of_range_flies_as_its_nearest_limit(step):
     """Of each vehicle, for a quarter of a second: twice the highest speed as that speed, -1,000 RPM as none."""
@@ -74,6 +75,7 @@ def test_a_command_out_of_range_flies_as_its_nearest_limit(step):
     assert jnp.all((flights[0].rpm >= 0) & (flights[0].rpm <= top[None]))
 
 
+@pytest.mark.slow
 def test_a_start_with_rotor_speeds_out_of_range_flies_as_one_on_the_limit():
     """So a rotor that is said to turn backwards does not lift."""
     start = flying(mixed)
@@ -109,6 +111,7 @@ def test_only_with_contact_is_there_a_floor():
         assert (end.pos[0, 2] > 0) == floor
 
 
+@pytest.mark.slow
 def test_whole_numbers_and_lists_are_rotor_speeds_too():
     team, start = jaxdrones.repeat(cf2x, 1), State.at_rest([[0.0, 0, 1]])
     expected = single_step(team, start, jnp.full((1, 4), 15000.0))
@@ -116,6 +119,7 @@ def test_whole_numbers_and_lists_are_rotor_speeds_too():
     assert_close(single_step(team, start, [[15000] * 4]), expected, atol=0)
 
 
+@pytest.mark.slow
 def test_substeps_equal_repeated_steps():
     team = jaxdrones.repeat(cf2x, 2)
     once = make_step((drag, ground_effect), (downwash,), lagging_rotors, substeps=5)
@@ -152,6 +156,7 @@ def test_vmap_over_vehicles_equals_a_loop():
         assert_close(jax.tree.map(lambda x, i=i: x[i], together), single_step(team, start, command), 1e-11, 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
 def test_a_mixed_team_flies_as_each_vehicle_alone(rotors):
     step = make_step((drag, ground_effect), rotors=rotors)
@@ -162,6 +167,7 @@ def test_a_mixed_team_flies_as_each_vehicle_alone(rotors):
         assert_close(jax.tree.map(lambda x, i=i: x[:, i : i + 1], together), alone, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pair", "x"), [(downwash, 1000.0), (downwash_2021, 10.1)], ids=["jet", "paper"])
 def test_a_distant_drone_changes_nothing(pair, x):
     """The paper's downwash ends at 10 m; the jet fades with the fourth power of the distance, to 1e-14 at 1 km."""
@@ -234,6 +240,7 @@ def test_effects_and_pairs_add_up():
     np.testing.assert_allclose(both - none, (first - none) + (second - none), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_list_of_effects_can_be_used_up_or_changed_afterwards():
     effects = [drag]
     step = jaxdrones.make_step(effects)
@@ -245,6 +252,7 @@ def test_a_list_of_effects_can_be_used_up_or_changed_afterwards():
     assert_close(jaxdrones.make_step(effect for effect in (drag,))(team, start, command), with_drag, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.parametrize("rotors", [instant_rotors, lagging_rotors], ids=name_of)
 @pytest.mark.parametrize("integrator", INTEGRATORS, ids=name_of)
@@ -255,6 +263,7 @@ def test_float32_stays_float32(integrator, rotors):
     assert {leaf.dtype for leaf in jax.tree.leaves(end)} == {jnp.dtype("float32")}
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @pytest.mark.parametrize(
     "step",

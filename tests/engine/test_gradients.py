@@ -119,6 +119,7 @@ def test_forward_and_reverse_mode_agree():
     np.testing.assert_allclose(inner(compiled_slope(FLIGHTS["default"])(*arguments), tangent), forward, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_gradients_of_many_worlds_are_those_of_each():
     step = jaxdrones.make_step()
     params, start, commands = flight()
@@ -158,6 +159,7 @@ def assert_finite_everywhere(step):
             assert np.all(gradients[1].vel != 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effects", [SMOOTH, PAPER], ids=["smooth", "paper"])
 def test_gradients_are_finite_where_formulas_tend_to_break(effects):
     assert_finite_everywhere(jaxdrones.make_step(*effects))

@@ -38,6 +38,7 @@ def total_wrench(pairs, neighbors=None):
     return lambda params, state: physics.wrench(params, state, Scene())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [1.0, 8.0, 100.0], ids=["more than fit: all pairs", "some near", "hardly any"])
 def test_nobody_within_reach_is_left_out_and_nobody_else_counts(spread):
     params, state = team(spread)

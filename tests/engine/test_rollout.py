@@ -37,6 +37,7 @@ def test_a_rollout_is_a_loop_of_steps():
     assert_close(final, jax.tree.map(lambda x: x[-1], trajectory), 1e-15, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_two_halves_equal_one_rollout():
     """The count starts anew, so the second half reads its commands from where the first one stopped."""
 

@@ -58,6 +58,7 @@ def _times(x, signs):
     return x * jnp.broadcast_to(signs, x.shape)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("effects", "pairs"), [SMOOTH, PAPER], ids=["smooth", "paper"])
 def test_turning_the_world_about_the_vertical_turns_the_flight(effects, pairs):
     """The paper's drag has equal coefficients along x and y, so it does not notice either."""

@@ -62,6 +62,7 @@ def test_rk4_measures_order_four_in_the_states_of_models(name):
     assert 3.7 < np.log2(coarse / fine) < 4.4
 
 
+@pytest.mark.slow
 @each_integrator
 @each_extension
 def test_a_model_is_mapped_and_flies_in_one_kernel_as_alone(name, integrator):
@@ -77,6 +78,7 @@ def test_a_model_is_mapped_and_flies_in_one_kernel_as_alone(name, integrator):
     assert_close(jd.over_worlds(fly)(vels), alone, 1e-9)
 
 
+@pytest.mark.slow
 @each_integrator
 @each_extension
 def test_gradients_through_a_model_are_those_of_differences(name, integrator):
@@ -94,6 +96,7 @@ def test_gradients_through_a_model_are_those_of_differences(name, integrator):
     np.testing.assert_allclose(jax.jit(jax.grad(sum_of_aux))(1.0), measured, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 @each_extension
 def test_bullet_integrates_a_model_beside_the_rotors(name):
@@ -110,6 +113,7 @@ def test_bullet_integrates_a_model_beside_the_rotors(name):
     assert misses[1] < 0.7 * misses[0]
 
 
+@pytest.mark.slow
 def test_a_battery_loses_the_energy_that_the_rotors_take():
     """At constant rotor speed: the charge falls by the current, and with it the highest speed."""
     step = jd.make_step(**EXTENSIONS["battery"], integrator=jd.rk4)
@@ -122,6 +126,7 @@ def test_a_battery_loses_the_energy_that_the_rotors_take():
     assert fastest[1] < 0.9 * fastest[0] < float(TEAM.max_rpm[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("integrator", "order"), [(jd.rk4, 4), (jd.semi_implicit_euler, 1)])
 def test_a_payload_on_cables_without_damping_keeps_energy_to_the_order_of_the_integrator(integrator, order):
     load = replace(LOAD, damping=0.0)
@@ -180,6 +185,7 @@ def test_a_state_without_that_of_a_model_says_where_to_start():
         step(TEAM, jd.State.at_rest(np.zeros((2, 3))), jnp.zeros((2, 4)))
 
 
+@pytest.mark.slow
 def test_a_rollout_starts_models_anew_and_keeps_those_that_are_there():
     step = make_step("battery", jd.rk4)
     start = jd.State.at_rest([[0.0, 0, 1], [0.6, 0, 1]])

@@ -37,6 +37,7 @@ def measured(sensor, params, state, rate=None, scene=None):
 # An inertial measurement unit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_at_rest_on_the_ground_an_imu_feels_the_ground_push_up(backend):
     still, state = jnp.zeros((2, 4)), jd.State.at_rest([[0, 0, 0.0125], [1, 0, 0.0125]], yaw=[0.0, 2.0])
@@ -80,6 +81,7 @@ def to_world(trajectory, v):
     return jax.vmap(jax.vmap(jd.rotation.rotate))(trajectory.quat, v)
 
 
+@pytest.mark.slow
 def test_what_an_imu_feels_integrates_to_the_velocity_that_was_flown():
     """Strapdown navigation: the velocity changes by the integral of R f + g."""
     trajectory, rate = flight(401)
@@ -102,6 +104,7 @@ def test_away_from_the_center_an_imu_feels_the_second_derivative_of_its_own_plac
         assert np.abs(felt(*inside, offset) - felt(*inside, (0, 0, 0))).max() > 1
 
 
+@pytest.mark.slow
 def test_the_variance_of_a_bias_grows_linearly_and_that_of_white_noise_does_not():
     n, dt = 4000, 0.01
     params, state = jd.repeat(jd.load_params("cf2x"), n), jd.State.at_rest(jnp.zeros((n, 3)))
@@ -170,6 +173,7 @@ def test_ranges_in_drawn_scenes_are_mapped_and_fly_in_one_kernel():
     assert_close(jd.over_worlds(range_in)(keys, pos), (found, height), 1e-12)
 
 
+@pytest.mark.slow
 def test_a_range_is_differentiable_in_the_flight_and_in_the_scene():
     state = jd.State.at_rest([[0, 0, 1.5], [1, 0, 1.5]])
 
@@ -186,6 +190,7 @@ def test_a_range_is_differentiable_in_the_flight_and_in_the_scene():
 # Sensors and scenes in an environment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_environments_carry_users_sensors(backend):
     sensors = (Imu(acc_walk=0.1).sensor, FINDER)

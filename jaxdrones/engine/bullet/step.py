@@ -35,8 +35,10 @@ _FILM_CAMERA = Camera(resolution=(640, 480), near=0.1)
 class BulletStep(HostStep):
     """`step(params, state, rpm) -> state`. The same input gives the same output whatever was called between."""
 
+    integrator = "Bullet"
+
     def __init__(self, client: Client, physics: Physics, substeps: int, dt: float, scene: Scene):
-        self.client, self.physics, self._substeps, self._dt, self._scene = client, physics, substeps, dt, scene
+        self.client, self.physics, self.substeps, self.dt, self._scene = client, physics, substeps, dt, scene
         client.set_scene(scene)
         self._loads = arrays.make_loads(physics, dt)
         # What the last call with values was checked for and what was made of it, kept as long as it stays the same:
@@ -46,7 +48,7 @@ class BulletStep(HostStep):
         self._flat_params: jax.Array  # one array is handed over faster than twenty
 
     def __repr__(self) -> str:
-        return f"<step: Bullet at {1 / (self._dt * self._substeps):.4g} Hz x {self._substeps}>"
+        return f"<step: Bullet at {1 / (self.dt * self.substeps):.4g} Hz x {self.substeps}>"
 
     def __enter__(self) -> BulletStep:
         return self
@@ -67,14 +69,14 @@ class BulletStep(HostStep):
             ValueError: a wrong shape, a closed client, or a number that is not finite (where it can be looked at).
             TypeError: a gradient is asked for.
         """
-        return self._flown(params, state, rpm, scene, self._substeps)
+        return self._flown(params, state, rpm, scene, self.substeps)
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """The mean time derivative over the physics step that follows `state`, contacts included."""
         after = self._flown(params, state, rpm, scene, substeps=1)
         same_sign = jnp.sign(jnp.sum(after.quat * state.quat, axis=-1, keepdims=True))
         after = after.replace(quat=same_sign * after.quat)
-        return jax.tree.map(lambda b, a: (b - a) / self._dt, after, state)
+        return jax.tree.map(lambda b, a: (b - a) / self.dt, after, state)
 
     def _flown(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None, substeps: int) -> State:
         scene = self._given(scene)
@@ -103,7 +105,7 @@ class BulletStep(HostStep):
         loads = self._loads_on(team, Layout.of(state.aux), acting)
         team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
         self.client.advance(team, loads)
-        return contacts_of_last_step(self.client, self._dt)
+        return contacts_of_last_step(self.client, self.dt)
 
     def camera(
         self, params: Params, state: State, camera: Camera = _DEFAULT_CAMERA, scene: Scene | None = None

@@ -135,6 +135,7 @@ def test_what_is_no_camera_is_refused():
         step.camera(CRAZYFLIE, at([0, 0, 1.0]), 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "camera",
     [

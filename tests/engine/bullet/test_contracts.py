@@ -25,6 +25,7 @@ def step():
         yield step
 
 
+@pytest.mark.slow
 def test_the_rate_is_that_of_the_explicit_backend_in_free_flight(step):
     """To the order of a physics step."""
     state = HIGH.replace(vel=jnp.ones((2, 3)), omega=jnp.full((2, 3), 0.1), rpm=0.9 * HOVER)
@@ -63,6 +64,7 @@ def test_a_checkpointed_rollout_is_refused_as_there_is_no_backward_pass(step):
         jd.rollout(step, lambda params, memory, state, k: (memory, HOVER), TEAM, HIGH, None, 4, checkpoint=2)
 
 
+@pytest.mark.slow
 def test_an_effect_sees_the_scene_of_either_backend():
     """A fan at every box: it lifts a drone that is within a meter of one."""
     scene = Scene.of(Box(pos=(0.0, 0.0, 1.5), size=(0.1, 0.1, 0.1)))

@@ -74,6 +74,7 @@ def test_single_steps_agree(name):
                 np.testing.assert_allclose(actual, a[f"{key}_out"][k], rtol=0, atol=1e-9, err_msg=f"{key} of row {k}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     golden_data.names(

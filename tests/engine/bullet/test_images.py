@@ -58,6 +58,7 @@ def agreement(seeds) -> dict[str, float]:
     return {"same": np.mean(same), "near": np.mean(near), "flat": np.mean(flat)}
 
 
+@pytest.mark.slow
 def test_labels_and_depths_are_those_of_bullet():
     share = agreement(range(6))
     assert share["same"] > 0.98 and share["flat"] > 0.999 and share["near"] > 0.97, share

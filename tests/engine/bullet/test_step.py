@@ -76,6 +76,7 @@ def test_substeps_are_repeated_steps(team, step):
     assert_same_motion(once, state, 1e-12)
 
 
+@pytest.mark.slow
 def test_compiled_and_not_and_mapped_are_the_same(team, step):
     starts = [apart(flying(team, seed)) for seed in range(3)]
     (command,) = np.asarray(tape(team, 1))
@@ -88,6 +89,7 @@ def test_compiled_and_not_and_mapped_are_the_same(team, step):
     assert_close(mapped, jax.tree.map(lambda *leaves: np.stack(leaves), *loop), 1e-12)
 
 
+@pytest.mark.slow
 def test_worlds_may_differ_in_their_vehicles(step):
     masses = jnp.array([0.025, 0.03])
     start = State.at_rest(jnp.array([[0.0, 0.0, 1.0]]))
@@ -134,6 +136,7 @@ def test_a_rollout_is_the_same_in_a_loop_and_compiled(step):
     assert_close(final.pos, trajectory.pos[-1], 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["cf2x", "cf2p", "hb", "racer"])
 def test_a_drone_at_rest_stays_at_rest(step, vehicle):
     params = jaxdrones.load_params(vehicle)

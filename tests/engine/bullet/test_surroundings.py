@@ -39,6 +39,7 @@ def resting(step, scene, height, steps=30):
     return state
 
 
+@pytest.mark.slow
 def test_a_scene_of_a_call_is_that_of_a_step_built_with_it_whatever_was_called_between():
     scenes = [Scene.of(corner(0.5)), Scene.of(corner(1.0), ground=False), forest(jax.random.key(1))]
     expected = []
@@ -52,6 +53,7 @@ def test_a_scene_of_a_call_is_that_of_a_step_built_with_it_whatever_was_called_b
     assert not np.array_equal(expected[0].pos, expected[1].pos)
 
 
+@pytest.mark.slow
 def test_many_worlds_have_a_scene_each_in_a_compiled_program():
     keys = jax.random.split(jax.random.key(2), 3)
     start = State.at_rest(jnp.array([[0.05, 0.05, 0.45], [2.0, 2.0, 2.0]]))

@@ -1,0 +1,42 @@
+"""The base of the classes that JAX takes apart into arrays."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import flax.struct
+from jax import export
+
+
+class PyTreeNode(flax.struct.PyTreeNode):
+    """A flax `PyTreeNode` that may be an argument or a result of a function that `jax.export` saves.
+
+    Fields that are no arrays are saved as JSON. A class that replaces another of its name, as when a cell of a notebook
+    runs again, is not registered: `jax.export` knows the first one.
+    """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        name = f"{cls.__module__}.{cls.__qualname__}"
+        if name not in _registered:
+            _registered.add(name)
+            export.register_pytree_node_serialization(
+                cls, serialized_name=name, serialize_auxdata=_to_bytes, deserialize_auxdata=_from_bytes
+            )
+
+
+_registered: set[str] = set()
+
+
+def _to_bytes(auxdata: Any) -> bytes:
+    return json.dumps(auxdata).encode()
+
+
+def _from_bytes(data: bytes | bytearray) -> Any:
+    return _as_tuple(json.loads(bytes(data)))
+
+
+def _as_tuple(value: Any) -> Any:
+    """JSON's lists are the tuples that were saved."""
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value

@@ -1,0 +1,29 @@
+"""Optimal control of one drone over the simulator's own step: LQR, iLQR with motor limits, and MPPI.
+
+Each module has `settings(step, ...)`, `init(settings, params, state)` (of `mppi` also with a random key) and
+`control(settings, params, memory, state, setpoints, dt=...) -> (memory, rpm)`, all of one drone; `setpoints` holds the
+target at the present and the next `settings.horizon` control steps. A team, or many worlds, is `jax.vmap`.
+"""
+
+from jaxdrones.optimal import ilqr, lqr, mppi
+from jaxdrones.optimal.coordinates import difference, displaced, linearize, linearize_step, single
+from jaxdrones.optimal.problem import Reference, Weights, reference, weights
+
+CONTROLLERS = {"lqr": lqr, "ilqr": ilqr, "mppi": mppi}
+"""Controllers by the names that the command line uses."""
+
+__all__ = [
+    "CONTROLLERS",
+    "Reference",
+    "Weights",
+    "difference",
+    "displaced",
+    "ilqr",
+    "linearize",
+    "linearize_step",
+    "lqr",
+    "mppi",
+    "reference",
+    "single",
+    "weights",
+]

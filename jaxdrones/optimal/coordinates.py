@@ -1,0 +1,160 @@
+"""States of one drone as vectors without a constraint: the differences that linear and quadratic models are about.
+
+A unit quaternion has four components and three degrees of freedom. Linearized in its components, the drone would have
+a direction that no command moves, and no Riccati equation a solution. Attitudes are therefore compared in the tangent
+space: by three numbers.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_shape, is_known, shown
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+SingleStep = Callable[[Params, State, Float[Array, "4"]], State]
+"""`(params, state, rpm) -> state` of one drone."""
+
+SIZE = 16
+"""Numbers in a difference of states without models."""
+
+
+def single(step: Callable) -> SingleStep:
+    """A step or a derivative of a team as one of a single drone."""
+
+    def step_of_one(params: Params, state: State, rpm: Float[Array, "4"]) -> State:
+        team = jax.tree.map(lambda x: jnp.asarray(x)[None], (params, state))
+        return jax.tree.map(lambda x: x[0], step(*team, rpm[None]))
+
+    return step_of_one
+
+
+def command_unit(params: Params) -> Float[Array, ""]:
+    """The rotor speed in which commands and rotor speeds are counted here: that of hover, RPM.
+
+    Raises:
+        ValueError: parameters of a team, or no gravity, so that nothing hovers.
+    """
+    check_shape("params.mass", params.mass, (), "optimal control is about one drone; use jax.vmap for a team")
+    if is_known(params.gravity) and not np.asarray(params.gravity) > 0:
+        raise ValueError(
+            f"params.gravity is {shown(params.gravity)}; optimal control counts commands in the rotor speed of hover, "
+            "give a positive gravity"
+        )
+    return params.hover_rpm
+
+
+def difference(params: Params, state: State, reference: State) -> Float[Array, " d"]:
+    """The difference between two states of one drone as a vector.
+
+    Args:
+        params: of the drone.
+        state: of the drone.
+        reference: what is subtracted.
+
+    Returns:
+        (d,) in this order: position, m, world; rotation from the reference to the state, twice the vector part of its
+        quaternion (in the limit of small angles the rotation vector, rad), body; velocity, m/s, world; angular
+        velocity, rad/s, body; rotor speeds over that of hover; states of models in their own units. d is 16 without
+        models.
+    """
+    error = rotation.multiply(rotation.conjugate(reference.quat), state.quat)
+    turn = jnp.where(error[3] < 0, -2, 2) * error[:3]
+    parts = (
+        state.pos - reference.pos,
+        turn,
+        state.vel - reference.vel,
+        state.omega - reference.omega,
+        (state.rpm - reference.rpm) / command_unit(params),
+        jax.tree.map(jnp.subtract, state.aux, reference.aux),
+    )
+    return ravel_pytree(parts)[0]
+
+
+def displaced(params: Params, state: State, vector: Float[Array, " d"]) -> State:
+    """The state of one drone that differs from a given one by a vector; to first order the inverse of `difference`."""
+    parts = (state.pos, state.pos, state.vel, state.omega, state.rpm, state.aux)
+    pos, turn, vel, omega, rpm, aux = ravel_pytree(parts)[1](vector)
+    return state.replace(
+        pos=state.pos + pos,
+        quat=rotation.multiply(state.quat, rotation.exp(turn)),
+        vel=state.vel + vel,
+        omega=state.omega + omega,
+        rpm=state.rpm + command_unit(params) * rpm,
+        aux=jax.tree.map(jnp.add, state.aux, aux),
+    )
+
+
+def tracking_error(params: Params, state: State, reference: State) -> Float[Array, " d"]:
+    """The `difference` with position and velocity along the heading of the reference instead of the world's axes.
+
+    One set of weights and one gain then serve all headings.
+    """
+    vector = difference(params, state, reference)
+    x_axis = rotation.axes(reference.quat)[0]
+    x, y = x_axis[0], x_axis[1]
+    length = jnp.sqrt(jnp.maximum(x * x + y * y, jnp.finfo(x.dtype).tiny))
+    cos, sin = x / length, y / length
+
+    def along(v: Array) -> Array:
+        return jnp.stack([cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2]])
+
+    return vector.at[:3].set(along(vector[:3])).at[6:9].set(along(vector[6:9]))
+
+
+def linearize_step(
+    step: SingleStep, params: Params, state: State, rpm: Float[Array, "4"]
+) -> tuple[Float[Array, "d d"], Float[Array, "d 4"]]:
+    """The matrices A and B of z' = A z + B u about a state and a command of one drone.
+
+    Args:
+        step: of one drone, such as `single(make_step(...))`.
+        params: of the drone.
+        state: of the drone.
+        rpm: (4,) commanded rotor speeds, RPM.
+
+    Returns:
+        (d, d) and (d, 4): z is the `difference` from the state before the step, z' that from the state after it, and u
+        the change of the command over the rotor speed of hover.
+    """
+    unit = command_unit(params)
+    after = step(params, state, rpm)
+
+    def moved(z: Array, u: Array) -> Array:
+        return difference(params, step(params, displaced(params, state, z), rpm + unit * u), after)
+
+    zero = jnp.zeros_like(difference(params, state, state))
+    return jax.jacfwd(moved, (0, 1))(zero, jnp.zeros_like(rpm))
+
+
+def linearize(
+    derivative: SingleStep, params: Params, state: State, rpm: Float[Array, "4"]
+) -> tuple[Float[Array, "d d"], Float[Array, "d 4"]]:
+    """The matrices A and B of the continuous law z' = A z + B u about the motion through a state of one drone.
+
+    Args:
+        derivative: of one drone, such as `single(make_derivative(...))`.
+        params: of the drone.
+        state: of the drone.
+        rpm: (4,) commanded rotor speeds, RPM.
+
+    Returns:
+        (d, d) 1/s and (d, 4) 1/s: z is the `difference` from the motion, u the change of the command over the rotor
+        speed of hover.
+    """
+    unit = command_unit(params)
+    rate = derivative(params, state, rpm)
+
+    def moving(z: Array, u: Array) -> Array:
+        other = displaced(params, state, z)
+        rates = (derivative(params, other, rpm + unit * u), rate)
+        return jax.jvp(lambda a, b: difference(params, a, b), (other, state), rates)[1]
+
+    zero = jnp.zeros_like(difference(params, state, state))
+    return jax.jacfwd(moving, (0, 1))(zero, jnp.zeros_like(rpm))

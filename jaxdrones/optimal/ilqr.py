@@ -1,0 +1,247 @@
+"""Iterative LQR over the simulator's step, with the limits of the motors as bounds (control-limited DDP).
+
+Tassa, Mansard, Todorov 2014, "Control-limited differential dynamic programming", with Gauss-Newton second derivatives:
+those of the dynamics are left out, as iLQR does (Li, Todorov 2004). Attitudes are in the tangent space.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_callable, check_shape, check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.control.single import check_single
+from jaxdrones.optimal import lqr
+from jaxdrones.optimal.box_qp import box_qp, solve_free
+from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
+from jaxdrones.optimal.problem import Reference, Weights, check_period, reference
+from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+
+_STEP_SIZES = tuple(0.5**k for k in range(8))  # of the line search
+_MIN_REGULARIZATION, _MAX_REGULARIZATION = 1e-6, 1e6
+_LESS, _MORE = 0.2, 10.0  # factors of the regularization after an iteration that improved the cost, or did not
+
+
+class Settings(PyTreeNode):
+    """What the planner knows of the world, what it minimizes, and how long it tries."""
+
+    weights: Weights
+    step: Any = flax.struct.field(pytree_node=False)
+    """The step of a team, `(params, state, rpm) -> state`, over one control period."""
+    horizon: int = flax.struct.field(pytree_node=False)
+    """H, control steps that are planned."""
+    iterations: int = flax.struct.field(pytree_node=False)
+    """Iterations per call of `control`."""
+
+
+class Memory(PyTreeNode):
+    """What is kept between calls: the plan, and the cost of what comes after it."""
+
+    correction: Array
+    """(H, 4) planned commands minus those of the reference, over the rotor speed of hover."""
+    lqr: lqr.Memory
+    """The regulator about hover: its value is the cost at the end of the horizon, its gain the first guess."""
+    started: Array
+    """() whether there is a plan of the call before."""
+
+
+class Solution(PyTreeNode):
+    """A plan of H steps."""
+
+    states: State
+    """(H + 1, ...) from the present state on."""
+    rpm: Array
+    """(H, 4) commands, RPM."""
+    gains: Array
+    """(H, 4, d) of u = K z, z the `difference` from the planned state, u over the rotor speed of hover."""
+    cost: Array
+    """()."""
+    costs: Array
+    """(iterations,) the cost after each iteration; it never grows."""
+
+
+def settings(step: Any, weights: Weights | None = None, horizon: int = 25, iterations: int = 2) -> Settings:
+    """Settings of a planner.
+
+    Args:
+        step: of a team, over one control period: that of the simulation, or a simpler one.
+        weights: of the errors; `problem.weights()` when left out.
+        horizon: control steps that are planned; what comes after is taken for flight by the regulator of `lqr`.
+        iterations: per call of `control`, each from the plan of the one before.
+    """
+    check_callable("step", step, "jaxdrones.make_step(...)")
+    check_whole("horizon", horizon, 2)
+    check_whole("iterations", iterations)
+    return Settings(default_weights() if weights is None else weights, step, horizon, iterations)
+
+
+def init(settings: Settings, params: Params, state: State) -> Memory:
+    """The memory of one drone before its first call."""
+    regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
+    return Memory(jnp.zeros((settings.horizon, 4), regulator.gain.dtype), regulator, jnp.zeros((), bool))
+
+
+def control(
+    settings: Settings, params: Params, memory: Memory, state: State, setpoints: Setpoint, *, dt: float
+) -> tuple[Memory, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of a plan over the horizon.
+
+    The plan of the call before is the guess, one step later; the first guess is flight by the regulator of `lqr`.
+
+    Args:
+        settings: of the planner.
+        params: of the drone.
+        memory: of `init` or the call before.
+        state: of the drone.
+        setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
+        dt: time between calls, s.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), a number of setpoints that does not fit the horizon, or `dt` is
+            not the period of the step.
+    """
+    check_single(params, state)
+    check_period(settings.step, dt)
+    check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
+    target = reference(params, setpoints, state.aux, dt)
+    unit = command_unit(params)
+
+    def kept() -> Array:
+        shifted = jnp.concatenate([memory.correction[1:], memory.correction[-1:]])
+        return target.rpm[:-1] + unit * shifted
+
+    guess = jax.lax.cond(memory.started, kept, lambda: regulated(settings.step, params, state, target, memory.lqr.gain))
+    plan = solve(settings, params, state, target, guess, memory.lqr.value)
+    correction = (plan.rpm - target.rpm[:-1]) / unit
+    return memory.replace(correction=correction, started=jnp.ones((), bool)), plan.rpm[0]
+
+
+def regulated(
+    step: Any, params: Params, state: State, target: Reference, gain: Float[Array, "4 d"]
+) -> Float[Array, "H 4"]:
+    """Commands of a flight by the regulator, RPM."""
+    one_step = single(step)
+
+    def advance(state: State, target: Reference) -> tuple[State, Array]:
+        rpm = lqr.feedback(params, gain, state, target.state, target.rpm)
+        return one_step(params, state, rpm), rpm
+
+    return jax.lax.scan(advance, state, jax.tree.map(lambda x: x[:-1], target))[1]
+
+
+def solve(
+    settings: Settings,
+    params: Params,
+    state: State,
+    target: Reference,
+    rpm: Float[Array, "H 4"],
+    value: Float[Array, "d d"],
+) -> Solution:
+    """The best plan that some iterations find from a guess.
+
+    Args:
+        settings: of the planner.
+        params: of the drone.
+        state: of the drone, at the start.
+        target: H + 1 states and commands to be near to.
+        rpm: (H, 4) the guess, RPM.
+        value: (d, d) weight of the tracking error at the end.
+    """
+    step, unit = single(settings.step), command_unit(params)
+    high = params.max_rpm / unit
+    sizes = jnp.asarray(_STEP_SIZES, rpm.dtype)
+    r = settings.weights.command_matrix()
+    nominal = target.rpm[:-1] / unit
+    ahead = jax.tree.map(lambda x: x[1:], target.state)
+    q = settings.weights.state_matrix(len(value))
+    matrices = jnp.concatenate([jnp.broadcast_to(q, (len(rpm) - 1, *q.shape)), value[None]])
+
+    def fly(commands: Array, states: State | None, gains: Array | None) -> tuple[State, Array, Array]:
+        """States after every step, commands, and cost; with gains about the states of another flight."""
+
+        def advance(now: State, given: tuple) -> tuple[State, tuple]:
+            command, planned, gain, wanted, nominal, matrix = given
+            if planned is not None:
+                command = command + gain @ difference(params, now, planned)
+            command = jnp.clip(command, 0, high)
+            after = step(params, now, unit * command)
+            z, u = tracking_error(params, after, wanted), command - nominal
+            return after, (after, command, (z @ (matrix @ z) + u @ (r @ u)) / 2)
+
+        _, (after, flown, costs) = jax.lax.scan(advance, state, (commands, states, gains, ahead, nominal, matrices))
+        return after, flown, jnp.sum(costs)
+
+    def before(after: State) -> State:
+        return jax.tree.map(lambda first, x: jnp.concatenate([jnp.asarray(first)[None], x[:-1]]), state, after)
+
+    def improve(carry: tuple, _: None) -> tuple[tuple, Array]:
+        after, commands, cost, gains, regularization = carry
+        start = before(after)
+        models = jax.vmap(lambda x, u: linearize_step(step, params, x, unit * u))(start, commands)
+        slopes, curvatures = jax.vmap(lambda x, wanted, m: _expanded(params, x, wanted, m))(after, ahead, matrices)
+        backward = _backward((*models, slopes, curvatures, commands, nominal), r, high, regularization)
+        changes, new_gains = backward
+        tried = jax.vmap(lambda size: fly(commands + size * changes, start, new_gains))(sizes)
+        costs = jnp.where(jnp.isfinite(tried[2]), tried[2], jnp.inf)
+        best = jnp.argmin(costs)
+        better = costs[best] < cost
+        new = (*jax.tree.map(lambda x: x[best], tried), new_gains)
+        old = (after, commands, cost, gains)
+        chosen = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        factor = jnp.where(better, _LESS, _MORE)
+        regularization = jnp.clip(regularization * factor, _MIN_REGULARIZATION, _MAX_REGULARIZATION)
+        return (*chosen, regularization), chosen[2]
+
+    after, commands, cost = fly(rpm / unit, None, None)
+    gains = jnp.zeros((*rpm.shape, len(value)), rpm.dtype)
+    regularization = jnp.asarray(_MIN_REGULARIZATION, rpm.dtype)
+    (after, commands, cost, gains, _), costs = jax.lax.scan(
+        improve, (after, commands, cost, gains, regularization), length=settings.iterations
+    )
+    states = jax.tree.map(lambda first, x: jnp.concatenate([jnp.asarray(first)[None], x]), state, after)
+    return Solution(states, unit * commands, gains, cost, costs)
+
+
+def _expanded(
+    params: Params, state: State, wanted: State, matrix: Float[Array, "d d"]
+) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    """Gradient and Gauss-Newton Hessian of the cost of a state with respect to its `difference`."""
+
+    def error(z: Array) -> Array:
+        return tracking_error(params, displaced(params, state, z), wanted)
+
+    zero = jnp.zeros(len(matrix), matrix.dtype)
+    z, jacobian = error(zero), jax.jacfwd(error)(zero)
+    return jacobian.T @ (matrix @ z), jacobian.T @ matrix @ jacobian
+
+
+def _backward(
+    models: tuple, r: Float[Array, "4 4"], high: Float[Array, ""], regularization: Float[Array, ""]
+) -> tuple[Float[Array, "H 4"], Float[Array, "H 4 d"]]:
+    """Changes of the commands, and the gains about them: the backward pass with box-constrained steps."""
+    eye = jnp.eye(4, dtype=r.dtype)
+
+    def backward(carry: tuple, given: tuple) -> tuple[tuple, tuple]:
+        slope, curvature = carry
+        a, b, own_slope, own_curvature, command, nominal = given
+        slope, curvature = slope + own_slope, curvature + own_curvature
+        q_u = r @ (command - nominal) + b.T @ slope
+        q_uu, q_ux = r + b.T @ curvature @ b, b.T @ curvature @ a
+        damped = q_uu + regularization * eye
+        change, free = box_qp(damped, q_u, -command, high - command)
+        gain = -solve_free(damped, q_ux, free)
+        slope = a.T @ slope + gain.T @ (q_uu @ change + q_u) + q_ux.T @ change
+        curvature = a.T @ curvature @ a + gain.T @ q_uu @ gain + gain.T @ q_ux + q_ux.T @ gain
+        return (slope, (curvature + curvature.T) / 2), (change, gain)
+
+    size = models[0].shape[-1]
+    end = (jnp.zeros(size, r.dtype), jnp.zeros((size, size), r.dtype))
+    return jax.lax.scan(backward, end, models, reverse=True)[1]

@@ -1,0 +1,132 @@
+"""Linear quadratic regulator about hover, with the motion of the target as feedforward."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_callable
+from jaxdrones.control import Setpoint
+from jaxdrones.control.single import check_single
+from jaxdrones.dynamics.rotors import limited
+from jaxdrones.optimal.coordinates import command_unit, linearize_step, single, tracking_error
+from jaxdrones.optimal.problem import Weights, check_period, hover, reference
+from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+
+_DOUBLINGS = 20  # a million control steps
+
+
+class Settings(PyTreeNode):
+    """What the regulator knows of the world, and what it minimizes."""
+
+    weights: Weights
+    step: Any = flax.struct.field(pytree_node=False)
+    """The step of a team, `(params, state, rpm) -> state`, over one control period."""
+    horizon: int = flax.struct.field(pytree_node=False, default=2)
+    """Setpoints after the present one that `control` is given: two, for the angular acceleration of the target."""
+
+
+class Memory(PyTreeNode):
+    """The solution of the regulator's problem; it depends on the drone alone."""
+
+    gain: Array
+    """(4, d) K of u = -K z, z a `tracking_error`."""
+    value: Array
+    """(d, d) P of the cost z P z / 2 that is still to come."""
+
+
+def settings(step: Any, weights: Weights | None = None) -> Settings:
+    """Settings of a regulator.
+
+    Args:
+        step: of a team, over one control period: that of the simulation, or a simpler one.
+        weights: of the errors; `problem.weights()` when left out.
+    """
+    check_callable("step", step, "jaxdrones.make_step(...)")
+    return Settings(default_weights() if weights is None else weights, step)
+
+
+def init(settings: Settings, params: Params, state: State) -> Memory:
+    """The regulator of one drone: the linearization about hover, and the solution of its Riccati equation.
+
+    Args:
+        settings: of the regulator.
+        params: of the drone.
+        state: of the drone, for the states of its models.
+    """
+    at_rest = hover(params, state)
+    a, b = linearize_step(single(settings.step), params, at_rest, at_rest.rpm)
+    q, r = settings.weights.state_matrix(len(a)), settings.weights.command_matrix()
+    value = riccati(a, b, q, r)
+    return Memory(gain(a, b, r, value), value)
+
+
+def control(
+    settings: Settings, params: Params, memory: Memory, state: State, setpoints: Setpoint, *, dt: float
+) -> tuple[Memory, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`.
+
+    Args:
+        settings: of the regulator.
+        params: of the drone.
+        memory: of `init`.
+        state: of the drone.
+        setpoints: of the drone at this and the next two control steps, arrays (3, ...).
+        dt: time between calls, s.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` is not the period of the step.
+    """
+    check_single(params, state)
+    check_period(settings.step, dt)
+    target = reference(params, setpoints, state.aux, dt)
+    return memory, feedback(params, memory.gain, state, jax.tree.map(lambda x: x[0], target.state), target.rpm[0])
+
+
+def feedback(
+    params: Params, gain: Float[Array, "4 d"], state: State, target: State, rpm: Float[Array, "4"]
+) -> Float[Array, "4"]:
+    """The command of a reference, corrected by the gain times the tracking error and limited, RPM."""
+    return limited(params, rpm - command_unit(params) * (gain @ tracking_error(params, state, target)))
+
+
+def gain(
+    a: Float[Array, "d d"], b: Float[Array, "d m"], r: Float[Array, "m m"], value: Float[Array, "d d"]
+) -> Float[Array, "m d"]:
+    """The gain K of u = -K z that minimizes u R u + z' P z', with z' = A z + B u."""
+    return jnp.linalg.solve(r + b.T @ value @ b, b.T @ value @ a)
+
+
+def riccati(
+    a: Float[Array, "d d"], b: Float[Array, "d m"], q: Float[Array, "d d"], r: Float[Array, "m m"]
+) -> Float[Array, "d d"]:
+    """The stabilizing solution P of the discrete algebraic Riccati equation.
+
+    P = Q + A' P A - A' P B (R + B' P B)^-1 B' P A, by the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang
+    2004): iteration k has the cost of 2^k steps, so it converges quadratically.
+
+    Args:
+        a: (d, d) A of z' = A z + B u; what B does not reach must decay.
+        b: (d, m) B.
+        q: (d, d) weight of z, symmetric, not negative.
+        r: (m, m) weight of u, symmetric, positive.
+    """
+    eye = jnp.eye(len(a), dtype=a.dtype)
+
+    def double(carry: tuple, _: None) -> tuple[tuple, None]:
+        a, g, h = carry
+        inverse = jnp.linalg.solve(eye + g @ h, jnp.concatenate([a, g], axis=1))
+        wa, wg = inverse[:, : len(a)], inverse[:, len(a) :]
+        g_after = g + a @ wg @ a.T
+        h_after = h + a.T @ h @ wa
+        return (a @ wa, (g_after + g_after.T) / 2, (h_after + h_after.T) / 2), None
+
+    start = (a, b @ jnp.linalg.solve(r, b.T), q)
+    return jax.lax.scan(double, start, length=_DOUBLINGS)[0][2]

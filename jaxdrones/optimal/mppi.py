@@ -1,0 +1,187 @@
+"""Model predictive path integral control: plans that are sampled around feedback, and averaged by their cost.
+
+Williams et al. 2017, "Information theoretic MPC for model-based reinforcement learning": the samples are weighted by
+exp(-cost / temperature). Here every sample is flown with the regulator's feedback, so that what is sampled are
+corrections of a stable flight, not rotor speeds of an unstable body (as in tube-based MPPI, Williams et al. 2018).
+The temperature is a share of the spread of the costs, and the term of the noise's own cost is left out.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_callable, check_positive, check_shape, check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.control.allocation import mixer
+from jaxdrones.control.single import check_single
+from jaxdrones.optimal import lqr
+from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
+from jaxdrones.optimal.problem import Reference, Weights, check_period, reference
+from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+
+
+class Settings(PyTreeNode):
+    """What the planner knows of the world, what it minimizes, and how it samples."""
+
+    weights: Weights
+    noise: Array
+    """(4,) standard deviation of sampled commands in collective, roll, pitch and yaw, over the hover speed."""
+    temperature: Array
+    """() in standard deviations of the samples' costs."""
+    step: Any = flax.struct.field(pytree_node=False)
+    """The step of a team, `(params, state, rpm) -> state`, over one control period."""
+    horizon: int = flax.struct.field(pytree_node=False)
+    """H, control steps that are planned."""
+    samples: int = flax.struct.field(pytree_node=False)
+    """Plans that are flown per call of `control`."""
+    hold: int = flax.struct.field(pytree_node=False)
+    """Control steps for which a sampled number holds."""
+
+
+class Memory(PyTreeNode):
+    """What is kept between calls."""
+
+    key: Array
+    """Random key of the next call."""
+    correction: Array
+    """(H, 4) planned corrections of the feedback's commands, over the rotor speed of hover."""
+    lqr: lqr.Memory
+    """The regulator about hover: the feedback, and the cost at the end of the horizon."""
+
+
+def settings(
+    step: Any,
+    weights: Weights | None = None,
+    horizon: int = 24,
+    samples: int = 256,
+    temperature: float = 0.3,
+    hold: int = 3,
+) -> Settings:
+    """Settings of a planner.
+
+    Args:
+        step: of a team, over one control period: that of the simulation, or a simpler one.
+        weights: of the errors; `problem.weights()` when left out.
+        horizon: control steps that are planned; what comes after is taken for flight by the regulator of `lqr`.
+        samples: plans that are flown per call.
+        temperature: in standard deviations of the samples' costs; the lower, the more the best sample counts.
+        hold: control steps for which a sampled number holds: noise that changes at every step hardly moves a drone.
+    """
+    check_callable("step", step, "jaxdrones.make_step(...)")
+    check_whole("horizon", horizon, 2)
+    check_whole("samples", samples, 2)
+    check_whole("hold", hold)
+    check_positive("temperature", temperature, "standard deviations")
+    noise = jnp.array([0.05, 0.02, 0.02, 0.02])
+    return Settings(
+        default_weights() if weights is None else weights,
+        noise,
+        jnp.asarray(temperature, float),
+        step,
+        horizon,
+        samples,
+        hold,
+    )
+
+
+def init(settings: Settings, params: Params, state: State, key: Array) -> Memory:
+    """The memory of one drone before its first call.
+
+    Args:
+        settings: of the planner.
+        params: of the drone.
+        state: of the drone, for the states of its models.
+        key: random key; one per drone.
+    """
+    regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
+    return Memory(key, jnp.zeros((settings.horizon, 4), regulator.gain.dtype), regulator)
+
+
+def control(
+    settings: Settings, params: Params, memory: Memory, state: State, setpoints: Setpoint, *, dt: float
+) -> tuple[Memory, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of the averaged plan.
+
+    Args:
+        settings: of the planner.
+        params: of the drone.
+        memory: of `init` or the call before.
+        state: of the drone.
+        setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
+        dt: time between calls, s.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), a number of setpoints that does not fit the horizon, or `dt` is
+            not the period of the step.
+    """
+    check_single(params, state)
+    check_period(settings.step, dt)
+    check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
+    next_key, noise_key = jax.random.split(memory.key)
+    target = reference(params, setpoints, state.aux, dt)
+    guess = jnp.concatenate([memory.correction[1:], memory.correction[-1:]])
+    plans = guess[None] + _noise(noise_key, settings, params, guess)
+    plans = plans.at[0].set(guess).at[1].set(0)
+    costs = jax.vmap(lambda plan: cost(settings, params, state, target, plan, memory.lqr))(plans)
+    plan = jnp.tensordot(importance(costs, settings.temperature), plans, 1)
+    now = jax.tree.map(lambda x: x[0], target)
+    rpm = now.rpm + command_unit(params) * plan[0]
+    command = lqr.feedback(params, memory.lqr.gain, state, now.state, rpm)
+    return memory.replace(key=next_key, correction=plan), command
+
+
+def importance(costs: Float[Array, " k"], temperature: Float[Array, ""]) -> Float[Array, " k"]:
+    """Weights of the samples, exp(-cost / (temperature x standard deviation of the costs)); their sum is one.
+
+    A sample whose cost is not finite counts nothing.
+    """
+    finite = jnp.isfinite(costs)
+    lowest = jnp.min(jnp.where(finite, costs, jnp.inf))
+    above = jnp.where(finite, costs - lowest, 0)
+    spread = jnp.sqrt(jnp.sum(above**2) / jnp.maximum(jnp.sum(finite), 1))
+    scaled = above / jnp.maximum(temperature * spread, jnp.finfo(costs.dtype).tiny)
+    return jax.nn.softmax(jnp.where(finite, -scaled, -jnp.inf))
+
+
+def cost(
+    settings: Settings,
+    params: Params,
+    state: State,
+    target: Reference,
+    plan: Float[Array, "H 4"],
+    regulator: lqr.Memory,
+) -> Float[Array, ""]:
+    """The cost of a flight over the horizon by the regulator's feedback with the corrections of a plan."""
+    step, unit = single(settings.step), command_unit(params)
+    q = settings.weights.state_matrix(len(regulator.value))
+    r = settings.weights.command_matrix()
+
+    def advance(now: State, given: tuple) -> tuple[State, Array]:
+        correction, here, ahead = given
+        rpm = lqr.feedback(params, regulator.gain, now, here.state, here.rpm + unit * correction)
+        after = step(params, now, rpm)
+        z, u = tracking_error(params, after, ahead), (rpm - here.rpm) / unit
+        return after, (z @ (q @ z) + u @ (r @ u)) / 2
+
+    here = jax.tree.map(lambda x: x[:-1], target)
+    ahead = jax.tree.map(lambda x: x[1:], target.state)
+    end, costs = jax.lax.scan(advance, state, (plan, here, ahead))
+    z = tracking_error(params, end, jax.tree.map(lambda x: x[-1], ahead))
+    return jnp.sum(costs) + z @ (regulator.value @ z) / 2
+
+
+def _noise(key: Array, settings: Settings, params: Params, like: Float[Array, "H 4"]) -> Float[Array, "k H 4"]:
+    """Sampled corrections of the commands."""
+    knots = -(-settings.horizon // settings.hold)
+    drawn = jax.random.normal(key, (settings.samples, knots, 4), like.dtype) * settings.noise[None, None]
+    held = jnp.repeat(drawn, settings.hold, axis=1)[:, : settings.horizon]
+    mixing = jnp.concatenate([jnp.ones((4, 1), like.dtype), mixer(params)], axis=1)
+    return held @ mixing.T

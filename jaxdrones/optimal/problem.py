@@ -1,0 +1,128 @@
+"""What optimal controllers minimize, and the motion that they follow."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_positive, check_shape
+from jaxdrones.control import Setpoint, attitude
+from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.optimal.coordinates import command_unit, tracking_error
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+from jaxdrones.vector import along_z, cross, dot, safe_sqrt
+
+
+class Weights(PyTreeNode):
+    """Weights of squared errors; an error of one over the root of its weight costs as much as any other such error."""
+
+    pos: Array
+    """(3,) 1/m^2, along the heading of the target."""
+    attitude: Array
+    """(3,) 1/rad^2, body."""
+    vel: Array
+    """(3,) 1/(m/s)^2, along the heading of the target."""
+    omega: Array
+    """(3,) 1/(rad/s)^2, body."""
+    command: Array
+    """(4,) of the command's distance from that of the reference, over the rotor speed of hover."""
+
+    def state_matrix(self, size: int) -> Float[Array, "d d"]:
+        """The matrix Q of the cost z Q z / 2 of a state that is off by z; rotor speeds and models cost nothing."""
+        weighted = jnp.concatenate([self.pos, self.attitude, self.vel, self.omega])
+        return jnp.diag(jnp.pad(weighted, (0, size - len(weighted))))
+
+    def command_matrix(self) -> Float[Array, "4 4"]:
+        """The matrix R of the cost u R u / 2 of a command that is off by u."""
+        return jnp.diag(self.command)
+
+
+def weights() -> Weights:
+    """Weights for tracking: 3 cm, 20 degrees of tilt, 0.5 m/s, 10 rad/s and 30 % of the hover speed cost the same."""
+    return Weights(
+        pos=jnp.full(3, 1000.0),
+        attitude=jnp.full(3, 8.0),
+        vel=jnp.full(3, 4.0),
+        omega=jnp.full(3, 0.01),
+        command=jnp.full(4, 10.0),
+    )
+
+
+class Reference(PyTreeNode):
+    """A motion to follow, at the times of H + 1 control steps."""
+
+    state: State
+    """States of one drone, arrays (H + 1, ...)."""
+    rpm: Array
+    """(H + 1, 4) rotor speeds that produce the motion without drag and other effects, RPM."""
+
+
+def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Reference:
+    """The motion of a drone whose center of mass follows setpoints, by differential flatness (Mellinger, Kumar 2011).
+
+    Thrust and attitude are those of the acceleration and heading; angular velocities and torques are differences of
+    attitudes in time. The angular velocity of the setpoints is not used.
+
+    Args:
+        params: of the drone.
+        setpoints: H + 1 setpoints of one drone, arrays (H + 1, ...), H >= 2.
+        aux: states of models, which the reference shares.
+        dt: time between setpoints, s.
+    """
+    check_shape("setpoints.pos", setpoints.pos, ("H + 1", 3), "the setpoints of one drone over the horizon")
+    quat, thrust = jax.vmap(lambda acc, yaw: _upright(params, acc, yaw))(setpoints.acc, setpoints.yaw)
+    omega = _with_last(jax.vmap(_turn)(quat[:-1], quat[1:]) / dt)
+    omega_rate = _with_last(jnp.diff(omega[:-1], axis=0) / dt, 2)
+    rpm = jax.vmap(lambda f, w, a: rpm_from_wrench(params, f, params.inertia * a + cross(w, params.inertia * w)))(
+        thrust, omega, omega_rate
+    )
+    length = len(thrust)
+    shared = jax.tree.map(lambda x: jnp.broadcast_to(x, (length, *jnp.shape(x))), aux)
+    return Reference(State(setpoints.pos, quat, setpoints.vel, omega, rpm, shared), rpm)
+
+
+def _upright(params: Params, acc: Float[Array, "3"], yaw: Float[Array, ""]) -> tuple[Array, Array]:
+    """Attitude and thrust (N) of an acceleration."""
+    force = params.mass * (acc + along_z(params.gravity))
+    axes = attitude.from_thrust(force, yaw)
+    return rotation.from_matrix(jnp.stack(axes, axis=-1)), safe_sqrt(dot(force, force))
+
+
+def _turn(quat: Float[Array, "4"], after: Float[Array, "4"]) -> Float[Array, "3"]:
+    """The rotation between two attitudes that are near each other, rad, body."""
+    error = rotation.multiply(rotation.conjugate(quat), after)
+    return jnp.where(error[3] < 0, -2, 2) * error[:3]
+
+
+def _with_last(x: Float[Array, "k 3"], times: int = 1) -> Float[Array, "_ 3"]:
+    return jnp.concatenate([x, *[x[-1:]] * times])
+
+
+def hover(params: Params, state: State) -> State:
+    """A level state of one drone at rest that heads along x, its rotors at hover speed, with the models of `state`."""
+    zero = jnp.zeros_like(state.pos)
+    quat = jnp.zeros_like(state.quat).at[3].set(1)
+    return state.replace(
+        pos=zero, quat=quat, vel=zero, omega=zero, rpm=jnp.broadcast_to(command_unit(params), state.rpm.shape)
+    )
+
+
+def check_period(step: Any, dt: float) -> None:
+    """Raise `ValueError` unless the time between calls is positive, and that of the step where it is known."""
+    check_positive("dt", dt, "s")
+    period = getattr(step, "period", None)
+    if period is not None and not math.isclose(period, dt, rel_tol=1e-6):
+        raise ValueError(f"dt is {dt} s and the step takes {period:g} s; give a step of one control period")
+
+
+def quadratic(params: Params, matrix: Float[Array, "d d"], state: State, target: State) -> Float[Array, ""]:
+    """The cost z M z / 2 of the tracking error z."""
+    z = tracking_error(params, state, target)
+    return z @ (matrix @ z) / 2

@@ -1,0 +1,10 @@
+"""A symbolic twin of the simulated vehicle for CasADi, and model predictive control with it.
+
+`casadi_model` makes it from the traced program of the physics; `Mpc` follows setpoints with it. Both need CasADi:
+pip install "jaxdrones[casadi]".
+"""
+
+from jaxdrones.symbolic.model import CasadiModel, casadi_model
+from jaxdrones.symbolic.mpc import Mpc
+
+__all__ = ["CasadiModel", "Mpc", "casadi_model"]

@@ -1,0 +1,150 @@
+"""The symbolic twin: the law of motion that JAX simulates, as a function of CasADi."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxdrones.checks import check_choice, check_shape, shown
+from jaxdrones.dynamics import Model, instant_rotors
+from jaxdrones.engine.explicit import make_derivative
+from jaxdrones.engine.physics import Physics, Rotors
+from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.state import State
+from jaxdrones.symbolic.interpreter import on_symbols
+from jaxdrones.symbolic.primitives import casadi
+from jaxdrones.urdf import load_params
+
+_BARE = Scene()
+
+
+@dataclasses.dataclass(frozen=True)
+class CasadiModel:
+    """The law of motion x' = f(x, u, p) of a drone or a team, with the symbols that it is written in."""
+
+    function: Any
+    """`casadi.Function` with the inputs `x`, `u` and, if constants stay symbols, `p`, and the output `xdot`."""
+    x: Any
+    """(nx,) `casadi.SX`, the state: see `names`."""
+    u: Any
+    """(4 n,) `casadi.SX`, commanded rotor speeds, RPM, drone after drone."""
+    p: Any
+    """(np,) `casadi.SX`, constants that stay symbols: see `parameter_names`."""
+    xdot: Any
+    """(nx,) `casadi.SX`, the rate of the state, per second."""
+    params: Params
+    """Constants of the drone or the team, NumPy arrays in double precision."""
+    names: tuple[str, ...]
+    """(nx) entries of the state: `pos[0]` of a drone, `pos[1,0]` of the second drone of a team."""
+    parameter_names: tuple[str, ...]
+    """(np) entries of p."""
+    start: State
+    """A state of the same structure, NumPy arrays: level, at rest at the origin."""
+
+    def vector(self, state: State) -> np.ndarray:
+        """(nx,) the numbers of a state in the order of `names`."""
+        given, wanted = (jax.tree.map(np.shape, s) for s in (state, self.start))
+        if given != wanted:
+            raise ValueError(f"the state has the shapes {shown(str(given))}; the model's are {shown(str(wanted))}")
+        return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(state)])
+
+    def state(self, vector: ArrayLike) -> State:
+        """The state whose numbers stand in a vector (nx,)."""
+        numbers = np.asarray(vector, float).ravel()
+        check_shape("vector", numbers, (len(self.names),), "the numbers of a state")
+        leaves, structure = jax.tree.flatten(self.start)
+        parts = np.split(numbers, np.cumsum([leaf.size for leaf in leaves])[:-1])
+        shaped = [jnp.asarray(part.reshape(leaf.shape), float) for part, leaf in zip(parts, leaves, strict=True)]
+        return jax.tree.unflatten(structure, shaped)
+
+    def parameters(self, params: Params) -> np.ndarray:
+        """(np,) the numbers of constants that stay symbols, of the same drone or team with other values."""
+        fields = dict.fromkeys(name.partition("[")[0] for name in self.parameter_names)
+        return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(getattr(params, name), float)) for name in fields)])
+
+
+def casadi_model(
+    vehicle: str | os.PathLike | Params,
+    effects: Sequence[Effect] = (),
+    *,
+    pairs: Sequence[Pair] = (),
+    team_effects: Sequence[TeamEffect] = (),
+    models: Sequence[Model] = (),
+    rotors: Rotors = instant_rotors,
+    scene: Scene = _BARE,
+    parameters: Sequence[str] = (),
+) -> CasadiModel:
+    """The law of motion as a function of CasADi, made from the traced program of `jaxdrones.make_derivative`.
+
+    There is no second copy of the physics: whatever JAX can trace, of the package or a user's own, is evaluated on
+    symbols in double precision. It is for one drone, or for a team where the constants are a team's.
+
+    Args:
+        vehicle: a bundled vehicle, the path of a URDF, or constants of a drone or a team.
+        effects: as for `make_derivative`.
+        pairs: as for `make_derivative`; they need a team.
+        team_effects: as for `make_derivative`; they need a team.
+        models: as for `make_derivative`.
+        rotors: as for `make_derivative`.
+        scene: what stands around.
+        parameters: names of fields of `Params` that stay symbols instead of becoming numbers, such as `("wind",)`.
+
+    Returns:
+        The function, its symbols, and the mapping between a `State` and a vector.
+
+    Raises:
+        NotImplementedError: an effect or model uses a primitive of JAX that has no counterpart here.
+        ValueError: an unknown vehicle or parameter, or something else than what `make_derivative` takes.
+    """
+    for name in parameters:
+        check_choice("field of Params", name, [f.name for f in dataclasses.fields(Params) if f.name != "aux"])
+    with jax.enable_x64(True):
+        loaded = vehicle if isinstance(vehicle, Params) else load_params(vehicle)
+        params = jax.tree.map(_as_double, loaded)
+        team, one = params, np.ndim(params.mass) == 0
+        if one:
+            if pairs or team_effects:
+                raise ValueError(
+                    "pairs or team_effects are given and the constants are of one drone; give those of a team, for "
+                    "example of jaxdrones.repeat(params, 2)"
+                )
+            team = jax.tree.map(lambda x: x[None], params)
+        n = len(team.mass)
+        derivative = make_derivative(effects, pairs, team_effects, models, rotors)
+        at_rest = State.at_rest(jnp.zeros((n, 3)))
+        start = Physics(effects, pairs, team_effects, models, rotors).init(team, at_rest)
+
+        def rate(state: State, command: Any, chosen: dict[str, Any]) -> State:
+            return derivative(team.replace(**chosen), state, command, scene)
+
+        chosen = {name: getattr(team, name) for name in sorted(parameters)}
+        (x, u, p), xdot = on_symbols(rate, x=start, u=jnp.zeros((n, 4)), p=chosen)
+        if one:
+            start, chosen = jax.tree.map(lambda leaf: leaf[0], (start, chosen))
+        params, start = jax.device_get((params, start))
+    given, labels = ([x, u, p], ["x", "u", "p"]) if parameters else ([x, u], ["x", "u"])
+    function = casadi.Function("f", given, [xdot], labels, ["xdot"])
+    return CasadiModel(function, x, u, p, xdot, params, _names(start), _names(chosen), start)
+
+
+def _as_double(leaf: Any) -> Any:
+    return jnp.asarray(leaf, float) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else leaf
+
+
+def _names(tree: Any) -> tuple[str, ...]:
+    """One name for every number of a pytree."""
+    names = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        name = ".".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)
+        places = [",".join(map(str, place)) for place in np.ndindex(np.shape(leaf))]
+        names += [f"{name}[{place}]" if place else name for place in places]
+    return tuple(names)

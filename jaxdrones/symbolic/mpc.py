@@ -1,0 +1,219 @@
+"""Nonlinear model predictive control of one drone by CasADi: multiple shooting over the symbolic twin."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdrones.checks import check_choice, check_number, check_positive, check_shape, check_whole
+from jaxdrones.control import Setpoint
+from jaxdrones.control.single import check_single
+from jaxdrones.optimal.coordinates import tracking_error
+from jaxdrones.optimal.problem import Weights, reference
+from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.symbolic.interpreter import on_symbols
+from jaxdrones.symbolic.model import CasadiModel
+from jaxdrones.symbolic.primitives import casadi
+
+SOLVERS: dict[str, dict[str, Any]] = {
+    "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 100, "mu_init": 1e-3}},
+    "fatrop": {"structure_detection": "auto", "fatrop": {"print_level": 0, "tol": 1e-6, "max_iter": 100}},
+}
+"""Solvers of nonlinear programs that come with CasADi, and their options.
+
+Ipopt is given the Gauss-Newton Hessian; fatrop, which takes none, has the exact one, and uses the structure in time.
+"""
+
+
+class Mpc:
+    """A controller on the host: `mpc(state, setpoints) -> rpm`. It keeps the last plan as the next guess."""
+
+    def __init__(
+        self,
+        model: CasadiModel,
+        dt: float,
+        horizon: int = 20,
+        weights: Weights | None = None,
+        terminal: float = 10.0,
+        solver: str = "ipopt",
+    ):
+        """Write down the nonlinear program and make its solver.
+
+        Args:
+            model: of one drone.
+            dt: control period, s: the length of one interval of the plan, over which the command holds. The law of
+                motion is integrated over it by one step of the classical Runge-Kutta method.
+            horizon: intervals of the plan.
+            weights: of the errors; `jaxdrones.optimal.weights()` when left out.
+            terminal: factor of the weights of the state at the end.
+            solver: a name of `SOLVERS`.
+
+        Raises:
+            ValueError: a model of a team, a number out of range, or an unknown solver.
+        """
+        check_positive("dt", dt, "s")
+        check_whole("horizon", horizon, 2)
+        check_number("terminal", terminal, at_least=0)
+        check_choice("solver", solver, SOLVERS)
+        check_shape("model.params.mass", model.params.mass, (), "the controller is of one drone; make one for each")
+        self.model, self.horizon = model, horizon
+        self.seconds = float("nan")
+        """Seconds that the last call of the solver took."""
+        self.status = "not called"
+        """What the solver said at its last call."""
+        self._unit = float(model.params.hover_rpm)
+        self._reference = jax.jit(lambda setpoints: reference(model.params, setpoints, model.start.aux, dt))
+        self._kept = _moving(model)
+        self._scale = np.array([self._unit if name.startswith("rpm") else 1.0 for name in model.names])[self._kept]
+        self._plan: np.ndarray | None = None
+        self._write(dt, default_weights() if weights is None else weights, terminal, solver)
+
+    def _write(self, dt: float, weights: Weights, terminal: float, solver: str) -> None:
+        model, n = self.model, len(self._kept)
+        advance, error = self._step(dt), _error(model)
+        q = np.diagonal(np.asarray(weights.state_matrix(error.size1_out(0)), float))
+        r = np.diagonal(np.asarray(weights.command_matrix(), float))
+        now = casadi.MX.sym("now", n)
+        targets = casadi.MX.sym("targets", len(model.names), self.horizon + 1)
+        nominal = casadi.MX.sym("nominal", 4, self.horizon)
+        constants = casadi.MX.sym("constants", model.p.numel())
+        rest = casadi.DM(model.vector(model.start))
+        scale = casadi.DM(self._scale)
+        variables, residuals, constraints = [], [], []
+        states = [casadi.MX.sym(f"x{k}", n) for k in range(self.horizon + 1)]
+        commands = [casadi.MX.sym(f"u{k}", 4) for k in range(self.horizon)]
+
+        def whole(scaled: Any) -> Any:
+            vector = casadi.MX(rest)
+            vector[self._kept.tolist()] = scaled * scale
+            return vector
+
+        for k in range(self.horizon):
+            variables += [states[k], commands[k]]
+            constraints.append(states[k + 1] - advance(states[k], commands[k], constants))
+            if k == 0:
+                constraints.append(states[0] - now)
+            u = commands[k] - nominal[:, k]
+            z = error(whole(states[k + 1]), targets[:, k + 1])
+            last = terminal if k + 1 == self.horizon else 1.0
+            residuals += [np.sqrt(last * q) * z, np.sqrt(r) * u]
+        variables.append(states[-1])
+        x, residual, constraint = (casadi.vertcat(*parts) for parts in (variables, residuals, constraints))
+        p = casadi.vertcat(now, casadi.vec(targets), casadi.vec(nominal), constants)
+        program = {"x": x, "f": casadi.sumsqr(residual) / 2, "g": constraint, "p": p}
+        options: dict[str, Any] = {"expand": True, "print_time": False, "error_on_fail": False, **SOLVERS[solver]}
+        if solver == "ipopt":
+            options["hess_lag"] = _gauss_newton(x, p, residual, constraint)
+        else:
+            options["equality"] = [True] * constraint.numel()
+        self._solver = casadi.nlpsol("mpc", solver, program, options)
+        high = np.full(4, float(model.params.max_rpm) / self._unit)
+        free, bounded = np.full(n, np.inf), [np.zeros(4), high]
+        self._low = np.concatenate([*[-free, bounded[0]] * self.horizon, -free])
+        self._high = np.concatenate([*[free, bounded[1]] * self.horizon, free])
+
+    def _step(self, dt: float) -> Any:
+        """One interval: scaled state, scaled command and constants -> scaled state."""
+        model, n = self.model, len(self._kept)
+        x, u = casadi.SX.sym("x", n), casadi.SX.sym("u", 4)
+        scale, kept = casadi.DM(self._scale), self._kept.tolist()
+
+        def rate(x: Any) -> Any:
+            vector = casadi.SX(casadi.DM(model.vector(model.start)))
+            vector[kept] = x * scale
+            arguments = [vector, u * self._unit, *([model.p] if model.parameter_names else [])]
+            return model.function(*arguments)[kept] / scale
+
+        k1 = rate(x)
+        k2 = rate(x + dt / 2 * k1)
+        k3 = rate(x + dt / 2 * k2)
+        k4 = rate(x + dt * k3)
+        return casadi.Function("advance", [x, u, model.p], [x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
+
+    def __call__(self, state: State, setpoints: Setpoint, params: Params | None = None) -> np.ndarray:
+        """Commanded rotor speeds of one drone, (4,) RPM, between 0 and `max_rpm`.
+
+        Args:
+            state: of the drone.
+            setpoints: at this and the next H control steps, arrays (H + 1, ...).
+            params: constants that the model keeps as symbols are taken from here; those of the model when left out.
+
+        Raises:
+            ValueError: arrays of a team, or a number of setpoints that does not fit the horizon.
+            RuntimeError: the solver found no finite plan.
+        """
+        model, horizon, n = self.model, self.horizon, len(self._kept)
+        check_single(model.params, state)
+        check_shape("setpoints.pos", setpoints.pos, (horizon + 1, 3), "this and the next H control steps")
+        target = jax.device_get(self._reference(setpoints))
+        rows = [jax.tree.map(lambda x, k=k: x[k], target) for k in range(horizon + 1)]
+        targets = np.stack([model.vector(row.state) for row in rows])
+        nominal = np.stack([row.rpm for row in rows[:-1]]) / self._unit
+        now = model.vector(state)[self._kept] / self._scale
+        constants = model.parameters(model.params if params is None else params)
+        guess = self._guess(now, targets, nominal)
+        start = time.perf_counter()
+        result = self._solver(
+            x0=guess,
+            p=np.concatenate([now, targets.ravel(), nominal.ravel(), constants]),
+            lbx=self._low,
+            ubx=self._high,
+            lbg=0,
+            ubg=0,
+        )
+        self.seconds = time.perf_counter() - start
+        self.status = str(self._solver.stats()["return_status"])
+        plan = np.asarray(result["x"]).ravel()
+        if not np.isfinite(plan).all():
+            self._plan = None
+            raise RuntimeError(f"the solver found no finite plan: {self.status}; check the state and the setpoints")
+        self._plan = plan
+        return np.clip(plan[n : n + 4], self._low[n : n + 4], self._high[n : n + 4]) * self._unit
+
+    def _guess(self, now: np.ndarray, targets: np.ndarray, nominal: np.ndarray) -> np.ndarray:
+        """The last plan, one interval later; the reference, where there is none."""
+        n = len(self._kept)
+        if self._plan is None:
+            states = targets[:, self._kept] / self._scale[None]
+            states[0] = now
+            pairs = np.concatenate([states[:-1], nominal], axis=1)
+            return np.concatenate([pairs.ravel(), states[-1]])
+        return np.concatenate([self._plan[n + 4 :], self._plan[-n - 4 :]])
+
+    def reset(self) -> None:
+        """Forget the last plan, before another flight."""
+        self._plan = None
+
+
+def _moving(model: CasadiModel) -> np.ndarray:
+    """Numbers of the state that change or that something depends on; not the speeds of rotors without a lag."""
+    sparsity = casadi.jacobian_sparsity(model.xdot, model.x)
+    acts = {int(column) for column in sparsity.get_triplet()[1]}
+    return np.array([i for i in range(model.x.numel()) if i in acts or not model.xdot[i].is_zero()])
+
+
+def _error(model: CasadiModel) -> Any:
+    """The tracking error of `jaxdrones.optimal`, as a function of two vectors."""
+
+    def error(state: State, target: State) -> Any:
+        return tracking_error(model.params, state, target)
+
+    symbols, z = on_symbols(error, x=model.start, target=model.start)
+    return casadi.Function("error", symbols, [z])
+
+
+def _gauss_newton(x: Any, p: Any, residual: Any, constraint: Any) -> Any:
+    """The Hessian of half a sum of squares without the second derivatives of what is squared, nor of the constraints.
+
+    It is as good near the targets, never indefinite, and an order of magnitude cheaper than the exact one.
+    """
+    weight, multipliers = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", constraint.numel())
+    jacobian = casadi.jacobian(residual, x)
+    hessian = casadi.triu(weight * casadi.mtimes(jacobian.T, jacobian))
+    names = ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
+    return casadi.Function("nlp_hess_l", [x, p, weight, multipliers], [hessian], *names).expand()

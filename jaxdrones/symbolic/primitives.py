@@ -1,0 +1,128 @@
+"""Primitives of JAX as functions of scalars of CasADi. Truth is one, falsehood zero."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+try:
+    import casadi
+except ImportError as error:
+    raise ImportError('jaxdrones.symbolic: casadi is not installed; pip install "jaxdrones[casadi]"') from error
+
+
+class _Bits(NamedTuple):
+    """The bits of a number, of which only the sign is ever asked."""
+
+    number: Any
+    width: int
+
+
+def select(which: Any, *cases: Any) -> Any:
+    """The case with the number `which`, from 0 on; a truth value chooses between two."""
+    if not isinstance(which, casadi.SX):
+        return cases[int(which)]
+    if len(cases) == 2:
+        return casadi.if_else(which, cases[1], cases[0])
+    return functools.reduce(
+        lambda rest, i: casadi.if_else(which <= i, cases[i], rest), reversed(range(len(cases) - 1)), cases[-1]
+    )
+
+
+def _integer_pow(x: Any, y: int, **_: Any) -> Any:
+    product = functools.reduce(operator.mul, [x] * abs(y), 1.0)
+    return product if y >= 0 else 1 / product
+
+
+def _round(x: Any, **_: Any) -> Any:
+    return casadi.floor(x + 0.5)
+
+
+def _bits(x: Any, new_dtype: Any) -> _Bits:
+    return _Bits(x, 8 * new_dtype.itemsize)
+
+
+def _sign_of_bits(bits: Any, shift: Any) -> Any:
+    """The sign bit, as `jnp.copysign` asks for it; a negative zero counts as positive."""
+    if not isinstance(bits, _Bits) or int(shift) != bits.width - 1:
+        raise NotImplementedError("a shift of bits has no counterpart in CasADi; write the effect without it")
+    return casadi.SX(bits.number) < 0
+
+
+def _of_two(function: Callable) -> Callable:
+    return lambda x, y, **_: function(x, y)
+
+
+def _of_one(function: Callable) -> Callable:
+    return lambda x, **_: function(x)
+
+
+ELEMENTWISE: dict[str, Callable[..., Any]] = {
+    "abs": _of_one(casadi.fabs),
+    "acos": _of_one(casadi.acos),
+    "acosh": _of_one(casadi.acosh),
+    "add": _of_two(operator.add),
+    "add_any": _of_two(operator.add),
+    "and": _of_two(casadi.logic_and),
+    "asin": _of_one(casadi.asin),
+    "asinh": _of_one(casadi.asinh),
+    "atan": _of_one(casadi.atan),
+    "atan2": _of_two(casadi.atan2),
+    "atanh": _of_one(casadi.atanh),
+    "bitcast_convert_type": _bits,
+    "cbrt": _of_one(lambda x: casadi.sign(x) * casadi.fabs(x) ** (1 / 3)),
+    "ceil": _of_one(casadi.ceil),
+    "clamp": lambda low, x, high, **_: casadi.fmin(casadi.fmax(x, low), high),
+    "cos": _of_one(casadi.cos),
+    "cosh": _of_one(casadi.cosh),
+    "div": _of_two(operator.truediv),
+    "eq": _of_two(operator.eq),
+    "erf": _of_one(casadi.erf),
+    "exp": _of_one(casadi.exp),
+    "exp2": _of_one(lambda x: 2**x),
+    "expm1": _of_one(casadi.expm1),
+    "floor": _of_one(casadi.floor),
+    "ge": _of_two(operator.ge),
+    "gt": _of_two(operator.gt),
+    "integer_pow": _integer_pow,
+    "is_finite": _of_one(lambda x: casadi.fabs(x) < casadi.inf),
+    "le": _of_two(operator.le),
+    "log": _of_one(casadi.log),
+    "log1p": _of_one(casadi.log1p),
+    "logistic": _of_one(lambda x: 1 / (1 + casadi.exp(-x))),
+    "lt": _of_two(operator.lt),
+    "max": _of_two(casadi.fmax),
+    "min": _of_two(casadi.fmin),
+    "mul": _of_two(operator.mul),
+    "ne": _of_two(operator.ne),
+    "neg": _of_one(operator.neg),
+    "not": _of_one(casadi.logic_not),
+    "or": _of_two(casadi.logic_or),
+    "pow": _of_two(operator.pow),
+    "round": _round,
+    "rsqrt": _of_one(lambda x: 1 / casadi.sqrt(x)),
+    "shift_right_arithmetic": _of_two(_sign_of_bits),
+    "shift_right_logical": _of_two(_sign_of_bits),
+    "sign": _of_one(casadi.sign),
+    "sin": _of_one(casadi.sin),
+    "sinh": _of_one(casadi.sinh),
+    "sqrt": _of_one(casadi.sqrt),
+    "square": _of_one(lambda x: x * x),
+    "sub": _of_two(operator.sub),
+    "tan": _of_one(casadi.tan),
+    "tanh": _of_one(casadi.tanh),
+    "xor": _of_two(operator.ne),
+}
+"""Functions of each number, with the parameters of the equation as keywords."""
+
+REDUCTIONS: dict[str, Callable[[list], Any]] = {
+    "reduce_and": lambda row: functools.reduce(casadi.logic_and, row),
+    "reduce_max": lambda row: functools.reduce(casadi.fmax, row),
+    "reduce_min": lambda row: functools.reduce(casadi.fmin, row),
+    "reduce_or": lambda row: functools.reduce(casadi.logic_or, row),
+    "reduce_prod": lambda row: functools.reduce(operator.mul, row),
+    "reduce_sum": lambda row: functools.reduce(operator.add, row),
+}
+"""Functions of the numbers along some axes."""

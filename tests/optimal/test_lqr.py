@@ -1,0 +1,107 @@
+"""The Riccati equation, the linearizations and the regulator."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from closed_loop import hovering, make_step, one, team_of
+from helpers import VEHICLES, flying, mostly_slow
+
+import jaxdrones as jd
+from jaxdrones import optimal
+from jaxdrones.control import Setpoint
+from jaxdrones.optimal import lqr
+from jaxdrones.optimal.problem import hover
+
+DT = 1 / 100
+
+
+def some_state(vehicle="cf2x"):
+    team = team_of(vehicle)
+    return one(team), one(flying(team))
+
+
+def test_the_riccati_solution_is_that_of_scipy():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(6, 6)), rng.normal(size=(6, 2))
+    q, r = np.diag(rng.uniform(0, 1, 6)), np.diag(rng.uniform(1, 2, 2))
+    value = lqr.riccati(*map(jnp.asarray, (a, b, q, r)))
+    np.testing.assert_allclose(value, scipy.linalg.solve_discrete_are(a, b, q, r), rtol=1e-9)
+
+
+def test_a_displacement_is_the_inverse_of_a_difference():
+    params, state = some_state()
+    z = 1e-4 * jnp.asarray(np.random.default_rng(1).normal(size=16))
+    found = jax.jit(lambda z: optimal.difference(params, optimal.displaced(params, state, z), state))(z)
+    np.testing.assert_allclose(found, z, rtol=0, atol=1e-12)  # the rotation errs by the third power of 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rotors", [jd.instant_rotors, jd.lagging_rotors])
+def test_a_short_step_moves_as_the_continuous_linearization_says(rotors):
+    """A of the step is 1 + dt A of the derivative, up to dt^2; so is B, where the rotors have a lag."""
+    params, state = some_state()
+    rpm = jnp.array([14000.0, 15000, 14500, 14200])
+    state = state.replace(rpm=rpm)
+    a, b = optimal.linearize(optimal.single(jd.make_derivative([jd.drag], rotors=rotors)), params, state, rpm)
+    dt = 1e-5
+    step = optimal.single(jd.make_step([jd.drag], rotors=rotors, integrator=jd.rk4, dt=dt))
+    a_step, b_step = optimal.linearize_step(step, params, state, rpm)
+    moving = slice(None) if rotors is jd.lagging_rotors else slice(12)  # instant rotors jump
+    np.testing.assert_allclose(((a_step - np.eye(16)) / dt)[moving, :12], a[moving, :12], rtol=2e-2, atol=2e-2)
+    if rotors is jd.lagging_rotors:
+        np.testing.assert_allclose(b_step / dt, b, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("vehicle", mostly_slow(VEHICLES, quick=["cf2x"]))
+def test_hover_can_be_controlled_and_the_regulator_makes_it_stable(vehicle):
+    params = one(team_of(vehicle))
+    step = jd.make_step([jd.drag], rotors=jd.lagging_rotors, dt=DT)
+    at_rest = hover(params, one(hovering(team_of(vehicle))))
+    settings = lqr.settings(step)
+    memory = jax.jit(lqr.init)(settings, params, at_rest)
+    linearize = jax.jit(optimal.linearize_step, static_argnums=0)
+    a, b = linearize(optimal.single(step), params, at_rest, at_rest.rpm)
+    assert np.max(np.abs(np.linalg.eigvals(a - b @ memory.gain))) < 1 - 1e-3
+    expected = scipy.linalg.solve_discrete_are(
+        a, b, settings.weights.state_matrix(16), settings.weights.command_matrix()
+    )
+    np.testing.assert_allclose(memory.value, expected, rtol=1e-6, atol=1e-6 * np.max(expected))
+
+
+@pytest.mark.slow
+def test_the_command_does_not_depend_on_the_heading():
+    """The world, turned about the vertical, with target and drone."""
+    params, state = some_state()
+    state = state.replace(quat=jd.rotation.exp(jnp.array([0.1, -0.2, 0.3])))
+    settings = lqr.settings(make_step(dt=DT))
+    memory = lqr.init(settings, params, state)
+    acc = jnp.array([[0.3, -0.2, 0.1], [0.4, -0.2, 0.1], [0.5, -0.1, 0.2]])
+    target = Setpoint.at(state.pos[None] + 0.1 * acc, vel=acc, acc=acc, yaw=jnp.full(3, 0.2))
+    _, rpm = lqr.control(settings, params, memory, state, target, dt=DT)
+    turn = jd.rotation.exp(jnp.array([0.0, 0.0, 1.1]))
+
+    def rotate(v):
+        return jnp.apply_along_axis(lambda v: jd.rotation.rotate(turn, v), -1, v)
+
+    turned = state.replace(pos=rotate(state.pos), vel=rotate(state.vel), quat=jd.rotation.multiply(turn, state.quat))
+    target = Setpoint.at(rotate(target.pos), rotate(target.vel), rotate(target.acc), target.yaw + 1.1)
+    _, again = lqr.control(settings, params, memory, turned, target, dt=DT)
+    np.testing.assert_allclose(again, rpm, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_controlled_so_is_refused():
+    params, state = some_state()
+    settings = lqr.settings(jd.make_step(dt=DT))
+    memory = lqr.init(settings, params, state)
+    target = Setpoint.at(jnp.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"dt is 0.02 s and the step takes 0.01 s"):
+        lqr.control(settings, params, memory, state, target, dt=0.02)
+    with pytest.raises(ValueError, match=r"gravity is 0.*positive gravity"):
+        lqr.init(settings, params.replace(gravity=jnp.zeros(())), state)
+    with pytest.raises(ValueError, match=r"use jax.vmap for a team"):
+        lqr.init(settings, team_of("cf2x", "cf2x"), state)
+    with pytest.raises(ValueError, match=r"step: 3 is not a function"):
+        lqr.settings(3)

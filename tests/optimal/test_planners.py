@@ -1,0 +1,162 @@
+"""iLQR and MPPI: bounds, improvement, and flights closer to the target than PID's."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_loop import distance, hovering, one, team_of
+
+import jaxdrones as jd
+from jaxdrones import optimal
+from jaxdrones.control import Setpoint, for_team, pid
+from jaxdrones.optimal import ilqr, lqr, mppi
+from jaxdrones.optimal.box_qp import box_qp
+from jaxdrones.optimal.mppi import importance
+from jaxdrones.tasks.curves import SHAPES, setpoint_on
+
+DT = 1 / 100
+HORIZON = 8
+
+
+def test_a_box_constrained_program_has_the_cost_of_the_best_of_all_active_sets():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        root = rng.normal(size=(4, 4))
+        hessian, gradient = root @ root.T + 0.1 * np.eye(4), 3 * rng.normal(size=4)
+        low, high = -rng.uniform(0, 1, 4), rng.uniform(0, 1, 4)
+        x, free = _box_qp(hessian, gradient, low, high)
+        best = min(
+            (c @ hessian @ c / 2 + gradient @ c for c in _candidates(hessian, gradient, low, high)), default=np.inf
+        )
+        np.testing.assert_allclose(x @ hessian @ x / 2 + gradient @ x, best, rtol=0, atol=1e-9)
+        assert np.all((x >= low) & (x <= high)) and np.array_equal(free, (x > low) & (x < high))
+
+
+_box_qp = jax.jit(box_qp)
+
+
+def _candidates(hessian, gradient, low, high):
+    """Feasible points at which the free components are stationary and the other ones on a bound."""
+    for sides in itertools.product((None, low, high), repeat=4):
+        x = np.array([0.0 if side is None else side[i] for i, side in enumerate(sides)])
+        free = [i for i, side in enumerate(sides) if side is None]
+        held = [i for i in range(4) if i not in free]
+        if free:
+            right = -gradient[free] - hessian[np.ix_(free, held)] @ x[held]
+            x[free] = np.linalg.solve(hessian[np.ix_(free, free)], right)
+        if np.all((x >= low - 1e-12) & (x <= high + 1e-12)):
+            yield x
+
+
+def test_importance_prefers_what_costs_less_and_leaves_out_what_is_not_finite():
+    weights = importance(jnp.array([3.0, 1.0, jnp.inf, 2.0, jnp.nan]), jnp.array(0.5))
+    assert weights[1] > weights[3] > weights[0] > 0 and weights[2] == weights[4] == 0
+    np.testing.assert_allclose(jnp.sum(weights), 1, rtol=1e-12)
+    np.testing.assert_allclose(importance(jnp.ones(4), jnp.array(0.5)), 0.25, rtol=1e-12)
+
+
+@functools.cache
+def _step():
+    return jd.make_step([jd.drag], dt=DT)
+
+
+@functools.cache
+def _plan(iterations):
+    settings = ilqr.settings(_step(), horizon=HORIZON, iterations=iterations)
+
+    @jax.jit
+    def plan(params, state, setpoints):
+        target = optimal.reference(params, setpoints, {}, DT)
+        value = ilqr.init(settings, params, state).lqr.value
+        return ilqr.solve(settings, params, state, target, target.rpm[:-1], value)
+
+    return plan
+
+
+@pytest.mark.slow
+def test_an_iteration_never_costs_more_and_a_plan_within_reach_is_optimal():
+    """Far off, commands are at their limits; near by, no small change of the plan costs less."""
+    team = team_of("cf2x")
+    params, state = one(team), one(hovering(team))
+    plan = _plan(6)
+    far = plan(params, state, Setpoint.at(jnp.broadcast_to(jnp.array([2.0, 0, 3]), (HORIZON + 1, 3))))
+    assert np.all(np.diff(far.costs) <= 0) and far.costs[-1] < far.costs[0]
+    assert np.all((far.rpm >= 0) & (far.rpm <= params.max_rpm))
+    assert np.any(far.rpm >= params.max_rpm * (1 - 1e-12))
+    near = plan(params, state, Setpoint.at(jnp.broadcast_to(jnp.array([0.02, 0.01, 1.01]), (HORIZON + 1, 3))))
+    assert np.diff(near.costs)[-1] > -1e-9 * near.cost
+    assert np.all((near.rpm > 0) & (near.rpm < params.max_rpm))
+
+
+@pytest.mark.slow
+def test_near_hover_the_plan_is_that_of_the_regulator():
+    """A quadratic problem with the regulator's value at its end: the first command is the regulator's."""
+    team = team_of("cf2x")
+    params, state = one(team), one(hovering(team))
+    state = state.replace(pos=state.pos + jnp.array([1e-4, -2e-4, 1e-4]))
+    setpoints = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.0]), (HORIZON + 1, 3)))
+    plan = _plan(6)(params, state, setpoints)
+    settings = lqr.settings(_step())
+    memory = lqr.init(settings, params, state)
+    _, rpm = lqr.control(settings, params, memory, state, jax.tree.map(lambda x: x[:3], setpoints), dt=DT)
+    change = np.asarray(rpm - params.hover_rpm)
+    np.testing.assert_allclose(plan.rpm[0] - params.hover_rpm, change, rtol=0, atol=1e-2 * np.max(np.abs(change)))
+
+
+def test_setpoints_that_do_not_fit_the_horizon_are_refused():
+    team = team_of("cf2x")
+    params, state, short = one(team), one(hovering(team)), Setpoint.at(jnp.zeros((3, 3)))
+    for module, keys in (ilqr, ()), (mppi, (jax.random.key(0),)):
+        settings = module.settings(_step(), horizon=HORIZON)
+        memory = jax.eval_shape(functools.partial(module.init, settings), params, state, *keys)
+        with pytest.raises(ValueError, match=r"setpoints.pos has shape \(3, 3\); expected \(9, 3\)"):
+            module.control(settings, params, memory, state, short, dt=DT)
+
+
+ROWS = [("figure-eight", 5.0), ("figure-eight", 3.0), ("circle", 5.0), ("lissajous", 10.0), ("polynomial", 10.0)]
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+@pytest.mark.parametrize("module", [lqr, ilqr, mppi], ids=lambda module: module.__name__.rpartition(".")[2])
+def test_every_curve_is_tracked_closer_than_by_pid(module):
+    """All curves at once, one world each; root mean square of the error after the first second."""
+    worlds = len(ROWS)
+    step = jd.make_step([jd.drag], dt=1 / 300, substeps=3)
+    team = jd.repeat(jd.load_params("cf2x"), worlds)
+    random = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, 27), jnp.float32)
+
+    def target(t):
+        def on(name, period):
+            return setpoint_on(lambda t: jnp.array([0, 0, 2.0]) + SHAPES[name](random, t / period), t)
+
+        return jax.tree.map(lambda *x: jnp.stack(x), *(on(*row) for row in ROWS))
+
+    start = target(jnp.zeros(()))
+    state = hovering(team).replace(pos=start.pos, vel=start.vel)
+
+    def flown(init, control):
+        fly = jax.jit(lambda memory: jd.rollout(step, control, team, state, memory, 400)[1])
+        times = DT * jnp.arange(1, 401)
+        error = distance(fly(init), jax.vmap(target)(times).pos)[100:]
+        return np.sqrt(np.mean(error**2, axis=0))
+
+    def by_pid(params, memory, state, k):
+        control = functools.partial(pid.control, pid.gains("cf2x"), dt=DT)
+        return jax.vmap(control)(params, memory, state, target(k * DT))
+
+    settings = module.settings(step)
+
+    def planned(params, memory, state, k):
+        setpoints = jax.vmap(target, out_axes=1)((k + jnp.arange(settings.horizon + 1)) * DT)
+        control = functools.partial(module.control, settings, dt=DT)
+        return jax.vmap(control)(params, memory, state, setpoints)
+
+    keys = (jax.random.split(jax.random.key(0), worlds),) if module is mppi else ()
+    memory = jax.vmap(functools.partial(module.init, settings))(team, state, *keys)
+    found = flown(memory, planned)
+    assert np.all(found < 0.5 * flown(for_team(pid.init(), worlds), by_pid)), found
+    assert np.all(found < 0.015)

@@ -1,0 +1,72 @@
+"""Model predictive control by CasADi tracks a curve in the simulator."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_loop import hovering, one, team_of
+
+import jaxdrones as jd
+from jaxdrones.control import Setpoint
+from jaxdrones.tasks.curves import figure_eight, setpoint_on
+
+pytestmark = pytest.mark.needs("casadi")
+
+DT = 1 / 40
+
+
+def controller(horizon=20, solver="ipopt", **options):
+    from jaxdrones.symbolic import Mpc, casadi_model
+
+    return Mpc(casadi_model("cf2x", [jd.drag], **options), DT, horizon=horizon, solver=solver)
+
+
+@pytest.mark.slow
+def test_at_the_target_the_plan_is_hover_and_far_off_it_keeps_to_the_limits():
+    mpc, team = controller(horizon=4), team_of("cf2x")
+    params, state = one(team), one(hovering(team))
+    stay = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.0]), (5, 3)))
+    np.testing.assert_allclose(mpc(state, stay), np.full(4, params.hover_rpm), rtol=1e-5)
+    assert mpc.status == "Solve_Succeeded" and mpc.seconds > 0
+    mpc.reset()
+    rpm = mpc(state, Setpoint.at(stay.pos + jnp.array([[0, 0, 3.0]])))
+    assert np.all(rpm <= params.max_rpm) and np.all(rpm > 1.2 * params.hover_rpm)
+
+
+def test_constants_that_are_symbols_are_given_at_each_call():
+    """Twice the mass needs more thrust at once, though the model was made for the light drone."""
+    mpc, team = controller(horizon=4, parameters=("mass",)), team_of("cf2x")
+    params, state = one(team), one(hovering(team))
+    stay = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.0]), (5, 3)))
+    light, heavy = mpc(state, stay), mpc(state, stay, params.replace(mass=1.2 * params.mass))
+    assert np.all(heavy > 1.01 * light)
+
+
+def test_what_does_not_fit_is_refused():
+    from jaxdrones.symbolic import Mpc, casadi_model
+
+    team = jd.repeat(jd.load_params("cf2x"), 2)
+    with pytest.raises(ValueError, match=r"unknown solver 'acados' \(known: fatrop, ipopt\)"):
+        controller(solver="acados")
+    with pytest.raises(ValueError, match="make one for each"):
+        Mpc(casadi_model(team), DT)
+    mpc, one_drone = controller(horizon=4), team_of("cf2x")
+    with pytest.raises(ValueError, match=r"setpoints.pos has shape \(3, 3\); expected \(5, 3\)"):
+        mpc(one(hovering(one_drone)), Setpoint.at(jnp.zeros((3, 3))))
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+@pytest.mark.parametrize("solver", ["ipopt", "fatrop"])
+def test_the_figure_eight_of_five_seconds_is_tracked_within_three_centimeters(solver):
+    mpc, team = controller(solver=solver), team_of("cf2x")
+    step = jd.make_step([jd.drag], dt=DT / 6, substeps=6)
+    target = jax.jit(jax.vmap(lambda t: setpoint_on(lambda t: jnp.array([0, 0, 2.0]) + figure_eight(None, t / 5), t)))
+    ahead = DT * jnp.arange(mpc.horizon + 1)
+    state = hovering(team).replace(pos=target(jnp.zeros(1)).pos, vel=target(jnp.zeros(1)).vel)
+    errors = []
+    for k in range(240):
+        rpm = mpc(one(state), target(k * DT + ahead))
+        state = step(team, state, jnp.asarray(rpm, jnp.float32)[None])
+        errors.append(np.linalg.norm(state.pos[0] - target(jnp.array([(k + 1) * DT])).pos[0]))
+    assert np.sqrt(np.mean(np.square(errors[40:]))) < 0.03

@@ -1,0 +1,171 @@
+"""Bags of ROS 2: flights written to and read from MCAP files. Needs the extra `ros2`."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from jaxdrones.ros2 import convert, topics
+from jaxdrones.ros2 import messages as msg
+from jaxdrones.ros2.topics import Topic
+
+if TYPE_CHECKING:
+    from jaxdrones.flights.record import Record
+
+_DTYPES = {"float64": np.float64, "float32": np.float32, "uint8": np.uint8}
+
+
+class Recorded(NamedTuple):
+    """One message of a bag."""
+
+    topic: str  # without the leading slash
+    ns: int  # simulated time
+    message: msg.Message
+
+
+@functools.cache
+def _typestore() -> Any:
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError('rosbags is not installed; pip install "jaxdrones[ros2]"') from error
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def serialize(message: msg.Message) -> bytes:
+    """A message as ROS 2 encodes it: CDR, little-endian, with its header of four bytes."""
+    store = _typestore()
+
+    def array(field: msg.Field, given: Any) -> np.ndarray:
+        kind = _DTYPES[str(field.kind)]
+        return np.frombuffer(given, kind) if field.kind == "uint8" else np.array(given, kind)
+
+    return bytes(store.serialize_cdr(msg.encode(message, lambda kind: store.types[kind.NAME], array), message.NAME))
+
+
+def deserialize(data: bytes, name: str) -> msg.Message:
+    """The message of the type `name` that bytes of ROS 2 hold.
+
+    Raises:
+        ValueError: a type that is not among `messages.MESSAGES`.
+    """
+    if name not in msg.MESSAGES:
+        raise ValueError(f"messages of type {name} are not known (known: {', '.join(sorted(msg.MESSAGES))})")
+    return msg.decode(msg.MESSAGES[name], _typestore().deserialize_cdr(data, name))
+
+
+class Recorder:
+    """Writes messages to a new bag; a context manager that finishes it."""
+
+    def __init__(self, path: Path):
+        """Start a bag.
+
+        Args:
+            path: folder that is made, with an MCAP file and `metadata.yaml` in it.
+
+        Raises:
+            ValueError: there is something at this path already, or its folder cannot be written.
+            ImportError: rosbags is not installed.
+        """
+        _typestore()
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        path = Path(path)
+        if path.exists():
+            raise ValueError(f"{path} exists already; name a bag that does not")
+        self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        self._connections: dict[str, Any] = {}
+        try:
+            self._writer.open()
+        except OSError as error:
+            raise ValueError(f"{path} cannot be written: {error.strerror}; choose another") from None
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def write(self, topic: Topic, message: msg.Message, ns: int) -> None:
+        """Write a message of a topic at a simulated time, ns."""
+        if topic.name not in self._connections:
+            self._connections[topic.name] = self._writer.add_connection(
+                f"/{topic.name}", topic.type.NAME, typestore=_typestore()
+            )
+        self._writer.write(self._connections[topic.name], ns, serialize(message))
+
+    def close(self) -> None:
+        """Finish the bag."""
+        self._writer.close()
+
+
+def read(path: Path) -> Iterator[Recorded]:
+    """The messages of a bag in the order of their times; those of types that are not known here are left out.
+
+    Raises:
+        ValueError: there is no bag at this path.
+        ImportError: rosbags is not installed.
+    """
+    _typestore()
+    from rosbags.rosbag2 import Reader, ReaderError
+
+    try:
+        reader = Reader(path)
+        reader.open()
+    except (ReaderError, OSError) as error:
+        raise ValueError(f"{path} is no bag of ROS 2: {error}; give the folder of one") from None
+    try:
+        known = [connection for connection in reader.connections if connection.msgtype in msg.MESSAGES]
+        for connection, ns, data in reader.messages(known):
+            yield Recorded(connection.topic.removeprefix("/"), ns, deserialize(data, connection.msgtype))
+    finally:
+        reader.close()
+
+
+def write_flight(record: Record, path: Path) -> None:
+    """Write the log of a flight as a bag: clock, poses, twists, odometry and rotor speeds.
+
+    Raises:
+        ValueError: there is something at this path already.
+        ImportError: rosbags is not installed.
+    """
+    with Recorder(path) as recorder:
+        for k, t in enumerate(np.asarray(record.t, float)):
+            ns = round(t * 1e9)
+            recorder.write(topics.CLOCK, msg.Clock(convert.stamp(ns)), ns)
+            vel = convert.to_body(record.quat[k], record.vel[k])
+            now = convert.Measurement(
+                record.pos[k], record.quat[k], vel, record.omega[k], acc=None, rpm=record.rpm[k], battery=None
+            )
+            for i in range(record.pos.shape[1]):
+                for name, message in convert.state_messages(now, i, ns).items():
+                    recorder.write(topics.output(i, name), message, ns)
+
+
+def read_flight(path: Path) -> dict[str, np.ndarray]:
+    """The flight that a bag holds, as arrays by the names and shapes of a `Record`.
+
+    Returns:
+        `t` (K,) s, `pos` (K, n, 3) m, `quat` (K, n, 4), `vel` (K, n, 3) m/s, `omega` (K, n, 3) rad/s and
+        `rpm` (K, n, 4) RPM.
+
+    Raises:
+        ValueError: there is no bag, or no flight of whole steps in it.
+    """
+    found: dict[str, dict[int, Any]] = {}
+    for topic, ns, message in read(path):
+        found.setdefault(topic, {})[ns] = message
+    n = 0
+    while topics.output(n, "odom").name in found:
+        n += 1
+    streams = {name: [found.get(topics.output(i, name).name, {}) for i in range(n)] for name in ("odom", "motors")}
+    times = sorted(set.intersection(*(set(stream) for kind in streams.values() for stream in kind))) if n else []
+    if not times:
+        raise ValueError(f"{path} holds no flight: it lacks /drone_0/odom and /drone_0/motors; record it with both")
+    states = [convert.to_state(*([stream[ns] for stream in kind] for kind in streams.values())) for ns in times]
+    arrays = {name: np.stack([getattr(s, name) for s in states]) for name in ("pos", "quat", "vel", "omega", "rpm")}
+    return arrays | {"t": np.array(times) / 1e9}

@@ -1,0 +1,208 @@
+"""Pure functions between states and messages, and from messages to commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from jaxdrones.checks import shown
+from jaxdrones.ros2 import messages as msg
+from jaxdrones.ros2 import topics
+from jaxdrones.ros2.command import Command, Mode
+from jaxdrones.sensing import Camera
+from jaxdrones.state import State
+
+_NS = 1_000_000_000
+_LITHIUM_POLYMER, _DISCHARGING, _HEALTH_GOOD = 3, 2, 1  # constants of sensor_msgs/BatteryState
+_AMPERE_HOUR = 3600.0  # A s
+
+
+class Measurement(NamedTuple):
+    """What is published about a team of n drones at an instant: arrays of NumPy, of JAX while it is computed."""
+
+    pos: Array | np.ndarray  # (n, 3) m, world
+    quat: Array | np.ndarray  # (n, 4) x, y, z, w, body to world
+    vel: Array | np.ndarray  # (n, 3) m/s, body
+    omega: Array | np.ndarray  # (n, 3) rad/s, body
+    acc: Array | np.ndarray | None  # (n, 3) specific force, m/s^2, body; not known from a log
+    rpm: Array | np.ndarray  # (n, 4) RPM
+    battery: dict[str, Array | np.ndarray] | None  # (n,) each; see `Simulation`
+
+
+def stamp(ns: int) -> msg.Time:
+    """A time in ns as a message."""
+    return msg.Time(*divmod(ns, _NS))
+
+
+def nanoseconds(time: msg.Time) -> int:
+    """A message's time in ns."""
+    return time.sec * _NS + time.nanosec
+
+
+def state_messages(now: Measurement, i: int, ns: int) -> dict[str, msg.Message]:
+    """What drone `i` publishes at the simulated time `ns`, by the names of `topics.OUTPUTS`; images apart.
+
+    The speeds of the motors have no stamp. They come before the odometry, so that whoever hears it has them.
+    """
+    world, body = msg.Header(stamp(ns), topics.WORLD), msg.Header(stamp(ns), topics.body_frame(i))
+    orientation = msg.Quaternion(*now.quat[i].tolist())
+    omega = msg.Vector3(*now.omega[i].tolist())
+    pose = msg.Pose(msg.Point(*now.pos[i].tolist()), orientation)
+    twist = msg.Twist(msg.Vector3(*now.vel[i].tolist()), omega)
+    found: dict[str, msg.Message] = {
+        "motors": motors(now.rpm[i]),
+        "pose": msg.PoseStamped(world, pose),
+        "twist": msg.TwistStamped(body, twist),
+        "odom": msg.Odometry(world, body.frame_id, msg.PoseWithCovariance(pose), msg.TwistWithCovariance(twist)),
+    }
+    if now.acc is not None:
+        acc = msg.Vector3(*now.acc[i].tolist())
+        found["imu"] = msg.Imu(body, orientation, angular_velocity=omega, linear_acceleration=acc)
+    if now.battery is not None:
+        found["battery"] = _battery({name: float(x[i]) for name, x in now.battery.items()}, body)
+    return found
+
+
+def motors(rpm: ArrayLike) -> msg.Float64MultiArray:
+    """Rotor speeds (4,), RPM, as a message."""
+    layout = msg.MultiArrayLayout((msg.MultiArrayDimension("rotor, RPM", 4, 4),))
+    return msg.Float64MultiArray(layout, tuple(np.asarray(rpm, float).tolist()))
+
+
+def _battery(reading: dict[str, float], header: msg.Header) -> msg.BatteryState:
+    """Readings of a battery; what it does not tell is NaN, as the message asks for."""
+    unknown = math.nan
+    charge, capacity = (reading.get(name, unknown) / _AMPERE_HOUR for name in ("charge", "capacity"))
+    readings = {
+        "voltage": reading.get("voltage", unknown),
+        "temperature": unknown,
+        "current": -reading.get("current", unknown),
+        "charge": charge,
+        "capacity": capacity,
+        "design_capacity": capacity,
+        "percentage": charge / capacity,
+    }
+    rounded: dict[str, Any] = {name: float(np.float32(value)) for name, value in readings.items()}  # as they arrive
+    return msg.BatteryState(
+        header,
+        **rounded,
+        power_supply_status=_DISCHARGING,
+        power_supply_health=_HEALTH_GOOD,
+        power_supply_technology=_LITHIUM_POLYMER,
+        present=True,
+    )
+
+
+def image_messages(rgb: np.ndarray, camera: Camera, i: int, ns: int) -> dict[str, msg.Message]:
+    """The image (h, w, 4) of the camera of drone `i` and its calibration."""
+    header = msg.Header(stamp(ns), topics.optical_frame(i))
+    height, width = rgb.shape[:2]
+    pixels = np.ascontiguousarray(rgb[..., :3])
+    image = msg.Image(header, height, width, "rgb8", step=3 * width, data=pixels.tobytes())
+    return {"camera/image_raw": image, "camera/camera_info": camera_info(camera, header)}
+
+
+def camera_info(camera: Camera, header: msg.Header) -> msg.CameraInfo:
+    """The calibration of a camera: pinhole, no distortion, pixel centers at whole numbers."""
+    (width, height), (across, down) = camera.resolution, camera.principal_point
+    fx, fy = (pixels / 2 / slope for pixels, slope in zip(camera.resolution, camera.slopes, strict=True))
+    cx, cy = width / 2 + across - 0.5, height / 2 + down - 0.5
+    return msg.CameraInfo(
+        header,
+        height,
+        width,
+        "plumb_bob",
+        d=(0.0,) * 5,
+        k=(fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0),
+        r=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+        p=(fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0),
+    )
+
+
+def to_state(odometry: Sequence[msg.Odometry], rotors: Sequence[msg.Float64MultiArray]) -> State:
+    """The state of a team from the messages of its drones; the inverse of `state_messages`."""
+    quat = np.array([numbers(m.pose.pose.orientation) for m in odometry])
+    vel = np.array([numbers(m.twist.twist.linear) for m in odometry])
+    arrays: dict[str, Any] = {  # of NumPy: float64, as messages are, whatever the precision of JAX
+        "pos": np.array([numbers(m.pose.pose.position) for m in odometry]),
+        "quat": quat,
+        "vel": to_world(quat, vel),
+        "omega": np.array([numbers(m.twist.twist.angular) for m in odometry]),
+        "rpm": np.array([m.data for m in rotors]),
+    }
+    return State(**arrays)
+
+
+def to_world(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """R v of every row of `quat` (n, 4) and `v` (n, 3): v + w t + u x t with t = 2 u x v and q = (u, w)."""
+    t = 2 * np.cross(quat[:, :3], v)
+    return v + quat[:, 3:] * t + np.cross(quat[:, :3], t)
+
+
+def to_body(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """R^T v of every row of `quat` (n, 4) and `v` (n, 3)."""
+    return to_world(quat * np.array([-1, -1, -1, 1], quat.dtype), v)
+
+
+def to_command(name: str, message: Any) -> Command:
+    """What a message on the topic `name` of `topics.COMMANDS` commands one drone.
+
+    Raises:
+        ValueError: numbers that are not finite, a frame that is not known, a quaternion of no length, or another
+            number of rotors.
+    """
+    return _COMMANDS[name](message)
+
+
+def _pose_command(message: msg.PoseStamped) -> Command:
+    frame = message.header.frame_id
+    if frame not in ("", topics.WORLD):
+        raise ValueError(f"its frame_id is {frame!r}; give poses in {topics.WORLD!r}")
+    x, y, z, w = _finite(numbers(message.pose.orientation), "orientation")
+    length = math.hypot(x, y, z, w)
+    if not abs(length - 1) < 1e-3:
+        raise ValueError(f"its orientation has length {length:g}; give a unit quaternion (x, y, z, w)")
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return Command.zero(Mode.POSITION, pos=_finite(numbers(message.pose.position), "position"), yaw=yaw)
+
+
+def _velocity_command(message: msg.Twist) -> Command:
+    vel, turn = (_finite(numbers(v), name) for v, name in ((message.linear, "linear"), (message.angular, "angular")))
+    return Command.zero(Mode.VELOCITY, vel=vel, yaw_rate=turn[2])
+
+
+def _rates_command(message: msg.Twist) -> Command:
+    acc, omega = (_finite(numbers(v), name) for v, name in ((message.linear, "linear"), (message.angular, "angular")))
+    if acc[2] < 0:
+        raise ValueError(f"its linear.z, the collective thrust per mass, is {acc[2]:g} m/s^2; give 0 or more")
+    return Command.zero(Mode.RATES, omega=omega, thrust=acc[2])
+
+
+def _motor_command(message: msg.Float64MultiArray) -> Command:
+    if len(message.data) != 4:
+        raise ValueError(f"its data has {len(message.data)} numbers; give 4 rotor speeds, RPM")
+    return Command.zero(Mode.MOTORS, rpm=_finite(message.data, "data"))
+
+
+_COMMANDS: dict[str, Callable[[Any], Command]] = {
+    "cmd_pose": _pose_command,
+    "cmd_vel": _velocity_command,
+    "cmd_rates": _rates_command,
+    "cmd_motors": _motor_command,
+}
+
+
+def numbers(vector: Any) -> tuple[float, ...]:
+    """The components of a point, a vector or a quaternion."""
+    return tuple(getattr(vector, field.name) for field in msg.fields(type(vector)))
+
+
+def _finite(values: tuple[float, ...], name: str) -> tuple[float, ...]:
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"its {name} is {shown(values)}; give finite numbers")
+    return values

@@ -1,0 +1,152 @@
+"""A simulation backend for Crazyswarm2: its server flies this engine in place of its own.
+
+Crazyswarm2 imports `crazyflie_sim.backend.<name>` and takes the class `Backend` from it, so one file in that folder,
+`jaxdrones.py`, with the line `from jaxdrones.ros2.crazyswarm import Backend` is all it needs, and `sim: backend:
+jaxdrones` in its `server.yaml`. Parameters of the server, all optional: `sim.jaxdrones.vehicle` (cf2x),
+`sim.jaxdrones.dt` (0.0005 s), `sim.jaxdrones.downwash` (true).
+
+The interface is that of Crazyswarm2's own backend `np`, read in its source; it has not been run inside Crazyswarm2.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_positive, check_switch
+from jaxdrones.dynamics import downwash, ground_contact
+from jaxdrones.engine.explicit import make_step
+from jaxdrones.params import repeat
+from jaxdrones.ros2.convert import stamp
+from jaxdrones.state import State
+from jaxdrones.urdf import load_params
+
+_NS = 1_000_000_000
+_GRAMS = (2.55077341e-08, -4.92422570e-05, -1.51910248e-01)  # of RPM; Crazyswarm2's fit to a Crazyflie's rotors
+_NEWTON_PER_GRAM = 9.81e-3
+_PLACES = ((1, -1), (-1, -1), (-1, 1), (1, 1))  # signs of x and y of the motors m1 to m4 of a Crazyflie
+_CLOCK_DEPTH = 10
+
+
+class SwarmState(Protocol):
+    """`crazyflie_sim.sim_data_types.State`: position, velocity (world), quaternion (w, x, y, z), rates (body)."""
+
+    pos: Any
+    vel: Any
+    quat: Any
+    omega: Any
+
+
+class SwarmAction(Protocol):
+    """`crazyflie_sim.sim_data_types.Action`: speeds of the motors m1 to m4, RPM."""
+
+    rpm: Any
+
+
+class Backend:
+    """Crazyswarm2's interface of a simulation backend."""
+
+    def __init__(self, node: Any, names: list[str], states: Sequence[SwarmState]):
+        """Start a team where Crazyswarm2 puts it, at rest or in motion.
+
+        Args:
+            node: the server, a node of rclpy; its parameters configure the backend, and it publishes the clock.
+            names: of the drones.
+            states: of the drones at the start; the same objects are updated and returned by `step`.
+
+        Raises:
+            ValueError: a parameter out of range or an unknown vehicle.
+        """
+        self.names, self._states, self._steps = names, list(states), 0
+        self.dt = float(_parameter(node, "dt", 0.0005))
+        check_positive("sim.jaxdrones.dt", self.dt, "s")
+        with_downwash = _parameter(node, "downwash", True)
+        check_switch("sim.jaxdrones.downwash", with_downwash)
+        vehicle = load_params(_parameter(node, "vehicle", "cf2x"))
+        self._params = repeat(vehicle, len(names))
+        self._order = _rotors_of_motors(np.asarray(vehicle.rotor_pos))
+        self._kf = np.asarray(self._params.kf)[:, None]
+        pairs = (downwash,) if with_downwash and len(names) > 1 else ()
+        self._step = make_step((ground_contact,), pairs, dt=self.dt)
+        self._state = _from_swarm(self._states, self._params.hover_rpm.dtype)
+        self._clock_type = importlib.import_module("rosgraph_msgs.msg").Clock
+        self._time_type = importlib.import_module("builtin_interfaces.msg").Time
+        self._clock = node.create_publisher(self._clock_type, "clock", _CLOCK_DEPTH)
+
+    def time(self) -> float:
+        """Simulated time, s."""
+        return self._steps * self.dt
+
+    def step(self, states_desired: Sequence[Any], actions: Sequence[SwarmAction]) -> list[SwarmState]:
+        """Advance all drones by `dt` and publish the clock.
+
+        A motor speed of Crazyswarm2 stands for the thrust that its fit gives it. The rotors here turn as fast as that
+        thrust needs, so that the firmware's thrust is flown whatever the coefficients of the vehicle.
+
+        Args:
+            states_desired: targets, not used.
+            actions: of the drones, in the order of their names; `None`, where there is no controller, stops the motors.
+
+        Returns:
+            The states of the drones.
+        """
+        speeds = np.array([np.zeros(4) if action is None else np.asarray(action.rpm, float) for action in actions])
+        rpm = np.sqrt(thrust_of(speeds)[:, self._order] / self._kf)
+        self._state = self._step(self._params, self._state, jnp.asarray(rpm, self._state.pos.dtype))
+        self._steps += 1
+        now = jax.device_get(self._state)
+        for i, state in enumerate(self._states):
+            state.pos, state.vel, state.omega = now.pos[i], now.vel[i], now.omega[i]
+            state.quat = now.quat[i][[3, 0, 1, 2]]
+        at = stamp(round(self.time() * _NS))
+        self._clock.publish(self._clock_type(clock=self._time_type(sec=at.sec, nanosec=at.nanosec)))
+        return self._states
+
+    def shutdown(self) -> None:
+        """End the flight; there is nothing to give back."""
+
+
+def thrust_of(rpm: np.ndarray) -> np.ndarray:
+    """Thrust of a Crazyflie's rotor by the fit that Crazyswarm2 simulates it with, N; never negative.
+
+    Args:
+        rpm: speeds of any shape, RPM.
+    """
+    return np.maximum(np.polyval(_GRAMS, rpm), 0) * _NEWTON_PER_GRAM
+
+
+def _parameter(node: Any, name: str, default: Any) -> Any:
+    """A parameter of the server, or the default where it is not set."""
+    name = f"sim.jaxdrones.{name}"
+    return node.get_parameter(name).value if node.has_parameter(name) else default
+
+
+def _rotors_of_motors(places: np.ndarray) -> np.ndarray:
+    """For each rotor of a vehicle (4, 3) the number of the Crazyflie's motor that sits in its quadrant.
+
+    Raises:
+        ValueError: the vehicle is no X configuration.
+    """
+    signs = [
+        tuple(row) for row in np.sign(np.where(np.abs(places[:, :2]) < 1e-6, 0, places[:, :2])).astype(int).tolist()
+    ]
+    if sorted(signs) != sorted(_PLACES):
+        where = places[:, :2].tolist()
+        raise ValueError(f"the rotors of the vehicle are at {where}; Crazyswarm2 flies an X configuration, give cf2x")
+    return np.array([_PLACES.index(sign) for sign in signs])
+
+
+def _from_swarm(states: Sequence[SwarmState], dtype: Any) -> State:
+    pos, vel, quat, omega = (
+        jnp.asarray(np.array([getattr(state, name) for state in states], float), dtype)
+        for name in ("pos", "vel", "quat", "omega")
+    )
+    return State(
+        pos, jax.vmap(rotation.normalize)(jnp.roll(quat, -1, axis=1)), vel, omega, jnp.zeros((len(states), 4), dtype)
+    )

@@ -1,0 +1,94 @@
+"""What a drone does once nobody commands it any more."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from jaxdrones.checks import check_choice, check_positive
+from jaxdrones.params import Params
+from jaxdrones.ros2.command import Command, Mode
+from jaxdrones.state import State
+
+ACTIONS = ("hover", "land", "stop")
+
+_SINK_RATE = 0.4  # m/s
+_NEAR_GROUND = 0.03  # m above the height at which a drone rests
+
+
+class PeerLost(RuntimeError):
+    """Commands ceased, or could not be understood, and the flight is configured to stop then."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Failsafe:
+    """How long commands may be missing, and what happens then.
+
+    Raises:
+        ValueError: an unknown action, or a time that is not positive.
+    """
+
+    action: str = "hover"
+    """`hover`: stay where the last position command was, or else where the drone is. `land`: sink to the ground there
+    and stop the rotors. `stop`: end the flight with an error."""
+    timeout: float = 1.0
+    """Longest time between commands, s."""
+    wait: float = 30.0
+    """Longest time until the first command, s."""
+
+    def __post_init__(self):
+        check_choice("failsafe", self.action, ACTIONS)
+        check_positive("timeout", self.timeout, "s")
+        check_positive("wait", self.wait, "s")
+
+
+class Watch:
+    """Whether one drone, or who steps a flight in lockstep, is still heard of."""
+
+    def __init__(self, failsafe: Failsafe, now: float):
+        self._failsafe, self._heard, self._ever, self.lost = failsafe, now, False, False
+
+    def hear(self, now: float) -> bool:
+        """Note a sign of life; returns whether it was lost before."""
+        was_lost, self.lost, self._heard, self._ever = self.lost, False, now, True
+        return was_lost
+
+    def lose(self, now: float) -> bool:
+        """Whether it has been silent for too long, told once."""
+        news = not self.lost and self.remaining(now) <= 0
+        self.lost = self.lost or news
+        return news
+
+    def remaining(self, now: float) -> float:
+        """Time until it counts as lost, s."""
+        return self._heard + self.limit - now
+
+    @property
+    def limit(self) -> float:
+        """Silence that is allowed, s."""
+        return self._failsafe.timeout if self._ever else self._failsafe.wait
+
+
+def resting_height(params: Params, i: int) -> float:
+    """Height of the center of mass of drone `i` of a team when it stands on the ground, m."""
+    return float(params.collision_height[i] / 2 - params.collision_offset[i])
+
+
+def hover(command: Command, state: State, i: int) -> Command:
+    """Stay at the last commanded position, or where drone `i` is if it was commanded otherwise."""
+    if command.mode == Mode.POSITION:
+        return command
+    x, y, z, w = np.asarray(state.quat[i]).tolist()
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return Command.zero(Mode.POSITION, pos=np.asarray(state.pos[i]), yaw=yaw)
+
+
+def sink(command: Command, params: Params, state: State, i: int, dt: float) -> Command:
+    """The next command of a landing: lower by what `dt` (s) allows, and rotors off once drone `i` is on the ground."""
+    ground = resting_height(params, i)
+    if command.mode == Mode.MOTORS or float(state.pos[i, 2]) < ground + _NEAR_GROUND:
+        return Command.zero(Mode.MOTORS)
+    pos = np.array(command.pos)
+    pos[2] = max(pos[2] - _SINK_RATE * dt, ground)
+    return command.replace(pos=pos)

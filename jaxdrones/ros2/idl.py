@@ -1,0 +1,68 @@
+"""The messages as types of CycloneDDS, with the names and the encoding that ROS 2 gives them on DDS."""
+
+from typing import Any
+
+from cyclonedds.idl import IdlStruct, make_idl_struct, types
+from cyclonedds.idl.annotations import final
+
+from jaxdrones.ros2 import messages as msg
+
+_KINDS: dict[str, Any] = {
+    "bool": bool,
+    "uint8": types.uint8,
+    "int32": types.int32,
+    "uint32": types.uint32,
+    "int64": types.int64,
+    "uint64": types.uint64,
+    "float32": types.float32,
+    "float64": types.float64,
+    "string": str,
+}
+_types: dict[str, type[IdlStruct]] = {}  # by names on DDS
+_HEADER = {"guid": "uint64", "seq": "int64"}  # of requests and replies in rmw_cyclonedds: who asked, and which time
+
+
+def dds_name(kind: type[msg.Message]) -> str:
+    """The name of a message type on DDS: `geometry_msgs::msg::dds_::Pose_`."""
+    package, _, name = kind.NAME.split("/")
+    return f"{package}::msg::dds_::{name}_"
+
+
+def idl_type(kind: type[msg.Message]) -> Any:
+    """The type of CycloneDDS for a message type; encoded as plain CDR."""
+    name = dds_name(kind)
+    if name not in _types:
+        _types[name] = _struct(name, {field.name: _idl_field(field) for field in msg.fields(kind)})
+    return _types[name]
+
+
+def _struct(name: str, fields: dict[str, Any]) -> type[IdlStruct]:
+    struct = make_idl_struct(name.rpartition("::")[2], name, fields)
+    final(struct)
+    return struct
+
+
+def _idl_field(field: msg.Field) -> Any:
+    base = _KINDS[field.kind] if isinstance(field.kind, str) else idl_type(field.kind)
+    if field.length is None:
+        return base
+    if field.length:
+        return types.array[base, field.length]
+    return bytes if base is types.uint8 else types.sequence[base]  # the same encoding, without a number for every pixel
+
+
+def encode(message: msg.Message) -> IdlStruct:
+    """A message as CycloneDDS writes it."""
+    return msg.encode(message, idl_type, lambda field, given: given if field.kind == "uint8" else list(given))
+
+
+REQUEST = _struct(
+    "std_srvs::srv::dds_::Trigger_Request_",
+    {name: _KINDS[kind] for name, kind in (_HEADER | {"structure_needs_at_least_one_member": "uint8"}).items()},
+)
+"""A request of `std_srvs/srv/Trigger`; what is empty in ROS has one byte on DDS."""
+REPLY = _struct(
+    "std_srvs::srv::dds_::Trigger_Response_",
+    {name: _KINDS[kind] for name, kind in (_HEADER | {"success": "bool", "message": "string"}).items()},
+)
+"""A reply of `std_srvs/srv/Trigger`."""

@@ -1,0 +1,242 @@
+"""The node: a simulated team on the topics of ROS 2, in real time or in lockstep."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+from jaxdrones.checks import check_number, check_positive
+from jaxdrones.ros2 import convert, topics
+from jaxdrones.ros2 import messages as msg
+from jaxdrones.ros2.bag import Recorder
+from jaxdrones.ros2.command import Mode
+from jaxdrones.ros2.failsafe import Failsafe, PeerLost, Watch, hover, sink
+from jaxdrones.ros2.simulation import Simulation
+from jaxdrones.ros2.topics import Topic
+from jaxdrones.ros2.transport import Transport
+from jaxdrones.sensing import Camera
+
+_LATE = 0.1  # s behind the clock from which on the schedule starts anew
+_FAREWELL = 2.0  # s within which the last messages have to arrive
+
+
+@dataclasses.dataclass
+class Flown:
+    """What happened in a flight."""
+
+    steps: int = 0
+    published: int = 0
+    received: int = 0
+    """Commands that were understood."""
+    refused: int = 0
+    late: int = 0
+    """How often the flight fell behind the clock by a tenth of a second."""
+    lost: int = 0
+    """How often a drone, or who steps in lockstep, was not heard of any more."""
+    landed: bool = False
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+class Node:
+    """Publishes what a team does, and has it fly what it hears.
+
+    In real time the flight follows the clock. In lockstep it advances by one control step whenever the service
+    `topics.STEP_SERVICE` is called, and answers once the messages of that step are published.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        transport: Transport,
+        *,
+        lockstep: bool = False,
+        failsafe: Failsafe | None = None,
+        speed: float = 1.0,
+        camera: Camera | None = None,
+        recorder: Recorder | None = None,
+        warn: Callable[[str], None] = _silent,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Offer the topics of a team.
+
+        Args:
+            simulation: the team in flight.
+            transport: what carries the messages; the caller closes it.
+            lockstep: whether the flight waits for the step service.
+            failsafe: what happens without commands; they are a stream, each to be repeated within the timeout. In
+                lockstep it is the calls of the step service that must not cease.
+            speed: simulated time over real time, where the clock paces the flight.
+            camera: on every drone; at its `rate`, or every control step. Without it there are no images.
+            recorder: where all messages are written.
+            warn: called with a line of text when something is wrong and the flight goes on.
+            clock: time, s.
+
+        Raises:
+            ValueError: a speed that is not positive.
+        """
+        check_positive("speed", speed, "")
+        self._flight, self._transport, self._lockstep = simulation, transport, lockstep
+        self._failsafe = failsafe or Failsafe()
+        self._speed, self._camera, self._recorder = speed, camera, recorder
+        self._warn, self._clock = warn, clock
+        self.flown = Flown()
+        self._publishers: dict[str, Callable[[msg.Message], None]] = {}
+        self._publishers[topics.CLOCK.name] = transport.publisher(topics.CLOCK)
+        for i in range(simulation.drones):
+            for name in topics.OUTPUTS:
+                if self._has(name):
+                    topic = topics.output(i, name)
+                    self._publishers[topic.name] = transport.publisher(topic)
+            for name in topics.COMMANDS:
+                topic = topics.command(i, name)
+                transport.subscribe(topic, functools.partial(self._receive, i, name, topic))
+        if lockstep:
+            transport.serve(topics.STEP_SERVICE, self._answer)
+        now = clock()
+        self._watches = [Watch(self._failsafe, now) for _ in range(simulation.drones)]
+        self._stepper = Watch(self._failsafe, now)
+        self._said: set[str] = set()
+        self._due = now
+
+    def run(self, duration: float | None = None) -> Flown:
+        """Fly until the simulated time `duration` (s), for ever when left out, or until all drones have landed.
+
+        Raises:
+            PeerLost: commands ceased or have a wrong type, and the failsafe is to stop.
+            ValueError: a duration that is negative.
+        """
+        if duration is not None:
+            check_number("duration", duration, "s", at_least=0)
+        steps = None if duration is None else round(duration * self._flight.control_hz)
+        now = self._clock()
+        self._watches = [Watch(self._failsafe, now) for _ in self._watches]
+        self._stepper, self._due = Watch(self._failsafe, now), now
+        self._publish()
+        try:
+            while not self.flown.landed and (steps is None or self.flown.steps < steps):
+                if self._lockstep and not self._stepper.lost:
+                    self._await_stepper()
+                else:
+                    self._await_clock()
+                for text in self._transport.complaints():
+                    self._object(text)
+        finally:
+            self._transport.flush(_FAREWELL)
+        return self.flown
+
+    def _has(self, name: str) -> bool:
+        """Whether the team publishes this kind of message."""
+        if name.startswith("camera/"):
+            return self._camera is not None
+        return name != "battery" or self._flight.has_battery
+
+    def _receive(self, i: int, name: str, topic: Topic, message: Any) -> None:
+        if self._recorder is not None:
+            self._recorder.write(topic, message, self._flight.ns)
+        try:
+            command = convert.to_command(name, message)
+        except ValueError as error:
+            self.flown.refused += 1
+            self._object(f"a message on /{topic.name} is refused: {error}")
+            return
+        self.flown.received += 1
+        self._flight.commands[i] = command
+        if self._watches[i].hear(self._clock()) and not self._lockstep:
+            self._warn(f"commands for {topics.drone(i)} are back; it flies them")
+
+    def _answer(self) -> tuple[bool, str]:
+        """The step service: one control step; the answer holds the simulated time."""
+        if self._stepper.hear(self._clock()):
+            self._warn("the step service is called again; the flight is in lockstep")
+        self._step()
+        seconds, ns = divmod(self._flight.ns, 1_000_000_000)
+        return True, f"{seconds}.{ns:09d}"
+
+    def _await_stepper(self) -> None:
+        """Wait for calls of the step service."""
+        self._transport.spin(max(self._stepper.remaining(self._clock()), 0))
+        if self._stepper.lose(self._clock()):
+            self.flown.lost += 1
+            silent = f"the step service was not called for {self._stepper.limit:g} s"
+            self._give_up(silent, "the flight goes on by the clock")
+            self._due = self._clock()
+            for i in range(self._flight.drones):
+                self._flight.commands[i] = hover(self._flight.commands[i], self._flight.state, i)
+
+    def _await_clock(self) -> None:
+        """Take one step when the clock says so."""
+        dt = 1 / self._flight.control_hz
+        self._due += dt / self._speed
+        while True:
+            self._transport.spin(max(self._due - self._clock(), 0))
+            if self._clock() >= self._due:
+                break
+        if self._lockstep and not self._stepper.lost:  # it was called meanwhile
+            return
+        self._guard(dt)
+        self._step()
+        if self._clock() > self._due + _LATE:
+            self.flown.late += 1
+            self._due = self._clock()
+
+    def _guard(self, dt: float) -> None:
+        """Let drones that nobody commands do what the failsafe says."""
+        flight, now = self._flight, self._clock()
+        down = 0
+        for i, watch in enumerate(self._watches):
+            if not self._lockstep and watch.lose(now):
+                self.flown.lost += 1
+                silent = f"no command for {topics.drone(i)} for {watch.limit:g} s"
+                self._give_up(silent, f"it {self._failsafe.action}s")
+                flight.commands[i] = hover(flight.commands[i], flight.state, i)
+            if self._failsafe.action == "land" and (watch.lost or self._lockstep):
+                flight.commands[i] = sink(flight.commands[i], flight.params, flight.state, i, dt)
+                down += int(flight.commands[i].mode == Mode.MOTORS)
+        self.flown.landed = down == flight.drones
+
+    def _give_up(self, what: str, then: str) -> None:
+        if self._failsafe.action == "stop":
+            raise PeerLost(f"{what}; the flight stops, as its failsafe 'stop' asks for")
+        self._warn(f"{what}; {then}")
+
+    def _object(self, text: str) -> None:
+        """Say once what is wrong with a peer, or stop because of it."""
+        if text not in self._said:
+            self._said.add(text)
+            self._give_up(text, "the flight goes on without it")
+
+    def _step(self) -> None:
+        self._flight.advance()
+        self.flown.steps += 1
+        self._publish()
+
+    def _publish(self) -> None:
+        flight, ns = self._flight, self._flight.ns
+        self._send(topics.CLOCK, msg.Clock(convert.stamp(ns)))
+        now = flight.measure()
+        for i in range(flight.drones):
+            for name, message in convert.state_messages(now, i, ns).items():
+                self._send(topics.output(i, name), message)
+        if self._camera is not None and self._image_is_due(self._camera):
+            for i, picture in enumerate(flight.images(self._camera)):
+                for name, message in convert.image_messages(picture, self._camera, i, ns).items():
+                    self._send(topics.output(i, name), message)
+
+    def _image_is_due(self, camera: Camera) -> bool:
+        """Whether an image is taken at this control step; the k-th one in the first that does not begin before."""
+        if camera.rate is None or camera.rate >= self._flight.control_hz:
+            return True
+        per_step, k = camera.rate / self._flight.control_hz, self._flight.steps
+        return k == 0 or int(k * per_step + 1e-6) > int((k - 1) * per_step + 1e-6)
+
+    def _send(self, topic: Topic, message: msg.Message) -> None:
+        self._publishers[topic.name](message)
+        self.flown.published += 1
+        if self._recorder is not None:
+            self._recorder.write(topic, message, self._flight.ns)

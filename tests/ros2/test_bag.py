@@ -1,0 +1,108 @@
+"""Bags: what is written is what is read, by this package and by a reader that knows nothing of it."""
+
+import json
+
+import numpy as np
+import pytest
+from in_process import InProcess, Wire
+from ros2_team import make_simulation
+
+from jaxdrones.cli import main
+from jaxdrones.flights.fly import fly
+from jaxdrones.ros2 import Node, Peer, bag, convert, topics
+from jaxdrones.ros2 import messages as msg
+from jaxdrones.sensing import Camera
+
+pytestmark = pytest.mark.needs("rosbags")
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A bag of a short flight with a camera and a command, and what was sent meanwhile."""
+    wire = Wire()
+    with bag.Recorder(tmp_path / "bag") as recorder:
+        camera = Camera(resolution=(8, 6), rate=20.0)
+        node = Node(make_simulation(2), InProcess(wire), clock=wire.clock, recorder=recorder, camera=camera)
+        peer = Peer(InProcess(wire), 2)
+        wire.script = [(0.042, lambda: peer.fly_to([[0.1, 0.0, 1.0], [0.1, 0.5, 1.0]]))]
+        node.run(0.1)
+    return tmp_path / "bag", wire
+
+
+@pytest.mark.slow
+def test_a_bag_holds_every_message_of_a_flight(recorded):
+    path, wire = recorded
+    read = {}
+    for name, ns, message in bag.read(path):
+        assert 0 <= ns <= 100_000_000
+        read.setdefault(name, []).append(message)
+    assert read == dict(wire.sent)
+    assert [type(m) for m in read["drone_0/cmd_pose"]] == [msg.PoseStamped]
+
+
+@pytest.mark.needs("mcap_ros2")
+def test_a_bag_opens_in_an_independent_reader(recorded):
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    path, wire = recorded
+    (file,) = path.glob("*.mcap")
+    found = {}
+    with file.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        for schema, channel, entry, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic.removeprefix("/"), []).append((schema.name, entry.log_time, message))
+    assert {name: len(entries) for name, entries in found.items()} == {
+        name: len(sent) for name, sent in wire.sent.items()
+    }
+    (schema, ns, message), sent = found["drone_1/odom"][-1], wire.sent["drone_1/odom"][-1]
+    assert (schema, ns) == ("nav_msgs/msg/Odometry", 100_000_000)
+    assert message.pose.pose.position.y == sent.pose.pose.position.y
+    assert message.header.stamp.nanosec == 100_000_000 and message.child_frame_id == "drone_1/base_link"
+    (_, _, picture), pixels = found["drone_0/camera/image_raw"][0], wire.sent["drone_0/camera/image_raw"][0].data
+    assert bytes(picture.data) == pixels and picture.encoding == "rgb8"
+
+
+def test_a_flight_comes_back_from_its_bag(tmp_path):
+    record = fly("circle", drones=2, duration=0.25)
+    bag.write_flight(record, tmp_path / "bag")
+    back = bag.read_flight(tmp_path / "bag")
+    np.testing.assert_allclose(back["t"], record.t, atol=1e-9)
+    for name in ("pos", "quat", "omega", "rpm"):
+        np.testing.assert_array_equal(back[name], getattr(record, name))
+    np.testing.assert_allclose(back["vel"], record.vel, atol=1e-14)
+
+
+def test_a_bag_is_not_written_over(recorded):
+    with pytest.raises(ValueError, match="exists already; name a bag that does not"):
+        bag.Recorder(recorded[0])
+
+
+def test_what_is_no_bag_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="is no bag of ROS 2"):
+        list(bag.read(tmp_path / "nothing"))
+
+
+def test_a_bag_without_a_flight_is_refused(tmp_path):
+    with bag.Recorder(tmp_path / "bag") as recorder:
+        recorder.write(topics.CLOCK, msg.Clock(convert.stamp(5)), 5)
+    with pytest.raises(ValueError, match="holds no flight"):
+        bag.read_flight(tmp_path / "bag")
+
+
+@pytest.fixture
+def wired(monkeypatch):
+    """The command line on a transport within this process."""
+    wire = Wire()
+    monkeypatch.setattr("jaxdrones.cli.ros2.open_transport", lambda name: InProcess(wire))
+    monkeypatch.setattr("time.monotonic", wire.clock)
+    return wire
+
+
+def test_a_bag_is_replayed_at_its_pace(recorded, wired, capsys):
+    path, first = recorded
+    assert main(["ros2", "--replay", str(path), "--json"]) == 0
+    assert dict(wired.sent) == dict(first.sent)
+    assert json.loads(capsys.readouterr().out)["published"] == sum(map(len, first.sent.values()))
+    assert wired.now == pytest.approx(0.1, abs=0.01)

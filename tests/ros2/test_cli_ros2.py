@@ -1,0 +1,97 @@
+"""`jaxdrones ros2` and the files that start it."""
+
+import json
+import shlex
+import xml.etree.ElementTree
+from pathlib import Path
+
+import pytest
+from in_process import InProcess, Wire
+
+from jaxdrones.cli import _parser, main
+
+FILES = Path(__file__).parents[2] / "ros2"
+
+
+@pytest.fixture
+def wire(monkeypatch):
+    wire = Wire()
+    monkeypatch.setattr("jaxdrones.cli.ros2.open_transport", lambda name: InProcess(wire))
+    return wire
+
+
+@pytest.mark.slow
+def test_a_flight_is_reported(wire, capsys):
+    assert main(["ros2", "--drones", "2", "--duration", "0.05", "--camera", "8x6", "--speed", "10", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["steps"] == 5 and report["simulated_s"] == 0.05
+    assert report["published"] == sum(map(len, wire.sent.values()))
+    assert len(wire.sent["drone_1/camera/image_raw"]) == 1
+
+
+@pytest.mark.slow
+def test_a_lost_peer_stops_the_flight_with_exit_code_1(wire, capsys):
+    assert main(["ros2", "--lockstep", "--failsafe", "stop", "--wait", "0.01", "--duration", "1"]) == 1
+    said = capsys.readouterr()
+    assert "the step service was not called for 0.01 s; the flight stops" in said.err and said.err.count("\n") == 1
+    assert "steps 0" in said.out
+
+
+def test_a_landing_is_reported_as_json(wire, capsys):
+    short = ["--lockstep", "--wait", "0.01", "--height", "0.03", "--speed", "20"]
+    assert main(["ros2", "--failsafe", "land", *short, "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["landed"] is True and "the flight goes on by the clock" in said.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--drones", "0"], "drones is 0"),
+        (["--failsafe", "pray"], "unknown failsafe 'pray'"),
+        (["--timeout", "0"], "timeout is 0.0"),
+        (["--camera", "big"], "--camera is 'big'; give width and height"),
+        (["--control-hz", "0"], "control rate (Hz) is 0"),
+        (["--duration", "-1"], "duration is -1.0"),
+        (["--speed", "0"], "speed is 0.0"),
+        (["--backend", "gazebo"], "unknown backend 'gazebo'"),
+        (["--controller", "none"], "unknown controller 'none'"),
+        (["--lockstep", "--real-time"], "not allowed with"),
+        (["--replay", "nothing"], "nothing is no bag of ROS 2"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, wire, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if "--replay" in arguments:
+        pytest.importorskip("rosbags")
+    try:
+        code = main(["ros2", *arguments])
+    except SystemExit as stop:
+        code = stop.code
+    said = capsys.readouterr()
+    assert code == 2 and message in said.err and said.err.count("\n") == 1
+
+
+def test_an_unknown_transport_is_refused(capsys):
+    assert main(["ros2", "--transport", "pigeon"]) == 2
+    assert "unknown transport 'pigeon'" in capsys.readouterr().err
+
+
+def test_the_launch_file_starts_a_command_that_exists():
+    root = xml.etree.ElementTree.parse(FILES / "launch" / "jaxdrones.launch.xml").getroot()
+    defaults = {arg.get("name"): arg.get("default") for arg in root.findall("arg")}
+    (executable,) = root.findall("executable")
+    command = executable.get("cmd")
+    for name, default in defaults.items():
+        command = command.replace(f"$(var {name})", default)
+    assert "$(" not in command
+    program, *arguments = shlex.split(command)
+    assert program == "jaxdrones" and _parser().parse_args(arguments).drones == int(defaults["drones"])
+
+
+def test_the_container_starts_a_command_that_exists():
+    lines = (FILES / "Dockerfile").read_text().splitlines()
+    (entry,) = [json.loads(line.removeprefix("ENTRYPOINT")) for line in lines if line.startswith("ENTRYPOINT")]
+    (default,) = [json.loads(line.removeprefix("CMD")) for line in lines if line.startswith("CMD")]
+    assert entry[-1] == "jaxdrones" or entry[-2:] == ["jaxdrones", "ros2"]
+    _parser().parse_args(["ros2", *default])

@@ -1,0 +1,127 @@
+"""States to messages and back, and messages to commands."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, flying
+from ros2_team import make_simulation
+
+import jaxdrones as jd
+from jaxdrones.ros2 import Mode, convert, topics
+from jaxdrones.ros2 import messages as msg
+from jaxdrones.sensing import Camera
+
+
+def measured(n=3):
+    simulation = make_simulation(n)
+    simulation.state = flying(simulation.params)
+    return simulation, simulation.measure()
+
+
+@pytest.mark.slow
+def test_a_state_comes_back_from_its_messages():
+    simulation, now = measured()
+    sent = [convert.state_messages(now, i, 0) for i in range(3)]
+    back = convert.to_state([m["odom"] for m in sent], [m["motors"] for m in sent])
+    assert_close(back, jax.device_get(simulation.state), atol=1e-14)
+
+
+def test_whoever_hears_the_odometry_has_the_motors_speeds_of_that_time():
+    """They have no stamp, so they are sent first."""
+    sent = list(convert.state_messages(measured(1)[1], 0, 0))
+    assert sent.index("motors") < sent.index("odom")
+
+
+def test_twists_are_in_body_axes_and_poses_in_the_world():
+    simulation, now = measured(1)
+    sent = convert.state_messages(now, 0, 1_500_000_000)
+    assert sent["pose"].header == msg.Header(msg.Time(1, 500_000_000), "world")
+    assert sent["odom"].child_frame_id == sent["twist"].header.frame_id == "drone_0/base_link"
+    forward = jd.rotation.rotate(simulation.state.quat[0], jnp.array([1.0, 0, 0]))
+    np.testing.assert_allclose(sent["twist"].twist.linear.x, simulation.state.vel[0] @ forward, rtol=1e-12)
+    assert sent["odom"].twist.twist == sent["twist"].twist and sent["odom"].pose.pose == sent["pose"].pose
+
+
+def test_the_imu_reads_gravity_at_rest_in_the_air_and_nothing_in_free_fall():
+    simulation = make_simulation(1)
+    hover = jnp.broadcast_to(simulation.params.hover_rpm[:, None], (1, 4))
+    for rpm, reading in ((hover, 9.8), (0 * hover, 0.0)):
+        simulation._rpm = rpm
+        imu = convert.state_messages(simulation.measure(), 0, 0)["imu"]
+        np.testing.assert_allclose(convert.numbers(imu.linear_acceleration), (0, 0, reading), atol=1e-9)
+
+
+def test_a_battery_is_published_where_the_team_has_one():
+    def battery(params, state):
+        return {"voltage": 3.9 + 0 * params.mass, "current": 2.0 + 0 * params.mass, "charge": 450.0, "capacity": 900.0}
+
+    now = make_simulation(1, battery=battery).measure()
+    state = convert.state_messages(now, 0, 0)["battery"]
+    assert state.voltage == pytest.approx(3.9) and state.current == -2.0 and state.percentage == 0.5
+    assert state.charge == 0.125 and state.present and math.isnan(state.temperature)
+    assert "battery" not in convert.state_messages(make_simulation(1).measure(), 0, 0)
+
+
+@pytest.mark.slow
+def test_the_camera_matrix_projects_as_the_camera_renders():
+    camera = Camera(resolution=(40, 30), principal_point=(2.0, -1.0))
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    state = jd.State.at_rest([[0.0, 0.0, 1.0]])
+    target = np.array([2.0, 0.3, 1.2])
+    scene = jd.Scene.of(jd.sensing.Sphere(pos=target, radius=0.1), ground=False)
+    seen = np.argwhere(np.asarray(jd.render(scene, params, state, camera).segmentation[0]) > 0)
+    x, y, z = target - [0, 0, 1]
+    u, v, w = np.array(convert.camera_info(camera, msg.Header()).k).reshape(3, 3) @ [-y, -z, x]
+    np.testing.assert_allclose(seen.mean(axis=0), [v / w, u / w], atol=0.5)
+
+
+def test_an_image_message_holds_the_pixels_row_by_row():
+    rgb = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
+    image = convert.image_messages(rgb, Camera(resolution=(3, 2)), 0, 0)["camera/image_raw"]
+    assert (image.height, image.width, image.step, image.encoding) == (2, 3, 9, "rgb8")
+    np.testing.assert_array_equal(np.frombuffer(image.data, np.uint8).reshape(2, 3, 3), rgb[..., :3])
+
+
+def pose(frame="world", w=1.0, x=1.0):
+    return msg.PoseStamped(msg.Header(frame_id=frame), msg.Pose(msg.Point(x, 2.0, 3.0), msg.Quaternion(w=w)))
+
+
+def test_a_message_becomes_a_command():
+    turned = msg.Quaternion(z=math.sin(0.4), w=math.cos(0.4))
+    command = convert.to_command("cmd_pose", msg.PoseStamped(pose=msg.Pose(msg.Point(1.0, 2.0, 3.0), turned)))
+    assert command.mode == Mode.POSITION and command.yaw == pytest.approx(0.8)
+    np.testing.assert_array_equal(command.pos, [1, 2, 3])
+    twist = msg.Twist(msg.Vector3(1.0, 2.0, 3.0), msg.Vector3(4.0, 5.0, 6.0))
+    command = convert.to_command("cmd_vel", twist)
+    assert command.mode == Mode.VELOCITY and command.yaw_rate == 6
+    np.testing.assert_array_equal(command.vel, [1, 2, 3])
+    command = convert.to_command("cmd_rates", twist)
+    assert command.mode == Mode.RATES and command.thrust == 3
+    np.testing.assert_array_equal(command.omega, [4, 5, 6])
+    command = convert.to_command("cmd_motors", convert.motors(np.arange(4)))
+    assert command.mode == Mode.MOTORS
+    np.testing.assert_array_equal(command.rpm, range(4))
+
+
+@pytest.mark.parametrize(
+    ("name", "message", "says"),
+    [
+        ("cmd_pose", pose(frame="map"), "frame_id is 'map'; give poses in 'world'"),
+        ("cmd_pose", pose(w=0.0), "orientation has length 0"),
+        ("cmd_pose", pose(x=math.nan), "position is .*finite"),
+        ("cmd_vel", msg.Twist(msg.Vector3(math.inf)), "linear is .*finite"),
+        ("cmd_rates", msg.Twist(msg.Vector3(z=-1.0)), "collective thrust"),
+        ("cmd_motors", msg.Float64MultiArray(data=(1.0, 2.0)), "data has 2 numbers; give 4 rotor speeds"),
+    ],
+)
+def test_a_message_that_cannot_be_flown_is_refused(name, message, says):
+    with pytest.raises(ValueError, match=says):
+        convert.to_command(name, message)
+
+
+def test_drones_and_their_topics_have_the_names_of_the_table():
+    assert topics.output(2, "camera/image_raw").name == "drone_2/camera/image_raw"
+    assert topics.command(0, "cmd_vel").type is msg.Twist

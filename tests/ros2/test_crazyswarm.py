@@ -1,0 +1,114 @@
+"""The backend for Crazyswarm2, held to the interface and the laws of Crazyswarm2's own backend."""
+
+import fake_ros
+import numpy as np
+import pytest
+
+
+class Swarm:
+    """A state as Crazyswarm2's server hands it over: pos, vel, quat (w, x, y, z), omega."""
+
+    def __init__(self, pos):
+        self.pos, self.vel, self.omega = np.array(pos, float), np.zeros(3), np.zeros(3)
+        self.quat = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Action:
+    def __init__(self, rpm):
+        self.rpm = rpm
+
+
+class Parameter:
+    def __init__(self, value):
+        self.value = value
+
+
+class Server(fake_ros.FakeNode):
+    """Crazyswarm2's server as far as a backend sees it."""
+
+    def __init__(self, **parameters):
+        super().__init__(fake_ros.Graph(), "crazyflie_server")
+        self.parameters, self.clocks = {f"sim.jaxdrones.{k}": v for k, v in parameters.items()}, []
+
+    def has_parameter(self, name):
+        return name in self.parameters
+
+    def get_parameter(self, name):
+        return Parameter(self.parameters[name])
+
+    def create_publisher(self, kind, topic, depth):
+        assert (kind.NAME, topic, depth) == ("rosgraph_msgs/msg/Clock", "clock", 10)
+        server = self
+
+        class Publisher:
+            def publish(self, message):
+                assert type(message) is kind
+                server.clocks.append(message.clock)
+
+        return Publisher()
+
+
+@pytest.fixture
+def backend(monkeypatch):
+    fake_ros.install(monkeypatch)
+    from jaxdrones.ros2.crazyswarm import Backend
+
+    def make(heights=(1.0,), **parameters):
+        server = Server(**parameters)
+        states = [Swarm([i, 0.0, z]) for i, z in enumerate(heights)]
+        return Backend(server, [f"cf{i}" for i in range(len(heights))], states), server
+
+    return make
+
+
+def hover_rpm():
+    """Crazyswarm2's motor speed whose thrust, by its own fit, is a quarter of the weight of a cf2x."""
+    from jaxdrones.ros2.crazyswarm import thrust_of
+
+    speeds = np.linspace(10_000, 25_000, 200_001)
+    return speeds[np.argmin(np.abs(thrust_of(speeds) - 0.027 * 9.8 / 4))]
+
+
+def test_time_goes_by_dt_and_the_clock_is_published(backend):
+    made, server = backend(dt=0.001)
+    assert made.time() == 0
+    states = None
+    for _ in range(3):
+        states = made.step([None], [Action([0, 0, 0, 0])])
+    assert made.time() == pytest.approx(0.003) and [c.nanosec for c in server.clocks] == [10**6, 2 * 10**6, 3 * 10**6]
+    assert len(states) == 1 and made.shutdown() is None
+
+
+@pytest.mark.slow
+def test_thrust_that_cancels_gravity_holds_a_drone_up(backend):
+    made, _ = backend()
+    for _ in range(500):
+        (state,) = made.step([None], [Action([hover_rpm()] * 4)])
+    assert abs(state.pos[2] - 1) < 1e-3 and abs(state.vel[2]) < 1e-3
+    np.testing.assert_allclose(state.quat, [1, 0, 0, 0], atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("faster", "axis", "sign"),
+    [((0, 1), 0, -1), ((2, 3), 0, 1), ((1, 2), 1, 1), ((0, 3), 1, -1), ((1, 3), 2, 1), ((0, 2), 2, -1)],
+)
+def test_motors_turn_a_drone_as_those_of_a_crazyflie_do(faster, axis, sign, backend):
+    made, _ = backend()
+    rpm = np.full(4, hover_rpm())
+    rpm[list(faster)] += 500
+    (state,) = made.step([None], [Action(rpm)])
+    assert sign * state.omega[axis] > 1e-3 * (0.01 if axis == 2 else 1)
+    assert np.abs(np.delete(state.omega, axis)).max() < 1e-6
+
+
+def test_a_drone_falls_without_an_action_and_rests_on_the_ground(backend):
+    made, _ = backend(heights=(0.05, 1.0), dt=0.002)
+    for _ in range(500):
+        low, high = made.step([None, None], [None, Action([hover_rpm()] * 4)])
+    assert 0 < low.pos[2] < 0.03 and abs(low.vel[2]) < 0.02 and high.pos[2] == pytest.approx(1, abs=0.05)
+
+
+def test_a_vehicle_that_is_no_x_is_refused(backend):
+    with pytest.raises(ValueError, match="X configuration"):
+        backend(vehicle="cf2p")

@@ -1,0 +1,209 @@
+"""The node in one process: what it publishes, flies and does when nobody speaks to it."""
+
+import jax
+import numpy as np
+import pytest
+from helpers import assert_close
+from in_process import InProcess, Wire, positions
+from ros2_team import HZ, make_simulation, team_step
+
+from jaxdrones.ros2 import Failsafe, Node, Peer, PeerLost, convert, topics
+from jaxdrones.ros2 import messages as msg
+from jaxdrones.sensing import Camera
+
+
+def make_node(wire, n=2, **options):
+    warnings = []
+    node = Node(make_simulation(n), InProcess(wire), clock=wire.clock, warn=warnings.append, **options)
+    return node, warnings
+
+
+def test_every_step_is_published_once_for_every_drone():
+    wire = Wire()
+    node, _ = make_node(wire)
+    flown = node.run(0.2)
+    stamps = [convert.nanoseconds(message.clock) for message in wire.sent["clock"]]
+    assert stamps == [k * 10_000_000 for k in range(21)]
+    for i in range(2):
+        for name in ("pose", "twist", "odom", "imu"):
+            sent = wire.sent[topics.output(i, name).name]
+            assert [convert.nanoseconds(message.header.stamp) for message in sent] == stamps
+    assert flown.steps == 20 and flown.published == sum(map(len, wire.sent.values())) and flown.late == 0
+
+
+def test_drones_fly_where_they_are_told():
+    wire = Wire()
+    node, warnings = make_node(wire, failsafe=Failsafe("hover", timeout=5.0))
+    peer = Peer(InProcess(wire), 2)
+    target = np.array([[0.3, 0.0, 1.2], [0.3, 0.5, 0.8]])
+    wire.script = [(0.1, lambda: peer.fly_to(target, yaw=0.5))]
+    node.run(4.0)
+    np.testing.assert_allclose(peer.state().pos, target, atol=0.02)
+    np.testing.assert_allclose(2 * np.arctan2(peer.state().quat[:, 2], peer.state().quat[:, 3]), 0.5, atol=0.05)
+    assert warnings == []
+
+
+@pytest.mark.slow
+def test_velocities_turn_with_the_heading():
+    wire = Wire()
+    node, _ = make_node(wire, n=1)
+    peer = Peer(InProcess(wire), 1)
+    twist = msg.Twist(msg.Vector3(0.5), msg.Vector3(z=1.0))
+    wire.script = [(0.005 + 0.1 * k, lambda: peer.send(0, "cmd_vel", twist)) for k in range(30)]
+    node.run(3.0)
+    body = wire.sent["drone_0/twist"][-1].twist
+    assert body.angular.z == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(np.hypot(body.linear.x, body.linear.y), 0.5, atol=0.1)
+
+
+def test_body_rates_and_thrust_are_flown():
+    wire = Wire()
+    node, _ = make_node(wire, n=1)
+    peer = Peer(InProcess(wire), 1)
+    twist = msg.Twist(msg.Vector3(z=11.0), msg.Vector3(x=1.0))
+    wire.script = [(0.0, lambda: peer.send(0, "cmd_rates", twist))]
+    node.run(0.3)
+    imu = wire.sent["drone_0/imu"][-1]
+    assert imu.angular_velocity.x == pytest.approx(1.0, abs=0.05)
+    assert imu.linear_acceleration.z == pytest.approx(11.0, rel=0.02)
+
+
+def test_in_lockstep_a_tape_of_rotor_speeds_is_flown_bit_for_bit_as_by_the_engine_alone():
+    wire = Wire()
+    node, _ = make_node(wire, lockstep=True)
+    simulation = make_simulation()
+    tape = np.random.default_rng(0).uniform(0.9, 1.1, (20, 2, 4)) * np.asarray(simulation.params.hover_rpm)[:, None]
+    peer, seen = Peer(InProcess(wire), 2), []
+
+    def fly():
+        for rpm in tape:
+            for i in range(2):
+                peer.send(i, "cmd_motors", convert.motors(rpm[i]))
+            seen.append(peer.step())
+
+    wire.script = [(0.5, fly)]
+    assert node.run(0.2).steps == 20
+    state, step = simulation.state, team_step()
+    for rpm, heard in zip(tape, seen, strict=True):
+        state = step(simulation.params, state, rpm)
+        for name in ("pos", "quat", "omega", "rpm"):
+            np.testing.assert_array_equal(getattr(heard, name), getattr(state, name))
+        np.testing.assert_allclose(heard.vel, state.vel, atol=1e-15)  # it comes in body axes
+    assert_close(node._flight.state, state, atol=0)
+
+
+@pytest.mark.parametrize("silent_from", [0.0, 0.5])
+def test_a_lost_peer_leaves_drones_that_hover_at_their_last_target(silent_from):
+    wire = Wire()
+    node, warnings = make_node(wire, failsafe=Failsafe("hover", timeout=0.3, wait=1.0))
+    peer, target = Peer(InProcess(wire), 2), np.array([[0.2, 0.0, 1.0], [0.2, 0.5, 1.0]])
+    wire.script = [(0.1 * k, lambda: peer.fly_to(target)) for k in range(round(10 * silent_from))]
+    flown = node.run(3.0)
+    expected = target if silent_from else np.array([[0, 0, 1], [0, 0.5, 1.0]])
+    np.testing.assert_allclose(peer.state().pos, expected, atol=0.03)
+    limit = "0.3" if silent_from else "1"
+    assert flown.lost == 2 and warnings == [f"no command for drone_{i} for {limit} s; it hovers" for i in range(2)]
+
+
+@pytest.mark.slow
+def test_a_peer_that_comes_back_is_heard():
+    wire = Wire()
+    node, warnings = make_node(wire, n=1, failsafe=Failsafe("hover", timeout=0.2, wait=0.2))
+    peer = Peer(InProcess(wire), 1)
+    wire.script = [(1.0, lambda: peer.fly_to([[0.2, 0.0, 1.0]]))]
+    node.run(1.1)
+    assert warnings == ["no command for drone_0 for 0.2 s; it hovers", "commands for drone_0 are back; it flies them"]
+
+
+def test_drones_of_a_lost_peer_land_and_the_flight_ends():
+    wire = Wire()
+    node, _ = make_node(wire, failsafe=Failsafe("land", wait=0.1))
+    flown = node.run(20.0)
+    assert flown.landed and flown.steps < 20 * HZ
+    last = [sent[-1] for sent in (positions(wire, 0), positions(wire, 1))]
+    assert all(0 < p.z < 0.06 for p in last)
+
+
+def test_a_flight_stops_with_its_peer_if_asked_to():
+    wire = Wire()
+    node, _ = make_node(wire, failsafe=Failsafe("stop", wait=0.5))
+    with pytest.raises(PeerLost, match=r"no command for drone_0 for 0\.5 s; the flight stops"):
+        node.run(3.0)
+    assert wire.now == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize("action", ["hover", "land", "stop"])
+def test_without_calls_of_the_step_service_the_failsafe_acts(action):
+    wire = Wire()
+    node, warnings = make_node(wire, lockstep=True, failsafe=Failsafe(action, wait=0.5))
+    if action == "stop":
+        with pytest.raises(PeerLost, match=r"the step service was not called for 0.5 s; the flight stops"):
+            node.run(1.0)
+        return
+    flown = node.run(10.0 if action == "land" else 0.5)
+    assert flown.landed == (action == "land") and flown.lost == 1
+    assert warnings == ["the step service was not called for 0.5 s; the flight goes on by the clock"]
+
+
+@pytest.mark.parametrize("action", ["hover", "stop"])
+def test_a_wrong_type_is_said_and_the_flight_goes_on_or_stops(action):
+    wire = Wire()
+    wire.wrong = ["a peer publishes /drone_0/cmd_vel as geometry_msgs/msg/Pose; its type is geometry_msgs/msg/Twist"]
+    node, warnings = make_node(wire, failsafe=Failsafe(action))
+    if action == "stop":
+        with pytest.raises(PeerLost, match="its type is geometry_msgs/msg/Twist; the flight stops"):
+            node.run(0.1)
+    else:
+        assert node.run(0.1).steps == 10 and len(warnings) == 1 and "goes on without it" in warnings[0]
+
+
+def test_a_refused_message_is_said_once_and_changes_nothing():
+    wire = Wire()
+    node, warnings = make_node(wire, n=1)
+    peer = Peer(InProcess(wire), 1)
+    bad = msg.Float64MultiArray(data=(1.0,))
+    wire.script = [(0.01 * k, lambda: peer.send(0, "cmd_motors", bad)) for k in range(5)]
+    flown = node.run(0.3)
+    assert flown.refused == 5 and flown.received == 0 and len(warnings) == 1
+    assert "a message on /drone_0/cmd_motors is refused: its data has 1 numbers" in warnings[0]
+    assert peer.state().pos[0, 2] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.slow
+def test_images_come_at_the_rate_of_the_camera():
+    wire = Wire()
+    node, _ = make_node(wire, camera=Camera(resolution=(8, 6), rate=25.0))
+    node.run(0.2)
+    stamps = [convert.nanoseconds(m.header.stamp) for m in wire.sent["drone_1/camera/image_raw"]]
+    assert stamps == [k * 40_000_000 for k in range(6)]
+    assert len(wire.sent["drone_1/camera/camera_info"]) == 6
+
+
+def test_a_slow_computer_is_counted_and_not_caught_up_with():
+    wire = Wire()
+    node, _ = make_node(wire, n=1)
+
+    def stall():
+        wire.now += 0.5
+
+    wire.script = [(0.05, stall)]
+    flown = node.run(0.2)
+    assert flown.late == 1 and wire.now == pytest.approx(0.7, abs=0.02)
+
+
+@pytest.mark.needs("pybullet")
+def test_bullet_flies_behind_the_same_topics():
+    import jaxdrones as jd
+    from jaxdrones.engine import bullet
+    from jaxdrones.ros2 import Simulation
+
+    wire = Wire()
+    params = jd.repeat(jd.load_params("cf2x"), 1)
+    with bullet.make_step(dt=1 / 300, substeps=3) as step:
+        simulation = Simulation(step, params, jd.State.at_rest([[0.0, 0.0, 0.3]]), HZ)
+        node = Node(simulation, InProcess(wire), clock=wire.clock, failsafe=Failsafe("land", wait=0.1))
+        assert node.run(5.0).landed
+        for _ in range(HZ // 2):
+            simulation.advance()
+        imu = convert.state_messages(jax.device_get(simulation.measure()), 0, 0)["imu"]
+    assert imu.linear_acceleration.z == pytest.approx(9.8, abs=0.5)  # on the ground, which carries it

@@ -1,11 +1,15 @@
 """Environments: tasks, steps, action types and observations put together."""
 
-from jaxdrones.envs.actions import ACTIONS, Action
+from jaxdrones.envs.action import Action
+from jaxdrones.envs.actions import ACTIONS
 from jaxdrones.envs.autoreset import AutoReset
 from jaxdrones.envs.contract import ContractError, check_env
 from jaxdrones.envs.env import Env
+from jaxdrones.envs.explainer import explain
+from jaxdrones.envs.explanation import Explanation
+from jaxdrones.envs.named_tasks import TASKS
 from jaxdrones.envs.observations import OBSERVATIONS
-from jaxdrones.envs.registry import TASKS, make
+from jaxdrones.envs.registry import make
 from jaxdrones.tasks.task import ObservationTerm
 
 __all__ = [
@@ -16,7 +20,9 @@ __all__ = [
     "AutoReset",
     "ContractError",
     "Env",
+    "Explanation",
     "ObservationTerm",
     "check_env",
+    "explain",
     "make",
 ]

@@ -7,55 +7,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_callable, check_number, check_shape, check_whole
-from jaxdrones.control import Setpoint, attitude, for_team, geometric, pid, rates, velocity
+from jaxdrones.checks import check_number, check_shape
+from jaxdrones.control import Setpoint, attitude, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.envs.action import Action
 from jaxdrones.params import Params
+from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.state import State
 
-Command = Callable[[Params, Any, State, Array, Setpoint, float], tuple[Any, Float[Array, "4"]]]
-
-
-def _no_memory() -> None:
-    """The memory of an action type that keeps none."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Action:
-    """An action type: functions of one drone."""
-
-    size: int
-    """How many numbers an action of one drone has."""
-    rpm: Command
-    """(params, memory, state, action (size,), setpoint of the task, control period) -> (memory, rotor speeds, RPM)."""
-    init: Callable[[], Any] = _no_memory
-    """() -> memory of one drone at the start of an episode."""
-    for_vehicle: Callable[[Params], Action] | None = None
-    """Nominal parameters of the team -> the action type for this vehicle; `None` where it is the same for all."""
-
-    def team_memory(self, n: int) -> Any:
-        """The memory of a team of n drones at the start of an episode."""
-        return for_team(self.init(), n)
-
-    def fitted(self, params: Params) -> Action:
-        """The action type for this vehicle.
-
-        Raises:
-            ValueError: the action type does not suit the vehicle.
-        """
-        return self if self.for_vehicle is None else self.for_vehicle(params)
-
-    def __post_init__(self):
-        check_whole("size of an action type", self.size)
-        check_callable("rpm of an action type", self.rpm, "jaxdrones.envs.ACTIONS['rpm']().rpm")
-        check_callable("init of an action type", self.init, "lambda: None")
+Entries = tuple[Quantity, ...]
+_AHEAD = "way from the drone to the setpoint"
 
 
 def rpm(near_hover: float | None = None) -> Action:
@@ -65,7 +31,10 @@ def rpm(near_hover: float | None = None) -> Action:
     def command(params, memory, state, action, setpoint, dt):
         return memory, _rotor_speed(params, action, near_hover)
 
-    return Action(4, command)
+    def entries(params: Params) -> Entries:
+        return tuple(Quantity(f"speed of rotor {i}", "RPM", values=_speeds(params, near_hover)) for i in range(4))
+
+    return Action(4, command, entries=entries)
 
 
 def one_d_rpm(near_hover: float | None = 0.05) -> Action:
@@ -75,7 +44,10 @@ def one_d_rpm(near_hover: float | None = 0.05) -> Action:
     def command(params, memory, state, action, setpoint, dt):
         return memory, jnp.broadcast_to(_rotor_speed(params, action, near_hover), (4,))
 
-    return Action(1, command)
+    def entries(params: Params) -> Entries:
+        return (Quantity("speed of all rotors", "RPM", values=_speeds(params, near_hover)),)
+
+    return Action(1, command, entries=entries)
 
 
 def thrust_and_torques(torque_share: float = 0.05) -> Action:
@@ -85,13 +57,21 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
     """
     _check_share("torque_share", torque_share)
 
+    def limits(params: Params) -> Array:
+        return torque_share * jnp.stack([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
+
     def command(params, memory, state, action, setpoint, dt):
-        limits = torque_share * jnp.stack([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
         unlimited = params.replace(max_rpm=jnp.full_like(params.max_rpm, jnp.inf))
-        rpm = rpm_from_wrench(unlimited, params.weight * (1 + action[0]), limits * action[1:])
+        rpm = rpm_from_wrench(unlimited, params.weight * (1 + action[0]), limits(params) * action[1:])
         return memory, jnp.minimum(rpm, params.max_rpm)
 
-    return Action(4, command)
+    def entries(params: Params) -> Entries:
+        torques = zip("xyz", map(float, limits(params)), strict=True)
+        return _thrust(0.0, params.weight, 2 * params.weight) + tuple(
+            Quantity(f"{axis} of the torque", "N m", "body", (-limit, 0.0, limit)) for axis, limit in torques
+        )
+
+    return Action(4, command, entries=entries)
 
 
 def one_d_thrust(share: float = 0.05) -> Action:
@@ -102,12 +82,21 @@ def one_d_thrust(share: float = 0.05) -> Action:
         thrust = params.weight * (1 + share * action[0])
         return memory, rpm_from_wrench(params, thrust, jnp.zeros(3, thrust.dtype))
 
-    return Action(1, command)
+    def entries(params: Params) -> Entries:
+        return _thrust((1 - share) * params.weight, params.weight, (1 + share) * params.weight)
+
+    return Action(1, command, entries=entries)
 
 
 def velocity_input() -> Action:
     """Velocity command of gym-pybullet-drones (2021): a direction and a share of the speed limit."""
-    return _setpoint(4, velocity.setpoint)
+
+    def entries(params: Params) -> Entries:
+        highest = float(velocity.SPEED_SHARE * params.max_speed)
+        speed = Quantity("speed", "m/s", "world", (highest, 0.0, highest))
+        return (*quantities("direction of the velocity", "-", "world"), speed)
+
+    return _setpoint(4, velocity.setpoint, entries)
 
 
 def one_d_velocity() -> Action:
@@ -117,13 +106,21 @@ def one_d_velocity() -> Action:
         vertical = jnp.stack([0 * action[0], 0 * action[0], jnp.sign(action[0]), jnp.abs(action[0])])
         return velocity.setpoint(params, state, vertical)
 
-    return _setpoint(1, target)
+    def entries(params: Params) -> Entries:
+        highest = float(velocity.SPEED_SHARE * params.max_speed)
+        return (Quantity("z of the velocity", "m/s", "world", (-highest, 0.0, highest)),)
+
+    return _setpoint(1, target, entries)
 
 
 def position(step: float = 0.1) -> Action:
     """A position up to `step` (m) away along each axis."""
     check_number("step", step, "m", above=0)
-    return _setpoint(3, lambda params, state, action: Setpoint.at(state.pos + step * action))
+
+    def target(params, state, action):
+        return Setpoint.at(state.pos + step * action)
+
+    return _setpoint(3, target, lambda params: quantities(_AHEAD, "m", "world", values=(-step, 0.0, step)))
 
 
 def one_d_position(step: float = 0.1) -> Action:
@@ -133,7 +130,7 @@ def one_d_position(step: float = 0.1) -> Action:
     def target(params, state, action):
         return Setpoint.at(state.pos + jnp.stack([0 * action[0], 0 * action[0], step * action[0]]))
 
-    return _setpoint(1, target)
+    return _setpoint(1, target, lambda params: quantities(_AHEAD, "m", "world", "z", (-step, 0.0, step)))
 
 
 def destination(max_step: float = 1.0) -> Action:
@@ -148,7 +145,7 @@ def destination(max_step: float = 1.0) -> Action:
         distance = jnp.maximum(vector.dot(away, vector.unit(away)), max_step)
         return Setpoint.at(state.pos + away * max_step / distance)
 
-    return _setpoint(3, target)
+    return _setpoint(3, target, lambda params: quantities("destination", "m", "world"))
 
 
 def pid_gains() -> Action:
@@ -159,15 +156,19 @@ def pid_gains() -> Action:
         scaled = pid.Gains(*((1 + a) * gain for a, gain in zip(action, vars(own).values(), strict=True)))
         return pid.control(scaled, params, memory, state, setpoint, dt=dt)
 
+    def entries(params: Params) -> Entries:
+        names = [field.name for field in dataclasses.fields(pid.Gains)]
+        return tuple(Quantity(f"factor of the gain {name}", values=(0.0, 1.0, 2.0)) for name in names)
+
     def for_vehicle(params):
         if pid.fits(params):
-            return Action(6, command, pid.init)
+            return Action(6, command, pid.init, entries=entries)
         raise ValueError(
             f"the action type 'pid_gains' scales the gains of the PID, which suit {', '.join(pid.VEHICLES)} and no "
             "vehicle of other mass, inertia, arm or coefficients; take one of these, or another action type"
         )
 
-    return Action(6, command, pid.init, for_vehicle)
+    return Action(6, command, pid.init, for_vehicle, entries)
 
 
 def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
@@ -180,7 +181,13 @@ def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -
         omega = jnp.array(max_rate, action.dtype) * action[1:]
         return memory, rates.follow(rates.gains(), params, state, _collective(params, action[0]), omega)
 
-    return Action(4, command)
+    def entries(params: Params) -> Entries:
+        turning = zip("xyz", map(float, max_rate), strict=True)
+        return _thrust(0.0, params.weight, params.max_thrust) + tuple(
+            Quantity(f"{axis} of the body rates", "rad/s", "body", (-rate, 0.0, rate)) for axis, rate in turning
+        )
+
+    return Action(4, command, entries=entries)
 
 
 def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
@@ -194,14 +201,18 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
         omega = -2 * gains.attitude * attitude.error(rotation.axes(state.quat), target)
         return memory, rates.follow(gains, params, state, _collective(params, action[0]), omega)
 
-    return Action(4, command)
+    def entries(params: Params) -> Entries:
+        angles = (("roll", max_tilt), ("pitch", max_tilt), ("yaw", 180.0))
+        return _thrust(0.0, params.weight, params.max_thrust) + tuple(
+            Quantity(angle, "degrees", "body to world", (-limit, 0.0, limit)) for angle, limit in angles
+        )
+
+    return Action(4, command, entries=entries)
 
 
-_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
-_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
-
-
-def _setpoint(size: int, target: Callable[[Params, State, Array], Setpoint]) -> Action:
+def _setpoint(
+    size: int, target: Callable[[Params, State, Array], Setpoint], entries: Callable[[Params], Entries]
+) -> Action:
     """An action type that commands a setpoint, whatever the task.
 
     The PID follows it with vehicles that its gains suit, the geometric controller with all others.
@@ -212,40 +223,27 @@ def _setpoint(size: int, target: Callable[[Params, State, Array], Setpoint]) -> 
             wanted = target(params, state, action)
             return controller.control(controller.gains(), params, memory, state, wanted, dt=dt)
 
-        return Action(size, command, controller.init, lambda params: flown_by(pid if pid.fits(params) else geometric))
+        return Action(
+            size, command, controller.init, lambda params: flown_by(pid if pid.fits(params) else geometric), entries
+        )
 
     return flown_by(pid)
-
-
-def check_loop(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:
-    """Raise `ValueError` if the controller of an action type would be called too seldom, or its rotors lag too much.
-
-    Args:
-        name: name of the action type.
-        action: the action type.
-        params: nominal parameters of the vehicle.
-        lagging: whether the rotors lag.
-        dt: control period, s.
-    """
-    if action.for_vehicle is None:
-        return
-    if dt > _MAX_PERIOD * (1 + 1e-6):
-        raise ValueError(
-            f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
-            f"{1 / _MAX_PERIOD:g} or more"
-        )
-    time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
-    if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
-        raise ValueError(
-            f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
-            f"{_MAX_ROTOR_TIME} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
-            "action type that commands rotors, thrust and torques, or rates"
-        )
 
 
 def _check_share(name: str, share: float | None) -> None:
     if share is not None:
         check_number(name, share, above=0, at_most=1)
+
+
+def _speeds(params: Params, near_hover: float | None) -> tuple[float, float, float]:
+    """Rotor speeds at -1, 0 and 1, RPM."""
+    low, hover, high = (float(_rotor_speed(params, jnp.asarray(x), near_hover)) for x in (-1.0, 0.0, 1.0))
+    return low, hover, high
+
+
+def _thrust(low: Array | float, zero: Array, high: Array) -> Entries:
+    """The collective thrust at -1, 0 and 1, N."""
+    return (Quantity("collective thrust", "N", "body", (float(low), float(zero), float(high))),)
 
 
 def _rotor_speed(params: Params, action: Array, near_hover: float | None) -> Array:

@@ -14,7 +14,7 @@ from jaxdrones.checks import (
     check_shape,
     shown,
 )
-from jaxdrones.envs.actions import Action
+from jaxdrones.envs.action import Action
 from jaxdrones.params import Params
 from jaxdrones.tasks.task import ObservationTerm, Task
 

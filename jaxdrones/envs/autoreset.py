@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,10 +11,11 @@ from jaxtyping import Array, Float
 from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.envs.env import RESET, Env, Obs
 from jaxdrones.envs.vision import observation, renewed_images
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.tasks.task import World
 
 
-class Episode(flax.struct.PyTreeNode):
+class Episode(PyTreeNode):
     """A world, and the statistics of its episode so far."""
 
     world: World
@@ -47,25 +47,33 @@ class AutoReset:
         self, key: jax.Array, episode: Episode, action: Float[Array, "n a"]
     ) -> tuple[Obs, Episode, Float[Array, " n"], Array, Array, dict[str, Any]]:
         """One control step; where it ends the episode, the observation and the world are those of the next one."""
-        obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
-        episode_return, length = episode.episode_return + reward, episode.length + 1
-        last = {"final_obs": obs, "final_world": world}
-        info = info | last | {"episode": {"return": episode_return, "length": length}}
+        obs, episode, reward, terminated, truncated, info = self.step_without_reset(key, episode, action)
+        info = info | {"final_obs": obs, "final_world": episode.world}
+        obs, episode = self.renewed(terminated | truncated, key, obs, episode)
+        return obs, episode, reward, terminated, truncated, info
 
-        ended = terminated | truncated
-        key = jax.random.fold_in(key, RESET)
+    def step_without_reset(
+        self, key: jax.Array, episode: Episode, action: Float[Array, "n a"]
+    ) -> tuple[Obs, Episode, Float[Array, " n"], Array, Array, dict[str, Any]]:
+        """One control step, whose info has the statistics of the episode; where it ends, nothing is reset."""
+        obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
+        episode = Episode(world, episode.episode_return + reward, episode.length + 1)
+        info = info | {"episode": {"return": episode.episode_return, "length": episode.length}}
+        return obs, episode, reward, terminated, truncated, info
+
+    def renewed(self, ended: Array, key: jax.Array, obs: Obs, episode: Episode) -> tuple[Obs, Episode]:
+        """The start of a new episode where one has `ended`, and elsewhere what is given; `key` is that of the step."""
+        world, key = episode.world, jax.random.fold_in(key, RESET)
         vector = obs["state"] if isinstance(obs, dict) else obs
         fresh_obs, fresh = where_needed(self._fresh)(ended, key)
         fresh = fresh.replace(**{name: getattr(world, name) for name in self._kept})
-        fresh = Episode(fresh, jnp.zeros_like(episode_return), jnp.zeros_like(length))
+        fresh = Episode(fresh, jnp.zeros_like(episode.episode_return), jnp.zeros_like(episode.length))
         vector, episode = jax.tree.map(
-            lambda new, old: old if new is old else jnp.where(ended, new, old),
-            (fresh_obs, fresh),
-            (vector, Episode(world, episode_return, length)),
+            lambda new, old: old if new is old else jnp.where(ended, new, old), (fresh_obs, fresh), (vector, episode)
         )
         if self.env.vision:
             episode = episode.replace(world=self.env.with_images(renewed_images, key, episode.world, ended))
-        return observation(vector, episode.world), episode, reward, terminated, truncated, info
+        return observation(vector, episode.world), episode
 
     @property
     def _kept(self) -> tuple[str, ...]:

@@ -13,10 +13,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxdrones.checks import check_callable, check_finite, check_key, check_shape
 from jaxdrones.engine.step import HostStep, Step
-from jaxdrones.envs.actions import Action
+from jaxdrones.envs.action import Action
 from jaxdrones.envs.arguments import check_randomizations, check_team, check_terms, delay_steps, episode_steps
+from jaxdrones.envs.construction import Constructed, constructed
 from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
+from jaxdrones.envs.process import check_process
 from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import ImageSpace, Vision, first_images, next_images, observation
@@ -33,12 +35,14 @@ Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
 Key = Any  # a random key; `None` where nothing is drawn
 
 
-class Env:
+class Env(Constructed):
     """`reset(key) -> obs, world` and `step(key, world, action) -> obs, world, reward, terminated, truncated, info`.
 
     Both are pure: use `jax.jit`, `jax.vmap` for many worlds, `jax.grad` on the explicit backend. Nothing is reset
     when an episode ends; `AutoReset` does that. A copy (`copy.copy`) is an environment of its own, whose attributes,
-    such as `steps`, may be set without changing the original; on Bullet both share one connection.
+    such as `steps`, may be set without changing the original; on Bullet both share one connection. Environments pickle,
+    compare and hash by the arguments they were made with (functions by identity), so that they may be static arguments
+    of `jax.jit`; those of Bullet are equal only to themselves.
     """
 
     def __init__(
@@ -81,6 +85,7 @@ class Env:
         Raises:
             ValueError: an argument of another kind, or a number out of range; says what to give.
         """
+        check_process()
         check_team(task, params, action, dt)
         terms, randomize = check_terms(observation), check_randomizations(randomize)
         if noise is not None:
@@ -92,37 +97,35 @@ class Env:
         obstacles = check_scene(self.scene, step, task)
         self.task, self.params, self.dt, self.drones = task, params, dt, task.drones
         self.action, self.action_size = action.fitted(params), action.size
-        self.physics, self.vision, self._vehicle = step, vision, vehicle
+        self.physics, self.vision, self.vehicle = step, vision, vehicle
         self.image_spaces: dict[str, ImageSpace] = vision.spaces(task.drones, obstacles) if vision else {}
         """Shape, dtype and bounds of every image of a drone, by name."""
         self.steps = episode_steps(task, dt)
         """Number of control steps after which an episode is truncated."""
         self.sensors = check_sensors(sensors)
-        self._terms, self._randomize, self._noise, self._disturbance = terms, randomize, noise, disturbance
-        self._delay = delay_steps(task, delay, dt)
-        self._history = max(math.ceil(self._delay) + 1, *(term.history for term in terms))
+        self.terms, self.randomize, self.noise, self.disturbance = terms, randomize, noise, disturbance
+        self.delay = delay_steps(task, delay, dt)  # control steps
+        self._history = max(math.ceil(self.delay) + 1, *(term.history for term in terms))
         self._drawn = drawn_leaves(randomize, params)
-        self.observation_bound = bounds(terms, self._widths())
+        self.observation_bound = bounds(terms, self.term_sizes())
         """(d,) largest magnitude of every entry of the observation."""
         self.observation_size = len(self.observation_bound)
+        constructed(self)
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        vars(self)["_programs"] = {}  # compiled with the old value
-        super().__setattr__(name, value)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_programs": {}}
+    @property
+    def _key(self) -> Any:
+        return id(self) if isinstance(self.physics, HostStep) else super()._key  # a connection is no other's
 
     def __repr__(self) -> str:
         backend = "bullet" if isinstance(self.physics, HostStep) else "explicit"
         seen = f"{self.observation_size} observations" + (f" and {self.vision}" if self.vision else "")
-        team = f"{self.drones} x {self._vehicle}, dt {self.dt:.4g} s, {self.steps} steps"
+        team = f"{self.drones} x {self.vehicle}, dt {self.dt:.4g} s, {self.steps} steps"
         return f"<Env {self.task.name}: {team}, {self.action_size} actions and {seen} a drone, {backend} backend>"
 
     @property
     def constant_fields(self) -> tuple[str, ...]:
         """Names of the fields of a world that are the same in every episode."""
-        params = () if self._randomize or self._disturbance else ("params",)
+        params = () if self.randomize or self.disturbance else ("params",)
         return (*params, "scene") if isinstance(self.scene, Scene) else params
 
     @property
@@ -177,7 +180,7 @@ class Env:
         check_shape("action", action, (self.drones, self.action_size), "one row of the action type's size per drone")
         check_finite("action", action)
         # A program without random keys can be a single kernel.
-        key_of_draws: Key = key if self._noise or self._disturbance or self.sensors else None
+        key_of_draws: Key = key if self.noise or self.disturbance or self.sensors else None
         world, rpm = self.compiled(Env._command)(key_of_draws, world, action)
         drones = self.physics(world.params, world.drones, rpm, scene_for_step(self.physics, self.scene, world))
         world = world.replace(drones=drones)
@@ -189,11 +192,12 @@ class Env:
     def privileged_observation(self, world: World) -> PrivilegedObservation:
         """What a critic may know in training: the observation without noise, and the drawn parameters."""
         return PrivilegedObservation(
-            observe(self._terms, self.task, world), deviations(world.params, self.params, self._drawn)
+            observe(self.terms, self.task, world), deviations(world.params, self.params, self._drawn)
         )
 
     def compiled(self, function: Callable) -> Callable:
         """`function(env, ...)` with this environment, compiled once until one of its attributes is set."""
+        check_process()
         programs = vars(self)["_programs"]
         if function not in programs:
             programs[function] = jax.jit(functools.partial(function, self))
@@ -212,7 +216,7 @@ class Env:
 
     def _start(self, key: jax.Array) -> World:
         """The world at the start of an episode, before the first measurement."""
-        params = draw(self._randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
+        params = draw(self.randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
         scene = self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE))
         drones, variables = self.task.begin(jax.random.fold_in(key, START), self.params, scene)
         return World(
@@ -251,14 +255,14 @@ class Env:
         action = jnp.clip(jnp.asarray(action, world.actions.dtype), -1, 1)
         actions = jnp.concatenate([world.actions[:, 1:], action[:, None]], axis=1)
         params = world.params
-        if self._disturbance:
-            params = self._disturbance(jax.random.fold_in(key, DISTURBANCE), params, self.dt)
+        if self.disturbance:
+            params = self.disturbance(jax.random.fold_in(key, DISTURBANCE), params, self.dt)
         world = world.replace(actions=actions, params=params)
 
         def of_drone(params, memory, state, action, setpoint):
             return self.action.rpm(params, memory, state, action, setpoint, self.dt)
 
-        flown = delayed(actions, self._delay), self.task.target_now(world)
+        flown = delayed(actions, self.delay), self.task.target_now(world)
         memory, rpm = jax.vmap(of_drone)(self.params, world.memory, world.drones, *flown)
         return world.replace(memory=memory), rpm
 
@@ -281,16 +285,16 @@ class Env:
         return obs, world, sum(rewards.values()), terminated, truncated, info
 
     def _noisy_observation(self, key: Key, world: World) -> Array:
-        if self._noise:
-            world = world.replace(drones=self._noise(jax.random.fold_in(key, NOISE), world.drones))
-        return observe(self._terms, self.task, world)
+        if self.noise:
+            world = world.replace(drones=self.noise(jax.random.fold_in(key, NOISE), world.drones))
+        return observe(self.terms, self.task, world)
 
-    def _widths(self) -> list[int]:
+    def term_sizes(self) -> list[int]:
         """How many numbers of a drone each observation term has."""
 
         def terms(key):
             world = self._start(key)
             _, world = self._first_observation(key, world, self._rate(world, world.drones.rpm))
-            return [term.observe(self.task, world) for term in self._terms]
+            return [term.observe(self.task, world) for term in self.terms]
 
         return [x.shape[-1] for x in jax.eval_shape(terms, jax.random.key(0))]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.tasks.task import ObservationTerm, Task, World, norm
 
 _MAX_DISTANCE, _MAX_SPEED, _MAX_RATE = 20.0, 30.0, 100.0  # m, m/s, rad/s: bounds of the observations
@@ -127,9 +129,14 @@ def last_actions(count: int) -> ObservationTerm:
     """A term of the last actions, oldest first."""
 
     def observe(task: Task, world: World) -> Array:
+        """The last actions, oldest first."""
         return jnp.reshape(world.actions[:, -count:], (len(world.actions), -1))
 
-    return ObservationTerm(observe, _UNIT, history=count)
+    def entries(drones: int, action: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
+        ages = ["last action"] if count == 1 else [f"action {count - i} steps ago" for i in range(count)]
+        return tuple(dataclasses.replace(entry, name=f"{age}: {entry.name}") for age in ages for entry in action)
+
+    return ObservationTerm(observe, _UNIT, history=count, entries=entries, name=f"last_actions({count})")
 
 
 def neighbors(count: int) -> ObservationTerm:
@@ -139,6 +146,7 @@ def neighbors(count: int) -> ObservationTerm:
     """
 
     def observe(task: Task, world: World) -> Array:
+        """Position and velocity of the nearest drones, relative to the drone."""
         n = len(world.drones.pos)
         away = jnp.where(jnp.eye(n, dtype=bool), jnp.inf, _distances(world))
         motion = jnp.concatenate([world.drones.pos, world.drones.vel], -1)
@@ -149,27 +157,35 @@ def neighbors(count: int) -> ObservationTerm:
             away = jnp.where(jnp.arange(n)[None] == nearest[:, None], jnp.inf, away)
         return jnp.pad(jnp.concatenate(relative, -1), ((0, 0), (0, 6 * max(count - n + 1, 0))))
 
-    return ObservationTerm(observe, _MAX_DISTANCE)
+    entries: list[Quantity] = []
+    for i in range(count):
+        which = "nearest drone" if i == 0 else f"drone nearest but {i}"
+        entries += quantities(f"position of the {which}", "m", "world")
+        entries += quantities(f"velocity of the {which}", "m/s", "world")
+    return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=f"neighbors({count})")
 
 
-def reading(sensor: str, bound: float = math.inf) -> ObservationTerm:
-    """A term of the latest reading of a sensor of this name, flattened."""
+def reading(sensor: str, bound: float = math.inf, entries: tuple[Quantity, ...] = ()) -> ObservationTerm:
+    """A term of the latest reading of a sensor of this name, flattened; `entries` say what its numbers stand for."""
 
     def observe(task: Task, world: World) -> Array:
+        """The latest reading of a sensor."""
         n = len(world.drones.pos)
         return jnp.concatenate([jnp.reshape(x, (n, -1)) for x in jax.tree.leaves(world.readings[sensor])], axis=-1)
 
-    return ObservationTerm(observe, bound)
+    return ObservationTerm(observe, bound, entries=entries, name=sensor)
 
 
 def preview(*ahead: float) -> ObservationTerm:
     """A term of the future positions of the target, `ahead` (s) from now, relative to the drone, m, world axes."""
 
     def observe(task: Task, world: World) -> Array:
+        """Future positions of the target, relative to the drone."""
         later = [task.target(world.variables, world.time + t).pos - world.drones.pos for t in ahead]
         return jnp.concatenate(later, axis=-1)
 
-    return ObservationTerm(observe, _MAX_DISTANCE)
+    entries = [entry for t in ahead for entry in quantities(f"target in {t:g} s, from the drone", "m", "world")]
+    return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=f"preview{ahead}")
 
 
 def observe(terms: Sequence[ObservationTerm], task: Task, world: World) -> Float[Array, "n d"]:
@@ -203,24 +219,57 @@ _KINEMATICS = (
 )
 _KINEMATICS_2X = (_MAX_DISTANCE,) * 3 + (_TURN,) * 3 + (_MAX_SPEED,) * 3 + (_MAX_RATE,) * 3
 
+_POSITION = quantities("position", "m", "world")
+_VELOCITY = quantities("velocity", "m/s", "world")
+_QUATERNION = quantities("quaternion", "-", "body to world", "xyzw")
+_RPY = tuple(Quantity(angle, "rad", "body to world") for angle in ("roll", "pitch", "yaw"))
+_MATRIX = tuple(Quantity(f"{b} of body {a} axis", "-", "world") for b in "xyz" for a in "xyz")
+_OMEGA_WORLD = quantities("angular velocity", "rad/s", "world")
+_RPM = tuple(Quantity(f"speed of rotor {i}", "RPM") for i in range(4))
+_NORMALIZED = (
+    *quantities("position", "m", "world", "xy", (-15.0, 0.0, 15.0)),
+    *quantities("position, seen from 0 to 5 m", "m", "world", "z", (-5.0, 0.0, 5.0)),
+    *(dataclasses.replace(angle, values=(-math.pi, 0.0, math.pi)) for angle in _RPY),
+    *quantities("velocity", "m/s", "world", "xy", (-3.0, 0.0, 3.0)),
+    *quantities("velocity, seen up to 1 m/s", "m/s", "world", "z", (-3.0, 0.0, 3.0)),
+    *quantities("direction of the angular velocity", "-", "world"),
+)
+
+
+def _others(drones: int, action: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
+    return tuple(Quantity(f"whether drone {i} is within 10 m") for i in range(drones))
+
+
 OBSERVATIONS: dict[str, ObservationTerm] = {
-    "position": ObservationTerm(position, _MAX_DISTANCE),
-    "position_error": ObservationTerm(position_error, _MAX_DISTANCE),
-    "position_error_body": ObservationTerm(position_error_body, _MAX_DISTANCE * 2),
-    "velocity": ObservationTerm(velocity, _MAX_SPEED),
-    "velocity_body": ObservationTerm(velocity_body, _MAX_SPEED),
-    "velocity_error": ObservationTerm(velocity_error, _MAX_SPEED),
-    "quaternion": ObservationTerm(quaternion, _UNIT),
-    "rpy": ObservationTerm(rpy, _TURN),
-    "rotation_matrix": ObservationTerm(rotation_matrix, _UNIT),
-    "gravity": ObservationTerm(gravity, _UNIT),
-    "omega": ObservationTerm(omega, _MAX_RATE),
-    "omega_world": ObservationTerm(omega_world, _MAX_RATE),
-    "rotor_speed": ObservationTerm(rotor_speed, 10.0),
-    "kinematics": ObservationTerm(kinematics, _KINEMATICS),
-    "kinematics_2x": ObservationTerm(kinematics_2x, _KINEMATICS_2X),
-    "normalized_kinematics": ObservationTerm(normalized_kinematics, _UNIT),
-    "adjacency": ObservationTerm(adjacency, 1.0),
+    "position": ObservationTerm(position, _MAX_DISTANCE, entries=_POSITION),
+    "position_error": ObservationTerm(
+        position_error, _MAX_DISTANCE, entries=quantities("target, from the drone", "m", "world")
+    ),
+    "position_error_body": ObservationTerm(
+        position_error_body, _MAX_DISTANCE * 2, entries=quantities("target, from the drone", "m", "body")
+    ),
+    "velocity": ObservationTerm(velocity, _MAX_SPEED, entries=_VELOCITY),
+    "velocity_body": ObservationTerm(velocity_body, _MAX_SPEED, entries=quantities("velocity", "m/s", "body")),
+    "velocity_error": ObservationTerm(
+        velocity_error, _MAX_SPEED, entries=quantities("velocity of the target, relative", "m/s", "world")
+    ),
+    "quaternion": ObservationTerm(quaternion, _UNIT, entries=_QUATERNION),
+    "rpy": ObservationTerm(rpy, _TURN, entries=_RPY),
+    "rotation_matrix": ObservationTerm(rotation_matrix, _UNIT, entries=_MATRIX),
+    "gravity": ObservationTerm(gravity, _UNIT, entries=quantities("direction of gravity", "-", "body")),
+    "omega": ObservationTerm(omega, _MAX_RATE, entries=quantities("angular velocity", "rad/s", "body")),
+    "omega_world": ObservationTerm(omega_world, _MAX_RATE, entries=_OMEGA_WORLD),
+    "rotor_speed": ObservationTerm(
+        rotor_speed, 10.0, entries=tuple(Quantity(f"speed of rotor {i}", "of the highest") for i in range(4))
+    ),
+    "kinematics": ObservationTerm(
+        kinematics, _KINEMATICS, entries=(*_POSITION, *_QUATERNION, *_RPY, *_VELOCITY, *_OMEGA_WORLD, *_RPM)
+    ),
+    "kinematics_2x": ObservationTerm(
+        kinematics_2x, _KINEMATICS_2X, entries=(*_POSITION, *_RPY, *_VELOCITY, *_OMEGA_WORLD)
+    ),
+    "normalized_kinematics": ObservationTerm(normalized_kinematics, _UNIT, entries=_NORMALIZED),
+    "adjacency": ObservationTerm(adjacency, 1.0, entries=_others),
     "last_action": last_actions(1),
     "last_actions_2x": last_actions(15),
     "neighbors": neighbors(2),

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 
 
-class PrivilegedObservation(flax.struct.PyTreeNode):
+class PrivilegedObservation(PyTreeNode):
     """Observation of a team that no sensor provides."""
 
     obs: Array

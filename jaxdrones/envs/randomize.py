@@ -10,6 +10,7 @@ from jaxdrones import rotation
 from jaxdrones.accelerate import compiler
 from jaxdrones.checks import POSITIVE, check_choice, check_number
 from jaxdrones.params import Params
+from jaxdrones.quantity import described
 from jaxdrones.state import State
 
 Randomization = Callable[[jax.Array, Params], Params]
@@ -42,7 +43,7 @@ def scaled(field: str, low: float, high: float) -> Randomization:
         value = getattr(params, field)
         return params.replace(**{field: value * jax.random.uniform(key, (), value.dtype, low, high)})
 
-    return randomize
+    return described(f"{field} times U({low:g}, {high:g})", randomize)
 
 
 def shifted(field: str, low: float, high: float) -> Randomization:
@@ -57,7 +58,7 @@ def shifted(field: str, low: float, high: float) -> Randomization:
         value = getattr(params, field)
         return params.replace(**{field: value + jax.random.uniform(key, value.shape, value.dtype, low, high)})
 
-    return randomize
+    return described(f"{field} plus U({low:g}, {high:g}), each entry", randomize)
 
 
 def constant_wind(speed: float) -> Randomization:
@@ -72,7 +73,7 @@ def constant_wind(speed: float) -> Randomization:
         wind = jax.random.uniform(key, (3,), params.wind.dtype, -speed, speed)
         return params.replace(wind=wind * jnp.array([1, 1, 0.25], wind.dtype))
 
-    return randomize
+    return described(f"wind U(-{speed:g}, {speed:g}) m/s along x and y, a quarter of it along z", randomize)
 
 
 def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> Params:
@@ -113,7 +114,7 @@ def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, om
             omega=state.omega + omega * x[:, 9:],
         )
 
-    return noise
+    return described(f"normal: {pos:g} m, {vel:g} m/s, {angle:g} rad and {omega:g} rad/s (standard deviations)", noise)
 
 
 def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) -> Disturbance:
@@ -135,7 +136,11 @@ def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) ->
         begins, ends = u[:, :1] < dt / interval, u[:, :1] > 1 - dt / duration
         return params.replace(external_force=jnp.where(begins, fresh, jnp.where(ends, 0, params.external_force)))
 
-    return disturbance
+    return described(
+        f"pushes of U(-{force:g}, {force:g}) of the weight along each axis, every {interval:g} s for {duration:g} s on "
+        "average",
+        disturbance,
+    )
 
 
 def delayed(actions: Array, steps: float) -> Array:

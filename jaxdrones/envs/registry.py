@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import os
 from collections.abc import Callable, Sequence
@@ -15,7 +16,6 @@ from jaxdrones.checks import (
     check_sequence,
     check_switch,
     check_whole,
-    hint,
     shown,
 )
 from jaxdrones.dynamics import (
@@ -34,10 +34,14 @@ from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import TeamEffect
-from jaxdrones.envs.actions import ACTIONS, Action, check_loop
+from jaxdrones.envs.action import Action, check_loop
+from jaxdrones.envs.actions import ACTIONS
 from jaxdrones.envs.arguments import check_randomizations
+from jaxdrones.envs.construction import remembered
 from jaxdrones.envs.env import Env
+from jaxdrones.envs.named_tasks import make_task
 from jaxdrones.envs.observations import OBSERVATIONS, reading
+from jaxdrones.envs.process import check_process
 from jaxdrones.envs.randomize import (
     REALISTIC_DELAY,
     REALISTIC_RANDOMIZATION,
@@ -51,35 +55,15 @@ from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
-from jaxdrones.tasks import follow, forest, gates, gym_pybullet_drones, hover, room, swap, tracking
 from jaxdrones.tasks.task import ObservationTerm, Task
 from jaxdrones.urdf import load_params
 
-TASKS: dict[str, Callable[..., Task]] = {
-    "hover": hover.hover,
-    "recovery": hover.recovery,
-    "landing": hover.landing,
-    "tracking": tracking.tracking,
-    "gates": gates.gates,
-    "forest": forest.forest,
-    "room": room.room,
-    "follow": follow.follow,
-    "swap-goals": swap.swap_goals,
-    "hover-2021": gym_pybullet_drones.hover,
-    "takeoff": gym_pybullet_drones.takeoff,
-    "fly-through-gate": gym_pybullet_drones.fly_through_gate,
-    "tune": gym_pybullet_drones.tune,
-    "leader-follower": gym_pybullet_drones.leader_follower,
-    "flock": gym_pybullet_drones.flock,
-    "meetup": gym_pybullet_drones.meetup,
-    "hover-2x": gym_pybullet_drones.hover_2x,
-    "multi-hover": gym_pybullet_drones.multi_hover,
-}
 BACKENDS = ("explicit", "bullet")
 
 
+@remembered
 def make(
-    task: str | Task,
+    task: str | Task | Callable[..., Task],
     *,
     backend: str = "explicit",
     vehicle: str | os.PathLike | Params = "cf2x",
@@ -107,7 +91,7 @@ def make(
     """Make an environment.
 
     Args:
-        task: a name of `TASKS`, or a task.
+        task: a name of `TASKS`; `file.py:function` of a function that returns a task, or this function; or a task.
         backend: `explicit` or `bullet`, which must be closed: use the environment in a `with` block.
         vehicle: a bundled vehicle, the path of a URDF, or the parameters of one drone.
         action: a name of `ACTIONS` or an action type; the task's own when left out.
@@ -136,13 +120,15 @@ def make(
         **options: options of the task, for example `drones`.
 
     Raises:
-        ValueError: an unknown name, a number out of range, an option that the task does not have, an action type that
-            is flown by a controller that the vehicle, its rotors or the control rate do not suit.
+        ValueError: an unknown name, a number out of range, an action type that is flown by a controller that the
+            vehicle, its rotors or the control rate do not suit.
+        TypeError: an option that neither this function nor the task has.
         ImportError: the Bullet backend is asked for and pybullet is not installed.
     """
+    check_process()
     check_choice("backend", backend, BACKENDS)
     check_switch("realistic", realistic)
-    task = _task(task, options)
+    task = make_task(task, options, _OWN_OPTIONS)
     control_hz = task.control_hz if control_hz is None else control_hz
     substeps = task.substeps if substeps is None else substeps
     check_positive("control_hz", control_hz, "1/s")
@@ -215,19 +201,6 @@ _REALISTIC: dict[str, Any] = dict(
 )
 
 
-def _task(task: str | Task, options: dict) -> Task:
-    if isinstance(task, Task):
-        if options:
-            meant = "".join(hint(option, _OWN_OPTIONS) for option in options)
-            raise ValueError(f"options {', '.join(options)} are given beside a task; give them to the task{meant}")
-        return task
-    check_choice("task", task, TASKS)
-    known = TASKS[task].__annotations__.keys() - {"return"}
-    for option in options:
-        check_choice(f"option of {task}", option, _OWN_OPTIONS | known)
-    return TASKS[task](**options)
-
-
 _OWN_OPTIONS = {name for name in inspect.signature(make).parameters if name not in ("task", "options")}
 
 
@@ -257,7 +230,7 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
             f"action is {shown(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
         )
     check_loop(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
-    return kind.fitted(nominal)
+    return dataclasses.replace(kind, name=action if isinstance(action, str) else kind.name).fitted(nominal)
 
 
 def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, ObservationTerm]:
@@ -266,7 +239,8 @@ def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, Observation
     for sensor in sensors:
         if sensor.name in terms:
             raise ValueError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
-    return terms | {sensor.name: reading(sensor.name, sensor.bound) for sensor in sensors}
+    terms |= {sensor.name: reading(sensor.name, sensor.bound, sensor.entries) for sensor in sensors}
+    return {name: dataclasses.replace(term, name=name) for name, term in terms.items()}
 
 
 def _vision(

@@ -22,7 +22,7 @@ from jaxdrones.state import State
 from jaxdrones.tasks.task import World
 
 IMAGES = ("rgb", "depth", "segmentation")
-_PIXELS = 4096  # that are computed at a time: so many stay in a cache
+_PIXELS = 16384  # that are computed at a time: so many stay in a cache
 
 
 class ImageSpace(NamedTuple):
@@ -32,6 +32,8 @@ class ImageSpace(NamedTuple):
     dtype: type
     low: float
     high: float
+    meaning: str
+    """What a value stands for, with its unit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,9 +94,13 @@ class Vision:
         width, height = self.camera.resolution
         shape = (height, width)
         known = {
-            "rgb": ImageSpace((*shape, 4), np.uint8, 0, 255),
-            "depth": ImageSpace(shape, np.float32, 0.0, self.camera.far),
-            "segmentation": ImageSpace(shape, np.int32, -1, drones + obstacles),
+            "rgb": ImageSpace((*shape, 4), np.uint8, 0, 255, "red, green, blue and opacity"),
+            "depth": ImageSpace(
+                shape, np.float32, 0.0, self.camera.far, "m along the viewing axis, the highest where nothing is"
+            ),
+            "segmentation": ImageSpace(
+                shape, np.int32, -1, drones + obstacles, "-1 nothing, 0 ground, then the drones, then the obstacles"
+            ),
         }
         return {name: known[name] for name in self.images}
 

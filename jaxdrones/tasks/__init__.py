@@ -1,1 +1,7 @@
 """Tasks: how episodes start, where drones should be, what is rewarded, and when an episode ends."""
+
+from jaxdrones.quantity import Quantity, described
+from jaxdrones.tasks.shaping import REACH_AND_STAY
+from jaxdrones.tasks.task import ObservationTerm, Task, World, out_of_control
+
+__all__ = ["REACH_AND_STAY", "ObservationTerm", "Quantity", "Task", "World", "described", "out_of_control"]

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdrones.checks import check_finite, check_positive, check_whole
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.pytree import PyTreeNode
 
 WAYPOINTS = 8
 RANDOM_NUMBERS = 3 * WAYPOINTS + 3
@@ -64,7 +65,7 @@ SHAPES: dict[str, Shape] = {
 }
 
 
-class Curve(flax.struct.PyTreeNode):
+class Curve(PyTreeNode):
     """A place for every drone at every time."""
 
     point: Point = flax.struct.field(pytree_node=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 
@@ -13,6 +14,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Camera
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
@@ -32,6 +34,9 @@ _TOLERANCE = 0.3  # share of the distance
 
 camera = Camera(resolution=(32, 24), field_of_view=60.0)
 """The camera of the task, fixed to the body. A drone that is out of its field of view is lost from sight."""
+
+
+_TOUCHED = shaping.variable("touched", "One if the drone has touched another one or the ground.")
 
 
 @check_keywords
@@ -64,6 +69,7 @@ def follow(
         return setpoint_on(lambda t: center + size * lissajous(variables["random"], variables["phase"] + t / period), t)
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        """The leader's point on its curve; of the others, the place at the distance from the drone before."""
         first = leader(variables, t)
         pos, vel = variables["pos"], variables["vel"]
         return Setpoint.at(
@@ -73,6 +79,7 @@ def follow(
         )
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """The leader on its curve, the others in a line behind it, facing it."""
         curve_key, phase_key, bearing_key, start_key = jax.random.split(key, 4)
         dtype = params.mass.dtype
         variables = {
@@ -106,20 +113,28 @@ def follow(
         | {
             "view": (-1.0, _out_of_sight),
             "crowding": (-5.0, shaping.crowding),
-            "touched": (-10.0, shaping.variable("touched")),
+            "touched": (-10.0, _TOUCHED),
         },
-        terminations={"touched": lambda task, world: world.variables["touched"]}
+        terminations={"touched": shaping.flag("touched", "A drone touches another one or the ground.")}
         | out_of_control(2 * HEIGHT + distance * drones, center=(0, 0, HEIGHT)),
         advance=_advance,
         metrics={
             "distance_error": distance_error,
-            "in_view": lambda task, world: _in_view(world).astype(world.drones.pos.dtype),
-            "touched": shaping.variable("touched"),
+            "in_view": _seen,
+            "touched": _TOUCHED,
         },
-        success=lambda metrics, dt: _followed(metrics, dt, distance),
+        success=functools.partial(_followed, distance=distance),
         observations={
-            "velocity_error_body": ObservationTerm(_observe_velocity_error, _MAX_SPEED),
-            "line_of_sight": ObservationTerm(_observe_line_of_sight, 1.0 + 1e-6),
+            "velocity_error_body": ObservationTerm(
+                _observe_velocity_error,
+                _MAX_SPEED,
+                entries=quantities("velocity of the target, relative", "m/s", "body"),
+            ),
+            "line_of_sight": ObservationTerm(
+                _observe_line_of_sight,
+                1.0 + 1e-6,
+                entries=quantities("direction of the drone that is followed", "-", "body"),
+            ),
         },
         control_hz=50.0,
         substeps=2,
@@ -181,6 +196,11 @@ def _in_view(world: World) -> Bool[Array, " n"]:
     horizontal, vertical = camera.slopes
     seen = (ahead > 0) & (jnp.abs(left) < horizontal * ahead) & (jnp.abs(up) < vertical * ahead)
     return seen | _is_leader(world)
+
+
+def _seen(task: Task, world: World) -> Float[Array, " n"]:
+    """One if the drone that is followed is within the field of view."""
+    return _in_view(world).astype(world.drones.pos.dtype)
 
 
 def _level(v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -10,6 +12,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Camera, Cylinder, Scene
 from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
@@ -32,6 +35,13 @@ _LANES = 32  # straight flights that tell the traversability
 
 camera = Camera(resolution=(16, 12), field_of_view=90.0, far=24.0)
 """The camera of the task, fixed to the body; 24 m are more than from one side of the forest to the other."""
+
+
+_METRICS = {
+    "touched": shaping.variable("touched", "One if the drone has touched something."),
+    "reached": shaping.variable("reached", f"One if the drone has been within {REACHED:g} m of its goal."),
+    "clearance": shaping.variable("clearance", "Smallest distance from obstacles and ground so far, m."),
+}
 
 
 @check_keywords
@@ -78,6 +88,7 @@ def forest(
         )
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """Nearly at rest on one side of the forest."""
         place = jnp.asarray([(0.0, place, HEIGHT) for place in y], params.mass.dtype)
         goal = place + jnp.array([[length, 0, 0]], place.dtype)
         state = thrown(key, params, place, reach=_REACH, speed=0.5, omega=0.5, tilt=0.2)
@@ -94,6 +105,7 @@ def forest(
         }
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        """The goal on the other side of the forest."""
         return Setpoint.at(variables["goal"])
 
     def desired(task: Task, world: World) -> Float[Array, "n 3"]:
@@ -114,9 +126,15 @@ def forest(
         return 1 - jnp.sum(forward * desired(task, world), axis=-1) / speed
 
     def observe_desired(task: Task, world: World) -> Float[Array, "n 3"]:
+        """Velocity to the goal at the commanded speed, m/s, body axes."""
         return jax.vmap(rotation.rotate_inverse)(world.drones.quat, desired(task, world))
 
+    def all_reached(task: Task, world: World) -> Bool[Array, " n"]:
+        """All drones have reached their goals."""
+        return jnp.broadcast_to(jnp.all(world.variables["reached"]), (drones,))
+
     def left(task: Task, world: World) -> Bool[Array, " n"]:
+        """A drone has left the strip of the forest."""
         x, y, z = world.drones.pos.T
         return ~((jnp.abs(x - length / 2) < length / 2 + _BEHIND) & (jnp.abs(y) < width / 2) & (z < _HIGHEST))
 
@@ -154,20 +172,23 @@ def forest(
             "heading": (-0.2, heading),
             "omega": (-0.02, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
-            "touched": (-10.0, shaping.variable("touched")),
-            "reached": (10.0, shaping.variable("reached")),
+            "touched": (-10.0, _METRICS["touched"]),
+            "reached": (10.0, _METRICS["reached"]),
         },
         terminations={
-            "touched": lambda task, world: world.variables["touched"],
-            "reached": lambda task, world: jnp.broadcast_to(jnp.all(world.variables["reached"]), (drones,)),
+            "touched": shaping.flag("touched", "A drone touches the ground, a tree or another drone."),
+            "reached": all_reached,
             "left": left,
             "spinning": out_of_control(length)["spinning"],
         },
         advance=_advance,
-        metrics={name: shaping.variable(name) for name in ("touched", "reached", "clearance")}
-        | {"detour": _detour, "traversability": traversability},
-        success=lambda metrics, dt: (metrics["reached"][-1] > 0) & (metrics["touched"][-1] == 0),
-        observations={"desired_velocity": ObservationTerm(observe_desired, _MAX_SPEED)},
+        metrics=_METRICS | {"detour": _detour, "traversability": traversability},
+        success=_reached_untouched,
+        observations={
+            "desired_velocity": ObservationTerm(
+                observe_desired, _MAX_SPEED, entries=quantities("velocity to the goal", "m/s", "body")
+            )
+        },
         control_hz=50.0,
         substeps=2,
         scene=scene,
@@ -191,6 +212,11 @@ def _advance(task: Task, world: World) -> dict[str, Array]:
         "touched": variables["touched"] | found.ground | found.drones | found.scene,
         "reached": variables["reached"] | (norm(pos - goal) < REACHED),
     }
+
+
+def _reached_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone reached its goal and touched nothing."""
+    return (metrics["reached"][-1] > 0) & (metrics["touched"][-1] == 0)
 
 
 def _height(task: Task, world: World) -> Float[Array, " n"]:

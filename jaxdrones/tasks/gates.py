@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from jaxdrones.checks import check_keywords, check_number, check_switch, check_whole, shown
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.quantity import described, quantities
 from jaxdrones.sensing import BEAMS, Cylinder, Scene, gate, track
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
@@ -39,6 +41,19 @@ _SIGHT = 3.0  # m, at which the observed positions of poles are clipped
 _INERTIA_RANGE = 0.2  # share: level 1 on
 
 
+_GATE_ENTRIES = tuple(
+    entry
+    for gate in ("next gate", "gate after it")
+    for entry in (
+        *quantities(f"center of the {gate}, from the drone", "m", "world"),
+        *quantities(f"direction through the {gate}", "-", "world"),
+    )
+)
+_POLE_ENTRIES = tuple(
+    entry for i in range(len(POLES)) for entry in quantities(f"pole {i}, from the drone", "m", "world", "xy")
+)
+
+
 @check_keywords
 def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start: bool = False) -> Task:
     """One lap through four gates.
@@ -61,6 +76,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
         raise ValueError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
+        """On the ground at the start of the track, or in the air in front of a random gate."""
         gate_key, place_key = jax.random.split(key)
         n, dtype = len(params.mass), params.mass.dtype
         variables = {"gates": _gates_of(scene, dtype), "poles": _poles_of(scene, dtype)}
@@ -85,20 +101,25 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
         return hovering(params, pos), variables | lap | {"lap_time": jnp.zeros(n, dtype)}
 
     def target(variables, t) -> Setpoint:
+        """The center of the next gate."""
         return Setpoint.at(_gate(variables)[:, :3])
 
     def crashed(task: Task, world: World):
+        """A drone touches a gate or a pole, or falls below the ground."""
         fell = world.drones.pos[:, 2] < standing_height(world.params) - 0.01
         return world.variables["hit"] | fell
 
     def finished(task: Task, world: World):
+        """All drones have passed all gates."""
         return jnp.broadcast_to(jnp.all(world.variables["index"] >= len(GATES)), (drones,))
 
     def passed(task: Task, world: World):
+        """One in the step in which the drone passes its next gate."""
         return world.variables["index"] - world.variables["before"]
 
     def as_number(condition):
-        return lambda task, world: condition(task, world).astype(world.drones.pos.dtype)
+        number = lambda task, world: condition(task, world).astype(world.drones.pos.dtype)  # noqa: E731
+        return described(condition.__doc__, number)
 
     return Task(
         name="gates",
@@ -108,7 +129,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
         start=start,
         target=target,
         rewards={
-            "progress": (10.0, lambda task, world: world.variables["progress"]),
+            "progress": (10.0, shaping.variable("progress", "Approach to the next gate in the last step, m.")),
             "passed": (5.0, as_number(passed)),
             "crashed": (-10.0, as_number(crashed)),
             "omega": (-0.002, shaping.body_rates),
@@ -117,17 +138,25 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
         terminations={"finished": finished, "crashed": crashed} | out_of_control(_ARENA, center=(0, 0, 1)),
         advance=_advance,
         metrics={
-            "gates": as_number(lambda task, world: world.variables["index"]),
-            "lap_time": lambda task, world: world.variables["lap_time"],
+            "gates": shaping.variable("index", "Number of gates passed so far."),
+            "lap_time": shaping.variable("lap_time", "Time until the last gate was passed, or so far, s."),
         },
-        success=lambda metrics, dt: metrics["gates"][-1] == len(GATES),
+        success=_finished,
         randomize=() if level == 0 else (_random_inertia,),
-        observations={"gates": ObservationTerm(_observe_gates, 20.0), "poles": ObservationTerm(_observe_poles, _SIGHT)},
+        observations={
+            "gates": ObservationTerm(_observe_gates, 20.0, entries=_GATE_ENTRIES),
+            "poles": ObservationTerm(_observe_poles, _SIGHT, entries=_POLE_ENTRIES),
+        },
         scene=_scene(level) if level < 2 else functools.partial(_scene, level),
         obstacles_terminate=True,
         contact=("ground",),
         observation=("position", "gates", "poles", "rotation_matrix", "velocity", "omega", "last_action"),
     )
+
+
+def _finished(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone passed all gates."""
+    return metrics["gates"][-1] == len(GATES)
 
 
 def _advance(task: Task, world: World) -> dict[str, Array]:
@@ -162,7 +191,7 @@ def _scene(level: int, key: jax.Array | None = None) -> Scene:
     if level == 3:
         return _solids(_random_track(u))
     moved = jax.random.uniform(pole_key, POLES.shape, minval=-_POLE_RANGE, maxval=_POLE_RANGE)
-    return _solids(GATES + jnp.asarray(_GATE_RANGE)[None] * u, POLES + moved)
+    return _solids(jnp.asarray(GATES) + jnp.asarray(_GATE_RANGE)[None] * u, jnp.asarray(POLES) + moved)
 
 
 def _random_track(u: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
@@ -207,6 +236,7 @@ def _poles_of(scene: Scene, dtype) -> Float[Array, "4 2"]:
 
 
 def _random_inertia(key: jax.Array, params: Params) -> Params:
+    """Every moment of inertia times a random factor near one."""
     factor = jax.random.uniform(key, params.inertia.shape, params.inertia.dtype, 1 - _INERTIA_RANGE, 1 + _INERTIA_RANGE)
     return params.replace(inertia=params.inertia * factor)
 

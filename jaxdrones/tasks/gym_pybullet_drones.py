@@ -16,6 +16,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_keywords, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.quantity import described
 from jaxdrones.state import State
 from jaxdrones.tasks.starts import hovering, on_diagonal
 from jaxdrones.tasks.task import Task, World, distance, square
@@ -43,6 +44,7 @@ def takeoff(drones: int = 1) -> Task:
     """Get off the ground: -5 below 2 cm, else -1 / (10 z)."""
 
     def cost(target, world):
+        """5 below 2 cm of height, else 1 / (10 z)."""
         z = world.drones.pos[:, 2]
         low = z < 0.02
         return jnp.where(low, 5, 1 / (10 * jnp.where(low, 1, z)))
@@ -55,11 +57,13 @@ def fly_through_gate(drones: int = 1) -> Task:
     """Follow a point that moves through the gate at (0, -1, 0.75) in the five seconds of an episode."""
 
     def target(starts, t):
+        """A point that moves through the gate."""
         zero = jnp.zeros_like(t)
         speed = -2 / _DURATION_2021
         return _everywhere(starts, [zero, speed * t, zero + 0.75], vel=[zero, zero + speed, zero])
 
     def cost(target, world):
+        """Ten times the squared distance from the target, m^2."""
         return 10 * _squared_distance(target, world)
 
     return _task_2021("fly-through-gate", "fly through the gate at y = -1 m", drones, target, cost)
@@ -76,6 +80,7 @@ def tune(drones: int = 1) -> Task:
         return 4 * jnp.cos(_TUNE_RATE * t)
 
     def target(starts, t):
+        """A point that swings along y at a height of 1 m."""
         zero = jnp.zeros_like(t)
         return _everywhere(starts, [zero, y(t), zero + 1], vel=[zero, 48 * (y(t) - y(t - 1 / 48)), zero])
 
@@ -88,6 +93,7 @@ def leader_follower(drones: int = 2) -> Task:
     """Equation 13: the leader, drone 0, hovers at (0, 0, 0.5); the others are to be as high as the leader."""
 
     def cost(target, world):
+        """Leader: squared distance from its target, m^2; others: squared height over the leader over n, m^2."""
         pos = world.drones.pos
         follower = (pos[:, 2] - pos[0, 2]) ** 2 / len(pos)
         return _first_then(_squared_distance(target, world), follower)
@@ -101,6 +107,7 @@ def flock(drones: int = 2) -> Task:
     """The first drone hovers at (0, 0, 1); every other one is to be as high as the one before it."""
 
     def cost(target, world):
+        """First drone: squared distance from its target, m^2; others: squared height over the drone before, m^2."""
         pos = world.drones.pos
         return _first_then(_squared_distance(target, world), (jnp.roll(pos, 1, 0) - pos)[:, 2] ** 2)
 
@@ -112,9 +119,11 @@ def meetup(drones: int = 2) -> Task:
     """Drone i and drone n - 1 - i meet; the reward is the negative squared distance between them."""
 
     def target(starts, t):
+        """Half-way between the starts of the drone and its partner."""
         return Setpoint.at((starts + starts[::-1]) / 2)
 
     def cost(target, world):
+        """Squared distance from the partner, m^2."""
         return square(world.drones.pos - world.drones.pos[::-1])
 
     task = _task_2021("meetup", "meet the partner half-way", drones, target, cost, action="velocity", minimum=2)
@@ -132,6 +141,7 @@ def multi_hover(drones: int = 2) -> Task:
     """Drone i hovers 1 / (i + 1) m above its start; the reward of (2.x) is the sum over the team."""
 
     def target(starts, t):
+        """Above the start of the drone, the first one highest."""
         return Setpoint.at(starts.at[:, 2].add(1 / (1 + jnp.arange(len(starts), dtype=starts.dtype))))
 
     return _task_2x("multi-hover", "every drone hovers at a height of its own", drones, target, box=2.0)
@@ -143,6 +153,7 @@ def _task_2021(
     check_whole(f"number of drones of {name}", drones, minimum)
 
     def late_cost(task: Task, world: World) -> Float[Array, " n"]:
+        """The cost after the step from the target before it."""
         return cost(task.target(world.variables, world.time - world.dt).pos, world)
 
     return Task(
@@ -152,7 +163,7 @@ def _task_2021(
         duration=_DURATION_2021,
         start=_start,
         target=target,
-        rewards={"cost": (-1.0, late_cost)},
+        rewards={"cost": (-1.0, described(cost.__doc__ or "", late_cost))},
         success=_close_at_the_end,
         contact=("ground",),
         action=action,
@@ -166,16 +177,20 @@ def _task_2x(name: str, summary: str, drones: int, target: Target, box: float) -
     check_whole(f"number of drones of {name}", drones)
 
     def closeness(task: Task, world: World) -> Float[Array, " n"]:
+        """The larger of 0 and 2 - d^4, with d the distance from the target, m."""
         return jnp.maximum(0, 2 - distance(task, world) ** 4)
 
     def arrived(task: Task, world: World):
+        """The distances of all drones from their targets are 0.1 mm in sum or less."""
         return jnp.broadcast_to(jnp.sum(distance(task, world)) < 1e-4, len(world.drones.pos))
 
     def out_of_box(task: Task, world: World):
+        """A drone is outside the box about the origin, or above 2 m."""
         x, y, z = world.drones.pos.T
         return (jnp.abs(x) > box) | (jnp.abs(y) > box) | (z > 2.0)
 
     def tilted(task: Task, world: World):
+        """A drone rolls or pitches by more than 0.4 rad."""
         roll, pitch, _ = jax.vmap(rotation.to_rpy)(world.drones.quat).T
         return (jnp.abs(roll) > _TILT) | (jnp.abs(pitch) > _TILT)
 
@@ -206,12 +221,18 @@ def _start(key: jax.Array, params: Params) -> tuple[State, Starts]:
 
 
 def _at(x: float, y: float, z: float) -> Target:
-    return lambda starts, t: Setpoint.at(jnp.broadcast_to(jnp.array([x, y, z], starts.dtype), starts.shape))
+    return described(
+        f"The point ({x:g}, {y:g}, {z:g}) m.",
+        lambda starts, t: Setpoint.at(jnp.broadcast_to(jnp.array([x, y, z], starts.dtype), starts.shape)),
+    )
 
 
 def _at_height(z: float) -> Target:
     """The target of every drone is above its start, that of the first one above the origin."""
-    return lambda starts, t: Setpoint.at(starts.at[:, 2].set(z).at[0, :2].set(0))
+    return described(
+        f"At a height of {z:g} m: the first drone over the origin, the others over their starts.",
+        lambda starts, t: Setpoint.at(starts.at[:, 2].set(z).at[0, :2].set(0)),
+    )
 
 
 def _everywhere(starts: Starts, pos: list[Array], vel: list[Array]) -> Setpoint:
@@ -221,6 +242,7 @@ def _everywhere(starts: Starts, pos: list[Array], vel: list[Array]) -> Setpoint:
 
 
 def _squared_distance(target: Float[Array, "n 3"], world: World) -> Float[Array, " n"]:
+    """Squared distance from the target, m^2."""
     return square(target - world.drones.pos)
 
 
@@ -229,4 +251,5 @@ def _first_then(first: Float[Array, " n"], rest: Float[Array, " n"]) -> Float[Ar
 
 
 def _close_at_the_end(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone was within 5 cm of its target in the end."""
     return metrics["error"][-1] < _SOLVED

@@ -10,6 +10,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_keywords, check_number, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.quantity import described
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import standing_height, thrown
@@ -19,6 +20,8 @@ SPACING = 3.0  # m between neighboring goals, more than the drones are thrown ap
 _MAX_REACH = 5.0  # m; a drone is lost 3 m or more beyond it
 _MAX_HEIGHT = 1000.0  # m; float32 resolves 0.1 mm there
 _MAX_SPEED = 100.0  # m/s
+_TOUCHING = 0.02  # m above the ground: sinking is then that of the touch
+_SOFT = 0.6  # m/s
 
 
 @check_keywords
@@ -56,12 +59,13 @@ def hover(
         goal = _goals(params, height)
         return thrown(key, params, goal, reach=reach, speed=speed, omega=omega, tilt=jnp.radians(tilt)), goal
 
+    where = f"Within +-{reach:g} m of the goal, +-{speed:g} m/s, +-{omega:g} rad/s, tilted by up to {tilt:g} degrees."
     return Task(
         name="hover",
         summary="fly to the goal from any motion and stay",
         drones=drones,
         duration=duration,
-        start=start,
+        start=described(where, start),
         target=_stay,
         rewards=shaping.REACH_AND_STAY,
         terminations=out_of_control(_MAX_REACH + SPACING * drones),
@@ -76,6 +80,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
     check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """Near the goal, upside down, in motion and turning."""
         goal = _goals(params, height)
         state = thrown(key, params, goal, reach=0.2, speed=2.0, omega=5.0, tilt=jnp.radians(60.0))
         half_turn = jnp.array([1, 0, 0, 0], goal.dtype)
@@ -83,7 +88,12 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
         return state.replace(quat=quat), {"goal": goal, "lowest": state.pos[:, 2], "start": state.pos[:, 2]}
 
     def target(variables, t):
+        """The goal."""
         return Setpoint.at(variables["goal"])
+
+    def altitude_lost(task: Task, world: World) -> Array:
+        """Height of the start above the lowest point so far, m."""
+        return world.variables["start"] - world.variables["lowest"]
 
     def advance(task: Task, world: World):
         lowest = jnp.minimum(world.variables["lowest"], world.drones.pos[:, 2])
@@ -100,7 +110,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
         terminations=out_of_control(_MAX_REACH + SPACING * drones),
         advance=advance,
         metrics={
-            "altitude_lost": lambda task, world: world.variables["start"] - world.variables["lowest"],
+            "altitude_lost": altitude_lost,
             "upright": upright,
         },
         success=_recovered,
@@ -113,16 +123,31 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
     check_whole("number of drones of landing", drones)
     check_number("height", height, "m", above=0, at_most=_MAX_REACH)
 
-    def start(key: jax.Array, params: Params) -> tuple[State, Array]:
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """Above the pad, in slow motion and slightly tilted."""
         pad = _goals(params, 0.0).at[:, 2].set(standing_height(params))
         over = pad.at[:, 2].add(height)
         reach = jnp.array([0.5, 0.5, height / 2], pad.dtype)
-        return thrown(key, params, over, reach=reach, speed=0.5, omega=0.5, tilt=jnp.radians(20.0)), pad
+        state = thrown(key, params, over, reach=reach, speed=0.5, omega=0.5, tilt=jnp.radians(20.0))
+        return state, {"goal": pad, "sinking": -state.vel[:, 2], "touch_speed": jnp.zeros_like(params.mass)}
+
+    def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        """The pad."""
+        return Setpoint.at(variables["goal"])
+
+    def above(world: World) -> Array:
+        """Height above where a drone stands on the pad, m."""
+        return world.drones.pos[:, 2] - world.variables["goal"][:, 2]
 
     def descent(task: Task, world: World):
         """How much faster than 0.3 m/s plus half the height per second the drone sinks, m/s."""
-        height = world.drones.pos[:, 2] - task.target_now(world).pos[:, 2]
-        return jnp.maximum(-world.drones.vel[:, 2] - (0.3 + 0.5 * jnp.maximum(height, 0)), 0)
+        return jnp.maximum(-world.drones.vel[:, 2] - (0.3 + 0.5 * jnp.maximum(above(world), 0)), 0)
+
+    def advance(task: Task, world: World) -> dict[str, Array]:
+        before, sinking = world.variables["sinking"], -world.drones.vel[:, 2]
+        fastest = jnp.where(above(world) < _TOUCHING, jnp.maximum(before, sinking), 0)
+        touch_speed = jnp.maximum(world.variables["touch_speed"], fastest)
+        return world.variables | {"sinking": sinking, "touch_speed": touch_speed}
 
     return Task(
         name="landing",
@@ -130,10 +155,14 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         drones=drones,
         duration=duration,
         start=start,
-        target=_stay,
+        target=target,
         rewards=shaping.REACH_AND_STAY | {"descent": (-1.0, descent)},
         terminations=out_of_control(_MAX_REACH + SPACING * drones) | {"crashed": _upside_down},
-        metrics={"upright": upright},
+        advance=advance,
+        metrics={
+            "upright": upright,
+            "touch_speed": shaping.variable("touch_speed", "Largest speed of sinking within 2 cm of the ground, m/s."),
+        },
         success=_landed,
         contact=("ground",),
     )
@@ -154,11 +183,13 @@ def _recovered(metrics: Mapping[str, Array], dt: float) -> Array:
 
 
 def _landed(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Whether a drone was within 10 cm of the pad, at rest and level in the end."""
-    return (metrics["error"][-1] < 0.1) & (metrics["speed"][-1] < 0.05) & (metrics["upright"][-1] > 0.95)
+    """Whether a drone was within 10 cm of the pad, at rest and level in the end, and touched down below 0.6 m/s."""
+    rests = (metrics["error"][-1] < 0.1) & (metrics["speed"][-1] < 0.05) & (metrics["upright"][-1] > 0.95)
+    return rests & (metrics["touch_speed"][-1] < _SOFT)
 
 
 def _upside_down(task: Task, world: World):
+    """A drone is upside down on the ground."""
     return (upright(task, world) < 0) & (world.drones.pos[:, 2] < 2 * world.params.collision_radius)
 
 
@@ -169,4 +200,5 @@ def _goals(params: Params, height: float) -> Array:
 
 
 def _stay(goal: Array, t: Array) -> Setpoint:
+    """The goal."""
     return Setpoint.at(goal)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_keywords, check_number, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
@@ -29,6 +30,12 @@ _SIGHT = 2.0  # m, at which the observed vector to the nearest surface is clippe
 _ARRIVED = 0.2  # m
 _SPEED = 1.5  # m/s, to the goal
 _SLOW_WITHIN = 1.0  # m of the goal
+
+
+_METRICS = {
+    "touched": shaping.variable("touched", "One if the drone has touched something."),
+    "clearance": shaping.variable("clearance", "Smallest distance from obstacles and ground so far, m."),
+}
 
 
 @check_keywords
@@ -56,6 +63,7 @@ def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float =
         return build_room((size, size, ROOM_HEIGHT), key=key, pillars=pillars, keep_free=ring, clearance=_CLEARANCE)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """Nearly at rest on a ring in the room."""
         start_key, order_key = jax.random.split(key)
         places = jnp.asarray(ring, params.mass.dtype)
         state = thrown(start_key, params, places, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
@@ -68,6 +76,7 @@ def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float =
         }
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        """The goal: a place on the ring where another drone started."""
         return Setpoint.at(variables["goal"])
 
     def velocity(task: Task, world: World) -> Float[Array, " n"]:
@@ -90,14 +99,18 @@ def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float =
             "crowding": (-5.0, shaping.crowding),
             "omega": (-0.02, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
-            "touched": (-10.0, shaping.variable("touched")),
+            "touched": (-10.0, _METRICS["touched"]),
         },
-        terminations={"touched": lambda task, world: world.variables["touched"]}
+        terminations={"touched": shaping.flag("touched", "A drone touches the room, a pillar or another drone.")}
         | out_of_control(size, center=(0, 0, HEIGHT)),
         advance=_advance,
-        metrics={name: shaping.variable(name) for name in ("touched", "clearance")},
+        metrics=_METRICS,
         success=_arrived_untouched,
-        observations={"nearest_surface": ObservationTerm(_observe_nearest_surface, _SIGHT)},
+        observations={
+            "nearest_surface": ObservationTerm(
+                _observe_nearest_surface, _SIGHT, entries=quantities("nearest surface, from the drone", "m", "world")
+            )
+        },
         control_hz=50.0,
         substeps=2,
         scene=scene if pillars else build_room((size, size, ROOM_HEIGHT)),
@@ -130,4 +143,5 @@ def _observe_nearest_surface(task: Task, world: World) -> Float[Array, "n 3"]:
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone was within 20 cm of its goal in the end and touched nothing."""
     return (metrics["error"][-1] < _ARRIVED) & (metrics["touched"][-1] == 0)

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.tasks.task import Task, Term, World, norm, square
+from jaxdrones.quantity import described
+from jaxdrones.tasks.task import Condition, Task, Term, World, norm, square
 
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
 _SLOW = 0.1  # m/s; below, the velocity term is a parabola
@@ -81,9 +82,14 @@ def crowding(task: Task, world: World) -> Float[Array, " n"]:
     return jnp.maximum(1 - nearest_drone(world.drones.pos) / _CROWDED, 0) ** 2
 
 
-def variable(name: str) -> Term:
-    """One of the task's variables as a number: a metric, or a term that is paid."""
-    return lambda task, world: world.variables[name].astype(world.drones.pos.dtype)
+def variable(name: str, meaning: str) -> Term:
+    """One of the task's variables as a number: a metric, or a term that is paid; `meaning` says what it is."""
+    return described(meaning, lambda task, world: world.variables[name].astype(world.drones.pos.dtype))
+
+
+def flag(name: str, meaning: str) -> Condition:
+    """One of the task's variables that is true or false: a condition; `meaning` says what it is."""
+    return described(meaning, lambda task, world: world.variables[name])
 
 
 def action_change(task: Task, world: World) -> Float[Array, " n"]:

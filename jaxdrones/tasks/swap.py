@@ -33,6 +33,7 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
     radius = max(1.0, _MIN_SPACING * drones / (2 * math.pi))
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """Nearly at rest on a ring."""
         start_key, order_key = jax.random.split(key)
         angle = 2 * jnp.pi * jnp.arange(drones, dtype=params.mass.dtype) / drones
         ring = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.full_like(angle, HEIGHT)], axis=-1)
@@ -45,6 +46,7 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         }
 
     def target(variables, t) -> Setpoint:
+        """The goal: a place on the ring where another drone started."""
         return Setpoint.at(variables["goal"])
 
     def advance(task: Task, world: World) -> dict[str, Array]:
@@ -62,11 +64,17 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         rewards=shaping.REACH_AND_STAY | {"crowding": (-5.0, shaping.crowding)},
         terminations=out_of_control(2 * radius + 4.0),
         advance=advance,
-        metrics={name: shaping.variable(name) for name in ("collisions", "nearest")},
+        metrics={
+            "collisions": shaping.variable(
+                "collisions", "Control steps so far in which the drone touched another one."
+            ),
+            "nearest": shaping.variable("nearest", "Distance of the nearest other drone, m."),
+        },
         success=_arrived_untouched,
         observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "neighbors"),
     )
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone was within 10 cm of its goal in the end and never touched another one."""
     return (metrics["error"][-1] < 0.1) & (metrics["collisions"][-1] == 0)

@@ -15,12 +15,14 @@ from jaxdrones import rotation, vector
 from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole, takes_scene
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.quantity import Quantity, described
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
 
 
-class World(flax.struct.PyTreeNode):
+class World(PyTreeNode):
     """The complete state of an episode between two control steps. Arrays of the team have a leading drone axis."""
 
     params: Params
@@ -59,6 +61,8 @@ class World(flax.struct.PyTreeNode):
         return self.actions[:, -1]
 
 
+Entries = tuple[Quantity, ...] | Callable[[int, tuple[Quantity, ...]], tuple[Quantity, ...]]
+"""Quantities, or a function (number of drones, quantities of an action) -> quantities."""
 MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 CONTACTS = ("ground", "drones", "obstacles")
 
@@ -73,6 +77,10 @@ class ObservationTerm:
     """Largest magnitude, of all entries or of each; what is beyond is clipped."""
     history: int = 2
     """Number of past actions that the term needs."""
+    entries: Entries = ()
+    """What each number of a drone stands for, for `jaxdrones.explain`; none where the term does not say."""
+    name: str = ""
+    """The name by which an environment knows the term; `jaxdrones.make` sets it."""
 
     def __post_init__(self):
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
@@ -203,7 +211,11 @@ def out_of_control(reach: float, center: tuple[float, float, float] | None = Non
     def spinning(task: Task, world: World) -> Bool[Array, " n"]:
         return _beyond(world.drones.omega, MAX_SPIN)
 
-    return {"lost": lost, "spinning": spinning}
+    place = "the target" if center is None else f"({', '.join(f'{x:g}' for x in center)}) m"
+    return {
+        "lost": described(f"A drone is {reach:g} m or more from {place} along some axis.", lost),
+        "spinning": described(f"A drone turns at {MAX_SPIN:g} rad/s or faster about some axis.", spinning),
+    }
 
 
 def _beyond(v: Float[Array, "n 3"], limit: float) -> Bool[Array, " n"]:

@@ -46,12 +46,15 @@ def tracking(
     shape = SHAPES[curve]
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        """The point that moves along the curve."""
+
         def one(center, u, phase):
             return setpoint_on(lambda t: center + shape(u, phase + t / period), t)
 
         return jax.vmap(one)(variables["center"], variables["random"], variables["phase"])
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """On the curve: near a random point in motion, or at its start at rest."""
         shape_key, phase_key, start_key = jax.random.split(key, 3)
         n, dtype = len(params.mass), params.mass.dtype
         y = SPACING * (jnp.arange(n, dtype=dtype) - (n - 1) / 2)

@@ -42,6 +42,7 @@ def test_randomizations_compose_and_draw_independently():
     assert_close(both.replace(mass=TEAM.mass, kf=TEAM.kf), TEAM, 0)
 
 
+@pytest.mark.slow
 def test_a_drawn_parameter_is_hidden_from_the_action_type():
     """A heavier drone is not given more thrust; a nominal one hovers at zero action, whatever its mass."""
     env = make("hover", randomize=(scaled("mass", 1.5, 1.5),), tilt=0.0, speed=0.0, omega=0.0)
@@ -53,6 +54,7 @@ def test_a_drawn_parameter_is_hidden_from_the_action_type():
     np.testing.assert_allclose(heavy.step(KEY, world, zero)[1].drones.vel, world.drones.vel, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_has_the_standard_deviations_it_is_given():
     state = jd.State.at_rest(jnp.zeros((4000, 3)))
     seen = sensor_noise(pos=0.01, vel=0.02, angle=0.03, omega=0.04)(KEY, state)
@@ -62,6 +64,7 @@ def test_noise_has_the_standard_deviations_it_is_given():
     np.testing.assert_allclose(jnp.sum(seen.quat**2, axis=-1), 1, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_noise_is_seen_and_does_not_move_the_drone():
     plain, noisy = make("hover"), make("hover", noise=sensor_noise())
     _, world = plain.reset(KEY)
@@ -92,6 +95,7 @@ def test_a_delayed_action_reaches_the_rotors_late():
     assert commanded[2] > 1.2 * hover
 
 
+@pytest.mark.slow
 def test_wind_blows_a_drone_with_drag_away():
     env = make("hover", effects=("drag",), randomize=(constant_wind(3.0),), tilt=0.0, speed=0.0, omega=0.0)
     _, world = env.reset(KEY)

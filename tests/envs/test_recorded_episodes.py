@@ -10,10 +10,10 @@ import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
+from jaxdrones.envs import TASKS
 from jaxdrones.envs.actions import ACTIONS, rpm
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.observations import OBSERVATIONS
-from jaxdrones.envs.registry import TASKS
 
 TASK = {
     ("paper", "HoverAviary"): "hover-2021",
@@ -97,6 +97,7 @@ def episode(request):
         return replayed(request.param)
 
 
+@pytest.mark.slow
 def test_the_start_is_the_recorded_one(episode):
     case, answers, _ = episode
     width = min(case.arrays["obs"].shape[-1], answers[0][0].shape[-1])

@@ -49,6 +49,7 @@ def test_what_is_no_scene_is_refused(scene):
         make("hover", scene=scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [BALL, lambda key: BALL], ids=["fixed", "drawn"])
 def test_an_effect_is_given_the_scene_of_the_episode(scene):
     env = make("hover", scene=scene, effects=(repelled,), **STILL)
@@ -59,6 +60,7 @@ def test_an_effect_is_given_the_scene_of_the_episode(scene):
     check_env(env)
 
 
+@pytest.mark.slow
 def test_a_drawn_scene_is_another_one_in_every_episode_and_the_same_within():
     env = make("hover", scene=random_ball, effects=(repelled,), sensors=(RANGE,), duration=0.02, observation=("range",))
     auto = AutoReset(env)
@@ -93,6 +95,7 @@ def test_a_fixed_scene_is_not_copied_at_the_end_of_an_episode():
     assert make("hover", scene=random_ball, effects=(repelled,)).constant_fields == ("params",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.needs("pybullet"))])
 def test_a_drone_rests_on_a_ball(backend):
     with make("hover", backend=backend, scene=BALL, sensors=(RANGE,), **STILL) as env:

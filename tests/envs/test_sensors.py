@@ -89,6 +89,7 @@ def test_a_model_starts_anew_in_every_episode_and_is_integrated_in_between(backe
         np.testing.assert_allclose(charges, [1 - 0.01 * share * k for k in range(5)] + [1], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_team_effect_acts_on_the_chosen_drones(backend):
     def pull_together(params, state):
@@ -133,6 +134,7 @@ def test_a_sensor_with_the_name_of_an_observation_term_is_refused():
         make("hover", sensors=(dataclasses.replace(IMU, name="position"),))
 
 
+@pytest.mark.slow
 def test_without_models_sensors_and_obstacles_a_world_has_nothing_more_and_a_step_is_one_kernel():
     env = make("hover")
     _, world = env.reset(KEY)

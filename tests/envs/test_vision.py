@@ -59,6 +59,7 @@ def shown(t):
 TAPE = jax.random.uniform(jax.random.key(1), (12, 1, 4), float, -0.5, 0.5)
 
 
+@pytest.mark.slow
 def test_an_image_shows_the_state_of_its_time_until_the_next_one_comes(env):
     obs, worlds = jax.jit(functools.partial(episode, env))(KEY, TAPE)
     at = np.array([shown(t) for t in range(len(TAPE) + 1)])
@@ -91,6 +92,7 @@ def test_the_gradient_of_a_held_image_is_that_of_the_state_that_it_shows(env):
     np.testing.assert_allclose(actual, expected, rtol=1e-7, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_worlds_of_different_ages_see_what_each_sees_alone_and_start_anew(env):
     auto = AutoReset(env)
     keys = jax.random.split(KEY, 5)
@@ -112,6 +114,7 @@ def test_the_contract_holds_with_images(env):
     assert "depth of 8 x 6 pixels every 3 steps, 4 steps late" in repr(env)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_both_backends_see_the_same_drawn_scene_at_the_same_times():
     names = ("rgb", "depth", "segmentation")
@@ -133,6 +136,7 @@ def test_both_backends_see_the_same_drawn_scene_at_the_same_times():
                 )
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_bullet_takes_pictures_only_where_one_is_due(monkeypatch):
     with sees("bullet", rate=25.0) as env:
@@ -149,6 +153,7 @@ def test_bullet_takes_pictures_only_where_one_is_due(monkeypatch):
         assert len(taken) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_bullet_shows_the_same_in_a_compiled_program():
     with sees("bullet", rate=50.0, vision=("segmentation",)) as env:

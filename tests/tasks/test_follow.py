@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxdrones.envs import make
 
@@ -20,6 +21,7 @@ def world_with(offset, yaw=0.0):
     return world.replace(variables=world.variables | {"pos": pos})
 
 
+@pytest.mark.slow
 def test_a_drone_is_in_view_where_the_camera_shows_it():
     half = np.tan(np.radians(30))  # of the vertical field of view
     for offset, seen in [

@@ -35,6 +35,7 @@ def test_starts_and_goals_are_never_in_an_obstacle():
     assert jnp.min(starts(jax.random.split(jax.random.key(1), 10_000))) > 0.9  # m
 
 
+@pytest.mark.slow
 def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
     assert moved_to((19.1, 0, 1.5))["reached"][0] and not moved_to((18.9, 0, 1.5))["reached"][0]
     trees = first_world().scene.cylinders
@@ -45,6 +46,7 @@ def test_a_drone_reaches_its_goal_within_a_meter_and_touches_what_it_is_in():
     assert moved_to((5.0, 0.0, 0.01))["touched"][0]  # the ground
 
 
+@pytest.mark.slow
 def test_what_is_touched_is_what_collisions_tell_in_one_world_and_in_many():
     world = first_world()
     pos = jax.random.uniform(jax.random.key(2), (512, 1, 3), minval=0, maxval=jnp.array([20, 5, 2.0]))
@@ -59,6 +61,7 @@ def test_what_is_touched_is_what_collisions_tell_in_one_world_and_in_many():
     np.testing.assert_array_equal(jax.jit(jax.vmap(lambda world: advance(world)["touched"]))(worlds), expected)
 
 
+@pytest.mark.slow
 def test_the_policy_is_told_the_desired_velocity_in_body_axes_and_nothing_of_its_place():
     world = first_world()
     term = TASK.observations["desired_velocity"].observe(TASK, world)

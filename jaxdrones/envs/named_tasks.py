@@ -1,0 +1,84 @@
+"""The tasks by name, and tasks made of a name, of a function or of a file of a user."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection
+from typing import Any
+
+from jaxdrones import user_code
+from jaxdrones.checks import UnexpectedKeyword, check_callable, check_choice, check_keyword, hint, shown
+from jaxdrones.tasks import follow, forest, gates, gym_pybullet_drones, hover, room, swap, tracking
+from jaxdrones.tasks.task import Task
+
+TASKS: dict[str, Callable[..., Task]] = {
+    "hover": hover.hover,
+    "recovery": hover.recovery,
+    "landing": hover.landing,
+    "tracking": tracking.tracking,
+    "gates": gates.gates,
+    "forest": forest.forest,
+    "room": room.room,
+    "follow": follow.follow,
+    "swap-goals": swap.swap_goals,
+    "hover-2021": gym_pybullet_drones.hover,
+    "takeoff": gym_pybullet_drones.takeoff,
+    "fly-through-gate": gym_pybullet_drones.fly_through_gate,
+    "tune": gym_pybullet_drones.tune,
+    "leader-follower": gym_pybullet_drones.leader_follower,
+    "flock": gym_pybullet_drones.flock,
+    "meetup": gym_pybullet_drones.meetup,
+    "hover-2x": gym_pybullet_drones.hover_2x,
+    "multi-hover": gym_pybullet_drones.multi_hover,
+}
+
+
+def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
+    """The function that makes a task.
+
+    Args:
+        task: a name of `TASKS`, `file.py:function`, or the function itself.
+
+    Raises:
+        ValueError: an unknown name, or a file that does not define the function.
+    """
+    if callable(task):
+        return task
+    if isinstance(task, str) and user_code.is_reference(task):
+        function = user_code.load(task)
+        check_callable(task, function, "a function that returns a jaxdrones.tasks.Task")
+        return function
+    check_choice("task", task, TASKS)
+    return TASKS[task]
+
+
+def make_task(task: str | Task | Callable[..., Task], options: dict[str, Any], others: Collection[str]) -> Task:
+    """The task that `jaxdrones.make` was given.
+
+    Args:
+        task: a task, or what `task_function` takes.
+        options: keyword arguments of the function.
+        others: names of the other options of `jaxdrones.make`, for errors.
+
+    Raises:
+        ValueError: an unknown name, or a function that returns something else than a task.
+        TypeError: an option that the function does not have.
+    """
+    if isinstance(task, Task):
+        if options:
+            option = next(iter(options))
+            raise UnexpectedKeyword(
+                f"make() got an unexpected keyword argument {option!r} beside a task{hint(option, others)}; give "
+                "options of the task to the task"
+            )
+        return task
+    function = task_function(task)
+    name = task if isinstance(task, str) else getattr(task, "__name__", "task")
+    parameters = inspect.signature(function).parameters
+    if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters.values()):
+        for option in options:
+            check_keyword(f"make({name!r})", option, {*others, *parameters})
+    made = function(**options)
+    if not isinstance(made, Task):
+        raise ValueError(f"{name} returned {shown(made)}; return a jaxdrones.tasks.Task")
+    return made

@@ -7,7 +7,7 @@ compiled step; the options are those of `jaxdrones.make`.
 from __future__ import annotations
 
 import copy
-import functools
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -17,18 +17,24 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from jaxdrones import envs
-from jaxdrones.adapters.session import SEEDS, Session, as_env, begin
+from jaxdrones.adapters import pictures
+from jaxdrones.adapters.session import SEEDS, Session, as_env, flat
 from jaxdrones.adapters.spaces import Layout
-from jaxdrones.checks import check_whole
+from jaxdrones.adapters.worlds import Worlds
+from jaxdrones.checks import check_choice, check_whole, shown
 from jaxdrones.tasks.task import Task
 
 NAMESPACE = "jaxdrones"
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One world. A team's reward is the sum over its drones; `info["rewards"]` has the terms of every drone by name."""
+    """One world. A team's reward is the sum over its drones.
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
+    `info` has the terms of the reward of every drone, `reward_position`, ..., and likewise `metric_...`, of the drones,
+    and `termination_...` and `truncation_...`, of the team.
+    """
+
+    metadata = {"render_modes": pictures.MODES, "render_fps": 100}  # noqa: RUF012
 
     def __init__(
         self, task: str | Task | envs.Env, *, dict_spaces: bool = False, render_mode: str | None = None, **options: Any
@@ -39,14 +45,13 @@ class GymnasiumEnv(gymnasium.Env):
             task: a name, a task, or an environment.
             dict_spaces: observations and actions are dicts by drone, "0", "1", ..., as in gym-pybullet-drones (2021);
                 else a team has Box spaces (n, d) and (n, a), and a single drone (d,) and (a,).
-            render_mode: `rgb_array` or nothing; pybullet renders the pictures, on both backends.
+            render_mode: `rgb_array` or nothing.
             **options: options of `jaxdrones.make`.
 
         Raises:
             ValueError: an argument that `jaxdrones.make` refuses.
         """
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
+        pictures.check_mode(render_mode)
         self.env, self.render_mode = as_env(task, options), render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / self.env.dt)}
         self._layout = _layout(self.env, dict_spaces)
@@ -70,17 +75,15 @@ class GymnasiumEnv(gymnasium.Env):
         if not self._session.running:
             raise gymnasium.error.ResetNeeded("step is called before reset or after the end of an episode; call reset")
         obs, reward, terminated, truncated, info = self._session.step(self._layout.gather(action))
+        info = flat(info)
         if self.env.drones == 1:
-            info["rewards"], info["metrics"] = (
-                {k: v.item() for k, v in info[x].items()} for x in ("rewards", "metrics")
-            )
+            info = {name: x if isinstance(x, bool) else x.item() for name, x in info.items()}
         return self._layout.arrange(obs), float(reward.sum()), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """A picture (height, width, 3) of the team from the side, if made with `render_mode="rgb_array"`.
 
         Raises:
-            ImportError: pybullet is not installed; says which extra to install.
             gymnasium.error.ResetNeeded: no episode has begun.
         """
         if self.render_mode is None:
@@ -96,15 +99,15 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
-    """Many worlds in one compiled step; where an episode ends, the next one begins in the same step.
+    """Many worlds in one compiled step; where an episode ends, the next one begins in the same step unless told else.
 
-    `infos` has `rewards`, `metrics`, `terminations` and `truncations` by name. If an episode ended, it has `final_obs`
-    (of all worlds; `_final_obs` says of which it is valid) and `final_info`, with the last infos of the episode and
-    `episode`: return `r` and length `l`. World i, reset with `seed`, starts like a `GymnasiumEnv` that is reset with
-    `seed + i`.
+    `infos` has arrays of what the infos of one world have, and of `name` a mask `_name`, of which worlds it is valid.
+    World i, reset with `seed`, starts like a `GymnasiumEnv` that is reset with `seed + i`. If an episode ended and the
+    autoreset mode is `SAME_STEP`, `infos` has `final_obs`, of all worlds with its mask, and `final_info`, with the last
+    infos of the episode and `episode`: return `r` and length `l`.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
+    metadata = {"render_modes": pictures.MODES, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(
         self,
@@ -114,6 +117,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         dict_spaces: bool = False,
         numpy: bool = True,
         max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
         **options: Any,
     ):
         """Wrap an environment.
@@ -125,10 +130,15 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             numpy: return new NumPy arrays; else JAX arrays, not copied and not waited for, with `final_obs` and
                 `final_info` in every step.
             max_episode_steps: truncate episodes after so many steps, not after the task's duration.
+            autoreset_mode: when a world starts its next episode, a mode of gymnasium or its value: `SAME_STEP`, in the
+                step that ends one; `NEXT_STEP`, in the step after it, which ignores the action and rewards nothing;
+                `DISABLED`, when `reset(options={"reset_mask": ...})` says so.
+            render_mode: `rgb_array` or nothing.
             **options: options of `jaxdrones.make`.
 
         Raises:
             ValueError: an argument that `jaxdrones.make` refuses.
+            TypeError: an option that it does not have.
         """
         check_whole("num_envs", num_envs)
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
@@ -136,22 +146,36 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             check_whole("max_episode_steps", max_episode_steps)
             self.env = copy.copy(self.env)
             self.env.steps = max_episode_steps
+        pictures.check_mode(render_mode)
+        self.autoreset_mode, self.render_mode = _autoreset_mode(autoreset_mode), render_mode
+        self.metadata = self.metadata | {
+            "autoreset_mode": self.autoreset_mode,
+            "render_fps": round(1 / self.env.dt),
+        }
         self._layout = _layout(self.env, dict_spaces)
         self.single_observation_space, self.single_action_space = self._layout.observation, self._layout.action
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._episodes = envs.AutoReset(self.env)
-        self._compiled_reset = jax.jit(self._reset)
-        self._compiled_step = jax.jit(self._step, donate_argnums=1)
-        self._worlds = None
+        self._worlds = Worlds(self.env, self._layout, self.autoreset_mode)
+        self._over = np.zeros(num_envs, bool)  # worlds that have to be reset, in NumPy with autoreset disabled
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode in every world; the same seed starts the same ones."""
-        super().reset(seed=seed)
-        _refuse(options)
-        first = int(self.np_random.integers(SEEDS)) if seed is None else seed
-        seeds = ((first + np.arange(self.num_envs)) % SEEDS).astype(np.uint32)
-        self._keys, self._worlds, obs = self._compiled_reset(seeds)
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode in every world, or in those of a mask; the same seed starts the same ones.
+
+        Args:
+            seed: of the first world, which is counted up for the others; or one for every world.
+            options: nothing, or `reset_mask`: (num_envs,) bool, the worlds to reset.
+
+        Raises:
+            ValueError: seeds or a mask that are not one for every world, or another option.
+            gymnasium.error.ResetNeeded: some worlds are to be reset before all of them were.
+        """
+        mask = self._mask(options)
+        seeds = self._seeds(seed)
+        obs = self._worlds.reset(seeds, mask)
+        self._over &= False if mask is None else ~mask
         return self._out(obs), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -159,37 +183,67 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             ValueError: actions of wrong shape or with NaN (JAX arrays are not searched for NaN).
+            gymnasium.error.ResetNeeded: no episode has begun, or one has ended and autoreset is disabled (with
+                `numpy=False` such a world flies on).
+        """
+        if not self._worlds.started:
+            raise gymnasium.error.ResetNeeded("step is called before reset; call reset")
+        if self._over.any():
+            raise gymnasium.error.ResetNeeded(
+                f"the episodes of worlds {shown(np.flatnonzero(self._over))} have ended; call "
+                'reset(options={"reset_mask": terminated | truncated})'
+            )
+        actions = self._layout.gather(actions, (self.num_envs,))
+        obs, reward, terminated, truncated, info = self._out(self._worlds.step(actions))
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._numpy:
+            self._over = terminated | truncated
+        return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture (height, width, 3) of every world from the side, if made with `render_mode="rgb_array"`.
+
+        Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        if self._worlds is None:
-            raise gymnasium.error.ResetNeeded("step is called before reset; call reset")
-        actions = self._layout.gather(actions, (self.num_envs,))
-        self._worlds, outcome = self._compiled_step(self._keys, self._worlds, actions)
-        obs, reward, terminated, truncated, info = self._out(outcome)
-        return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
+        if self.render_mode is None:
+            gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
+            return None
+        if not self._worlds.started:
+            raise gymnasium.error.ResetNeeded("render is called before reset; call reset")
+        return tuple(pictures.of_worlds(self.env, self._worlds.world))
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the connection to Bullet, if there is one."""
         self.env.close()
 
-    def _reset(self, seeds: jax.Array):
-        keys, episodes, obs = jax.vmap(functools.partial(begin, self._episodes))(seeds)
-        return keys, (np.uint32(0), episodes), self._layout.arrange(obs, 1)
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
+        """A seed for every world."""
+        if seed is None or isinstance(seed, int | np.integer):
+            super().reset(seed=None if seed is None else int(seed))
+            first = int(self.np_random.integers(SEEDS)) if seed is None else int(seed)
+            seeds = [first + i for i in range(self.num_envs)]
+        else:
+            if len(seed) != self.num_envs:
+                raise ValueError(f"seed has {len(seed)} entries; give one number, or one for each of {self.num_envs}")
+            given = [int(x) for x in seed if x is not None]
+            super().reset(seed=given[0] if given else None)
+            seeds = [int(self.np_random.integers(SEEDS)) if x is None else int(x) for x in seed]
+        return np.array([seed % SEEDS for seed in seeds], np.uint32)
 
-    def _step(self, keys: jax.Array, worlds: tuple, actions: jax.Array):
-        count, episodes = worlds
-
-        def step(key, episode, action):
-            return self._episodes.step(jax.random.fold_in(key, count), episode, action)
-
-        obs, episodes, reward, terminated, truncated, info = jax.vmap(step)(keys, episodes, actions)
-        last = {"rewards": info["rewards"], "metrics": info["metrics"]}
-        if self.env.drones == 1:
-            last = jax.tree.map(lambda x: x[:, 0], last)
-        last |= {name: info[name] for name in ("terminations", "truncations")}
-        episode = {"r": info["episode"]["return"].sum(-1), "l": info["episode"]["length"]}
-        info = {"last": last, "episode": episode, "final_obs": self._layout.arrange(info["final_obs"], 1)}
-        return (count + 1, episodes), (self._layout.arrange(obs, 1), reward.sum(-1), terminated, truncated, info)
+    def _mask(self, options: dict[str, Any] | None) -> np.ndarray | None:
+        """The worlds that options of `reset` choose; `None` for all."""
+        if not options or "reset_mask" not in options:
+            _refuse(options)
+            return None
+        _refuse({name: x for name, x in options.items() if name != "reset_mask"})
+        mask = np.asarray(options["reset_mask"])
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(
+                f"reset_mask has shape {mask.shape} and dtype {mask.dtype}; give ({self.num_envs},) of True and False"
+            )
+        if not self._worlds.started:
+            raise gymnasium.error.ResetNeeded("worlds are reset by a mask before all were reset; call reset first")
+        return mask
 
     def _out(self, tree: Any) -> Any:
         if not self._numpy:
@@ -198,11 +252,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def _infos(self, info: dict[str, Any], ended: Any) -> dict[str, Any]:
         """The infos with gymnasium's masks: `_name` says of which worlds `name` is valid."""
-        last, goes_on = info["last"], ~ended
-        infos = _masked({name: _masked(group, goes_on) for name, group in last.items()}, goes_on)
-        if not self._numpy or ended.any():
-            final = {name: _masked(group, ended) for name, group in (last | {"episode": info["episode"]}).items()}
-            infos |= _masked({"final_obs": info["final_obs"], "final_info": _masked(final, ended)}, ended)
+        last, goes_on = info["last"], info["goes_on"]
+        infos = _masked(last, goes_on)
+        if "final_obs" in info and (not self._numpy or ended.any()):
+            final = _masked(last | {"episode": _masked(info["episode"], ended)}, ended)
+            infos |= _masked({"final_obs": info["final_obs"], "final_info": final}, ended)
         return infos
 
 
@@ -219,9 +273,15 @@ def _layout(env: envs.Env, by_drone: bool) -> Layout:
     return Layout(env, [str(i) for i in range(env.drones)] if by_drone else None)
 
 
+def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    if not isinstance(mode, AutoresetMode):
+        check_choice("autoreset_mode", mode, [known.value for known in AutoresetMode])
+    return AutoresetMode(mode)
+
+
 def _refuse(options: dict[str, Any] | None) -> None:
     if options:
-        raise ValueError(f"reset is called with options {', '.join(map(str, options))}; there are none, leave them out")
+        raise ValueError(f"reset is called with the unknown options {', '.join(map(str, options))}; leave them out")
 
 
 def _masked(values: dict[str, Any], mask: Any) -> dict[str, Any]:

@@ -7,7 +7,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from jaxdrones.adapters.session import SEEDS, Session, as_env
+from jaxdrones.adapters import pictures
+from jaxdrones.adapters.session import SEEDS, Session, as_env, flat
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import Env
 from jaxdrones.tasks.task import Task
@@ -31,20 +32,19 @@ class ParallelEnv(pettingzoo.ParallelEnv):
 
         Args:
             task: a name, a task, or an environment.
-            render_mode: `rgb_array` or nothing; pybullet renders the pictures, on both backends.
+            render_mode: `rgb_array` or nothing.
             **options: options of `jaxdrones.make`.
 
         Raises:
             ValueError: an argument that `jaxdrones.make` refuses.
         """
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
+        pictures.check_mode(render_mode)
         self.env = as_env(task, options)
         self.render_mode = render_mode
         self.metadata = {
             "name": f"jaxdrones/{self.env.task.name}",
             "is_parallelizable": True,
-            "render_modes": ["rgb_array"],
+            "render_modes": pictures.MODES,
             "render_fps": round(1 / self.env.dt),
         }
         self.possible_agents = [f"drone_{i}" for i in range(self.env.drones)]
@@ -107,7 +107,6 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         """A picture (height, width, 3) of the team from the side, if made with `render_mode="rgb_array"`.
 
         Raises:
-            ImportError: pybullet is not installed; says which extra to install.
             ValueError: no episode has begun.
         """
         if self.render_mode is None:
@@ -127,9 +126,4 @@ class ParallelEnv(pettingzoo.ParallelEnv):
 
 
 def _of_drone(info: dict[str, Any], i: int) -> dict[str, Any]:
-    rewards, metrics = ({name: x[i].item() for name, x in info[group].items()} for group in ("rewards", "metrics"))
-    return {
-        "rewards": rewards,
-        "metrics": metrics,
-        **{name: dict(info[name]) for name in ("terminations", "truncations")},
-    }
+    return {name: x if isinstance(x, bool) else x[i].item() for name, x in flat(info).items()}

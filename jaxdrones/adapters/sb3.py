@@ -23,20 +23,30 @@ class VecEnv(vec_env.VecEnv):
     There it has `terminal_observation`, `TimeLimit.truncated`, and `episode` (return `r`, length `l`) for SB3's log.
     """
 
-    def __init__(self, task: str | Task | Env, num_envs: int, *, seed: int | None = None, **options: Any):
+    def __init__(
+        self,
+        task: str | Task | Env,
+        num_envs: int,
+        *,
+        seed: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ):
         """Make the worlds.
 
         Args:
             task: a name, a task, or an environment.
             num_envs: number of worlds.
             seed: seed of the first reset; SB3's algorithms set it too.
+            render_mode: `rgb_array` or nothing.
             **options: options of `jaxdrones.make`.
 
         Raises:
             ValueError: an argument that `jaxdrones.make` refuses.
         """
-        self.envs = gymnasium.VectorEnv(task, num_envs, **options)
-        self.render_mode = None
+        self.envs = gymnasium.VectorEnv(task, num_envs, render_mode=render_mode, **options)
+        self.render_mode = render_mode
+        self.metadata = self.envs.metadata
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
         self._seed = seed
         self._actions: np.ndarray
@@ -70,6 +80,10 @@ class VecEnv(vec_env.VecEnv):
                 "episode": {"r": float(episode["r"][i]), "l": int(episode["l"][i])},
             }
         return obs, reward, done, infos
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture (height, width, 3) of every world from the side."""
+        return self.envs.render() or [None] * self.num_envs
 
     def close(self) -> None:
         """End the connection to Bullet, if there is one."""

@@ -10,11 +10,14 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxdrones.adapters import pictures
+from jaxdrones.checks import UnexpectedKeyword
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.tasks.task import Task, World
 
 SEEDS = 2**32  # seeds are taken modulo this
+_GROUPS = {"rewards": "reward", "metrics": "metric", "terminations": "termination", "truncations": "truncation"}
 
 
 class Session:
@@ -52,45 +55,40 @@ class Session:
         return obs, reward, terminated, truncated, info
 
     def photo(self) -> np.ndarray:
-        """A picture of the team from the side, RGB (height, width, 3) uint8; Bullet renders it, whatever the backend.
-
-        Raises:
-            ImportError: pybullet is not installed; says which extra to install.
-        """
+        """A picture of the team from the side, RGB (height, width, 3) uint8."""
         assert self.world is not None
-        pos = np.asarray(self.world.drones.pos, float)
-        center = pos.mean(axis=0)
-        reach = 1.0 + np.abs(pos - center).max()  # m
-        eye = center + reach * np.array([0.9, -1.2, 0.6])
-        return self._renderer.photo(self.world.params, self.world.drones, eye, center, scene=self.world.scene)
+        return pictures.of_world(self.env, self.world)
 
     def close(self) -> None:
-        """End the connections to Bullet; the session cannot go on."""
+        """End the connection to Bullet, if there is one; the session cannot go on."""
         self.running = False
         self.env.close()
-        if "_renderer" in vars(self):
-            self._renderer.close()
-
-    @functools.cached_property
-    def _renderer(self):
-        if isinstance(self.env.physics, HostStep):
-            return self.env.physics
-        from jaxdrones.engine import bullet  # an optional library behind it
-
-        return bullet.make_step()
 
 
 def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
     """The environment for a name, a task, or an environment.
 
     Raises:
-        ValueError: an argument that `jaxdrones.make` refuses, or options beside an environment.
+        ValueError: an argument that `jaxdrones.make` refuses.
+        TypeError: an option that it does not have, or options beside an environment.
     """
     if not isinstance(task, Env):
         return make(task, **options)
     if options:
-        raise ValueError(f"options {', '.join(options)} are given beside an environment; give them to jaxdrones.make")
+        raise UnexpectedKeyword(
+            f"got an unexpected keyword argument {next(iter(options))!r} beside an environment; give options to "
+            "jaxdrones.make"
+        )
     return task
+
+
+def flat(info: dict[str, Any]) -> dict[str, Any]:
+    """The infos of an environment in one dictionary, as other libraries read them: `reward_position`, `metric_error`.
+
+    Args:
+        info: infos of which `rewards`, `metrics`, `terminations` and `truncations` are taken.
+    """
+    return {f"{prefix}_{name}": x for group, prefix in _GROUPS.items() for name, x in info[group].items()}
 
 
 def begin(env: Env | AutoReset, seed: ArrayLike) -> tuple[jax.Array, Any, Any]:

@@ -82,6 +82,7 @@ def test_every_episode_starts_anew(env_of):
     assert len(np.unique(starts, axis=0)) == len(starts)
 
 
+@pytest.mark.slow
 def test_episode_metrics_are_sums_over_the_episode(env_of):
     env = brax.wrap(env_of("hover"))
     wrapped = brax.wrap_for_training(env, episode_length=4)
@@ -93,6 +94,28 @@ def test_episode_metrics_are_sums_over_the_episode(env_of):
     metrics = state.info["episode_metrics"]
     np.testing.assert_allclose(metrics["sum_reward"], rewards[4] + rewards[5], rtol=1e-5)
     np.testing.assert_array_equal(metrics["length"], 2)
+
+
+@pytest.mark.slow
+def test_braxs_own_wrappers_and_statistics_run(env_of):
+    """Each episode of a world begins at its first start again, as brax's wrapper has it."""
+    from brax.training.acme import running_statistics, specs
+
+    env = brax.wrap(env_of("hover"))
+    wrapped = training.EvalWrapper(training.wrap(env, episode_length=4))
+    start = state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 2))
+    statistics = running_statistics.init_state(specs.Array((env.observation_size,), jnp.dtype("float32")))
+    step = jax.jit(wrapped.step)
+    for k in range(4):
+        state = step(state, jnp.full((2, 4), 0.1))
+        with jax.numpy_rank_promotion("allow"):  # which brax relies on
+            statistics = running_statistics.update(statistics, state.obs)
+            normalized = running_statistics.normalize(state.obs, statistics)
+        assert state.done.tolist() == state.info["truncation"].tolist() == [float(k == 3)] * 2
+    np.testing.assert_array_equal(state.obs, start.obs)
+    assert np.isfinite(normalized).all() and statistics.count.lo == 8
+    metrics = state.info["eval_metrics"]
+    np.testing.assert_array_equal(metrics.episode_steps, 4)
 
 
 def test_a_team_acts_and_sees_as_one(env_of):

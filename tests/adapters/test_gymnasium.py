@@ -1,3 +1,5 @@
+import functools
+
 import gymnasium
 import jax
 import numpy as np
@@ -19,6 +21,12 @@ def short(env_of):
     return env_of("hover", duration=SHORT)
 
 
+@pytest.fixture(scope="module")
+def vector_of(env_of):
+    """Three short worlds in an autoreset mode, compiled once; to be reset by the test that asks for them."""
+    return functools.cache(lambda mode=AutoresetMode.SAME_STEP: VectorEnv(short(env_of), 3, autoreset_mode=mode))
+
+
 def test_every_task_has_an_id_whose_entry_points_are_only_names():
     assert ids()["hover-2021"] == "jaxdrones/Hover2021-v0" and ids().keys() == TASKS.keys()
     for name in ids().values():
@@ -33,11 +41,13 @@ def test_gymnasium_finds_nothing_to_complain_about(task, env_of):
     check_env(env, skip_render_check=True, skip_close_check=True)
 
 
+@pytest.mark.slow
 def test_made_by_its_id_it_passes_too_and_takes_pictures():
     pytest.importorskip("pybullet")
     check_env(gymnasium.make("jaxdrones/Hover-v0").unwrapped)
 
 
+@pytest.mark.slow
 def test_dict_spaces_by_drone_pass_and_show_what_the_boxes_show(env_of):
     stacked, by_drone = (GymnasiumEnv(env_of("leader-follower"), dict_spaces=choice) for choice in (False, True))
     by_drone.spec = gymnasium.spec("jaxdrones/LeaderFollower-v0")
@@ -58,7 +68,7 @@ def test_a_teams_reward_is_the_sum_over_drones_and_terms(env_of):
     env.reset(seed=0)
     _, reward, *_, info = env.step(env.action_space.sample())
     assert type(reward) is float
-    assert reward == pytest.approx(sum(term.sum() for term in info["rewards"].values()), rel=1e-6)
+    assert reward == pytest.approx(sum(x.sum() for name, x in info.items() if name.startswith("reward_")), rel=1e-6)
 
 
 def test_a_seed_fixes_the_episode_and_those_that_follow(env_of):
@@ -93,17 +103,23 @@ def test_mistakes_are_named(env_of):
         envs.step(np.zeros(4))
     with pytest.raises(ValueError, match="not finite"):
         envs.step(np.full((3, 4), np.inf))
-    with pytest.raises(ValueError, match="options reset_mask"):
-        envs.reset(options={"reset_mask": np.ones(3, bool)})
-    with pytest.raises(ValueError, match="unknown option of hover 'heigth'; did you mean 'height'"):
+    with pytest.raises(ValueError, match="unknown options mask; leave them out"):
+        envs.reset(options={"mask": np.ones(3, bool)})
+    with pytest.raises(ValueError, match=r"reset_mask has shape \(2,\) and dtype bool; give \(3,\) of True and False"):
+        envs.reset(options={"reset_mask": np.ones(2, bool)})
+    with pytest.raises(ValueError, match="seed has 2 entries; give one number, or one for each of 3"):
+        envs.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match="unknown autoreset_mode 'Never'"):
+        VectorEnv(short(env_of), 3, autoreset_mode="Never")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'heigth'; did you mean 'height'"):
         gymnasium.make("jaxdrones/Hover-v0", heigth=1.0)
-    with pytest.raises(ValueError, match="unknown option"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'colour'"):
         gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=2, colour="red")
     with pytest.raises(ValueError, match="num_envs is 0"):
         VectorEnv("hover", 0)
     with pytest.raises(ValueError, match="render_mode is 'human'"):
         GymnasiumEnv("hover", render_mode="human")
-    with pytest.raises(ValueError, match="given beside an environment"):
+    with pytest.raises(TypeError, match="unexpected keyword argument 'backend' beside an environment"):
         GymnasiumEnv(short(env_of), backend="explicit")
     by_drone = GymnasiumEnv(env_of("leader-follower"), dict_spaces=True)
     by_drone.reset(seed=0)
@@ -111,8 +127,8 @@ def test_mistakes_are_named(env_of):
         by_drone.step({"0": np.zeros(1)})
 
 
-def test_world_i_of_many_flies_as_one_that_is_reset_with_the_seed_plus_i(env_of):
-    envs, alone = VectorEnv(short(env_of), 3), GymnasiumEnv(short(env_of))
+def test_world_i_of_many_flies_as_one_that_is_reset_with_the_seed_plus_i(env_of, vector_of):
+    envs, alone = vector_of(), GymnasiumEnv(short(env_of))
     obs, _ = envs.reset(seed=7)
     alone_obs, _ = alone.reset(seed=9)
     np.testing.assert_array_equal(obs[2], alone_obs)
@@ -126,8 +142,8 @@ def test_world_i_of_many_flies_as_one_that_is_reset_with_the_seed_plus_i(env_of)
     assert truncated.all()
 
 
-def test_the_next_episode_begins_in_the_step_in_which_one_ends(env_of):
-    envs = VectorEnv(short(env_of), 3)
+def test_the_next_episode_begins_in_the_step_in_which_one_ends(vector_of):
+    envs = vector_of()
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     starts = [envs.reset(seed=0)[0]]
     hover = np.zeros((3, 4), np.float32)
@@ -146,19 +162,101 @@ def test_the_next_episode_begins_in_the_step_in_which_one_ends(env_of):
     assert len(np.unique(rows, axis=0)) == len(rows)  # every episode of every world begins anew
 
 
-def test_only_worlds_whose_episode_ended_are_masked(env_of):
-    envs = VectorEnv("hover", 2, duration=0.5, reach=0.0)
-    obs, _ = envs.reset(seed=0)
-    state = jax.tree.map(np.array, envs._worlds)
-    count, episodes = state
-    episodes.world.step[1] = envs.env.steps - 1
-    envs._worlds = (count, episodes)
-    obs, _, _, truncated, infos = envs.step(np.zeros((2, 4)))
-    assert truncated.tolist() == infos["_final_obs"].tolist() == infos["_final_info"].tolist() == [False, True]
-    assert infos["_metrics"].tolist() == [True, False]
+def test_only_worlds_whose_episode_ended_are_masked(vector_of):
+    envs = vector_of()
+    envs.reset(seed=0)
+    envs.step(np.zeros((3, 4)))
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    for _ in range(4):
+        obs, _, _, truncated, infos = envs.step(np.zeros((3, 4)))
+    assert truncated.tolist() == infos["_final_obs"].tolist() == infos["_final_info"].tolist() == [False, True, False]
+    assert infos["_metric_error"].tolist() == [True, False, True]
     np.testing.assert_array_equal(infos["final_obs"][0], obs[0])
 
 
+@pytest.mark.slow
+def test_the_next_episode_begins_in_the_step_after_the_end(vector_of):
+    """The step that resets ignores its action, rewards nothing, and shows what the same-step mode shows before."""
+    same, after = vector_of(), vector_of(AutoresetMode.NEXT_STEP)
+    assert after.autoreset_mode is after.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    np.testing.assert_array_equal(same.reset(seed=0)[0], after.reset(seed=0)[0])
+    for _ in range(5):
+        _, same_reward, *_, same_infos = same.step(np.full((3, 4), 0.1))
+        obs, reward, terminated, truncated, infos = after.step(np.full((3, 4), 0.1))
+        assert "final_obs" not in infos and infos["_reward_position"].all()
+    assert truncated.all()
+    np.testing.assert_allclose(obs, same_infos["final_obs"], rtol=1e-4, atol=1e-5)  # two programs round differently
+    np.testing.assert_allclose(reward, same_reward, rtol=1e-4)
+    starts, reward, terminated, truncated, infos = after.step(np.ones((3, 4)))
+    assert not reward.any() and not terminated.any() and not truncated.any() and not infos["_reward_position"].any()
+    assert len(np.unique(np.concatenate([starts, obs]), axis=0)) == 6
+    first = after.step(np.zeros((3, 4)))
+    assert not first[3].any() and first[-1]["_reward_position"].all() and not np.array_equal(first[0], starts)
+
+
+def test_without_autoreset_a_mask_says_which_worlds_begin_anew(env_of, vector_of):
+    envs = vector_of(AutoresetMode.DISABLED)
+    start, _ = envs.reset(seed=[5, None, 1])
+    np.testing.assert_array_equal(start[0], vector_of().reset(seed=5)[0][0])
+    with pytest.raises(gymnasium.error.ResetNeeded, match="before all were reset"):
+        VectorEnv(short(env_of), 3).reset(options={"reset_mask": np.ones(3, bool)})
+    for _ in range(5):
+        last, *_, truncated, _ = envs.step(np.zeros((3, 4)))
+    assert truncated.all()
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"worlds \[0, 1, 2\] have ended"):
+        envs.step(np.zeros((3, 4)))
+    obs, _ = envs.reset(seed=[5, 5, 5], options={"reset_mask": np.array([True, False, True])})
+    np.testing.assert_array_equal(obs, [start[0], last[1], start[0]])
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"worlds \[1\] have ended"):
+        envs.step(np.zeros((3, 4)))
+    envs.reset(options={"reset_mask": np.array([False, True, False])})
+    for _ in range(5):
+        truncated = envs.step(np.zeros((3, 4)))[3]
+    assert truncated.all()
+
+
+def test_a_list_of_seeds_is_one_for_every_world(vector_of):
+    envs = vector_of()
+    counted, _ = envs.reset(seed=7)
+    listed, _ = envs.reset(seed=[9, 8, 7])
+    np.testing.assert_array_equal(listed, counted[::-1])
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # gymnasium compares bounds with float64's range
+@pytest.mark.parametrize(
+    ("wrapper", "mode"),
+    [
+        ("NormalizeObservation", AutoresetMode.NEXT_STEP),  # which takes no other
+        ("FlattenObservation", AutoresetMode.NEXT_STEP),
+        ("FlattenObservation", AutoresetMode.DISABLED),
+        ("DtypeObservation", AutoresetMode.NEXT_STEP),
+    ],
+)
+def test_observation_wrappers_of_gymnasium_run(wrapper, mode, vector_of):
+    given = {"dtype": np.float64} if wrapper == "DtypeObservation" else {}
+    envs = getattr(gymnasium.wrappers.vector, wrapper)(vector_of(mode), **given)
+    envs.reset(seed=0)
+    for _ in range(5):
+        obs, *_ = envs.step(np.zeros((3, 4)))
+    assert obs in envs.observation_space or wrapper == "NormalizeObservation"
+    assert np.isfinite(obs).all()
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # gymnasium compares bounds with float64's range
+@pytest.mark.parametrize("wrapper", ["NormalizeObservation", "FlattenObservation", "DtypeObservation"])
+def test_observation_wrappers_of_one_environment_run(wrapper, env_of):
+    given = {"dtype": np.float64} if wrapper == "DtypeObservation" else {}
+    by_drone = wrapper == "FlattenObservation"
+    plain = GymnasiumEnv(env_of("leader-follower"), dict_spaces=True) if by_drone else GymnasiumEnv(short(env_of))
+    env = getattr(gymnasium.wrappers, wrapper)(plain, **given)
+    obs, _ = env.reset(seed=0)
+    for _ in range(3):
+        obs, *_ = env.step(env.action_space.sample())
+    assert obs.shape == env.observation_space.shape and obs.dtype == env.observation_space.dtype
+    assert obs in env.observation_space or wrapper == "NormalizeObservation"
+
+
+@pytest.mark.slow
 def test_a_time_limit_is_that_of_the_adapter_and_not_of_the_environment_it_was_given(env_of):
     env = short(env_of)
     envs = VectorEnv(env, 2, max_episode_steps=2)
@@ -167,21 +265,21 @@ def test_a_time_limit_is_that_of_the_adapter_and_not_of_the_environment_it_was_g
     assert env.steps == 5
 
 
-def test_wrappers_of_gymnasium_understand_the_infos(env_of):
-    envs = RecordEpisodeStatistics(VectorEnv(short(env_of), 3))
+def test_wrappers_of_gymnasium_understand_the_infos(vector_of):
+    envs = RecordEpisodeStatistics(vector_of())
     envs.reset(seed=0)
     for _ in range(5):
         *_, infos = envs.step(np.zeros((3, 4)))
     np.testing.assert_allclose(infos["episode"]["r"], infos["final_info"]["episode"]["r"], rtol=1e-5)
-    listed = DictInfoToList(VectorEnv(short(env_of), 3))
+    listed = DictInfoToList(vector_of())
     listed.reset(seed=0)
     for _ in range(5):
         *_, infos = listed.step(np.zeros((3, 4)))
-    assert infos[2]["final_info"]["episode"]["l"] == 5 and "error" in infos[2]["final_info"]["metrics"]
+    assert infos[2]["final_info"]["episode"]["l"] == 5 and "metric_error" in infos[2]["final_info"]
 
 
-def test_arrays_are_ones_own_or_not_copied_at_all(env_of):
-    envs = VectorEnv(short(env_of), 3)
+def test_arrays_are_ones_own_or_not_copied_at_all(env_of, vector_of):
+    envs = vector_of()
     first, _ = envs.reset(seed=0)
     obs, reward, terminated, *_ = envs.step(np.zeros((3, 4)))
     assert all(type(x) is np.ndarray and x.flags.writeable for x in (first, obs, reward, terminated))

@@ -75,3 +75,17 @@ def test_sb3s_ppo_learns_to_hover(env_of):
     model.learn(750_000)
     after = episode_return(model, test)
     assert after > before + 300, (before, after)  # of at most 1,000
+
+
+def test_sb3_records_videos_of_all_worlds(env_of, tmp_path):
+    pytest.importorskip("moviepy")
+    from stable_baselines3.common.vec_env import VecVideoRecorder
+
+    envs = VecEnv(env_of("hover", duration=0.05), 2, render_mode="rgb_array")
+    recorder = VecVideoRecorder(envs, str(tmp_path), record_video_trigger=lambda step: step == 0, video_length=3)
+    recorder.reset()
+    for _ in range(4):
+        recorder.step(np.zeros((2, 4), np.float32))
+    assert [image.shape for image in envs.get_images()] == [(480, 640, 3)] * 2
+    recorder.close()
+    assert any(file.stat().st_size > 1000 for file in tmp_path.glob("*.mp4"))

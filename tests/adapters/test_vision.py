@@ -18,6 +18,7 @@ def env(env_of):
     return env_of("hover", drones=2, vision=("rgb", "depth", "segmentation"), camera=CAMERA)
 
 
+@pytest.mark.slow
 def test_gymnasium_gives_what_its_spaces_promise(env):
     pytest.importorskip("gymnasium")
     from jaxdrones.adapters.gymnasium import GymnasiumEnv
@@ -30,6 +31,7 @@ def test_gymnasium_gives_what_its_spaces_promise(env):
     assert one.step(one.action_space.sample())[0] in space
 
 
+@pytest.mark.slow
 def test_many_worlds_of_gymnasium_give_what_their_spaces_promise(env):
     pytest.importorskip("gymnasium")
     from jaxdrones.adapters.gymnasium import VectorEnv
@@ -41,6 +43,7 @@ def test_many_worlds_of_gymnasium_give_what_their_spaces_promise(env):
     assert envs.step(envs.action_space.sample())[0] in space
 
 
+@pytest.mark.slow
 def test_pettingzoo_gives_what_its_spaces_promise(env):
     pytest.importorskip("pettingzoo")
     from jaxdrones.adapters.pettingzoo import parallel_env
@@ -53,6 +56,7 @@ def test_pettingzoo_gives_what_its_spaces_promise(env):
     assert team.state() in team.state_space
 
 
+@pytest.mark.slow
 def test_brax_gives_images_by_the_names_that_its_networks_look_for(env):
     pytest.importorskip("brax")
     from jaxdrones.adapters import brax
@@ -69,6 +73,7 @@ def test_brax_gives_images_by_the_names_that_its_networks_look_for(env):
     assert {x.dtype for x in after.obs.values()} == {jnp.dtype("float32")}
 
 
+@pytest.mark.slow
 def test_the_drones_of_a_team_are_the_channels_of_an_image_of_brax(env):
     pytest.importorskip("brax")
     from jaxdrones.adapters import brax

@@ -1,0 +1,155 @@
+"""JaxMARL-style environments: a team as dictionaries by agent, one agent per drone, for loops that JAX compiles.
+
+from jaxdrones.adapters import jaxmarl
+
+env = jaxmarl.wrap(jd.make("leader-follower"))
+obs, state = env.reset(key)
+obs, state, rewards, dones, infos = env.step(key, state, {agent: action for agent in env.agents})
+
+Neither JaxMARL nor another library is needed.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxdrones import envs
+from jaxdrones.adapters import jax_spaces
+from jaxdrones.adapters.jax_spaces import Spaces, action_table, of_gymnasium
+from jaxdrones.adapters.spaces import Layout, observation_of_drone
+from jaxdrones.envs.autoreset import Episode
+from jaxdrones.envs.vision import observation
+
+ALL = "__all__"
+WORLD_STATE = "world_state"
+
+
+def wrap(
+    env: envs.Env, *, world_state: bool = False, discrete_actions: ArrayLike | None = None, spaces: Spaces = jax_spaces
+) -> JaxMARLEnv:
+    """An environment with the interface of JaxMARL.
+
+    Args:
+        env: environment.
+        world_state: whether observations also have `world_state` (n, n d), a row for the centralized critic of every
+            agent: its own observation, then those of the others, without images.
+        discrete_actions: (k, a) the actions of a drone between which a discrete action chooses; actions are continuous
+            when left out.
+        spaces: module whose classes the spaces are of, for loops that ask for the class of a space, such as
+            `jaxmarl.environments.spaces`.
+
+    Raises:
+        ValueError: a table of actions of another shape, or with numbers that are not finite.
+    """
+    return JaxMARLEnv(env, world_state, discrete_actions, spaces)
+
+
+class JaxMARLEnv:
+    """One world; an episode begins and ends for all agents at once, and the next one begins in the same step."""
+
+    def __init__(self, env: envs.Env, world_state: bool, discrete_actions: ArrayLike | None, spaces: Spaces):
+        self.env = env
+        self.num_agents = env.drones
+        self.agents = [f"drone_{i}" for i in range(env.drones)]
+        self.agent_classes = {"drones": self.agents}
+        self._episodes, self._layout = envs.AutoReset(env), Layout(env, self.agents)
+        self._with_world_state = world_state
+        self._table = None if discrete_actions is None else action_table(discrete_actions, env.action_size)
+        action = spaces.Box(-1.0, 1.0, (env.action_size,)) if self._table is None else spaces.Discrete(len(self._table))
+        self.observation_spaces = dict.fromkeys(self.agents, of_gymnasium(observation_of_drone(env), spaces))
+        self.action_spaces = dict.fromkeys(self.agents, action)
+
+    @property
+    def name(self) -> str:
+        """Name of the task."""
+        return self.env.task.name
+
+    def observation_space(self, agent: str) -> Any:
+        """The observation space of an agent."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """The action space of an agent."""
+        return self.action_spaces[agent]
+
+    def world_state_size(self) -> int:
+        """Length of a row of the world state."""
+        return self.env.drones * self.env.observation_size
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def reset(self, key: jax.Array) -> tuple[dict[str, Any], Episode]:
+        """Start an episode: the observations and the state."""
+        obs, state = self._episodes.reset(key)
+        return self._by_agent(obs), state
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def step(
+        self, key: jax.Array, state: Episode, actions: Mapping[str, Array], reset_state: Episode | None = None
+    ) -> tuple[dict[str, Any], Episode, dict[str, Array], dict[str, Array], dict[str, Any]]:
+        """One control step.
+
+        Args:
+            key: random key.
+            state: as `reset` or `step` returned it.
+            actions: one for every agent.
+            reset_state: state at which the next episode begins; a newly drawn one when left out.
+
+        Returns:
+            Observations and state, those of the next episode where one ended; rewards; dones, by agent and `__all__`;
+            and infos, whose arrays have one entry per agent: `rewards` and `metrics` by name, `terminated` and
+            `truncated`.
+        """
+        if reset_state is None:
+            outcome = self._episodes.step(key, state, self._gathered(actions))
+            return self._by_agent(outcome[0]), outcome[1], *self._outcome(*outcome[2:])
+        obs, state, rewards, dones, infos = self.step_env(key, state, actions)
+        begun = self.get_obs(reset_state), reset_state
+        obs, state = jax.tree.map(lambda new, old: jnp.where(dones[ALL], new, old), begun, (obs, state))
+        return obs, state, rewards, dones, infos
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def step_env(
+        self, key: jax.Array, state: Episode, actions: Mapping[str, Array]
+    ) -> tuple[dict[str, Any], Episode, dict[str, Array], dict[str, Array], dict[str, Any]]:
+        """One control step, after which no episode begins; returns what `step` does."""
+        outcome = self._episodes.step_without_reset(key, state, self._gathered(actions))
+        return self._by_agent(outcome[0]), outcome[1], *self._outcome(*outcome[2:])
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def get_obs(self, state: Episode) -> dict[str, Any]:
+        """The observations of a state, without noise."""
+        return self._by_agent(observation(self.env.privileged_observation(state.world).obs, state.world))
+
+    def get_avail_actions(self, state: Episode) -> dict[str, Array]:
+        """Ones for every discrete action, or every entry of an action, of every agent: all are available."""
+        n = self.env.action_size if self._table is None else len(self._table)
+        return dict.fromkeys(self.agents, jnp.ones(n))
+
+    def _gathered(self, actions: Mapping[str, Array]) -> Float[Array, "n a"]:
+        if self._table is not None:
+            actions = {agent: self._table[jnp.reshape(action, ())] for agent, action in actions.items()}
+        return self._layout.gather(actions)
+
+    def _by_agent(self, obs: Any) -> dict[str, Any]:
+        by_agent = self._layout.arrange(obs)
+        if self._with_world_state:
+            vectors = obs["state"] if isinstance(obs, dict) else obs
+            by_agent[WORLD_STATE] = jnp.stack([jnp.roll(vectors, -i, axis=0).ravel() for i in range(self.num_agents)])
+        return by_agent
+
+    def _outcome(self, reward: Array, terminated: Array, truncated: Array, info: dict[str, Any]) -> tuple:
+        done = terminated | truncated
+        infos = {"rewards": info["rewards"], "metrics": info["metrics"]}
+        infos |= {
+            name: jnp.broadcast_to(x, (self.num_agents,))
+            for name, x in (("terminated", terminated), ("truncated", truncated))
+        }
+        rewards = {agent: reward[i] for i, agent in enumerate(self.agents)}
+        return rewards, dict.fromkeys((*self.agents, ALL), done), infos

@@ -1,0 +1,58 @@
+"""Pictures of teams from the side, for `render_mode="rgb_array"`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdrones.engine.step import HostStep
+from jaxdrones.envs import Env
+from jaxdrones.sensing import Camera, photograph
+from jaxdrones.tasks.task import World
+
+MODES = ["rgb_array"]
+_CAMERA = Camera(resolution=(640, 480), field_of_view=60.0)
+_DIRECTION = np.array([-1.2, 0.9, 0.6])  # from the middle of the team to the camera; so that the sun is behind it
+_AT_A_TIME = 8  # pictures of worlds: what many take at once does not stay in a cache
+
+
+def check_mode(render_mode: str | None) -> None:
+    """Raise unless there are pictures of this mode."""
+    if render_mode not in (None, *MODES):
+        raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
+
+
+def of_world(env: Env, world: World) -> np.ndarray:
+    """A picture of a team, RGB (480, 640, 3) uint8: by the explicit renderer, or by Bullet on its backend."""
+    if not isinstance(env.physics, HostStep):
+        return np.array(_picture(world))
+    eye, center = map(np.asarray, _side(world.drones.pos))
+    bullet: Any = env.physics
+    return bullet.photo(world.params, world.drones, eye, center, _CAMERA, scene=world.scene)
+
+
+def of_worlds(env: Env, worlds: World) -> np.ndarray:
+    """Pictures of worlds, which have a leading axis: (worlds, 480, 640, 3)."""
+    if not isinstance(env.physics, HostStep):
+        return np.array(_pictures(worlds))
+    count = len(worlds.drones.pos)
+    return np.stack([of_world(env, jax.tree.map(lambda x, i=i: x[i], worlds)) for i in range(count)])
+
+
+def _side(pos: Float[Array, "n 3"]) -> tuple[Array, Array]:
+    """Where a camera sees the whole team, and the middle of the team, m, world."""
+    center = jnp.mean(pos, axis=0)
+    reach = 1.0 + jnp.max(jnp.abs(pos - center[None]))
+    return center + reach * jnp.asarray(_DIRECTION, pos.dtype), center
+
+
+def _of(world: Any) -> Array:
+    return photograph(world.scene, world.params, world.drones, *_side(world.drones.pos), _CAMERA)
+
+
+_picture = jax.jit(_of)
+_pictures = jax.jit(lambda worlds: jax.lax.map(_of, worlds, batch_size=_AT_A_TIME))

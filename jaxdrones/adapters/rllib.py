@@ -1,0 +1,70 @@
+"""RLlib: a team as a `MultiAgentEnv`, one agent per drone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.adapters.session import SEEDS, Session, as_env
+from jaxdrones.adapters.spaces import Layout
+from jaxdrones.envs import Env
+from jaxdrones.tasks.task import Task
+
+try:
+    from ray.rllib.env import multi_agent_env
+except ImportError as error:
+    raise ImportError('RLlib is not installed; pip install "ray[rllib]==2.60.0" torch') from error
+
+
+class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
+    """One world whose agents are `drone_0`, `drone_1`, ...; an episode begins and ends for all of them at once."""
+
+    def __init__(self, task: str | Task | Env, **options: Any):
+        """Wrap an environment.
+
+        Args:
+            task: a name, a task, or an environment.
+            **options: options of `jaxdrones.make`.
+
+        Raises:
+            ValueError: an argument that `jaxdrones.make` refuses.
+        """
+        super().__init__()
+        self.env = as_env(task, options)
+        self.possible_agents = [f"drone_{i}" for i in range(self.env.drones)]
+        self.agents = list(self.possible_agents)
+        self._layout = Layout(self.env, self.possible_agents)
+        self.observation_spaces = dict(self._layout.observation.items())
+        self.action_spaces = dict(self._layout.action.items())
+        self._session = Session(self.env)
+        self._seeds = np.random.default_rng()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Start an episode; the same seed starts the same one, and the same ones after it. There are no options."""
+        if seed is not None:
+            self._seeds = np.random.default_rng(seed)
+        obs = self._session.reset(int(self._seeds.integers(SEEDS)) if seed is None else seed)
+        return self._layout.arrange(obs), {agent: {} for agent in self.agents}
+
+    def step(self, action_dict: dict[str, np.ndarray]) -> tuple[Any, Any, Any, Any, Any]:
+        """One control step.
+
+        Raises:
+            ValueError: an agent without an action, an action of wrong shape or with NaN, or there is no episode.
+        """
+        if not self._session.running:
+            raise ValueError("step is called before reset or after the end of an episode; call reset")
+        obs, reward, terminated, truncated, _ = self._session.step(self._layout.gather(action_dict))
+        everyone = (*self.agents, "__all__")
+        return (
+            self._layout.arrange(obs),
+            dict(zip(self.agents, reward.tolist(), strict=True)),
+            dict.fromkeys(everyone, terminated),
+            dict.fromkeys(everyone, truncated),
+            {agent: {} for agent in self.agents},
+        )
+
+    def close(self) -> None:
+        """End the connection to Bullet, if there is one."""
+        self._session.close()

@@ -1,0 +1,160 @@
+"""Tianshou: many worlds in one compiled step as its vector environment, for `Collector`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from jaxdrones.adapters import pictures
+from jaxdrones.adapters.session import SEEDS, as_env
+from jaxdrones.adapters.spaces import Layout
+from jaxdrones.adapters.worlds import Worlds
+from jaxdrones.checks import check_whole
+from jaxdrones.envs import Env
+from jaxdrones.tasks.task import Task
+
+try:
+    from tianshou.env import BaseVectorEnv
+except ImportError as error:
+    raise ImportError("tianshou is not installed; pip install tianshou torch") from error
+
+
+class VectorEnv(BaseVectorEnv):
+    """Many worlds; `Collector` says which of them take a step and which begin an episode.
+
+    Observations and actions have the shapes of `jaxdrones.adapters.gymnasium.VectorEnv`. Infos are empty.
+    """
+
+    def __init__(self, task: str | Task | Env, num_envs: int, *, seed: int | None = None, **options: Any):
+        """Make the worlds.
+
+        Args:
+            task: a name, a task, or an environment.
+            num_envs: number of worlds.
+            seed: seed of the first reset of all worlds.
+            **options: options of `jaxdrones.make`.
+
+        Raises:
+            ValueError: an argument that `jaxdrones.make` refuses.
+        """
+        check_whole("num_envs", num_envs)
+        self.env, self.env_num = as_env(task, options), num_envs
+        self.is_async = self.is_closed = False
+        self._layout = Layout(self.env, None)
+        self._worlds = Worlds(self.env, self._layout, AutoresetMode.DISABLED)
+        self.seed(seed)
+
+    def get_env_attr(self, key: str, id: Any = None) -> list[Any]:
+        """An attribute of the environment, or one of its spaces, for every world asked for."""
+        spaces = {"observation_space": self._layout.observation, "action_space": self._layout.action}
+        value = spaces[key] if key in spaces else getattr(self.env, key)
+        return [value] * int(self._mask(id).sum())
+
+    def set_env_attr(self, key: str, value: Any, id: Any = None) -> None:
+        """Always raises: all worlds are one compiled step and cannot be set apart.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(f"attribute {key} cannot be set in a compiled environment; give it as an option")
+
+    def seed(self, seed: int | Sequence[int] | None = None) -> list[int]:
+        """Seed the worlds, of which each draws all its episodes from its own seed.
+
+        Args:
+            seed: of the first world, which is counted up for the others; or one for every world; or drawn.
+
+        Raises:
+            ValueError: not one seed for every world.
+        """
+        if seed is None:
+            seed = int(np.random.default_rng().integers(SEEDS))
+        seeds = [seed + i for i in range(self.env_num)] if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != self.env_num:
+            raise ValueError(f"seed has {len(seeds)} entries; give one number, or one for each of {self.env_num}")
+        self._seeds = [np.random.default_rng(int(x) % SEEDS) for x in seeds]
+        return seeds
+
+    def reset(
+        self, env_id: int | Sequence[int] | np.ndarray | None = None, *, seed: int | Sequence[int] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Start an episode in worlds `env_id`, or in all; returns their observations and infos.
+
+        Raises:
+            ValueError: some worlds are to begin before all have begun.
+        """
+        if seed is not None:
+            self.seed(seed)
+        mask = self._mask(env_id)
+        if not (mask.all() or self._worlds.started):
+            raise ValueError("some worlds are reset before all were; call reset() first")
+        seeds = [rng.integers(SEEDS) if chosen else 0 for rng, chosen in zip(self._seeds, mask, strict=True)]
+        obs = self._worlds.reset(np.array(seeds, np.uint32), None if mask.all() else mask)
+        chosen = self._ids(env_id)
+        return self._rows(obs, chosen), _infos(chosen)
+
+    def step(
+        self, action: Any, id: int | Sequence[int] | np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """One control step of worlds `id`, or of all; the others stand still.
+
+        Args:
+            action: one for each of these worlds.
+            id: indices of worlds.
+
+        Returns:
+            Observations, rewards, terminated, truncated and infos of these worlds, in their order.
+
+        Raises:
+            ValueError: no episode has begun, or actions of wrong shape or with NaN.
+        """
+        if not self._worlds.started:
+            raise ValueError("step is called before reset; call reset")
+        chosen, action = self._ids(id), np.asarray(action, np.float32)
+        everyone = np.zeros((self.env_num, *self._layout.action.shape), np.float32)
+        if action.shape != (len(chosen), *everyone.shape[1:]):
+            raise ValueError(f"action has shape {action.shape}; expected {(len(chosen), *everyone.shape[1:])}")
+        everyone[chosen] = action
+        mask = self._mask(id)
+        actions = self._layout.gather(everyone, (self.env_num,))
+        obs, *outcome, _ = self._worlds.step(actions, None if mask.all() else mask)
+        reward, terminated, truncated = (np.asarray(x)[chosen] for x in outcome)
+        return self._rows(obs, chosen), reward, terminated, truncated, _infos(chosen)
+
+    def render(self, **kwargs: Any) -> list[np.ndarray]:
+        """A picture (height, width, 3) of every world from the side.
+
+        Raises:
+            ValueError: no episode has begun.
+        """
+        if not self._worlds.started:
+            raise ValueError("render is called before reset; call reset")
+        return list(pictures.of_worlds(self.env, self._worlds.world))
+
+    def close(self) -> None:
+        """End the connection to Bullet, if there is one."""
+        self.is_closed = True
+        self.env.close()
+
+    def _ids(self, chosen: Any) -> np.ndarray:
+        return np.arange(self.env_num) if chosen is None else np.atleast_1d(np.asarray(chosen))
+
+    def _mask(self, chosen: Any) -> np.ndarray:
+        mask = np.zeros(self.env_num, bool)
+        mask[self._ids(chosen)] = True
+        return mask
+
+    def _rows(self, obs: Any, chosen: np.ndarray) -> np.ndarray:
+        """Observations of some worlds; with images an array of dictionaries, as tianshou batches them."""
+        rows = jax.tree.map(lambda x: np.asarray(x)[chosen], obs)
+        if not isinstance(rows, dict):
+            return rows
+        return np.array([{name: x[i] for name, x in rows.items()} for i in range(len(chosen))])
+
+
+def _infos(chosen: np.ndarray) -> np.ndarray:
+    return np.array([{"env_id": int(i)} for i in chosen])

@@ -1,0 +1,158 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_same_kind, mostly_slow
+
+from jaxdrones.adapters import gymnax
+from jaxdrones.envs import TASKS, AutoReset, make
+
+pytestmark = pytest.mark.float32
+KEY = jax.random.PRNGKey(0)
+
+
+@pytest.mark.parametrize("task", mostly_slow(TASKS, ("hover",)))
+def test_a_step_returns_what_it_was_given_as_loops_scan_over_it(task, env_of):
+    env = gymnax.wrap(env_of(task))
+    obs, state = jax.eval_shape(env.reset, KEY)
+    action = jax.eval_shape(env.action_space().sample, KEY)
+    next_obs, next_state, reward, done, info = jax.eval_shape(env.step, KEY, state, action)
+    assert_same_kind((obs, state), (next_obs, next_state))
+    assert reward.shape == done.shape == info["discount"].shape == () and done.dtype == bool
+    space = env.observation_space()
+    shapes = {k: s.shape for k, s in space.spaces.items()} if isinstance(obs, dict) else space.shape
+    assert jax.tree.map(jnp.shape, obs) == shapes
+    assert action.shape == (env.num_actions,) == env.action_space(env.default_params).shape
+
+
+@pytest.mark.slow
+def test_it_is_the_environment_with_autoreset(env_of):
+    plain = env_of("hover", drones=2, duration=0.02)
+    env, episodes = gymnax.wrap(plain), AutoReset(plain)
+    obs, state = env.reset(KEY)
+    expected, episode = episodes.reset(KEY)
+    np.testing.assert_array_equal(obs, expected.ravel())
+    discounts = []
+    for k in range(3):
+        key = jax.random.fold_in(KEY, k)
+        action = env.action_space().sample(key)
+        obs, state, reward, done, info = env.step(key, state, action)
+        expected, episode, rewards, *_ = jax.jit(episodes.step)(key, episode, action.reshape(2, 4))
+        np.testing.assert_allclose(obs, expected.ravel(), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(reward, rewards.sum(), rtol=1e-5)
+        assert done == (k == 1)
+        discounts.append(float(info["discount"]))
+    assert discounts == [1, 1, 1]  # truncated, not terminated
+
+
+def test_truncation_may_be_separate_as_in_gymnax_1(env_of):
+    env = gymnax.wrap(env_of("hover", drones=2, duration=0.02), separate_truncation=True)
+    _, state = env.reset(KEY)
+    for _ in range(2):
+        obs, state, _, terminated, truncated, info = env.step(KEY, state, jnp.zeros(8))
+    assert truncated and not terminated and info["truncated"]
+    assert not np.allclose(obs, info["final_observation"])
+
+
+@pytest.mark.parametrize("separate_truncation", [False, True])
+def test_a_step_without_reset_stays_in_the_episode(separate_truncation, env_of):
+    env = gymnax.wrap(env_of("hover", drones=2, duration=0.02), separate_truncation=separate_truncation)
+    _, state = env.reset_env(KEY)
+    for _ in range(2):
+        *_, flag, info = env.step(KEY, state, jnp.zeros(8))
+        obs, state, _, ended, last = env.step_env(KEY, state, jnp.zeros(8))
+    assert state.length == 2
+    if separate_truncation:
+        assert last["truncated"] and not ended and flag
+        np.testing.assert_allclose(obs, info["final_observation"], rtol=1e-6)
+    else:
+        assert ended and flag and last["discount"] == 1
+
+
+@pytest.mark.slow
+def test_params_are_those_of_another_environment():
+    """A heavier vehicle in `params` flies as one that the environment is made with."""
+    light, env = make("hover"), gymnax.wrap(make("hover"))
+    heavy = light.params.replace(mass=1.3 * light.params.mass)
+    params = jax.tree.map(
+        lambda *x: jnp.stack([jnp.asarray(y) for y in x]),
+        env.default_params,
+        gymnax.EnvParams(3, heavy),
+    )
+    obs, state = jax.vmap(env.reset, (None, 0))(KEY, params)
+    alone = gymnax.wrap(make("hover", vehicle=jax.tree.map(lambda x: x[0], heavy)))
+    expected, single = alone.reset(KEY)
+    np.testing.assert_array_equal(obs[0], obs[1])
+    step = jax.vmap(env.step, (None, 0, None, 0))
+    action, done = jnp.full(4, 0.1), []
+    for _ in range(3):
+        obs, state, _, ended, _ = step(KEY, state, action, params)
+        done.append(ended.tolist())
+        if not ended[1]:
+            expected, single, *_ = alone.step(KEY, single, action)
+            np.testing.assert_allclose(obs[1], expected, rtol=1e-4, atol=1e-5)
+    assert not np.allclose(obs[0], obs[1])
+    assert done == [[False, False], [False, False], [False, True]]
+
+
+def test_a_discrete_action_is_a_row_of_the_table(env_of):
+    plain, table = env_of("hover", drones=2, duration=0.02), np.linspace(-1, 1, 24).reshape(3, 8)
+    env = gymnax.wrap(plain, discrete_actions=table)
+    assert env.num_actions == env.action_space().n == 3
+    _, state = env.reset(KEY)
+    chosen, _, *_ = env.step(KEY, state, jnp.asarray(2))
+    given, _, *_ = gymnax.wrap(plain).step(KEY, state, jnp.asarray(table[2], jnp.float32))
+    np.testing.assert_array_equal(chosen, given)
+    with pytest.raises(ValueError, match=r"discrete_actions has shape \(3, 4\); expected \(k, 8\)"):
+        gymnax.wrap(plain, discrete_actions=table[:, :4])
+    with pytest.raises(ValueError, match="discrete_actions is not finite"):
+        gymnax.wrap(plain, discrete_actions=np.full((1, 8), np.nan))
+
+
+def test_samples_are_in_their_spaces(env_of):
+    env = gymnax.wrap(env_of("hover", drones=2, duration=0.02))
+    obs, _ = env.reset(KEY)
+    assert env.observation_space().contains(obs)
+    assert env.action_space().contains(env.action_space().sample(KEY))
+    assert not env.action_space().contains(jnp.full(8, 2.0))
+
+
+@pytest.mark.needs("gymnax")
+@pytest.mark.slow
+def test_gymnaxs_own_wrappers_run(env_of):
+    from gymnax.environments import spaces
+    from gymnax.wrappers.purerl import FlattenObservationWrapper, LogWrapper
+
+    env = LogWrapper(FlattenObservationWrapper(gymnax.wrap(env_of("hover"), separate_truncation=True, spaces=spaces)))
+    params = env.default_params
+    assert isinstance(env.action_space(params), spaces.Box)
+    _, state = env.reset(KEY, params)
+    *_, info = env.step(KEY, state, env.action_space(params).sample(KEY), params)
+    assert "returned_episode_returns" in info
+
+
+@pytest.mark.needs("gymnax")
+@pytest.mark.slow
+def test_gymnaxs_wrapper_for_gymnasium_runs(env_of):
+    """Gymnasium's own checker finds that this wrapper does not seed gymnasium's generator, of any environment."""
+    from gymnax.environments import spaces
+    from gymnax.wrappers.gym import GymnaxToGymWrapper
+
+    env = GymnaxToGymWrapper(gymnax.wrap(env_of("hover", duration=0.02), separate_truncation=True, spaces=spaces))
+    obs, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(obs, env.reset(seed=0)[0])
+    for k in range(2):
+        obs, _, terminated, truncated, _ = env.step(np.zeros(4, np.float32))
+        assert not terminated and truncated == (k == 1)
+    assert np.shape(obs) == env.observation_space.shape and env.action_space.shape == (4,)
+
+
+@pytest.mark.needs("gymnax")
+@pytest.mark.slow
+def test_it_has_what_gymnaxs_base_class_promises(env_of):
+    from gymnax.environments.environment import Environment
+
+    own = {name for name in vars(Environment) if not name.startswith("_")}
+    gradients = {"supports_transition_gradients", "transition_gradients_enabled", "with_transition_gradients"}
+    of_its_state = {"is_terminal", "is_terminated", "is_truncated", "discount", "observe", "get_obs", "state_space"}
+    assert own - set(dir(gymnax.wrap(env_of("hover")))) <= gradients | of_its_state

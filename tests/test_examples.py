@@ -1,0 +1,74 @@
+"""The examples run and learn; in the tests' environment only those whose library is installed."""
+
+import importlib.util
+
+import numpy as np
+import pytest
+from documents import ROOT
+
+pytestmark = [pytest.mark.float32, pytest.mark.slow, pytest.mark.filterwarnings("default")]
+
+
+def example(name):
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.needs("torch")
+def test_arrays_and_tensors_share_their_memory():
+    import gymnasium
+    import jax.numpy as jnp
+    import torch
+
+    module = example("cleanrl_ppo")
+    obs, _ = gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=64, numpy=False).reset(seed=0)
+    tensor = module.to_torch(obs)
+    assert tensor.data_ptr() == obs.unsafe_buffer_pointer() and tensor.shape == obs.shape
+    action = torch.zeros(64, 4)
+    assert isinstance(module.to_jax(action), jnp.ndarray)
+    assert module.to_jax(action).unsafe_buffer_pointer() == action.data_ptr()
+
+
+@pytest.mark.needs("torch")
+def test_the_policy_that_is_evaluated_is_the_one_that_was_trained():
+    import torch
+
+    module = example("cleanrl_ppo")
+    torch.manual_seed(0)
+    agent, obs = module.Agent(22, 4, 0.4), torch.randn(5, 22)
+    agent.update_statistics(torch.randn(100, 22) * 3 + 1)
+    with torch.no_grad():
+        expected = agent.distribution(obs).mean
+        np.testing.assert_allclose(module.jax_policy(agent)(module.to_jax(obs)), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.needs("torch")
+def test_cleanrls_style_of_ppo_learns():
+    _, returns = example("cleanrl_ppo").train(1_000_000)
+    assert returns[-1] > returns[0] + 300, returns
+
+
+@pytest.mark.needs("skrl")
+def test_skrls_ppo_learns():
+    returns = example("skrl_ppo").train(200_000)
+    assert returns[-1] > 3 * returns[0], returns
+
+
+@pytest.mark.needs("torchrl")
+def test_torchrls_ppo_learns():
+    returns = example("torchrl_ppo").train(200_000)
+    assert returns[-1] > 3 * returns[0], returns
+
+
+@pytest.mark.needs("torchrl")
+def test_torchrls_checker_passes():
+    from torchrl.envs.utils import check_env_specs
+
+    import jaxdrones as jd
+
+    env = example("torchrl_ppo").DroneEnv(jd.make("hover", duration=0.1), 3)
+    check_env_specs(env)
+    assert env.rollout(25, break_when_any_done=False)["next", "truncated"].sum() == 6  # every 10 steps

@@ -6,13 +6,15 @@ import dataclasses
 import math
 import os
 
+from jaxdrones import control, optimal
 from jaxdrones.checks import check_choice, check_positive, check_whole
-from jaxdrones.control import CONTROLLERS, pid
+from jaxdrones.control import pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.limits import check_at_most, check_memory, check_seed
 
 BACKENDS = ("explicit", "bullet")
+CONTROLLERS = (*control.CONTROLLERS, *optimal.CONTROLLERS)
 PHYSICS_HZ = 240  # lowest rate; raised to a multiple of the control rate
 
 _MAX_HZ = 20_000  # above it the step of 1 mm/s is lost in the rounding of a float32 position of 1 m

@@ -1,18 +1,17 @@
 """Flying the control examples on either backend."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxdrones import rotation
-from jaxdrones.control import CONTROLLERS, Setpoint, for_team, pid, velocity
+from jaxdrones.control import Setpoint, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.rollout import rollout
 from jaxdrones.flights.conditions import Conditions
+from jaxdrones.flights.controllers import controller_of
 from jaxdrones.flights.examples import FLIGHTS, Flight
 from jaxdrones.flights.record import Record
 from jaxdrones.params import Params, repeat
@@ -37,31 +36,37 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
     """
     conditions = Conditions(flight, **options)
     example, n, dt, steps = FLIGHTS[flight], conditions.drones, conditions.dt, conditions.steps
-    controller, memory = _controller(conditions)
+    controller = controller_of(conditions)
 
     def control(params, memory, state, k):
         if progress is not None:
             _report(k, steps, progress)
-        return jax.vmap(controller)(params, memory, state, example.target(n, k * dt, conditions.duration))
+        return controller.control(params, memory, state, k * dt)
 
     @jax.jit
-    def prepare(params: Params) -> tuple[Params, State]:
-        return example.change_params(repeat(params, n)), _start(example, n, conditions.seed)
+    def prepare(params: Params) -> tuple[Params, State, Any]:
+        team, start = example.change_params(repeat(params, n)), _start(example, n, conditions.seed)
+        return team, start, controller.init(team, start)
 
     @jax.jit
     def finish(params: Params, trajectory: State) -> dict[str, jax.Array]:
         t = dt * jnp.arange(1, steps + 1)
         target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
         target_pos, target_vel = _targets(target, params)
-        rpy = jax.vmap(jax.vmap(rotation.to_rpy))(trajectory.quat)
         motion = {name: getattr(trajectory, name) for name in ("pos", "quat", "vel", "omega", "rpm")}
-        return dict(motion, t=t, rpy=rpy, target_pos=target_pos, target_vel=target_vel)
+        return dict(motion, t=t, target_pos=target_pos, target_vel=target_vel)
 
-    params, start = prepare(load_params(conditions.vehicle))
+    params, start, memory = prepare(load_params(conditions.vehicle))
     trajectory = _rollout(conditions, gui, control, params, start, memory)
     log = jax.device_get(finish(params, trajectory))
     jax.effects_barrier()
-    return Record(**log, labels=example.labels or tuple(f"drone {i}" for i in range(n)), conditions=conditions)
+    return Record(
+        **log,
+        labels=example.labels or tuple(f"drone {i}" for i in range(n)),
+        conditions=conditions,
+        params=jax.device_get(params),
+        scene=scene_of(conditions),
+    )
 
 
 def scene_of(conditions: Conditions) -> Scene:
@@ -90,16 +95,6 @@ def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: 
     with bullet.make_step(**common, scene=scene_of(conditions), gui=gui) as simulated:
         watched = bullet.Window(simulated, params, conditions.dt) if gui else simulated
         return rollout(watched, control, params, start, memory, conditions.steps)[1]
-
-
-def _controller(conditions: Conditions) -> tuple[Callable, object]:
-    """The controller of one drone, and the initial memory of all."""
-    if conditions.flight == "velocity":
-        control = functools.partial(velocity.control, pid.gains(conditions.vehicle), dt=conditions.dt)
-        return control, for_team(pid.init(), conditions.drones)
-    module = CONTROLLERS[conditions.controller]
-    gains = pid.gains(conditions.vehicle) if module is pid else module.gains()
-    return functools.partial(module.control, gains, dt=conditions.dt), for_team(module.init(), conditions.drones)
 
 
 def _start(flight: Flight, n: int, seed: int | None) -> State:

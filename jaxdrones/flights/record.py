@@ -2,17 +2,58 @@
 
 import csv
 import dataclasses
+import functools
 import json
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones import rotation
 from jaxdrones.control.pid import VEHICLES, rpm_to_pwm
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.sensing.serialization import scene_from_dict, scene_to_dict
 
+_ARRAYS = ("t", "pos", "quat", "rpy", "vel", "omega", "rpm", "target_pos", "target_vel", "labels")  # of a log
+_IMAGES = "images/"  # that names of arrays begin with
 _BAND = 0.1  # share of the steady error within which a response counts as settled
 _MIN_BAND = 5e-3  # m or m/s
 _LOST = 1.0  # m or m/s above the error at the start, at which a drone has diverged
+
+
+class ImageSequence(NamedTuple):
+    """Images of the drones' cameras."""
+
+    t: np.ndarray
+    """(F,) when each was taken or, of an episode, observed first, s."""
+    frames: np.ndarray
+    """(F, n, height, width, ...): of colors uint8 with 3 or 4 channels, of depth in m, of segmentation numbers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LoggedConditions:
+    """The conditions of a flight as its log has them."""
+
+    entries: dict[str, Any]
+    about: str
+    """The same in words."""
+
+    @property
+    def vehicle(self) -> str:
+        """Name of a bundled vehicle, or path of a URDF."""
+        return self.entries["vehicle"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The conditions for JSON."""
+        return self.entries
+
+    def __str__(self) -> str:
+        return self.about
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +63,6 @@ class Record:
     t: np.ndarray  # (K,) s
     pos: np.ndarray  # (K, n, 3) m, world
     quat: np.ndarray  # (K, n, 4) body to world
-    rpy: np.ndarray  # (K, n, 3) rad
     vel: np.ndarray  # (K, n, 3) m/s, world
     omega: np.ndarray  # (K, n, 3) rad/s, body
     rpm: np.ndarray  # (K, n, 4) RPM
@@ -30,6 +70,14 @@ class Record:
     target_vel: np.ndarray  # (K, n, 3) m/s; NaN where a position is commanded
     labels: tuple[str, ...]  # n names
     conditions: Any  # conditions of the flight, with `as_dict()` for JSON
+    params: Params  # of the team: every array has a leading axis of length n
+    scene: Scene = dataclasses.field(default_factory=Scene)
+    images: Mapping[str, ImageSequence] = dataclasses.field(default_factory=dict)  # of the on-board cameras, by kind
+
+    @functools.cached_property
+    def rpy(self) -> np.ndarray:
+        """(K, n, 3) roll, pitch and yaw, rad."""
+        return np.asarray(jax.jit(jax.vmap(jax.vmap(rotation.to_rpy)))(jnp.asarray(self.quat)))
 
     @property
     def last_quarter(self) -> np.ndarray:
@@ -39,7 +87,7 @@ class Record:
     @property
     def error(self) -> np.ndarray:
         """(K, n, 1) distance to the target position, m."""
-        return np.linalg.norm(self.pos - self.target_pos, axis=-1, keepdims=True)
+        return np.linalg.norm(self.pos.astype(float) - self.target_pos, axis=-1, keepdims=True)
 
     def not_finite(self) -> dict[str, str]:
         """Drones whose state is not finite at some time: label -> what happened and when."""
@@ -81,7 +129,7 @@ class Record:
         """
         difference, unit = self._difference()
         unit = unit.replace("/", "_")
-        counted = self.t >= (after if after < self.t[-1] else self.t[-1] / 2)
+        counted = self.t >= self._counted_from(after)
         steady = self.last_quarter
         with np.errstate(over="ignore", invalid="ignore"):  # where the state is not finite
             error, speed = np.linalg.norm(difference, axis=-1), np.linalg.norm(self.vel, axis=-1)
@@ -101,6 +149,21 @@ class Record:
             for i, label in enumerate(self.labels)
         ]
 
+    def definitions(self, after: float) -> str:
+        """What the numbers of `results` are and from which times on they count, in words; three lines."""
+        unit = "mm" if self._difference()[1] == "m" else "mm/s"
+        last, begin = self.t[self.last_quarter][0], self._counted_from(after)
+        band = f"{100 * _BAND:g} % or {1000 * _MIN_BAND:g} {unit}"
+        return (
+            f"steady: mean error from {last:.2f} s on, the last quarter of the flight\n"
+            f"settled: time from which on the error stays within {band} of steady (-: not before the last quarter)\n"
+            f"all other numbers count from {begin:.2f} s on"
+        )
+
+    def _counted_from(self, after: float) -> float:
+        """Time from which on results count, s."""
+        return after if after < self.t[-1] else float(self.t[-1]) / 2
+
     def _difference(self) -> tuple[np.ndarray, str]:
         """(K, n, 3) difference between actual and commanded position or velocity, and its unit."""
         if np.isnan(self.target_pos).any():
@@ -108,21 +171,62 @@ class Record:
         return self.pos - self.target_pos, "m"
 
     def arrays(self, pwm: bool = False) -> dict[str, np.ndarray]:
-        """The log by name, with the conditions as JSON; `pwm` adds the Crazyflie's PWM signals.
+        """The log by name; conditions, parameters and scene are JSON; `pwm` adds the Crazyflie's PWM signals.
 
         Raises:
             ValueError: PWM is asked for and the vehicle is no Crazyflie.
         """
         if pwm:
             check_pwm(self.conditions.vehicle)
-        arrays = {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
-        arrays["conditions"] = np.asarray(json.dumps(self.conditions.as_dict()))
+        texts = {
+            "conditions": self.conditions.as_dict(),
+            "params": {name: np.asarray(x).tolist() for name, x in vars(self.params).items() if name != "aux"},
+            "scene": scene_to_dict(self.scene),
+        }
+        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        arrays |= {name: np.asarray(json.dumps(entries)) for name, entries in texts.items()}
+        arrays["about"] = np.asarray(str(self.conditions))
+        for kind, images in self.images.items():
+            arrays |= {f"{_IMAGES}{kind}/{name}": array for name, array in images._asdict().items()}
         return arrays | {"pwm": rpm_to_pwm(self.rpm)} if pwm else arrays
 
     def save_npz(self, path: Path, pwm: bool = False) -> None:
         """Write the log as named arrays."""
         arrays: dict[str, Any] = self.arrays(pwm)
         np.savez_compressed(path, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> "Record":
+        """The record that `save_npz` wrote.
+
+        Raises:
+            ValueError: the file is no log of a flight, or lacks something; names it.
+        """
+        names = {field.name for field in dataclasses.fields(cls)} - {"images"}
+        try:
+            with np.load(path) as log:
+                arrays: dict[str, Any] = {name: log[name] for name in names}
+                about = str(log["about"])
+                kinds = sorted({name.split("/")[1] for name in log if name.startswith(_IMAGES)})
+                images = {
+                    kind: ImageSequence(*(log[f"{_IMAGES}{kind}/{name}"] for name in ImageSequence._fields))
+                    for kind in kinds
+                }
+        except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise ValueError(
+                f"{path} is not the log of a flight ({error}); give a log.npz that `jaxdrones fly` wrote"
+            ) from None
+        texts = {name: json.loads(str(arrays.pop(name))) for name in ("conditions", "params", "scene")}
+        constants: dict[str, Any] = {name: np.asarray(x) for name, x in texts["params"].items()}
+        return cls(
+            **arrays | {"labels": tuple(map(str, arrays["labels"]))},
+            conditions=LoggedConditions(texts["conditions"], about),
+            params=Params(**constants),
+            scene=scene_from_dict(texts["scene"]),
+            images=images,
+        )
 
     def save_csv(self, path: Path, pwm: bool = False) -> None:
         """Write one line per time and drone."""

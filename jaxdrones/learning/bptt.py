@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
@@ -33,6 +32,7 @@ from jaxdrones.learning.settings import (
     check_config,
     check_settings,
 )
+from jaxdrones.pytree import PyTreeNode
 
 
 @check_keywords
@@ -76,7 +76,7 @@ class Config:
         check_settings(self)
 
 
-class TrainState(flax.struct.PyTreeNode):
+class TrainState(PyTreeNode):
     """Everything that training needs to continue."""
 
     step: Array

@@ -6,7 +6,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -19,13 +18,14 @@ from jaxdrones.learning import sharding
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
 from jaxdrones.learning.settings import Scalar
+from jaxdrones.pytree import PyTreeNode
 
 Act = Callable[[jax.Array, Any, Obs], tuple[Any, Array, Any]]
 """(a key for each world (w,), memory, observations (w, n, d)) -> memory, actions (w, n, a), and extras for the learner,
 such as log probabilities."""
 
 
-class Worlds(flax.struct.PyTreeNode):
+class Worlds(PyTreeNode):
     """w worlds, each in the middle of an episode."""
 
     episodes: Episode
@@ -37,7 +37,7 @@ class Worlds(flax.struct.PyTreeNode):
     """(w, n, m) memory of the policy before the observations, zero at the start of an episode; `None` without one."""
 
 
-class Trajectory(flax.struct.PyTreeNode):
+class Trajectory(PyTreeNode):
     """t control steps of w worlds."""
 
     obs: Obs

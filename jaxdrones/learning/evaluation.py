@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +15,13 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import compilation
 from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
+from jaxdrones.pytree import PyTreeNode
 
 _CHUNK = 1000  # episodes simulated at a time
 _EPISODE_BYTES = 64  # memory that the results of an episode take per drone until the evaluation ends
 
 
-class Report(flax.struct.PyTreeNode):
+class Report(PyTreeNode):
     """Results of an evaluation."""
 
     episodes: int
@@ -61,7 +61,7 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
     check_key("key", key)
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
-    if isinstance(policy, flax.struct.PyTreeNode):
+    if isinstance(policy, PyTreeNode):
         outcomes = _compiled_outcomes()(compilation.Static(env), policy, keys)
     else:
         outcomes = jax.jit(functools.partial(_outcomes, env, policy))(keys)

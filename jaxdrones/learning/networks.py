@@ -18,6 +18,7 @@ from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning.layers import CNN, GRU, IMAGE_CHANNELS, MLP, convolutions, image_channels
 from jaxdrones.learning.normalize import RunningStatistics, map_state_vector, state_vector
+from jaxdrones.pytree import PyTreeNode
 
 
 class Network(nn.Module):
@@ -88,7 +89,7 @@ def make_network(
     )
 
 
-class Policy(flax.struct.PyTreeNode):
+class Policy(PyTreeNode):
     """A function from a team's observations to its actions; a pytree, which can be saved, mapped and differentiated.
 
     A recurrent policy also has a memory, see `learning.recurrence`; a policy without one can be called.

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning.settings import Scalar
+from jaxdrones.pytree import PyTreeNode
 
 _CLIP = 10.0  # standard deviations
 _MIN_STD = 1e-2  # so that an entry that hardly changes is not amplified
 
 
-class RunningStatistics(flax.struct.PyTreeNode):
+class RunningStatistics(PyTreeNode):
     """Mean and variance of all observation vectors seen so far."""
 
     mean: Array

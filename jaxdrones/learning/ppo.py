@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
@@ -17,6 +15,7 @@ from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect
 from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
+from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob
 from jaxdrones.learning.networks import Policy, init_params
 from jaxdrones.learning.normalize import state_vector
 from jaxdrones.learning.result import Result, clip_gradient, count_nonfinite, run_training
@@ -36,8 +35,8 @@ from jaxdrones.learning.settings import (
     check_config,
     check_settings,
 )
+from jaxdrones.pytree import PyTreeNode
 
-_HALF_LOG_2_PI = math.log(2 * math.pi) / 2
 _RATE_FACTOR = 1.2  # by which the learning rate is raised or lowered
 _MAX_LOG_RATIO = 10.0  # far beyond what is rewarded; its exponential is finite
 
@@ -108,7 +107,7 @@ class Config:
             raise ValueError(f"worlds is {self.worlds}; give a multiple of minibatches, {self.minibatches}")
 
 
-class TrainState(flax.struct.PyTreeNode):
+class TrainState(PyTreeNode):
     """Everything that training needs to continue."""
 
     step: Array
@@ -125,7 +124,7 @@ class TrainState(flax.struct.PyTreeNode):
     worlds: collect.Worlds
 
 
-class Batch(flax.struct.PyTreeNode):
+class Batch(PyTreeNode):
     """Trajectories to learn from; leading axes (t, w, n)."""
 
     obs: Obs
@@ -174,16 +173,9 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     key, restart_key, collect_key, optimize_key = jax.random.split(state.key, 4)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
 
-    def act(policy, log_std, keys, memory, obs):
-        memory, mean = policy.act(memory, obs)
-        std = jnp.broadcast_to(jnp.exp(log_std), mean.shape)
-        noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(keys)
-        action = mean + std * noise
-        return memory, action, log_prob(action, mean, log_std)
-
-    explore = jax.tree_util.Partial(act, state.policy, state.log_std)
+    act = jax.tree_util.Partial(explore, state.policy, state.log_std)
     after, trajectory = collect.collect(
-        collect_key, env, explore, worlds, config.horizon, privileged=config.privileged_critic
+        collect_key, env, act, worlds, config.horizon, privileged=config.privileged_critic
     )
     batch = _batch(config, state, worlds.memory, trajectory)
     (params, log_std, critic), opt_state, learning_rate, metrics = _optimize(optimize_key, config, state, batch)
@@ -203,13 +195,6 @@ def train(key: jax.Array, env: Env, config: Config) -> Result:
     return run_training(init, update, key, env, config)
 
 
-def log_prob(action: Array, mean: Array, log_std: Array) -> Array:
-    """(*batch, n) logarithm of the density of actions (*batch, n, a) that are normally distributed about their mean."""
-    log_std = jnp.broadcast_to(log_std, mean.shape)
-    terms = -(((action - mean) * jnp.exp(-log_std)) ** 2) / 2 - log_std - _HALF_LOG_2_PI
-    return jnp.sum(terms, axis=-1)
-
-
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
     """The clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy."""
     mean = policy.replay(jax.tree.map(lambda x: x[0], batch.memory), batch.obs, batch.starts)
@@ -219,7 +204,7 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Bat
     surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     value_error = (1 - config.gamma) * (_value(config, critic, batch.critic_obs) - batch.value_target)
     value_loss = jnp.mean(value_error**2)
-    entropy = jnp.mean(jnp.sum(log_std + 0.5 + _HALF_LOG_2_PI, axis=-1))
+    entropy = jnp.mean(jnp.sum(log_std + 0.5 + HALF_LOG_2_PI, axis=-1))
     total = -surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
     kl = jnp.mean(ratio - 1 - log_ratio)
     return total, {"value_loss": value_loss, "kl": kl}

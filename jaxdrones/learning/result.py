@@ -6,7 +6,6 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import compilation
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.settings import Scalar
+from jaxdrones.pytree import PyTreeNode
 
 PATIENCE = 10
 """Training has diverged when gradients were not finite in so many updates in a row, or in all of fewer updates."""
@@ -27,7 +27,7 @@ class Diverged(RuntimeError):
     """Training has diverged: its numbers or its gradients are not finite."""
 
 
-class Result(flax.struct.PyTreeNode):
+class Result(PyTreeNode):
     """A trained policy, and how the training went."""
 
     policy: Policy

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
@@ -37,6 +36,7 @@ from jaxdrones.learning.settings import (
     check_config,
     check_settings,
 )
+from jaxdrones.pytree import PyTreeNode
 
 _CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 
@@ -95,7 +95,7 @@ class Config:
         check_settings(self)
 
 
-class TrainState(flax.struct.PyTreeNode):
+class TrainState(PyTreeNode):
     """Everything that training needs to continue."""
 
     step: Array

@@ -6,23 +6,24 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones import rotation
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
 from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
+from jaxdrones.visualization.viewer.show import records_of, refuse
 
 _LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
 
 
-class EpisodeLog(flax.struct.PyTreeNode):
+class EpisodeLog(PyTreeNode):
     """K control steps of n drones, up to the end of the episode."""
 
     t: np.ndarray
@@ -37,6 +38,10 @@ class EpisodeLog(flax.struct.PyTreeNode):
     """(K, n) for each of the task's metrics."""
     ended_by: tuple[str, ...]
     """Names of the terminations and truncations that ended the episode; none if its time was up."""
+    images: dict[str, np.ndarray]
+    """(K, n, ...) images that the policy observed, by kind; none of an environment without vision."""
+    params: Params
+    """Parameters of the team (n, ...), as drawn for this episode."""
     scene: Scene
     """What stood around, as drawn for this episode."""
     success: bool | None
@@ -71,18 +76,36 @@ class EpisodeConditions:
         )
 
 
-def to_record(log: EpisodeLog, conditions: EpisodeConditions) -> Record:
+def to_record(log: EpisodeLog, conditions: EpisodeConditions | LoggedConditions) -> Record:
     """The log of an episode in the form that demonstration flights have too."""
     drones = jax.tree.map(np.asarray, log.drones)
     return Record(
         **{name: getattr(drones, name) for name in _LOGGED},
         t=log.t,
-        rpy=np.asarray(jax.vmap(jax.vmap(rotation.to_rpy))(jnp.asarray(drones.quat))),
         target_pos=log.target,
         target_vel=np.full_like(log.target, np.nan),
         labels=tuple(f"drone {i}" for i in range(drones.pos.shape[1])),
         conditions=conditions,
+        params=log.params,
+        scene=log.scene,
+        images={name: _renewed(log.t, frames) for name, frames in log.images.items()},
     )
+
+
+def _renewed(t: np.ndarray, frames: np.ndarray) -> ImageSequence:
+    """Those of some images that differ from the one before."""
+    new = np.flatnonzero(np.any(frames[1:] != frames[:-1], axis=tuple(range(1, frames.ndim)))) + 1
+    rows = np.concatenate([[0], new])
+    return ImageSequence(t[rows], frames[rows])
+
+
+@records_of.register
+def _(flight: EpisodeLog, of_trajectory: dict[str, Any]) -> list[Record]:
+    refuse(of_trajectory)
+    end = {"success": flight.success, "ended_by": list(flight.ended_by), "duration": float(flight.t[-1])}
+    how = {True: ", success", False: ", no success", None: ""}[flight.success]
+    why = f", ended by {', '.join(flight.ended_by)}" if flight.ended_by else ""
+    return [to_record(flight, LoggedConditions(end, f"an episode of {flight.t[-1]:.2f} s{how}{why}"))]
 
 
 def fly_episode(
@@ -99,7 +122,8 @@ def fly_episode(
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)
-    obs, world = env.reset(start_key)
+    obs, start = env.reset(start_key)
+    world = start
     memory = initial_memory(policy, env.drones)
 
     def decide(memory, obs):
@@ -115,6 +139,7 @@ def fly_episode(
             reward,
             info["metrics"],
             info["terminations"] | info["truncations"],
+            world.images,
         )
         return (memory, obs, world), (row, terminated | truncated)
 
@@ -131,7 +156,7 @@ def fly_episode(
         _, (log, done) = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys))(memory, obs, world)
         length = int(np.argmax(done)) + 1 if np.any(done) else env.steps
         log = jax.tree.map(lambda x: np.asarray(x)[:length], log)
-    drones, target, reward, metrics, ends = log
+    drones, target, reward, metrics, ends, images = log
     length = len(reward)
     return EpisodeLog(
         t=env.dt * np.arange(1, length + 1),
@@ -140,7 +165,9 @@ def fly_episode(
         reward=reward,
         metrics=metrics,
         ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
-        scene=jax.device_get(world.scene),
+        images=images or {},
+        params=jax.device_get(start.params),
+        scene=jax.device_get(start.scene),
         success=_success(env, drones, metrics),
     )
 

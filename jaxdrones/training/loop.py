@@ -18,7 +18,7 @@ from jaxdrones.training import distributed
 from jaxdrones.training.progress import Progress
 from jaxdrones.training.run import Run, report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM, Score, best_of, score_of
-from jaxdrones.training.trainer import MAX_CALL, Trainer
+from jaxdrones.training.trainer import MAX_CALL, BaseTrainer, Trainer
 
 EVALUATIONS = 10
 """Number of evaluations in the course of a training."""
@@ -30,7 +30,7 @@ OnProgress = Callable[[int, dict[str, float]], None]
 """(number of updates made, newest metrics) -> None: shows progress."""
 
 
-def train(trainer: Trainer, run: Run, seed: int, on_progress: OnProgress) -> None:
+def train(trainer: BaseTrainer, run: Run, seed: int, on_progress: OnProgress) -> None:
     """Train one seed to the end, from the start or from the state that the run holds; evaluate the best policy.
 
     Args:
@@ -86,7 +86,7 @@ def _load(trainer: Trainer, run: Run) -> tuple[Any, float, Score, float]:
 class _Loop:
     """The training of one seed: its state, and the results so far."""
 
-    def __init__(self, trainer: Trainer, run: Run, seed: int):
+    def __init__(self, trainer: BaseTrainer, run: Run, seed: int):
         """Start a training, or continue the one that the run holds."""
         self.trainer, self.run, self.config = trainer, run, trainer.recipe.config
         self.key = jax.random.key(seed)
@@ -96,6 +96,7 @@ class _Loop:
         self.best: Score | None = None
         self.highest_success = 0.0
         if run.started:
+            assert isinstance(trainer, Trainer)
             state, self.seconds, self.best, self.highest_success = _load(trainer, run)
             self.state = sharding.shard_state(trainer.mesh, state)
             self.update = int(self.state.step)
@@ -166,7 +167,7 @@ class _Loop:
         state = sharding.gather(self.trainer.mesh, self.state)
         about = self.about | {"update": self.update}
         self.run.save_policy("last", state.policy, **about)
-        self.run.save_state(state, **about, seconds=self.seconds, highest_success=self.highest_success)
+        self.trainer.save(self.run, state, **about, seconds=self.seconds, highest_success=self.highest_success)
 
     def finish(self) -> None:
         """Evaluate the best policy, in other episodes than those that chose it, and write the report."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 from jaxdrones.checks import check_choice
-from jaxdrones.envs import TASKS, Env, make
+from jaxdrones.envs import Env, make
+from jaxdrones.envs.named_tasks import task_function
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
-from jaxdrones.training.algorithms import learner
+from jaxdrones.tasks.task import Task
+from jaxdrones.training import user_files
+from jaxdrones.training.algorithms import config_type
 from jaxdrones.training.presets import preset
 
 _DRONE_BYTES = 256  # memory that the parameters and the state of a drone take
@@ -21,50 +24,64 @@ class Recipe:
     """The task, the learner and the settings of a training."""
 
     task: str
+    """A name of `jaxdrones.envs.TASKS`, or `file.py:function` of a file in `files`."""
     algorithm: str
     realistic: bool
     options: dict[str, Any]
     """Options of `jaxdrones.make`."""
     config: Any
     """Settings of the learner, its `Config`."""
+    files: user_files.Files = dataclasses.field(default_factory=dict)
+    """Texts of the user's files that task and vehicle are in."""
+    library: str = "jaxdrones"
 
     @classmethod
-    def of(cls, task: str, algorithm: str = "bptt", realistic: bool = False, **changes: Any) -> Recipe:
+    def of(
+        cls, task: str, algorithm: str = "bptt", realistic: bool = False, library: str = "jaxdrones", **changes: Any
+    ) -> Recipe:
         """A preset with changes.
 
         Args:
-            task: a name of `jaxdrones.envs.TASKS`.
-            algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
+            task: a name of `jaxdrones.envs.TASKS`, or `file.py:function` of a function that returns a task.
+            algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`, or for RLlib of `RLLIB_ALGORITHMS`.
             realistic: see `presets.preset`.
+            library: library of the learner, jaxdrones or rllib.
             **changes: settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
 
         Raises:
             ValueError: an unknown name, or a value of the wrong type.
         """
-        check_choice("task", task, TASKS)
-        fields = dataclasses.fields(learner(algorithm).Config)
+        task, files = user_files.take_task(task)
+        function = user_files.task_of(task, files)
+        settings_type = config_type(library, algorithm)
+        fields = dataclasses.fields(settings_type)
         known = {field.name for field in fields if field.default is not None}  # JSON holds no functions
-        options, settings = split_changes(task, changes, known)
-        _, config = checked_preset(task, algorithm, realistic, options)
+        options, settings = split_changes(function, changes, known)
+        options, vehicle = user_files.take_vehicle(options)
+        _, config = checked_preset(function, algorithm, realistic, user_files.options_of(options, vehicle))
+        config = config if isinstance(config, settings_type) else settings_type()
         settings = {name: convert_setting(name, x, getattr(config, name)) for name, x in settings.items()}
         config = dataclasses.replace(config, **settings)
         for name in ("updates", "worlds", "horizon"):
             check_at_most(name, getattr(config, name), LARGEST_COUNT)
-        return cls(task, algorithm, realistic, options, config)
+        return cls(task, algorithm, realistic, options, config, files | vehicle, library)
 
     @property
     def trained_by(self) -> str:
         """Name of the learner for titles."""
-        return self.algorithm
+        return self.algorithm if self.library == "jaxdrones" else f"{self.library} {self.algorithm}"
 
     def env(self, practice: bool = False, **options: Any) -> Env:
         """The environment to fly in or to train in; options of `jaxdrones.make` replace those of the recipe."""
-        return preset(self.task, self.algorithm, self.realistic, practice, **self.options | options)[0]
+        task = user_files.task_of(self.task, self.files)
+        options = user_files.options_of(self.options | options, self.files)
+        return preset(task, self.algorithm, self.realistic, practice, **options)[0]
 
     def as_dict(self) -> dict[str, Any]:
         """The recipe for JSON."""
         config = {name: x for name, x in dataclasses.asdict(self.config).items() if x is not None}
-        return dataclasses.asdict(self) | {"config": config}
+        entries = dataclasses.asdict(self) | {"config": config}
+        return entries if self.files else {name: x for name, x in entries.items() if name != "files"}
 
     @classmethod
     def from_dict(cls, entries: dict[str, Any]) -> Recipe:
@@ -74,20 +91,23 @@ class Recipe:
             ValueError: they are damaged, or of another version of this library.
         """
         try:
-            check_choice("task", entries["task"], TASKS)
+            user_files.task_of(entries["task"], entries.get("files", {}))
             config = {name: tuple(x) if isinstance(x, list) else x for name, x in entries["config"].items()}
-            return cls(**entries | {"config": learner(entries["algorithm"]).Config(**config)})
+            settings_type = config_type(entries.get("library", "jaxdrones"), entries["algorithm"])
+            return cls(**entries | {"config": settings_type(**config)})
         except (AttributeError, KeyError, TypeError) as error:
             raise ValueError(f"the recipe is not one of this version ({error!r}); train anew") from error
 
 
-def split_changes(task: str, changes: dict[str, Any], known: Collection[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def split_changes(
+    task: str | Callable[..., Task], changes: dict[str, Any], known: Collection[str]
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Options of the environment, and settings of the learner, whose names are `known`.
 
     Raises:
         ValueError: a name is neither; lists both.
     """
-    options = {*inspect.signature(make).parameters, *inspect.signature(TASKS[task]).parameters}
+    options = {*inspect.signature(make).parameters, *inspect.signature(task_function(task)).parameters}
     options -= {"task", "backend", "realistic", "options", "vision"}
     for name in changes:
         check_choice("setting", name, options.union(known))
@@ -95,7 +115,9 @@ def split_changes(task: str, changes: dict[str, Any], known: Collection[str]) ->
     return {name: x for name, x in changes.items() if name not in known}, settings
 
 
-def checked_preset(task: str, algorithm: str, realistic: bool, options: dict[str, Any]) -> tuple[Env, Any]:
+def checked_preset(
+    task: str | Callable[..., Task], algorithm: str, realistic: bool, options: dict[str, Any]
+) -> tuple[Env, Any]:
     """The result of `preset`; options of wrong types raise a `ValueError`."""
     drones = options.get("drones")
     if isinstance(drones, int):
@@ -103,7 +125,8 @@ def checked_preset(task: str, algorithm: str, realistic: bool, options: dict[str
     try:
         return preset(task, algorithm, realistic, **options)
     except TypeError as error:
-        raise ValueError(f"options {options} do not fit {task}: {error}") from None
+        name = task if isinstance(task, str) else task.__name__
+        raise ValueError(f"options {options} do not fit {name}: {error}") from None
 
 
 def convert_setting(name: str, value: Any, current: Any) -> Any:

@@ -15,6 +15,7 @@ import dataclasses
 import json
 import math
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,9 @@ from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
 from jaxdrones.training.events import PREFIX
 from jaxdrones.training.recipe import Recipe
+
+RLLIB_CHECKPOINT = "rllib"
+"""Folder of a run that holds a checkpoint of RLlib, if RLlib trained it."""
 
 
 class Run:
@@ -68,6 +72,9 @@ class Run:
         """Remove the files of an earlier run, and no others."""
         for file in self.files:
             file.unlink()
+        checkpoint = self.folder / RLLIB_CHECKPOINT
+        if (checkpoint / "rllib_checkpoint.json").exists():
+            shutil.rmtree(checkpoint)
 
     def sidecar(self, name: str = "best") -> dict[str, Any]:
         """The description of the checkpoint `best`, `last` or `state`."""

@@ -17,8 +17,10 @@ from jaxtyping import Array, Float
 
 from jaxdrones.adapters.sb3 import VecEnv  # names the extra to install, so it comes before the libraries of the extra
 from jaxdrones.checks import check_choice, check_whole
-from jaxdrones.envs import TASKS, Env
+from jaxdrones.envs import Env
 from jaxdrones.learning import files
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.training import user_files
 from jaxdrones.training.algorithms import SB3_ALGORITHMS
 from jaxdrones.training.recipe import checked_preset, convert_setting, split_changes
 from jaxdrones.training.run import Run
@@ -32,12 +34,14 @@ NETWORK = (512, 512, 256, 128)
 """The paper's hidden layers, with ReLU. In the paper, actor and critic of ppo and a2c share the first two layers, which
 Stable-Baselines3 no longer offers."""
 
+PRESET_TASK = "hover-2021"
+"""The task that the settings below were found for."""
 _PRESETS: dict[str, dict[str, Any]] = {
     "ppo": dict(steps=120_000, worlds=16, n_steps=128, batch_size=256, n_epochs=5, gamma=0.98),
     "a2c": dict(steps=120_000, worlds=8, n_steps=121, gamma=0.98, gae_lambda=0.95, normalize_advantage=True),
     "sac": dict(steps=14_000, worlds=4, batch_size=64, gamma=0.98, tau=0.02, ent_coef=0.01, learning_starts=1000),
 }
-"""Settings for `hover-2021`, on which ppo reaches the best return, and a2c and sac may not. All other settings are the
+"""Settings for that task, on which ppo reaches the best return, and a2c and sac may not. All other settings are the
 defaults of Stable-Baselines3."""
 
 _NO_SETTINGS = ("verbose", "_init_setup_model", "use_sde", "sde_sample_freq", "use_sde_at_warmup")
@@ -56,13 +60,15 @@ class SB3Recipe:
     config: dict[str, Any]
     """`steps` (control steps of all worlds), `worlds`, `net_arch`, and arguments of the algorithm's class."""
     library: str = "sb3"
+    files: user_files.Files = dataclasses.field(default_factory=dict)
+    """Texts of the user's files that task and vehicle are in."""
 
     @classmethod
     def of(cls, task: str, algorithm: str = "ppo", realistic: bool = False, **changes: Any) -> SB3Recipe:
         """A preset with changes.
 
         Args:
-            task: a name of `jaxdrones.envs.TASKS`.
+            task: a name of `jaxdrones.envs.TASKS`, or `file.py:function` of a function that returns a task.
             algorithm: ppo, a2c or sac.
             realistic: see `presets.preset`.
             **changes: `steps`, `worlds`, `net_arch`, arguments of the algorithm's class, and options of
@@ -71,13 +77,16 @@ class SB3Recipe:
         Raises:
             ValueError: an unknown name, or a value of the wrong type.
         """
-        check_choice("task", task, TASKS)
+        task, files = user_files.take_task(task)
+        function = user_files.task_of(task, files)
         check_choice("algorithm", algorithm, SB3_ALGORITHMS)
         defaults = _defaults(algorithm)
-        options, settings = split_changes(task, changes, defaults)
+        options, settings = split_changes(function, changes, defaults)
+        options, vehicle = user_files.take_vehicle(options)
         for name, x in settings.items():
             settings[name] = x if isinstance(defaults[name], str) else convert_setting(name, x, defaults[name])
-        recipe = cls(task, algorithm, realistic, options, _PRESETS[algorithm] | {"net_arch": NETWORK} | settings)
+        config = _PRESETS[algorithm] | {"net_arch": NETWORK} | settings
+        recipe = cls(task, algorithm, realistic, options, config, files=files | vehicle)
         for name in ("steps", "worlds"):
             check_whole(name, recipe.config[name])
         recipe.env()
@@ -91,7 +100,7 @@ class SB3Recipe:
             ValueError: they are damaged, or of another version of this library.
         """
         try:
-            check_choice("task", entries["task"], TASKS)
+            user_files.task_of(entries["task"], entries.get("files", {}))
             check_choice("algorithm", entries["algorithm"], SB3_ALGORITHMS)
             return cls(**entries)
         except (KeyError, TypeError) as error:
@@ -108,7 +117,8 @@ class SB3Recipe:
 
     def env(self, **options: Any) -> Env:
         """The environment; options of `jaxdrones.make` replace those of the recipe."""
-        return checked_preset(self.task, "ppo", self.realistic, self.options | options)[0]
+        task = user_files.task_of(self.task, self.files)
+        return checked_preset(task, "ppo", self.realistic, user_files.options_of(self.options | options, self.files))[0]
 
     def model(self, envs: VecEnv, seed: int) -> BaseAlgorithm:
         """The untrained model.
@@ -146,7 +156,7 @@ def _defaults(algorithm: str) -> dict[str, Any]:
     return {name: x for name, x in (plain | optional | own).items() if name not in _NO_SETTINGS}
 
 
-class SB3Policy(flax.struct.PyTreeNode):
+class SB3Policy(PyTreeNode):
     """The actor of a trained model, without exploration, as a function of JAX."""
 
     layers: tuple[tuple[Float[Array, "out in"], Float[Array, " out"]], ...]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 
@@ -17,9 +16,9 @@ from jaxdrones.training.progress import Progress
 from jaxdrones.training.run import report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM
 from jaxdrones.training.stable_baselines import SB3Policy, SB3Recipe, SB3Run
+from jaxdrones.training.torch_threads import one_torch_thread
 
 # isort: split
-import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 _EVALUATIONS = 20  # in the course of a training
@@ -74,7 +73,7 @@ class SB3Trainer:
             KeyboardInterrupt: passed on after the newest model was saved.
         """
         steps = self.recipe.config["steps"] if deadline is None else np.iinfo(np.int64).max
-        with _one_thread(), Progress(run, _COLUMNS, 0) as progress:
+        with one_torch_thread(), Progress(run, _COLUMNS, 0) as progress:
             callback = _Callback(self, run, on_progress, progress, deadline)
             try:
                 self.model.learn(steps, callback=callback)
@@ -85,17 +84,6 @@ class SB3Trainer:
                 what = f"parameters are not finite at update {callback.update}"
                 raise Diverged(f"{what}; try a smaller learning rate") from error
             callback.finish()
-
-
-@contextlib.contextmanager
-def _one_thread():
-    """Let torch use one thread: batches are so small that more threads wait for each other and for those of JAX."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 class _Callback(BaseCallback):

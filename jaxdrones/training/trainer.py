@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import time
 from typing import Any
@@ -9,7 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.evaluation import check_episodes
 from jaxdrones.limits import LARGEST_COUNT, check_memory
@@ -23,7 +26,57 @@ _TIMED_UPDATES = 3  # to estimate the time of an update
 _DISK_FACTOR = 4  # the disk must have space for so many training states
 
 
-class Trainer:
+class BaseTrainer(abc.ABC):
+    """What the loop of a training asks of a learner, whichever library it is of."""
+
+    recipe: Recipe
+    episodes: int
+    """Number of episodes of an evaluation."""
+    env: Env
+    """The environment to evaluate in."""
+    mesh: Mesh
+    """The devices that share a state."""
+    metrics: list[str]
+    """Names of the metrics of an update."""
+    compile_seconds: float
+    """Seconds that `compile` took."""
+
+    @abc.abstractmethod
+    def compile(self) -> None:
+        """Compile the programs."""
+
+    @abc.abstractmethod
+    def prepare(self, run: Run) -> None:
+        """Make the folder of a run and check that its files can be written.
+
+        Raises:
+            OSError: they cannot be written.
+        """
+
+    @abc.abstractmethod
+    def start(self, key: jax.Array) -> Any:
+        """The training state before the first update, which has at least `policy`."""
+
+    @abc.abstractmethod
+    def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
+        """Make at most `MAX_CALL` updates in one call: the state after them, and (updates,) of every metric."""
+
+    @abc.abstractmethod
+    def save(self, run: Run, state: Any, **about: Any) -> None:
+        """Write what a training can continue from, with entries of its description."""
+
+    def fit_budget(self, seconds: float, made: int = 0) -> None:
+        """Set the number of updates to those already made and those that take about so many seconds."""
+        state, _ = self.advance(self.start(jax.random.key(0)), 1)
+        start = time.perf_counter()
+        self.advance(state, _TIMED_UPDATES)
+        update_seconds = (time.perf_counter() - start) / _TIMED_UPDATES
+        more = max(1, int(distributed.from_first_host(seconds / update_seconds)))
+        config = dataclasses.replace(self.recipe.config, updates=min(made + more, LARGEST_COUNT))
+        self.recipe = dataclasses.replace(self.recipe, config=config)
+
+
+class Trainer(BaseTrainer):
     """The compiled programs of a recipe; all seeds share them, and all devices of all hosts share the worlds."""
 
     def __init__(self, recipe: Recipe, episodes: int = 1000):
@@ -54,7 +107,7 @@ class Trainer:
         init = compilation.jit(self._init, in_shardings=same, out_shardings=state)
         updates = compilation.jit(self._updates, in_shardings=(state, same, same), out_shardings=(state, same))
         with jax.set_mesh(self.mesh):
-            self.start = init.lower(jax.random.key(0)).compile()
+            self._start = init.lower(jax.random.key(0)).compile()
             self._advance = updates.lower(self.shapes, count, count).compile()
         self.compile_seconds = time.perf_counter() - start
 
@@ -66,21 +119,19 @@ class Trainer:
         """
         run.prepare(_DISK_FACTOR * size_of(self.shapes))
 
-    def fit_budget(self, seconds: float, made: int = 0) -> None:
-        """Set the number of updates to those already made and those that take about so many seconds."""
-        state, _ = self.advance(self.start(jax.random.key(0)), 1)
-        start = time.perf_counter()
-        self.advance(state, _TIMED_UPDATES)
-        update_seconds = (time.perf_counter() - start) / _TIMED_UPDATES
-        more = max(1, int(distributed.from_first_host(seconds / update_seconds)))
-        config = dataclasses.replace(self.recipe.config, updates=min(made + more, LARGEST_COUNT))
-        self.recipe = dataclasses.replace(self.recipe, config=config)
+    def start(self, key: jax.Array) -> Any:
+        """The training state before the first update."""
+        return self._start(key)
 
     def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
         """Make at most `MAX_CALL` updates in one call: the state after them, and (updates,) of every metric."""
         total = jnp.asarray(self.recipe.config.updates, jnp.int32)
         state, metrics = self._advance(state, jnp.asarray(updates, jnp.int32), total)
         return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
+
+    def save(self, run: Run, state: Any, **about: Any) -> None:
+        """Write the training state, with entries of its description."""
+        run.save_state(state, **about)
 
     def _check_memory(self) -> None:
         """Raise if the worlds, with their observations and actions in an update, need more memory than there is."""

@@ -1,12 +1,15 @@
 """A flight that diverged is told from one that flew well."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.record import Record
+from jaxdrones.params import repeat
+from jaxdrones.urdf import load_params
 
 
 def hovering(steps=100, drones=2, commanded="position"):
@@ -20,7 +23,6 @@ def hovering(steps=100, drones=2, commanded="position"):
         t=0.01 * np.arange(1, steps + 1),
         pos=zeros + np.float32([0.1, 0, 1]),
         quat=level,
-        rpy=zeros,
         vel=zeros + np.float32([0.1, 0, 0]),
         omega=zeros,
         rpm=np.full((*shape, 4), 14_000, np.float32),
@@ -28,6 +30,7 @@ def hovering(steps=100, drones=2, commanded="position"):
         target_vel=missing if position else zeros,
         labels=tuple(f"drone {i}" for i in range(drones)),
         conditions=Conditions("circle"),
+        params=repeat(load_params("cf2x"), drones),
     )
 
 
@@ -82,3 +85,16 @@ def test_pwm_is_of_a_crazyflie():
     assert "pwm" in hovering().arrays(pwm=True)
     with pytest.raises(ValueError, match="PWM is asked for with 'racer'; it is known for cf2x and cf2p only"):
         record.arrays(pwm=True)
+
+
+@pytest.mark.parametrize("after", [0.3, 99.0])
+def test_the_words_below_a_table_say_from_when_its_numbers_count(after):
+    """A peak just before the time that they name is not counted, one at that time is."""
+    record = hovering()
+    steady, settled, others = record.definitions(after).splitlines()
+    begin, last = (float(re.search(r"from (\d+\.\d+) s on", line)[1]) for line in (others, steady))
+    assert begin == (0.3 if after < 1 else 0.5) and last == 0.75 and "10 % or 5 mm " in settled
+    at = int(np.searchsorted(record.t, begin - 1e-9))
+    peaks = [changed(record, "pos", row, [3, 0, 1]).results(after)[1]["peak_error_m"] for row in (at - 1, at)]
+    np.testing.assert_allclose(peaks, [0.1, 3], rtol=1e-6)
+    assert "mm/s" in hovering(commanded="velocity").definitions(after)

@@ -43,6 +43,7 @@ def test_training_goes_on_bit_for_bit(tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_errors_say_what_is_wrong(env, tmp_path):
     path = tmp_path / "policy"
     with pytest.raises(FileNotFoundError, match="no checkpoint at"):

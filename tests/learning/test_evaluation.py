@@ -37,6 +37,7 @@ def test_a_drone_that_stays_succeeds_in_every_episode(env):
     np.testing.assert_allclose(report.mean_length, 5.0)
 
 
+@pytest.mark.slow
 def test_a_drone_that_falls_is_lost_and_its_metrics_stay_what_they_were_then(env):
     report = evaluate(env, falling, jax.random.key(0), episodes=20)
     assert report.success == 0 and report.end_rates["lost"] == 1

@@ -110,6 +110,7 @@ def test_a_point_mass_is_pushed_by_thrust_and_by_turning_the_thrust_and_its_atti
     assert not jnp.any(vel_of_state.quat) and not jnp.any(vel_of_state.omega) and not jnp.any(after.quat[1])
 
 
+@pytest.mark.slow
 def test_images_may_be_constants_for_the_gradient_and_are_the_same():
     down = jd.Camera(resolution=(3, 3), orientation=(0.0, 0.5**0.5, 0.0, 0.5**0.5))
     env = envs.make("hover", tilt=0.0, omega=0.0, vision=("depth",), camera=down)

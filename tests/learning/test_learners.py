@@ -141,6 +141,7 @@ def test_a_privileged_critic_learns_the_value_of_drawn_parameters():
     assert value_loss(True) < 0.2 * value_loss(False)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_episodes_that_ended_stay_as_they_are_and_do_not_count_until_they_are_restarted():
     env = envs.make("hover", duration=0.05)  # five steps

@@ -15,6 +15,7 @@ def team():
     return envs.make("leader-follower")
 
 
+@pytest.mark.slow
 def test_a_new_policy_hovers(team):
     obs = jax.random.normal(jax.random.key(1), (50, 2, 12))
     action = Policy.init(jax.random.key(0), team, (16, 16))(obs)
@@ -35,6 +36,7 @@ def test_drones_share_a_network_or_have_their_own(team, per_agent):
     assert (action[0] == action[1]) == (not per_agent)
 
 
+@pytest.mark.slow
 def test_a_policy_is_the_same_for_one_world_and_for_many(team):
     policy = Policy.init(jax.random.key(0), team, (16,), per_agent=True)
     obs = jax.random.normal(jax.random.key(1), (3, 5, 2, 12))
@@ -49,6 +51,7 @@ def test_the_central_critic_of_the_paper_sees_25_numbers_its_own_first():
     np.testing.assert_array_equal(seen[1], [*range(12, 24), *range(12), 100])
 
 
+@pytest.mark.slow
 def test_a_layer_of_the_cnn_is_a_convolution():
     cnn, picture = CNN(channels=(5,), strides=(4,), features=7), jax.random.normal(jax.random.key(1), (2, 8, 12, 3))
     params = cnn.init(jax.random.key(0), picture)["params"]
@@ -63,6 +66,7 @@ QUICK = [(17, 13), (5, 3)]
 SLOW = [pytest.param(*size, marks=pytest.mark.slow) for size in [(16, 12), (16, 9), (80, 60), (64, 48), (33, 1)]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), QUICK + SLOW)
 def test_a_cnn_takes_images_of_any_resolution_and_sees_all_of_it(width, height):
     channels, strides = convolutions(height, width)
@@ -73,6 +77,7 @@ def test_a_cnn_takes_images_of_any_resolution_and_sees_all_of_it(width, height):
     assert jnp.mean(gradient != 0) > 0.9  # a pixel whose units are all off has none
 
 
+@pytest.mark.slow
 def test_an_image_that_is_no_multiple_of_the_strides_has_a_margin_of_nothing():
     cnn = CNN(channels=(5,), strides=(4,), features=7)
     image = jax.random.uniform(jax.random.key(1), (10, 15, 2))

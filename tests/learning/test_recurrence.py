@@ -40,6 +40,7 @@ def learnt_cost(learner, env, **changes):
     return jax.jit(cost)(KEY)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 @BPTT_IS_QUICK
 def test_a_recurrent_policy_remembers_what_it_saw_at_the_start_of_each_episode(learner):
@@ -68,6 +69,7 @@ def test_what_is_remembered_may_be_an_image(learner):
     assert learnt_cost(learner, Cue(image=True), recurrent_size=8, **changes) < 0.05 * FORGETFUL_COST
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("per_agent", [False, True])
 def test_a_sequence_is_replayed_as_it_was_flown_with_an_empty_memory_where_episodes_start(per_agent):
     env = envs.make("leader-follower")
@@ -92,6 +94,7 @@ def test_a_sequence_is_replayed_as_it_was_flown_with_an_empty_memory_where_episo
     assert jnp.all(jnp.abs(replayed[2:, 2] - fresh[:, 2]) > 0)  # where no episode starts, the past matters
 
 
+@pytest.mark.slow
 def test_episodes_that_follow_one_another_are_flown_as_each_would_be_alone():
     env = Cue()
 
@@ -107,6 +110,7 @@ def test_episodes_that_follow_one_another_are_flown_as_each_would_be_alone():
     np.testing.assert_allclose(*actions(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_ppo_replays_the_probabilities_that_it_recorded():
     env = Cue()
     config = dataclasses.replace(SMALL[ppo], horizon=4, recurrent_size=4, epochs=1, minibatches=1)
@@ -140,6 +144,7 @@ class ThenFall:
         return count + 1, jnp.broadcast_to(jnp.where(count < 3, 0.5, -1.0)[:, None], (len(count), 4))
 
 
+@pytest.mark.slow
 def test_every_way_to_fly_a_policy_carries_its_memory():
     env = envs.make("hover", duration=0.1, tilt=0.0, omega=0.0)
     log = fly_episode(env, ThenFall(), jax.random.split(KEY, 1)[0])
@@ -149,6 +154,7 @@ def test_every_way_to_fly_a_policy_carries_its_memory():
     np.testing.assert_allclose(report.mean_return, log.reward.sum(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_policy_with_a_memory_is_saved_and_says_how_it_is_called(tmp_path):
     env = envs.make("hover")
     policy = jax.jit(lambda: Policy.init(KEY, env, (8,), recurrent_size=4))()

@@ -79,6 +79,7 @@ def test_nobody_is_asked_about_compilers():
     assert not [name for name in dir(learning) if "compiler" in name.lower()]
 
 
+@pytest.mark.slow
 def test_train_compiles_itself_once_for_all_keys_and_equal_settings():
     env = Counted()
     first = bptt.train(KEY, env, SMALL[bptt])
@@ -89,6 +90,7 @@ def test_train_compiles_itself_once_for_all_keys_and_equal_settings():
     assert len(env.traced) > traced
 
 
+@pytest.mark.slow
 def test_train_and_evaluate_notice_that_an_attribute_of_the_environment_was_set():
     env = envs.make("hover")
     policy = Policy.init(KEY, env, (4,))
@@ -101,6 +103,7 @@ def test_train_and_evaluate_notice_that_an_attribute_of_the_environment_was_set(
     assert not np.array_equal(*rewards)
 
 
+@pytest.mark.slow
 def test_train_in_a_program_of_the_user_does_what_it_does_alone():
     env = DoubleIntegrator()
     alone = bptt.train(KEY, env, SMALL[bptt])
@@ -121,6 +124,7 @@ def test_seeds_and_settings_can_be_mapped_inside_and_outside_of_a_program(compil
     np.testing.assert_allclose(together[1], train(keys[1], float(rates[1])), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_settings_that_are_arrays_and_environments_that_are_mapped_train_too():
     config = dataclasses.replace(SMALL[bptt], learning_rate=jnp.asarray(1e-2))
     same(bptt.train(KEY, DoubleIntegrator(), config), bptt.train(KEY, DoubleIntegrator(), config), rtol=1e-6)

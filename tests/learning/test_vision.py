@@ -158,6 +158,7 @@ def test_a_policy_of_many_worlds_is_that_of_each(team, per_agent):
     np.testing.assert_allclose(action[1, 1], alone, rtol=1e-5, atol=1e-9)  # pictures are in single precision
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_a_policy_that_sees_flies_on_as_it_was_saved(team, tmp_path):
     policy, obs = Policy.init(KEY, team, (8,), per_agent=True), seen(team)
@@ -179,6 +180,7 @@ def test_a_central_critic_sees_every_vector_and_its_own_pictures(team):
     assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_a_compiled_program_sees_what_is_seen_without_one(team):
     drones = jax.vmap(team.reset)(jax.random.split(KEY, 3))[1].drones

@@ -1,0 +1,75 @@
+"""The controllers that a flight can be flown by, and what each is told of the target."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxdrones import control, optimal
+from jaxdrones.control import Setpoint, for_team, pid, velocity
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, ROTORS
+from jaxdrones.engine.explicit import make_step
+from jaxdrones.flights.conditions import Conditions
+from jaxdrones.flights.examples import FLIGHTS
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.tasks.curves import setpoint_on
+
+
+class Controller(NamedTuple):
+    """A controller of a team."""
+
+    init: Callable[[Params, State], Any]
+    """Constants and start of a team -> memory."""
+    control: Callable[[Params, Any, State, jax.Array], tuple[Any, jax.Array]]
+    """(params, memory, state, time in s) -> memory and rotor speeds (n, 4)."""
+
+
+def controller_of(conditions: Conditions) -> Controller:
+    """The controller of a flight."""
+    if conditions.controller in optimal.CONTROLLERS:
+        return _optimal(conditions)
+    example, n = FLIGHTS[conditions.flight], conditions.drones
+    module = velocity if conditions.flight == "velocity" else control.CONTROLLERS[conditions.controller]
+    gains = pid.gains(conditions.vehicle) if module in (pid, velocity) else module.gains()
+    memory = for_team((pid if module is velocity else module).init(), n)
+    one = functools.partial(module.control, gains, dt=conditions.dt)
+
+    def fly(params: Params, memory: Any, state: State, t: jax.Array) -> tuple[Any, jax.Array]:
+        return jax.vmap(one)(params, memory, state, example.target(n, t, conditions.duration))
+
+    return Controller(lambda params, start: memory, fly)
+
+
+def _optimal(conditions: Conditions) -> Controller:
+    """One that plans over the step of the flight, each drone as if it were alone, and knows how its target moves."""
+    example, n, module = FLIGHTS[conditions.flight], conditions.drones, optimal.CONTROLLERS[conditions.controller]
+    step = make_step(
+        effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
+        rotors=ROTORS[conditions.rotors],
+        integrator=INTEGRATORS[conditions.integrator],
+        dt=conditions.dt / conditions.substeps,
+        substeps=conditions.substeps,
+    )
+    settings = module.settings(step)
+    one = functools.partial(module.control, settings, dt=conditions.dt)
+
+    def init(params: Params, start: State) -> Any:
+        keys = jax.random.split(jax.random.key(conditions.seed or 0), n)
+        own = (keys,) if module is optimal.mppi else ()
+        return jax.vmap(functools.partial(module.init, settings))(params, start, *own)
+
+    def target(i: int, t: jax.Array) -> Setpoint:
+        def now(t: jax.Array) -> Setpoint:
+            return jax.tree.map(lambda x: x[i], example.target(n, t, conditions.duration))
+
+        return setpoint_on(lambda t: now(t).pos, t).replace(yaw=now(t).yaw)
+
+    def fly(params: Params, memory: Any, state: State, t: jax.Array) -> tuple[Any, jax.Array]:
+        times = t + conditions.dt * jnp.arange(settings.horizon + 1)
+        setpoints = jax.vmap(lambda i: jax.vmap(functools.partial(target, i))(times))(jnp.arange(n))
+        return jax.vmap(one)(params, memory, state, setpoints)
+
+    return Controller(init, fly)

@@ -1,0 +1,43 @@
+"""Actions that are normally distributed about those of a policy."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.envs.env import Obs
+from jaxdrones.learning.networks import Policy
+
+HALF_LOG_2_PI = math.log(2 * math.pi) / 2
+
+
+def explore(
+    policy: Policy, log_std: Array, keys: jax.Array, memory: Array | None, obs: Obs
+) -> tuple[Array | None, Array, Array]:
+    """Actions about those of a policy in many worlds, for `collect.collect`.
+
+    Args:
+        policy: policy.
+        log_std: (a,) or (n, a), logarithm of the standard deviation of actions.
+        keys: (w,) random key of each world.
+        memory: (w, n, m) memory of the policy before the observations; `None` without one.
+        obs: (w, n, d) observations, or a dictionary with images.
+
+    Returns:
+        The memory after the observations, the actions (w, n, a), and the logarithm of their density (w, n).
+    """
+    memory, mean = policy.act(memory, obs)
+    std = jnp.broadcast_to(jnp.exp(log_std), mean.shape)
+    noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(keys)
+    action = mean + std * noise
+    return memory, action, log_prob(action, mean, log_std)
+
+
+def log_prob(action: Float[Array, "*batch n a"], mean: Array, log_std: Array) -> Float[Array, "*batch n"]:
+    """Logarithm of the density of actions that are normally distributed about their mean."""
+    log_std = jnp.broadcast_to(log_std, mean.shape)
+    terms = -(((action - mean) * jnp.exp(-log_std)) ** 2) / 2 - log_std - HALF_LOG_2_PI
+    return jnp.sum(terms, axis=-1)

@@ -1,0 +1,106 @@
+"""A user's files in a recipe: the Python file of a task, the URDF of a vehicle.
+
+A recipe names them without their folder and holds their text. So a run flies what it was trained on, wherever its
+folder is and whatever becomes of the files. The text of a task is executed when its run is opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxdrones import user_code
+from jaxdrones.checks import check_callable, check_choice
+from jaxdrones.envs import TASKS
+from jaxdrones.tasks.task import Task
+from jaxdrones.urdf import parse_params
+
+Files = dict[str, str]
+"""Name of a file, without its folder -> its text."""
+
+
+def take_task(task: str, kept: Mapping[str, str] | None = None) -> tuple[str, Files]:
+    """The name of a task as a recipe has it, and the file that it is in.
+
+    Args:
+        task: a name of `jaxdrones.envs.TASKS`, or `folder/file.py:function`.
+        kept: files of a run; they stand in for those that are no longer there.
+
+    Raises:
+        ValueError: a file that cannot be read, or no function is named.
+    """
+    if not user_code.is_reference(task):
+        return task, {}
+    file, name = user_code.split_reference(task)
+    return f"{file.name}:{name}", _read(file, kept)
+
+
+def take_vehicle(options: dict[str, Any], kept: Mapping[str, str] | None = None) -> tuple[dict[str, Any], Files]:
+    """Options of `jaxdrones.make` as a recipe has them, and the file that the vehicle is in.
+
+    Args:
+        options: with a `vehicle` that is a bundled one or the path of a URDF, or without one.
+        kept: files of a run; they stand in for those that are no longer there.
+
+    Raises:
+        ValueError: a file that cannot be read.
+    """
+    vehicle = options.get("vehicle")
+    if not (isinstance(vehicle, str) and vehicle.endswith(".urdf")):
+        return options, {}
+    file = Path(vehicle)
+    return options | {"vehicle": file.name}, _read(file, kept)
+
+
+def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
+    """The task of a recipe as `jaxdrones.make` takes it: a name, or the function that a file of the recipe defines.
+
+    Raises:
+        ValueError: an unknown name, or a file that is missing, cannot be executed or does not define the function.
+    """
+    if not user_code.is_reference(task):
+        check_choice("task", task, TASKS)
+        return task
+    file, name = user_code.split_reference(task)
+    function = user_code.definition(file.name, _text(file.name, files), name)
+    check_callable(task, function, "a function that returns a jaxdrones.tasks.Task")
+    return function
+
+
+def options_of(options: dict[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
+    """The options of a recipe as `jaxdrones.make` takes them: a vehicle of a file by its constants.
+
+    Raises:
+        ValueError: a URDF that cannot be flown.
+    """
+    vehicle = options.get("vehicle")
+    if not (isinstance(vehicle, str) and vehicle.endswith(".urdf")):
+        return options
+    return options | {"vehicle": parse_params(vehicle, _text(vehicle, files))}
+
+
+def check_unchanged(folder: Path, kept: Mapping[str, str], found: Mapping[str, str]) -> None:
+    """Raise unless the files that were found have the texts that a run keeps.
+
+    Raises:
+        ValueError: one has changed; says what to do.
+    """
+    for name, text in found.items():
+        if kept.get(name, text) != text:
+            raise ValueError(
+                f"{name} has changed since {folder} was started; undo the change to --resume (best.json there has the "
+                "old text), or train anew with --overwrite or in another --output"
+            )
+
+
+def _read(file: Path, kept: Mapping[str, str] | None) -> Files:
+    if kept and file.name in kept and not file.exists():
+        return {file.name: kept[file.name]}
+    return {file.name: user_code.read_text(file)}
+
+
+def _text(name: str, files: Mapping[str, str]) -> str:
+    if name not in files:
+        raise ValueError(f"the recipe lacks the text of {name}; train anew")
+    return files[name]

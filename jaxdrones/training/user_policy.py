@@ -1,0 +1,54 @@
+"""A policy of a user's file, which flies a task as the policy of a run does."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from jaxdrones import user_code
+from jaxdrones.envs import Env, make
+from jaxdrones.learning.recurrence import AnyPolicy, RecurrentPolicy
+
+
+@dataclasses.dataclass(frozen=True)
+class UserPolicy:
+    """A policy of a user's file and the task that it flies: what is asked of a run, and of its recipe."""
+
+    reference: str
+    """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a policy with a memory."""
+    task: str
+    """A name of `jaxdrones.envs.TASKS`, or `file.py:function`."""
+    realistic: bool
+    options: dict[str, Any]
+    """Options of `jaxdrones.make`."""
+
+    @property
+    def trained_by(self) -> str:
+        """Name of the policy for titles."""
+        return self.reference
+
+    def as_dict(self) -> dict[str, Any]:
+        """The policy and the task for JSON."""
+        return dataclasses.asdict(self)
+
+    def recipe(self) -> UserPolicy:
+        """What says which environment is flown: this."""
+        return self
+
+    def env(self, **options: Any) -> Env:
+        """The environment to fly in; options of `jaxdrones.make` replace those given."""
+        return make(self.task, realistic=self.realistic, **self.options | options)
+
+    def policy(self, env: Env) -> AnyPolicy:
+        """The policy.
+
+        Raises:
+            ValueError: the file cannot be read or executed, or the name is not that of a policy.
+        """
+        policy = user_code.load(self.reference)
+        if not (callable(policy) or isinstance(policy, RecurrentPolicy)):
+            raise ValueError(
+                f"{self.reference} is {policy!r:.60}; give a function from observations ({env.drones}, "
+                f"{env.observation_size}) to actions ({env.drones}, {env.action_size}), or a policy with a memory"
+            )
+        return policy

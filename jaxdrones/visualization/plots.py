@@ -1,11 +1,14 @@
-"""Figures of flights, in the layout of the gym-pybullet-drones paper. They need matplotlib (extra `cli`)."""
+"""Figures of flights: paths, and the panels of the gym-pybullet-drones paper. They need matplotlib (extra `cli`)."""
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxdrones.flights.record import Record
+from jaxdrones.visualization import paths, style
+from jaxdrones.visualization.palette import colors
 
 # panel: (array of the record, column, label); the order alternates between left and right column
 PANELS = {
@@ -28,6 +31,9 @@ PANELS = {
 }
 ERROR = {"error": ("error", 0, "error (m)")}
 POLICY_PANELS = ("x", "rpm0", "y", "rpm1", "z", "rpm2", "vz", "rpm3", "error", "yaw")
+_SMALLEST = {"pos": 0.02, "vel": 0.02, "rpy": 0.02, "omega": 0.05, "rpm": 200.0, "error": 0.01}  # ranges of axes
+_MOST_NAMED = 12  # drones in a legend
+_WIDTH, _PATHS, _ROW = 13.0, 5.4, 1.6  # in
 
 
 def check_matplotlib() -> None:
@@ -45,7 +51,7 @@ def check_matplotlib() -> None:
 
 
 def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = ()) -> None:
-    """Draw a flight: one line per drone, the commanded values dashed.
+    """Draw a flight: its paths, and signals over time; one color per drone, what is commanded dashed.
 
     Args:
         record: the flight.
@@ -53,62 +59,60 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
         title: title of the figure.
         panels: names of `PANELS`, or `error`; all `PANELS` when empty.
     """
-    from matplotlib.figure import Figure  # importing it takes half a second
-
     panels = panels or list(PANELS)
     columns = 1 if len(panels) < 4 else 2
     rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(max(8, 5.5 * columns), 1.5 * rows + 1.2), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+    tints = colors(len(record.labels))
+    with style.figure(_WIDTH, _PATHS + _ROW * rows + 1.3) as figure:
+        above, below = figure.subfigures(2, 1, height_ratios=(_PATHS, _ROW * rows + 0.6))
+        paths.draw_space(above.add_subplot(1, 2, 1, projection="3d"), record, tints)
+        paths.draw_plane(above.add_subplot(1, 2, 2), record, tints)
+        axes = below.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+        for axis, name in zip(axes, panels, strict=False):
+            _draw_signal(axis, record, name, tints)
+        for axis in axes[len(panels) :]:
+            axis.set_axis_off()
+        for axis in axes[max(0, len(panels) - columns) : len(panels)]:
+            axis.set_xlabel("t (s)")
+            axis.tick_params(labelbottom=True)
+        figure.align_ylabels(list(axes))
+        figure.suptitle(title + "\n")
+        figure.legend(handles=_handles(record, tints), loc="outside lower center", ncols=4)
+        figure.savefig(path, dpi=style.DPI)
+
+
+def _draw_signal(axis: Any, record: Record, name: str, tints: Sequence[str]) -> None:
+    """Draw one panel over time, and say what of it lies outside of the axes."""
+    array, column, label = (PANELS | ERROR)[name]
+    signal = np.asarray(getattr(record, array), float)[..., column]
     targets = {"pos": record.target_pos, "vel": record.target_vel}
-    for axis, name in zip(axes, panels, strict=False):
-        array, column, label = (PANELS | ERROR)[name]
-        for i, drone in enumerate(record.labels):
-            (line,) = axis.plot(record.t, getattr(record, array)[:, i, column], linewidth=1, label=drone)
-            if array in targets and np.isfinite(targets[array]).any():
-                axis.plot(
-                    record.t, targets[array][:, i, column], "--", linewidth=0.8, color=line.get_color(), alpha=0.6
-                )
-        axis.set_ylabel(label)
-        axis.grid(linewidth=0.3)
-    for axis in axes[-columns:]:
-        axis.set_xlabel("t (s)")
-    figure.suptitle(title, fontsize="medium")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    figure.savefig(path, dpi=120)
+    command = np.asarray(targets[array], float)[..., column] if array in targets else np.full_like(signal, np.nan)
+    for i, tint in enumerate(tints):
+        axis.plot(record.t, command[:, i], color=tint, **style.TARGET)
+        axis.plot(record.t, signal[:, i], color=tint)
+    low, high = style.limits(np.concatenate([signal, command], axis=1), _SMALLEST[array])
+    axis.set_ylim(low, high)
+    axis.set_ylabel(label)
+    axis.locator_params(axis="y", nbins=4)
+    with np.errstate(invalid="ignore"):
+        outside = np.isfinite(signal) & ((signal < low) | (signal > high))
+    if outside.any():
+        text = f"outside: {_range(signal[outside])}, first at {record.t[outside.any(axis=1)][0]:.2f} s"
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
+        axis.text(0.995, 0.97, text, transform=axis.transAxes, ha="right", va="top", fontsize=11.5, bbox=box)
 
 
-def save_curves(histories: dict[str, list[dict[str, float]]], path: Path, title: str) -> None:
-    """Draw learning curves: one line per run, over the number of control steps.
+def _range(values: np.ndarray) -> str:
+    """From the smallest to the largest value, as text."""
+    ends = [f"{x:,.0f}" if 1e3 <= abs(x) < 1e6 else f"{x:.2g}" for x in (values.min(), values.max())]
+    return " to ".join(dict.fromkeys(ends))
 
-    Args:
-        histories: label -> rows of progress.csv, as `training.run.Run.history` returns them.
-        path: path of the picture.
-        title: title of the figure.
-    """
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 6), layout="constrained")
-    axes = figure.subplots(2, 2, sharex=True).ravel()
-    panels = {
-        "reward": "reward per step, in training",
-        "evaluated_return": "return of an episode, evaluated",
-        "success": "success, evaluated",
-        "evaluated_error": "median error in the end (m), evaluated",
-    }
-    for axis, (name, label) in zip(axes, panels.items(), strict=True):
-        for run, rows in histories.items():
-            points = [(row["steps"], row[name]) for row in rows if name in row and np.isfinite(row[name])]
-            marker = "o" if len(points) < len(rows) else None
-            axis.plot(*(zip(*points, strict=True) if points else ((), ())), linewidth=1, marker=marker, ms=3, label=run)
-            if name == "evaluated_error" and points and min(y for _, y in points) > 0:
-                axis.set_yscale("log")
-        axis.set_ylabel(label, fontsize="small")
-        axis.grid(linewidth=0.3)
-    axes[2].set_ylim(-0.03, 1.03)
-    for axis in axes[2:]:
-        axis.set_xlabel("control steps flown")
-    figure.suptitle(title, fontsize="medium")
-    if len(histories) > 1:
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
-    figure.savefig(path, dpi=120)
+def _handles(record: Record, tints: Sequence[str]) -> list[Any]:
+    """The lines of the legend: drones, what is dashed, start and end."""
+    from matplotlib.lines import Line2D
+
+    named = [Line2D([], [], color=tint, label=drone) for tint, drone in zip(tints, record.labels, strict=True)]
+    if len(named) > _MOST_NAMED:
+        named = [*named[:_MOST_NAMED], Line2D([], [], linestyle="none", label=f"and {len(named) - _MOST_NAMED} more")]
+    return named + paths.legend_handles(record)

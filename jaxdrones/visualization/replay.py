@@ -1,82 +1,48 @@
-"""Films of recorded flights of either backend, from outside or from on board. They need the extra `bullet`."""
+"""Films and on-board pictures of recorded flights of either backend, drawn by Bullet (extra `bullet`)."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from jaxdrones.engine import bullet
-from jaxdrones.flights.record import Record
-from jaxdrones.params import repeat
-from jaxdrones.sensing import Scene, camera_2021
+from jaxdrones.flights.record import ImageSequence, Record
+from jaxdrones.sensing import Camera, camera_2021
 from jaxdrones.state import State
-from jaxdrones.urdf import load_params
-from jaxdrones.visualization import video
+from jaxdrones.visualization.shots import FIELD_OF_VIEW, rows_of_frames, shoot
 
 FPS = 24  # frames per simulated second; the camera rate of gym-pybullet-drones (2021)
 
-_DIRECTION = np.array([-0.6, -0.7, 0.4])  # from the middle of the flight to the camera
-_DISTANCE = 1.6  # of the camera, over the extent of the flight
-_MIN_EXTENT = 0.6  # m
-_FAR = 1e6  # m; states beyond are not shown
+
+def frames(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+    """The pictures (height, width, 3) uint8 of a film that Bullet draws, without its title."""
+    shot = shoot(record, fps, size[0] / size[1])
+    camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW, near=0.02)
+    with bullet.make_step(scene=record.scene) as step:
+        for row, eye, target in zip(shot.rows, shot.eyes, shot.targets, strict=True):
+            yield step.photo(record.params, _state(record, row), eye, target, camera)
 
 
-def film(record: Record, path: Path, scene: Scene | None = None, fps: int = FPS) -> int:
-    """Write a film of a flight from a camera that shows all of it; one frame per 1/fps of simulated time.
-
-    Args:
-        record: the flight.
-        path: path of the film, .mp4 or .gif.
-        scene: obstacles and ground; a bare ground plane when left out.
-        fps: frames per second.
-
-    Returns:
-        The number of frames.
-
-    Raises:
-        ValueError: no state of the flight is finite.
-    """
-    video.check_video(path)
-    if not len(_finite(record)):
-        raise ValueError(f"{path} is not written: no state of the flight is finite")
-    pos = record.pos[_finite(record)]
-    low, high = pos.min(axis=(0, 1)), pos.max(axis=(0, 1))
-    middle = (low + high) / 2
-    eye = middle + _DIRECTION * _DISTANCE * max(_MIN_EXTENT, float(np.linalg.norm(high - low)))
-    with bullet.make_step(scene=scene) as step:
-        params = _params(record)
-        frames = (step.photo(params, state, eye, middle) for state in _states(record, fps))
-        return video.write(frames, path, fps)
-
-
-def save_cameras(record: Record, folder: Path, scene: Scene | None = None, fps: int = FPS) -> int:
-    """Write the pictures of every drone's camera as `drone 0/00000.png` and so on; returns their number."""
+def save_cameras(record: Record, folder: Path, fps: int = FPS) -> ImageSequence:
+    """Write the pictures of every drone's camera as `drone 0/00000.png` and so on; returns them."""
     from matplotlib.image import imsave
 
-    count = 0
-    with bullet.make_step(scene=scene) as step:
-        params = _params(record)
+    t, pictures = [], []
+    with bullet.make_step(scene=record.scene) as step:
         for frame, state in enumerate(_states(record, fps)):
-            for label, picture in zip(record.labels, step.camera(params, state, camera_2021).rgb, strict=True):
+            rgb = step.camera(record.params, state, camera_2021).rgb
+            for label, picture in zip(record.labels, rgb, strict=True):
                 (folder / label).mkdir(parents=True, exist_ok=True)
                 imsave(folder / label / f"{frame:05d}.png", picture)
-                count += 1
-    return count
-
-
-def _params(record: Record):
-    return repeat(load_params(record.conditions.vehicle), len(record.labels))
-
-
-def _finite(record: Record) -> np.ndarray:
-    """Rows in which the pose of every drone is a number that Bullet can show."""
-    poses = np.concatenate([record.pos, record.quat], axis=-1)
-    return np.flatnonzero((np.abs(poses) < _FAR).all(axis=(1, 2)))
+            t.append(frame / fps)
+            pictures.append(np.asarray(rgb))
+    return ImageSequence(np.array(t), np.stack(pictures))
 
 
 def _states(record: Record, fps: int) -> Iterator[State]:
     """The recorded state nearest to every frame's time, out of those that can be shown; at least one."""
-    rows = _finite(record)
-    for time in np.arange(max(1, round(record.t[-1] * fps))) / fps:
-        k = rows[np.abs(record.t[rows] - time).argmin()]
-        yield State(record.pos[k], record.quat[k], record.vel[k], record.omega[k], record.rpm[k])
+    return (_state(record, row) for row in rows_of_frames(record, fps))
+
+
+def _state(record: Record, row: int) -> State:
+    return State(record.pos[row], record.quat[row], record.vel[row], record.omega[row], record.rpm[row])

@@ -16,13 +16,13 @@ def check_video(path: Path) -> None:
     Raises:
         ValueError: an unknown suffix, or a package that is not installed; says which extra to install.
     """
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"{path}: films end in {' or '.join(SUFFIXES)}")
     try:
+        import PIL  # noqa: F401
+
         if path.suffix == ".mp4":
             import imageio_ffmpeg  # noqa: F401
-        elif path.suffix == ".gif":
-            import PIL  # noqa: F401
-        else:
-            raise ValueError(f"{path}: films end in {' or '.join(SUFFIXES)}")
     except ImportError as error:
         raise ValueError(
             f'{error.name} is not installed, so {path} cannot be written; pip install "jaxdrones[video]"'
@@ -49,7 +49,9 @@ def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
         for frame in frames:
             if writer is None:
                 size = frame.shape[1::-1]
-                writer = imageio_ffmpeg.write_frames(str(new), size, fps=fps, quality=7, ffmpeg_log_level="quiet")
+                writer = imageio_ffmpeg.write_frames(
+                    str(new), size, fps=fps, quality=7, macro_block_size=2, ffmpeg_log_level="quiet"
+                )
                 with warnings.catch_warnings():  # about forking a process with threads: it becomes ffmpeg at once
                     warnings.simplefilter("ignore", RuntimeWarning)
                     writer.send(None)

@@ -1,13 +1,35 @@
+import contextlib
+import dataclasses
+
 import numpy as np
 import pytest
+from helpers import mostly_slow
 
 from jaxdrones.flights.fly import fly
-from jaxdrones.visualization import plots
+from jaxdrones.sensing import Box, Cylinder, Scene, Sphere
+from jaxdrones.visualization import paths, plots, style
+from jaxdrones.visualization.palette import colors
 
 
 @pytest.fixture(scope="module")
 def record():
     return fly("circle", drones=2, duration=0.5)
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """The figures that are drawn in a test."""
+    drawn = []
+    original = style.figure
+
+    @contextlib.contextmanager
+    def kept(width, height):
+        with original(width, height) as figure:
+            drawn.append(figure)
+            yield figure
+
+    monkeypatch.setattr(style, "figure", kept)
+    return drawn
 
 
 def test_every_quantity_of_the_state_has_a_panel(record):
@@ -16,13 +38,89 @@ def test_every_quantity_of_the_state_has_a_panel(record):
         assert np.isfinite(getattr(record, array)[:, :, column]).all()
 
 
-@pytest.mark.parametrize("panels", [(), ("z",), ("z", "vz", "rpm0"), ("x", "vx", "z", "vz")])
-def test_a_figure_shows_something_for_any_choice_of_panels(record, tmp_path, panels):
+PANELS = [(), ("z",), ("z", "vz", "rpm0"), ("x", "vx", "z", "vz"), plots.POLICY_PANELS]
+
+
+@pytest.mark.parametrize("panels", mostly_slow(PANELS, [(), ("z",)]))
+def test_a_figure_shows_everything_and_all_of_it_can_be_read_at_half_size(record, tmp_path, panels, figures):
     from matplotlib.image import imread
+    from matplotlib.text import Text
 
     plots.save_flight(record, tmp_path / "flight.png", "a title", panels)
     picture = imread(tmp_path / "flight.png")
-    assert picture.shape[0] > 200 and picture[..., :3].std() > 0.05
+    assert picture[..., :3].std() > 0.05
+    (figure,) = figures
+    assert len(figure.axes) == 2 + len(panels or plots.PANELS)
+    texts = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+    assert min(text.get_fontsize() * style.DPI / 72 / 2 for text in texts) >= 8  # pixels
+    height, width = picture.shape[:2]
+    (legend,) = figure.legends
+    for text in [
+        *legend.get_texts(),
+        *(axis.yaxis.label for axis in figure.axes),
+        *(axis.title for axis in figure.axes),
+    ]:
+        box = text.get_window_extent()
+        assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= width and box.y1 <= height
+
+
+def test_the_legend_names_every_drone_and_explains_what_is_dashed(record, tmp_path, figures):
+    plots.save_flight(record, tmp_path / "flight.png", "a title", ("z",))
+    entries = dict(
+        zip(
+            (text.get_text() for text in figures[0].legends[0].get_texts()),
+            figures[0].legends[0].get_lines(),
+            strict=True,
+        )
+    )
+    assert list(entries) == ["drone 0", "drone 1", "commanded", "last target", "start", "end"]
+    assert [entries[name].get_color() for name in record.labels] == list(colors(2))
+    assert entries["commanded"].is_dashed() and not entries["drone 0"].is_dashed()
+
+
+def test_a_panel_holds_nearly_all_samples_and_says_what_it_leaves_out(record, tmp_path, figures):
+    rpm = np.full_like(record.rpm, 14_000)
+    rpm[0] = 30_000
+    plots.save_flight(dataclasses.replace(record, rpm=rpm), tmp_path / "flight.png", "a title", ("rpm0",))
+    axis = figures[0].axes[-1]
+    low, high = axis.get_ylim()
+    assert low < 14_000 < high < 20_000
+    assert [text.get_text() for text in axis.texts] == ["outside: 30,000, first at 0.01 s"]
+
+
+def test_a_team_of_many_drones_has_a_short_legend(record, tmp_path, figures):
+    many = {name: np.repeat(getattr(record, name), 15, axis=1) for name in ("pos", "quat", "vel", "omega", "rpm")}
+    many |= {name: np.repeat(getattr(record, name), 15, axis=1) for name in ("target_pos", "target_vel")}
+    crowd = dataclasses.replace(record, **many, labels=tuple(f"drone {i}" for i in range(30)))
+    plots.save_flight(crowd, tmp_path / "flight.png", "a title", ("z",))
+    assert "and 18 more" in [text.get_text() for text in figures[0].legends[0].get_texts()]
+
+
+@pytest.mark.parametrize(
+    ("extent", "plane"), [((1, 1, 0.1), (0, 1)), ((1, 0, 0.5), (0, 2)), ((0, 1, 2), (1, 2)), ((0, 0, 1), (0, 2))]
+)
+def test_the_path_is_drawn_in_the_plane_in_which_it_is_largest(extent, plane):
+    t = np.linspace(0, 1, 50)[:, None]
+    assert paths.widest_plane((np.sin(7 * t + [0, 1, 2]) * extent)[:, None]) == plane
+
+
+def test_outlines_of_obstacles_have_their_area():
+    turned = (0.0, 0.0, np.sin(0.3), np.cos(0.3))
+    scene = Scene.of(
+        Box(pos=(1.0, 0.0, 0.5), size=(0.4, 1.0, 2.0), quat=turned),
+        Sphere(pos=(0.0, 2.0, 0.5), radius=0.3),
+        Cylinder(pos=(-1.0, 0.0, 1.0), radius=0.2, height=2.0),
+    )
+
+    def area(outline):
+        x, y = outline.T
+        return abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
+
+    x, y, z = np.eye(3)
+    box, sphere, cylinder = paths.outlines(scene, x, y)
+    np.testing.assert_allclose([area(box), area(sphere), area(cylinder)], [0.4, 0.09 * np.pi, 0.04 * np.pi], rtol=0.02)
+    np.testing.assert_allclose(cylinder.mean(axis=0), [-1, 0], atol=1e-6)
+    np.testing.assert_allclose(area(paths.outlines(scene, x, z)[2]), 0.8, rtol=0.02)
 
 
 def test_without_matplotlib_the_error_names_the_extra(monkeypatch):

@@ -9,7 +9,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from jaxdrones.flights.fly import fly
-from jaxdrones.visualization import replay, video
+from jaxdrones.visualization import films, replay, shots, video
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 pytestmark = [  # imageio-ffmpeg leaves its pipes to the garbage collector
@@ -30,9 +30,10 @@ def read(path) -> tuple[dict, list[np.ndarray]]:
     return about, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in frames]
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_a_film_has_a_frame_for_every_24th_of_a_simulated_second_and_moves(record, tmp_path):
-    assert replay.film(record, tmp_path / "flight.mp4") == 36
+    assert films.film(record, tmp_path / "flight.mp4", "", "bullet", size=(640, 360)) == 36
     about, frames = read(tmp_path / "flight.mp4")
     assert about["fps"] == 24 and len(frames) == 36
     assert frames[0].std() > 10
@@ -42,7 +43,7 @@ def test_a_film_has_a_frame_for_every_24th_of_a_simulated_second_and_moves(recor
 
 @pytest.mark.needs("pybullet")
 def test_a_film_may_be_a_gif(record, tmp_path):
-    replay.film(record, tmp_path / "flight.gif", fps=8)
+    films.film(record, tmp_path / "flight.gif", "", "bullet", fps=8, size=(320, 180))
     with Image.open(tmp_path / "flight.gif") as picture:
         assert picture.n_frames == 12
         durations = [picture.seek(frame) or picture.info["duration"] for frame in range(12)]
@@ -53,7 +54,7 @@ def test_a_film_may_be_a_gif(record, tmp_path):
 @pytest.mark.parametrize("name", ["short.mp4", "short.gif", "-x:y %d.mp4"])
 def test_the_shortest_flight_is_one_frame_whatever_its_file_is_called(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert replay.film(fly("circle", drones=2, duration=0.01), Path(name)) == 1
+    assert films.film(fly("circle", drones=2, duration=0.01), Path(name), "", "bullet", size=(320, 180)) == 1
     assert (tmp_path / name).stat().st_size > 100
 
 
@@ -64,8 +65,8 @@ def test_a_flight_that_breaks_is_filmed_until_then(wrong, record):
     states = list(replay._states(dataclasses.replace(record, pos=pos), fps=10))
     assert len(states) == 15
     np.testing.assert_array_equal(states[-1].pos, record.pos[59])
-    with pytest.raises(ValueError, match=r"film\.gif is not written: no state of the flight is finite"):
-        replay.film(dataclasses.replace(record, pos=np.full_like(pos, wrong)), Path("film.gif"))
+    with pytest.raises(ValueError, match="the film is not written: no state of the flight is finite"):
+        shots.shoot(dataclasses.replace(record, pos=np.full_like(pos, wrong)), 10, 16 / 9)
 
 
 @pytest.mark.needs("pybullet")
@@ -86,7 +87,7 @@ def test_a_film_that_ffmpeg_cannot_write_is_one_line_and_leaves_the_old_one(
 
     monkeypatch.setattr(imageio_ffmpeg, "count_frames_and_secs", count)
     with pytest.raises(OSError, match=r"film\.mp4 cannot be written, ffmpeg broke off; is the disk full") as error:
-        replay.film(record, film, fps=2)
+        films.film(record, film, "", "bullet", fps=2, size=(320, 180))
     assert "\n" not in str(error.value) and capfd.readouterr().err == ""
     assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
     assert fault == "a folder" or film.read_bytes() == b"old"
@@ -102,7 +103,8 @@ def test_frames_are_in_step_with_simulated_time(record):
 
 @pytest.mark.needs("pybullet")
 def test_every_drone_leaves_its_pictures(record, tmp_path):
-    assert replay.save_cameras(record, tmp_path, fps=4) == 12
+    images = replay.save_cameras(record, tmp_path, fps=4)
+    assert images.frames.shape == (6, 2, 48, 64, 4) and images.t.tolist() == [0, 0.25, 0.5, 0.75, 1, 1.25]
     pictures = sorted((tmp_path / "drone 1").glob("*.png"))
     assert len(pictures) == 6 and imread(pictures[0]).shape == (48, 64, 4)
 

@@ -1,0 +1,97 @@
+"""Films by the cameras of JAX, with shadows of the drones, and with trails, targets, names and a clock drawn on top."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Generator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from jaxdrones import rotation
+from jaxdrones.flights.record import Record
+from jaxdrones.params import Params
+from jaxdrones.sensing import Camera
+from jaxdrones.sensing.images import Images, view
+from jaxdrones.sensing.shading import SUN
+from jaxdrones.state import State
+from jaxdrones.visualization.overlay import Lens, Overlay
+from jaxdrones.visualization.palette import as_rgb, colors
+from jaxdrones.visualization.shots import FIELD_OF_VIEW, Shot, shoot
+
+_DARKNESS = 0.45  # share of light that a shadow takes away
+_SCALED = ("rotor_pos", "prop_radius", "collision_radius", "collision_height", "collision_offset")
+_ROUGH = 24.0  # levels of brightness between neighboring pixels from which on an edge is smoothed
+
+
+def frames(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+    """The pictures (height, width, 3) uint8 of a film that JAX draws."""
+    shot = shoot(record, fps, size[0] / size[1])
+    camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW)
+    params = _enlarged(record.params, shot.scale)
+    tints = np.stack([as_rgb(color) for color in colors(len(record.labels))]) / 255
+    draw = jax.jit(functools.partial(_draw, camera=camera))
+    overlay = Overlay(record, title, shot.scale)
+    for k, row in enumerate(shot.rows):
+        state = State(*(getattr(record, name)[row] for name in ("pos", "quat", "vel", "omega", "rpm")))
+        picture, depth = draw(shot.scene, params, state, shot.eyes[k], shot.targets[k], tints)
+        yield overlay.draw(np.asarray(picture), np.asarray(depth), _lens(shot, k, size), int(row), k / fps)
+
+
+def _lens(shot: Shot, k: int, size: tuple[int, int]) -> Lens:
+    return Lens(shot.eyes[k], shot.targets[k], FIELD_OF_VIEW, size)
+
+
+def _enlarged(params: Params, scale: float) -> Params:
+    """Parameters of drones that look larger."""
+    names = {field.name for field in dataclasses.fields(params)}
+    return params.replace(**{name: scale * jnp.asarray(getattr(params, name)) for name in _SCALED if name in names})
+
+
+def _draw(scene, params: Params, state: State, eye: Array, target: Array, tints: Array, camera: Camera):
+    """A picture (h, w, 3) uint8 with shadows and without jagged edges, and its depth (h, w), m."""
+    images = view(scene, params, state, eye, target, camera, tints)
+    picture = images.rgb[..., :3].astype(jnp.float32)
+    if scene.ground:
+        picture = picture * (1 - _DARKNESS * _shadow(images, params, state, eye, target, camera))[..., None]
+    return _smooth(picture), images.depth
+
+
+def _shadow(images: Images, params: Params, state: State, eye: Array, target: Array, camera: Camera) -> Array:
+    """(h, w) how much of each pixel is in the shadow that hubs and rotors, as discs, cast on the ground, 0 to 1."""
+    height, width = images.depth.shape
+    forward, left, up = Lens.axes_of(eye, target, jnp)
+    u = camera.slopes[0] * (1 - (2 * jnp.arange(width)[None] + 1) / width)
+    v = camera.slopes[1] * (1 - (2 * jnp.arange(height)[:, None] + 1) / height)
+    x, y = (eye[i] + images.depth * (forward[i] + u * left[i] + v * up[i]) for i in range(2))
+    pixel = 1.5 * camera.slopes[1] / height * images.depth
+    rotors = jax.vmap(lambda pos, quat, places: pos[None] + jax.vmap(rotation.rotate, (None, 0))(quat, places))(
+        state.pos, state.quat, params.rotor_pos
+    )
+    centers = jnp.concatenate([state.pos, rotors.reshape(-1, 3)])
+    hubs = 0.6 * jnp.max(jnp.abs(params.rotor_pos), axis=(1, 2))
+    radii = jnp.concatenate([hubs, jnp.repeat(params.prop_radius, rotors.shape[1])])
+    sun = jnp.asarray(SUN)
+    spots = centers[:, :2] - centers[:, 2:] * (sun[:2] / sun[2])[None]
+
+    def darker(shadow: Array, disc: tuple[Array, Array]) -> tuple[Array, None]:
+        spot, radius = disc
+        inside = (radius - jnp.sqrt((x - spot[0]) ** 2 + (y - spot[1]) ** 2)) / pixel
+        return jnp.maximum(shadow, jnp.clip(inside + 0.5, 0, 1)), None
+
+    shadow = jax.lax.scan(darker, jnp.zeros_like(x), (spots, radii), unroll=10)[0]
+    return jnp.where(images.segmentation == 0, shadow, 0)
+
+
+def _smooth(picture: Float[Array, "h w 3"]) -> UInt8[Array, "h w 3"]:
+    """A picture whose edges are averaged over their neighborhood."""
+    padded = jnp.pad(picture, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    height, width = picture.shape[:2]
+    around = [padded[i : i + height, j : j + width] for i, j in ((1, 1), (0, 1), (1, 0), (1, 2), (2, 1))]
+    mean = (around[0] + sum(around)) / 6
+    gray = [x[..., 1] for x in around]  # green is most of the brightness
+    contrast = functools.reduce(jnp.maximum, gray) - functools.reduce(jnp.minimum, gray)
+    return jnp.round(jnp.where((contrast > _ROUGH)[..., None], mean, picture)).astype(jnp.uint8)

@@ -1,0 +1,97 @@
+"""Films of recorded flights: by the page in a browser where there is one, else by the cameras of JAX."""
+
+import contextlib
+from collections.abc import Callable, Generator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.checks import check_choice
+from jaxdrones.flights.record import Record
+from jaxdrones.visualization import video
+from jaxdrones.visualization.browser import find_browser
+from jaxdrones.visualization.shots import shoot
+
+FPS = 24
+SIZE = (1280, 720)
+
+
+def choose_renderer(renderer: str | None, path: Path) -> str:
+    """The renderer of a film, by default the page where there is a browser, else JAX.
+
+    Raises:
+        ValueError: an unknown renderer, or something that it or the kind of film needs is not there.
+    """
+    video.check_video(path)
+    if renderer is None:
+        return "page" if find_browser() else "jax"
+    check_choice("renderer", renderer, RENDERERS)
+    if renderer == "page" and not find_browser():
+        raise ValueError("there is no Chromium for --renderer page; install it, or take --renderer jax")
+    if renderer == "bullet":
+        from jaxdrones.visualization import replay  # noqa: F401  says which extra to install
+    return renderer
+
+
+def film(
+    record: Record,
+    path: Path,
+    title: str,
+    renderer: str | None = None,
+    fps: int = FPS,
+    size: tuple[int, int] = SIZE,
+    on_frame: Callable[[float], Any] = lambda share: None,
+) -> int:
+    """Write a film of a flight, with drones in colors of their own, trails, targets and a clock.
+
+    Bullet draws all drones alike, neither trails nor targets, and no clock.
+
+    Args:
+        record: the flight.
+        path: path of the film, .mp4 or .gif.
+        title: what is written above.
+        renderer: one of `RENDERERS`; what `choose_renderer` chooses when left out.
+        fps: frames per simulated second.
+        size: width and height, pixels; even numbers.
+        on_frame: function that is called with the share of the film that is done, after every frame.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        ValueError: something that is needed is not there, or no state of the flight is finite.
+        OSError: the film cannot be written.
+    """
+    frames = RENDERERS[choose_renderer(renderer, path)](record, title, fps, size)
+
+    def reported() -> Iterator[np.ndarray]:
+        for k, frame in enumerate(frames):
+            yield frame
+            on_frame(min(1.0, (k + 1) / max(1, round(record.t[-1] * fps))))
+
+    with contextlib.closing(frames):
+        return video.write(reported(), path, fps)
+
+
+def _by_page(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+    from jaxdrones.visualization.viewer import film, show
+
+    shot = shoot(record, fps, size[0] / size[1])
+    return film.frames(show(record, scene=shot.scene, title=title), fps, size, shot)
+
+
+def _by_jax(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+    from jaxdrones.visualization import drawn_film  # needs Pillow
+
+    return drawn_film.frames(record, title, fps, size)
+
+
+def _by_bullet(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+    from jaxdrones.visualization import replay  # needs pybullet
+
+    return replay.frames(record, title, fps, size)
+
+
+RENDERERS = {"page": _by_page, "jax": _by_jax, "bullet": _by_bullet}
+"""What draws films: the viewer's page in Chromium, the cameras of JAX, or Bullet's TinyRenderer."""

@@ -1,0 +1,122 @@
+"""Figures of trainings, with what the seeds have in common. They need matplotlib (extra `cli`)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.visualization import style
+from jaxdrones.visualization.palette import COLORS, colors
+
+PANELS = {
+    "reward": "reward per step, in training",
+    "evaluated_return": "return of an episode, evaluated",
+    "success": "success, evaluated",
+    "evaluated_error": "median error in the end (m), evaluated",
+}
+_MEDIAN, _BAND = COLORS[-1], "#b4bac1"
+_GRID = 400
+_MOST_NAMED = 7  # runs that have lines and names of their own
+
+
+def save_curves(
+    histories: Mapping[str, Sequence[Mapping[str, float]]],
+    path: Path,
+    title: str,
+    interval: Callable[[float], tuple[float, float]] | None = None,
+) -> None:
+    """Draw learning curves over the number of control steps.
+
+    Each run is a line. Several runs have their median besides, and a band from the lowest to the highest of them. The
+    success of a single run has its confidence interval.
+
+    Args:
+        histories: label -> rows of progress.csv, as `training.run.Run.history` returns them.
+        path: path of the picture.
+        title: title of the figure.
+        interval: function that returns the 95 % interval of a success rate; without it none is drawn.
+    """
+    from matplotlib.ticker import EngFormatter
+
+    with style.figure(13, 9) as figure:
+        axes = figure.subplots(2, 2, sharex=True).ravel()
+        for axis, (name, label) in zip(axes, PANELS.items(), strict=True):
+            curves = {run: points for run, rows in histories.items() if len(points := _points(rows, name))}
+            _draw_runs(axis, curves, list(histories))
+            if len(curves) > 1:
+                steps, median, lowest, highest = spread(list(curves.values()))
+                axis.fill_between(steps, lowest, highest, color=_BAND, alpha=0.5, linewidth=0)
+                axis.plot(steps, median, color=_MEDIAN, linewidth=2.6)
+            elif curves and name == "success" and interval is not None:
+                points = next(iter(curves.values()))
+                intervals = np.transpose([interval(success) for success in points[:, 1]])
+                axis.fill_between(points[:, 0], *intervals, color=_BAND, alpha=0.5, linewidth=0)
+            if name == "evaluated_error" and curves and min(points[:, 1].min() for points in curves.values()) > 0:
+                axis.set_yscale("log")
+                axis.yaxis.set_major_formatter("{x:g}")
+            elif name == "reward" and curves:
+                longest = max(map(len, curves.values()))
+                padded = [np.pad(x[:, 1], (0, longest - len(x)), constant_values=np.nan) for x in curves.values()]
+                axis.set_ylim(*style.limits(np.stack(padded, axis=1)))
+            axis.set_title(label)
+        axes[2].set_ylim(-0.03, 1.03)
+        axes[2].yaxis.set_major_formatter("{x:.0%}")
+        for axis in axes[2:]:
+            axis.set_xlabel("control steps flown")
+            axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
+        figure.suptitle(title + "\n")
+        handles = _handles(list(histories), interval is not None)
+        if handles:
+            figure.legend(handles=handles, loc="outside lower center", ncols=5)
+        figure.savefig(path, dpi=style.DPI)
+
+
+def spread(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Median, lowest and highest of several curves where all of them have values.
+
+    Args:
+        curves: (p, 2) points of each, number of steps and value; between its points a curve is a straight line.
+
+    Returns:
+        Numbers of steps, medians, lowest and highest values, each (s,); nothing of curves that do not overlap.
+    """
+    begin, end = max(points[0, 0] for points in curves), min(points[-1, 0] for points in curves)
+    between = np.linspace(begin, max(begin, end), _GRID)  # where curves cross between their points
+    steps = np.unique(np.concatenate([between, *(points[:, 0] for points in curves)]))
+    steps = steps[(steps >= begin) & (steps <= end)]
+    values = np.stack([np.interp(steps, *points.T) for points in curves])
+    return steps, np.median(values, axis=0), values.min(axis=0), values.max(axis=0)
+
+
+def _points(rows: Sequence[Mapping[str, float]], name: str) -> np.ndarray:
+    """(p, 2) numbers of steps and values, where there are values."""
+    points = [(row["steps"], row[name]) for row in rows if name in row and np.isfinite(row[name])]
+    return np.array(sorted(points)).reshape(-1, 2)
+
+
+def _draw_runs(axis: Any, curves: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
+    tints = dict(zip(names, _tints(len(names)), strict=True))
+    for name, points in curves.items():
+        marker = "o" if len(points) < 60 else None
+        alone = len(names) == 1
+        axis.plot(*points.T, color=tints[name], linewidth=1.8 if alone else 1.2, marker=marker, markersize=4)
+
+
+def _tints(runs: int) -> tuple[str, ...]:
+    return colors(runs) if runs <= _MOST_NAMED else (_BAND,) * runs
+
+
+def _handles(names: Sequence[str], has_interval: bool) -> list[Any]:
+    """The lines of the legend."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    def band(label: str) -> Any:
+        return Patch(facecolor=_BAND, alpha=0.5, label=label)
+
+    if len(names) == 1:
+        return [band("95 % interval")] * has_interval
+    runs = [Line2D([], [], color=tint, label=name) for tint, name in zip(_tints(len(names)), names, strict=True)]
+    median = Line2D([], [], color=_MEDIAN, linewidth=2.6, label=f"median of {len(names)}")
+    return [*(runs if len(names) <= _MOST_NAMED else []), median, band("lowest to highest")]

@@ -1,0 +1,130 @@
+"""Panels of a figure that show the paths of a flight: in three dimensions, and in the plane in which it is largest."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdrones import rotation
+from jaxdrones.flights.record import Record
+from jaxdrones.sensing import Mesh, Scene
+from jaxdrones.sensing.files import File
+from jaxdrones.visualization import style
+
+_SMALLEST = 0.2  # m, range of a panel
+_MOST_OBSTACLES = 400
+_CORNERS = 180  # of the outline of an obstacle
+_OUTLINE: dict[str, Any] = {"facecolor": "#c9ced3", "edgecolor": "#9aa1a8", "linewidth": 0.8, "zorder": 0}
+_START: dict[str, Any] = {
+    "marker": "o",
+    "markersize": 7,
+    "markerfacecolor": "white",
+    "markeredgewidth": 1.8,
+    "linestyle": "none",
+}
+_GOAL: dict[str, Any] = {"marker": "x", "markersize": 9, "markeredgewidth": 2.2, "linestyle": "none"}
+_END: dict[str, Any] = {"marker": "o", "markersize": 7, "linestyle": "none"}
+
+
+def widest_plane(pos: np.ndarray) -> tuple[int, int]:
+    """The two axes along which positions (K, n, 3) extend most, in the order x, y, z; x and z of a vertical line."""
+    extent = [np.ptp(style.limits(pos[..., axis])) for axis in range(3)]
+    first, second = np.argsort([-extent[0], -extent[1], -extent[2]], kind="stable")[:2]
+    if extent[second] < 0.1 * extent[first]:
+        second = {0: 1, 1: 0, 2: 0}[int(first)]
+    return min(first, second), max(first, second)
+
+
+def draw_plane(axis: Any, record: Record, colors: Sequence[str]) -> None:
+    """Draw the paths in the widest plane, at the same scale along both axes, and obstacles as their outlines."""
+    plane = list(widest_plane(record.pos))
+    names = ["xyz"[k] for k in plane]
+    axis.set_title({"xy": "path from above", "xz": "path from the side", "yz": "path from the side"}["".join(names)])
+    for outline in outlines(record.scene, *np.eye(3)[plane]):
+        axis.fill(*outline.T, **_OUTLINE)
+    if record.scene.ground and plane[1] == 2:
+        axis.axhline(0, color="#9aa1a8", linewidth=1.2, zorder=0)
+    for i, color in enumerate(colors):
+        axis.plot(*record.target_pos[:, i, plane].T, color=color, **style.TARGET)
+        axis.plot(*record.pos[:, i, plane].T, color=color)
+        axis.plot(*record.target_pos[-1, i, plane].T, color=color, **_GOAL)
+        axis.plot(*record.pos[0, i, plane].T, color=color, **_START)
+        axis.plot(*record.pos[-1, i, plane].T, color=color, **_END)
+    (left, right), (low, high) = _ranges(record, plane)
+    wide, tall = max(right - left, (high - low) / 1.5), max(high - low, (right - left) / 1.5)  # neither a strip
+    middle, height = (left + right) / 2, (low + high) / 2
+    axis.set(xlim=(middle - wide / 2, middle + wide / 2), ylim=(height - tall / 2, height + tall / 2))
+    axis.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
+    axis.set_aspect("equal")
+
+
+def draw_space(axis: Any, record: Record, colors: Sequence[str]) -> None:
+    """Draw the paths in three dimensions, with their shadows on the floor of the panel."""
+    ranges = _ranges(record, [0, 1, 2])
+    floor = ranges[2][0]
+    for i, color in enumerate(colors):
+        x, y, z = _inside(record.pos[:, i], ranges).T
+        axis.plot(x, y, np.full_like(z, floor), color="#c3c8cd", linewidth=1.2)
+        axis.plot(*_inside(record.target_pos[:, i], ranges).T, color=color, **style.TARGET)
+        axis.plot(x, y, z, color=color)
+        axis.plot(*record.target_pos[-1:, i].T, color=color, **_GOAL)
+        axis.plot(*record.pos[:1, i].T, color=color, **_START)
+        axis.plot(*record.pos[-1:, i].T, color=color, **_END)
+    axis.set(xlim=ranges[0], ylim=ranges[1], zlim=ranges[2], xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    spans = np.ptp(ranges, axis=1)
+    axis.set_box_aspect(np.maximum(spans, 0.5 * spans.max()), zoom=0.95)
+    axis.view_init(elev=26, azim=-55)
+    axis.locator_params(nbins=4)
+    axis.tick_params(labelsize=12, pad=3)
+    for side in (axis.xaxis, axis.yaxis, axis.zaxis):
+        side.labelpad = 10
+    axis.set_title("path")
+
+
+def legend_handles(record: Record) -> list[Any]:
+    """Lines for a legend that explain what all drones of a figure have in common."""
+    from matplotlib.lines import Line2D
+
+    looks = {"start": _START, "end": _END}
+    if np.isfinite(record.target_pos).any():
+        looks = {"commanded": style.TARGET, "last target": _GOAL} | looks
+    elif np.isfinite(record.target_vel).any():
+        looks = {"commanded": style.TARGET} | looks
+    return [Line2D([], [], color="#555555", label=label, **look) for label, look in looks.items()]
+
+
+def outlines(scene: Scene, right: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
+    """Outlines (c, 2) of the obstacles of a scene, seen along the cross product of two directions (3,).
+
+    Scenes with more than 400 obstacles have none, and so have URDF files.
+    """
+    solids = [solid.bounding_box() if isinstance(solid, Mesh) else solid for solid in scene.numbered.values()]
+    if len(solids) > _MOST_OBSTACLES:
+        return []
+    angles = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
+    directions = np.cos(angles)[:, None] * right + np.sin(angles)[:, None] * up
+    found = []
+    for solid in solids:
+        if isinstance(solid, File):
+            continue
+        local = jax.vmap(rotation.rotate_inverse, (None, 0))(solid.quat, directions)
+        reach = np.asarray(jax.vmap(solid.extent)(local) + solid.rounding)
+        following = np.roll(reach, -1)
+        # the tangents at two neighboring directions meet at reach along the first and this much to its left
+        aside = (following - reach * np.cos(angles[1])) / np.sin(angles[1])
+        left = -np.sin(angles)[:, None] * right + np.cos(angles)[:, None] * up
+        corners = np.asarray(solid.pos) + reach[:, None] * directions + aside[:, None] * left
+        found.append(np.stack([corners @ right, corners @ up], axis=1))
+    return found
+
+
+def _ranges(record: Record, axes: Sequence[int]) -> list[tuple[float, float]]:
+    both = np.concatenate([record.pos, record.target_pos], axis=1)
+    return [style.limits(both[..., axis], _SMALLEST) for axis in axes]
+
+
+def _inside(path: np.ndarray, ranges: Sequence[tuple[float, float]]) -> np.ndarray:
+    """A path (K, 3) without its points outside of the ranges, which axes in three dimensions do not cut off."""
+    low, high = np.transpose(ranges)
+    return np.where(((path >= low) & (path <= high)).all(axis=1, keepdims=True), path, np.nan)

@@ -1,0 +1,166 @@
+"""Where the camera of a film is: as close as the whole team allows, and where obstacles do not hide it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxdrones.flights.record import Record
+from jaxdrones.sensing import Mesh, Scene, Urdf, from_urdf, ray
+
+FIELD_OF_VIEW = 45.0  # degrees, vertical
+_FAR = 1e6  # m; states beyond are not shown
+_FILLED = 0.85  # share of the picture, along each side, that the team may fill
+_LARGE = 0.06  # height of a drone over that of the picture from which on a camera that stands still is close enough
+_WINDOW = 1.2  # s around each time of which a moving camera shows all positions, so that it moves calmly
+_SCALES = (1.0, 3.0, 10.0)  # of the size of drones
+_SMALL = 0.03  # height of a drone over that of the picture below which it is drawn larger
+_ELEVATIONS = (0.46, 0.9)  # rad, of the camera above the team
+_AZIMUTHS = np.deg2rad([229, 139, 319, 49, 184, 274, 94, 4])  # of the camera, the preferred ones first
+_LOOKS, _LOOKED_AT = 24, 8  # times and drones for which sight lines are counted
+_POINTS = 3000  # of a flight, most that are kept in view
+_CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)  # of a box of size 1
+_BLOCKING = 0.2  # share of the sight lines from which on an obstacle is left out
+
+
+class Shot(NamedTuple):
+    """The camera of a film of F frames, and what it films."""
+
+    rows: np.ndarray
+    """(F,) row of the record in every frame."""
+    eyes: np.ndarray
+    """(F, 3) position of the camera, m, world."""
+    targets: np.ndarray
+    """(F, 3) what is in the middle of the picture, m, world."""
+    scene: Scene
+    """Boxes, spheres, cylinders and capsules, without those that would hide the team."""
+    scale: float
+    """How many times as large as they are drones are drawn; above 1 where they would be too small to be seen."""
+
+
+def shoot(record: Record, fps: int, aspect: float) -> Shot:
+    """Choose the camera of a film that has a frame for every 1/fps of simulated time, at least one.
+
+    The camera stands still if it can show the whole flight with drones that are large enough. Otherwise it follows the
+    box around the team. It looks from the direction in which obstacles hide the team least; an obstacle that still
+    hides it in a fifth of the sight lines, such as a ceiling, is left out.
+
+    Args:
+        record: the flight.
+        fps: frames per second.
+        aspect: width of the picture over its height.
+
+    Raises:
+        ValueError: no state of the flight is finite.
+    """
+    finite, rows = _finite_rows(record), rows_of_frames(record, fps)
+    reach = float(np.max(np.linalg.norm(record.params.rotor_pos, axis=-1).max(-1) + record.params.prop_radius))
+    directions = _directions()
+    everything = np.concatenate([record.pos[finite], record.target_pos[finite]], axis=1).reshape(-1, 3).astype(float)
+    everything = everything[np.isfinite(everything).all(axis=1)]
+    everything = everything[:: max(1, len(everything) // _POINTS)]
+    middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    points = (everything - middle)[None]
+    if reach / (_distance(points, reach, directions[0], aspect)[0] * _slope()) >= _LARGE:
+        middle, points = (np.broadcast_to(x, (len(rows), *x.shape[-k:])) for x, k in ((middle, 1), (points, 2)))
+    else:
+        team = record.pos[rows].astype(float)
+        low, high = _calm(team.min(axis=1), team.max(axis=1), round(_WINDOW / 2 * fps))
+        middle, points = (low + high) / 2, (high - low)[:, None] * _CORNERS
+    scene = only_shapes(record.scene)
+    some = np.unique(np.linspace(0, len(rows) - 1, _LOOKS).round().astype(int))
+    seen = record.pos[rows[some], :_LOOKED_AT]
+    eyes = np.stack([middle + _distance(points, reach, d, aspect)[:, None] * d for d in directions])
+    hidden = _hidden(scene, eyes[:, some], seen)  # (obstacles, directions, sight lines)
+    best = int(np.argmin(hidden.any(axis=0).mean(axis=-1).round(1)))
+    scene = _without(scene, hidden[:, best].mean(axis=-1) > _BLOCKING)
+    smallest = reach / (np.linalg.norm(eyes[best] - middle, axis=1).max() * _slope())
+    scale = next((scale for scale in _SCALES if scale * smallest > _SMALL), _SCALES[-1])
+    return Shot(rows, eyes[best], middle, scene, scale)
+
+
+def rows_of_frames(record: Record, fps: int) -> np.ndarray:
+    """The row (F,) nearest to the time of every frame, at least one, in which the pose of every drone is a number.
+
+    Raises:
+        ValueError: no state of the flight is finite.
+    """
+    finite = _finite_rows(record)
+    if not len(finite):
+        raise ValueError("the film is not written: no state of the flight is finite")
+    times = np.arange(max(1, round(record.t[-1] * fps))) / fps
+    return finite[[int(np.abs(record.t[finite] - time).argmin()) for time in times]]
+
+
+def _finite_rows(record: Record) -> np.ndarray:
+    """Rows in which the pose of every drone is a number that can be shown."""
+    poses = np.concatenate([record.pos, record.quat], axis=-1)
+    return np.flatnonzero((np.abs(poses) < _FAR).all(axis=(1, 2)))
+
+
+def only_shapes(scene: Scene) -> Scene:
+    """A scene of boxes, spheres, cylinders and capsules: a mesh is its bounding box, a URDF what collides in it."""
+    solids: list = []
+    for solid in scene.numbered.values():
+        if isinstance(solid, Urdf):
+            solids += only_shapes(from_urdf(solid.path, solid.pos, solid.quat, ground=False)).numbered.values()
+        else:
+            solids.append(solid.bounding_box() if isinstance(solid, Mesh) else solid)
+    return Scene.of(*solids, ground=scene.ground)
+
+
+def _slope() -> float:
+    return float(np.tan(np.deg2rad(FIELD_OF_VIEW) / 2))
+
+
+def _directions() -> list[np.ndarray]:
+    """Unit vectors from the team to the camera, the preferred ones first."""
+    return [
+        np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+        for up in _ELEVATIONS
+        for around in _AZIMUTHS
+    ]
+
+
+def _calm(low: np.ndarray, high: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes that hold those given and change slowly: means of boxes that hold all within `half` frames."""
+
+    def windows(x: np.ndarray) -> np.ndarray:
+        padded = np.pad(x, ((half, half), (0, 0)), mode="edge")
+        return np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
+
+    return windows(windows(low).min(axis=-1)).mean(axis=-1), windows(windows(high).max(axis=-1)).mean(axis=-1)
+
+
+def _distance(points: np.ndarray, reach: float, direction: np.ndarray, aspect: float) -> np.ndarray:
+    """Distances (F,) at which a camera in a direction shows points (F, m, 3), and `reach` m around them, m."""
+    right = np.cross([0, 0, 1.0], direction)
+    right /= np.linalg.norm(right)
+    up = np.cross(direction, right)
+    tall = _FILLED * _slope()
+    across = np.maximum((np.abs(points @ right) + reach) / (tall * aspect), (np.abs(points @ up) + reach) / tall)
+    return (across + points @ direction).max(axis=1)
+
+
+def _hidden(scene: Scene, eyes: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(k, d, F n) which of k obstacles are between the camera (d, F, 3), in d directions, and the drones (F, n, 3)."""
+    ends = jnp.asarray(np.broadcast_to(seen, (len(eyes), *seen.shape)).reshape(-1, 3))
+    begins = jnp.asarray(np.repeat(eyes[:, :, None], seen.shape[1], axis=2).reshape(-1, 3))
+
+    def hits(begin: Float[jax.Array, "3"], end: Float[jax.Array, "3"], solid) -> jax.Array:
+        return ray(Scene.of(solid, ground=False), begin, end - begin) < 1
+
+    lines = jax.vmap(hits, (0, 0, None))
+    found = [jax.jit(jax.vmap(lines, (None, None, 0)))(begins, ends, kind) for kind in scene.shapes(ends.dtype)]
+    none = np.zeros((0, len(ends)), bool)
+    return np.concatenate([none, *found]).reshape(-1, len(eyes), seen.shape[0] * seen.shape[1])
+
+
+def _without(scene: Scene, left_out: Sequence[bool] | np.ndarray) -> Scene:
+    kept = [solid for i, solid in scene.numbered.items() if not left_out[i]]
+    return Scene.of(*kept, ground=scene.ground)

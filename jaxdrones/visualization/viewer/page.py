@@ -1,0 +1,58 @@
+"""The page as a file, and in a notebook."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import html
+import os
+from pathlib import Path
+
+_TEMPLATE = Path(__file__).with_name("page.html")
+
+
+@dataclasses.dataclass(frozen=True)
+class Page:
+    """One page of HTML that plays flights; it needs nothing from the network. Notebooks show it as it is."""
+
+    title: str
+    payload: str
+    """As `payload.encode` made it."""
+    height: int = 600
+    """Height in a notebook, pixels."""
+
+    @property
+    def html(self) -> str:
+        """The page as text."""
+        return _template().replace("@TITLE@", html.escape(self.title)).replace("@PAYLOAD@", self.payload)
+
+    def save(self, path: str | os.PathLike) -> Path:
+        """Write the page as a file, which any browser opens, and its folder if there is none; returns its path.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.html, encoding="utf-8")
+        return path
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{html.escape(self.html)}" title="{html.escape(self.title)}" sandbox="allow-scripts" '
+            f'allow="fullscreen" style="width: 100%; height: {self.height}px; border: 0"></iframe>'
+        )
+
+    def __repr__(self) -> str:
+        return f"Page({self.title!r}, {len(self.payload) / 1e6:.1f} MB of data)"
+
+
+@functools.cache
+def _template() -> str:
+    try:
+        return _TEMPLATE.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ImportError(
+            f"the viewer's page is not built: {_TEMPLATE} is not there; run `make viewer` in the sources, which needs "
+            "npm, or install the wheel"
+        ) from None

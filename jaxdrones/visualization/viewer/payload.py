@@ -1,0 +1,145 @@
+"""What a page holds of flights: a JSON header and arrays of numbers, compressed, in base64.
+
+The bytes before compression are the length of the header (uint32), the header, and the arrays, all little-endian. In
+the header an array is `{"dtype", "offset", "shape", "low", "step"}`. Numbers that 65,536 steps tell apart well enough
+are int16: they count steps from `low`, and are stored as differences along the first axis, modulo 2^16.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.flights.record import Record
+from jaxdrones.params import Params
+from jaxdrones.sensing.serialization import scene_to_dict
+from jaxdrones.visualization.palette import COLORS, as_rgb
+from jaxdrones.visualization.shots import only_shapes
+
+_LARGEST_ERROR = {"pos": 5e-5, "targets": 5e-5}  # m, of rounding to int16
+_FARTHEST = 10.0  # m: depth of a black pixel, unless all is nearer
+_LEVELS = 65535  # steps of an int16 beside the first
+_CONSTANTS = ("rotor_pos", "prop_radius", "rotor_spin", "kf", "mass", "inertia", "gravity")  # that the page needs
+
+
+class _Arrays:
+    """Arrays one after the other, and where each is."""
+
+    def __init__(self) -> None:
+        self.data: list[bytes] = []
+        self.size = 0
+
+    def add(self, array: np.ndarray, largest_error: float = math.inf) -> dict[str, Any]:
+        """Append an array (K, ...); returns its entry in the header."""
+        columns = array.shape[-1] if array.ndim > 1 else 1
+        rows = np.asarray(array, float).reshape(-1, columns)
+        finite = bool(np.isfinite(rows).all())
+        with np.errstate(over="ignore"):
+            low, step = rows.min(axis=0), np.ptp(rows, axis=0) / _LEVELS
+        if array.ndim > 1 and finite and np.isfinite(step).all() and (step / 2 <= largest_error).all():
+            counts = np.round((rows - low) / np.where(step > 0, step, 1)) - 32768
+            whole = counts.astype(np.int16).reshape(array.shape)
+            differences = np.diff(whole, axis=0, prepend=np.zeros_like(whole[:1]))  # wraps around, and so back
+            entry = {"dtype": "i2", "low": low.tolist(), "step": step.tolist()}
+            return entry | self._append(differences.astype("<i2"))
+        with np.errstate(over="ignore"):  # beyond float32: infinite, and not shown
+            return {"dtype": "f4"} | self._append(np.asarray(array, "<f4"))
+
+    def add_bytes(self, array: np.ndarray) -> dict[str, Any]:
+        """Append an array of uint8; returns its entry in the header."""
+        return {"dtype": "u1"} | self._append(array)
+
+    def _append(self, array: np.ndarray) -> dict[str, Any]:
+        data = array.tobytes()
+        entry = {"offset": self.size, "shape": list(array.shape)}
+        padding = -len(data) % 4
+        self.data.append(data + bytes(padding))
+        self.size += len(data) + padding
+        return entry
+
+
+def encode(records: Sequence[Record], names: Sequence[str], title: str, **looks: Any) -> str:
+    """The payload of a page.
+
+    Args:
+        records: the flights, one world each.
+        names: of the worlds.
+        title: of the page.
+        looks: further entries of the header, as the page reads them.
+    """
+    arrays = _Arrays()
+    vehicles: list[dict[str, Any]] = []
+    scenes: list[dict[str, Any]] = []
+    worlds = []
+    for record, name in zip(records, names, strict=True):
+        world: dict[str, Any] = {"name": name, "labels": list(record.labels), "t": arrays.add(record.t)}
+        for array in ("pos", "quat", "vel", "omega", "rpm"):
+            world[array] = arrays.add(getattr(record, array), _LARGEST_ERROR.get(array, math.inf))
+        for entry, target in (("targets", record.target_pos), ("target_vel", record.target_vel)):
+            known = bool(np.isfinite(target).any())
+            world[entry] = arrays.add(target, _LARGEST_ERROR.get(entry, math.inf)) if known else None
+        world["vehicle"] = [_index(vehicles, vehicle) for vehicle in _vehicles(record.params)]
+        world["images"] = [
+            {"name": kind, "t": arrays.add(images.t), "frames": arrays.add_bytes(_pixels(kind, images.frames))}
+            for kind, images in record.images.items()
+        ]
+        world["scene"] = _index(scenes, scene_to_dict(only_shapes(record.scene)))
+        worlds.append(world)
+    header = {"title": title, "worlds": worlds, "vehicles": vehicles, "scenes": scenes} | looks
+    text = json.dumps(header, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    data = len(text).to_bytes(4, "little") + text + b"".join(arrays.data)
+    return base64.b64encode(zlib.compress(data, 6)).decode()
+
+
+def decode(payload: str) -> dict[str, Any]:
+    """The header of a payload with arrays in place of their entries, as the page reads it."""
+    data = zlib.decompress(base64.b64decode(payload))
+    start = 4 + int.from_bytes(data[:4], "little")
+    return _resolved(json.loads(data[4:start]), data[start:])
+
+
+def _resolved(value: Any, data: bytes) -> Any:
+    if isinstance(value, list):
+        return [_resolved(x, data) for x in value]
+    if not isinstance(value, dict):
+        return value
+    if "dtype" not in value:
+        return {name: _resolved(x, data) for name, x in value.items()}
+    stored = np.frombuffer(data, "<" + value["dtype"], math.prod(value["shape"]), value["offset"])
+    stored = stored.reshape(value["shape"])
+    if value["dtype"] != "i2":
+        return stored
+    counts = np.cumsum(stored, axis=0, dtype=np.int16).astype(float) + 32768
+    return (value["low"] + value["step"] * counts).astype(np.float32)
+
+
+def _pixels(kind: str, frames: np.ndarray) -> np.ndarray:
+    """Images as uint8 (F, n, height, width, channels): depth as shades of grey, near is bright; 1, 3 or 4 channels."""
+    if kind == "depth":
+        seen = frames[np.isfinite(frames)]
+        farthest = max(1e-6, min(_FARTHEST, float(seen.max()))) if seen.size else 1.0
+        grey = 1 - np.clip(np.nan_to_num(frames, nan=np.inf), 0, farthest) / farthest
+        return np.round(255 * grey).astype(np.uint8)[..., None]
+    if kind == "segmentation":
+        colors = np.array([as_rgb(color) for color in COLORS], np.uint8)
+        return np.where(frames[..., None] < 0, np.uint8(255), colors[frames % len(colors)])
+    return np.asarray(frames, np.uint8)
+
+
+def _index(known: list[dict[str, Any]], entry: dict[str, Any]) -> int:
+    if entry not in known:
+        known.append(entry)
+    return known.index(entry)
+
+
+def _vehicles(params: Params) -> list[dict[str, Any]]:
+    """What the page needs to know of each drone of a team."""
+    constants = {name: np.asarray(getattr(params, name), float).tolist() for name in _CONSTANTS}
+    return [{name: values[i] for name, values in constants.items()} for i in range(len(constants["mass"]))]

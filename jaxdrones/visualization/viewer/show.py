@@ -1,0 +1,242 @@
+"""Showing what flew: trajectories, records, logs, episodes; one or many worlds."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxdrones.checks import check_choice, check_params, check_positive, shown
+from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.sensing.scene import check_scene
+from jaxdrones.state import State
+from jaxdrones.visualization.palette import DISTINCT, colors
+from jaxdrones.visualization.viewer.page import Page
+from jaxdrones.visualization.viewer.payload import encode
+
+LAYOUTS = {"ghosts": "ghosts", "side by side": "grid", "hidden": "alone"}
+"""How other worlds than the chosen one are shown at first -> what the page calls it."""
+CHANNELS = {"rgb": True, "depth": False, "segmentation": False}
+"""Kinds of images -> whether a pixel is several numbers."""
+_MOST = 2_000_000  # states of drones in a page, which are 60 MB
+
+
+def show(
+    flight: Any,
+    params: Params | None = None,
+    *,
+    dt: float | None = None,
+    scene: Scene | None = None,
+    targets: ArrayLike | None = None,
+    labels: Sequence[str] | None = None,
+    images: Mapping[str, ArrayLike] | None = None,
+    others: str = "ghosts",
+    title: str | None = None,
+    height: int = 600,
+) -> Page:
+    """A page that plays flights in three dimensions, as an object that notebooks show and that `save` writes to a file.
+
+    Args:
+        flight: what to show. The trajectory that `rollout` returns, a `State` of arrays (K, n, ...), or (W, K, n, ...)
+            for W worlds; a `Record`; the episode of a policy that `fly_episode` returns; the path of a log.npz or of
+            the folder it is in; or several of these, a list or a dictionary by name, each of them a world.
+        params: of the team, with a leading drone axis. Records, logs and episodes have their own.
+        dt: time between the rows of a trajectory, s. Records, logs and episodes have their own.
+        scene: obstacles and ground; the flight's own, or a bare ground, when left out.
+        targets: positions (n, 3), (K, n, 3) or (W, K, n, 3), m, world, of a trajectory; none when left out.
+        labels: names of the drones of a trajectory; `drone 0`, ... when left out.
+        images: what the drones' cameras saw at every row of a trajectory of one world, by kind: `rgb`
+            (K, n, height, width, 3 or 4) uint8, `depth` (K, n, height, width) m, or `segmentation`.
+        others: how the worlds beside the chosen one are shown at first: `ghosts`, `side by side` or `hidden`.
+        title: title of the page; the conditions of the flight when left out.
+        height: height in a notebook, pixels.
+
+    Raises:
+        ValueError: something that is no flight, shapes that do not fit together, or so much that no browser plays it.
+    """
+    check_choice("layout of other worlds", others, LAYOUTS)
+    check_positive("height", height, "pixels")
+    of_trajectory = {"params": params, "dt": dt, "targets": targets, "labels": labels, "images": images}
+    if targets is not None:
+        of_trajectory["targets"] = np.asarray(targets, float)
+    worlds = _worlds(flight, of_trajectory)
+    records = list(worlds.values())
+    if scene is not None:
+        check_scene(scene, files=True)
+        records = [dataclasses.replace(record, scene=scene) for record in records]
+    _check_size(*(record.pos for record in records))
+    has_targets = any(np.isfinite(record.target_pos).any() for record in records)
+    title = str(records[0].conditions) if title is None else title
+    looks = {
+        "palette": colors(DISTINCT),
+        "layout": LAYOUTS[others],
+        "signals": ["distance from target" if has_targets else "position z", "rotor speeds"],  # names in plots.js
+    }
+    return Page(title, encode(records, list(worlds), title, **looks), height)
+
+
+def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, Record]:
+    """The worlds of one or several flights, by name."""
+    if isinstance(flight, Mapping):
+        named = {str(name): records_of(part, of_trajectory) for name, part in flight.items()}
+    elif isinstance(flight, list | tuple) and not isinstance(flight, State):
+        named = {f"flight {i}": records_of(part, of_trajectory) for i, part in enumerate(flight)}
+    else:
+        records = records_of(flight, of_trajectory)
+        return {f"world {i}": record for i, record in enumerate(records)}
+    if not named:
+        raise ValueError("there is no flight to show; give at least one")
+    return {
+        name if len(records) == 1 else f"{name}, world {i}": record
+        for name, records in named.items()
+        for i, record in enumerate(records)
+    }
+
+
+@functools.singledispatch
+def records_of(flight: Any, of_trajectory: dict[str, Any]) -> list[Record]:
+    """The worlds of a flight. Other modules register kinds of flights here, `@records_of.register`.
+
+    Args:
+        flight: what was given to `show`.
+        of_trajectory: arguments of `show` that only a bare trajectory needs; `None` where they were left out.
+    """
+    raise ValueError(
+        f"{shown(flight)} cannot be shown; give a trajectory of jaxdrones.rollout, a record, an episode, or the path "
+        "of a log.npz"
+    )
+
+
+def refuse(of_trajectory: dict[str, Any]) -> None:
+    """Raise if an argument is given that the flight knows itself."""
+    for name, value in of_trajectory.items():
+        if value is not None:
+            raise ValueError(f"{name} is given beside a flight that has its own; leave it out")
+
+
+@records_of.register
+def _(flight: Record, of_trajectory: dict[str, Any]) -> list[Record]:
+    refuse(of_trajectory)
+    return [flight]
+
+
+@records_of.register(str)
+@records_of.register(os.PathLike)
+def _(flight: str | os.PathLike, of_trajectory: dict[str, Any]) -> list[Record]:
+    refuse(of_trajectory)
+    return [Record.load(find_log(Path(flight)))]
+
+
+def find_log(path: Path) -> Path:
+    """The log of a path: itself, or `log.npz` or `flight/log.npz` in a folder.
+
+    Raises:
+        ValueError: there is no log.
+    """
+    if path.is_file():
+        return path
+    found = [log for log in (path / "log.npz", path / "flight" / "log.npz") if log.is_file()]
+    if not found:
+        what = "has no log of a flight" if path.is_dir() else "is not there"
+        raise ValueError(f"{path} {what}; fly first, `jaxdrones fly circle --output {path}`, or give another path")
+    return found[0]
+
+
+@records_of.register
+def _(flight: State, of_trajectory: dict[str, Any]) -> list[Record]:
+    params, dt = of_trajectory["params"], of_trajectory["dt"]
+    for name, value, what in ("params", params, "the team's"), ("dt", dt, "seconds between two rows"):
+        if value is None:
+            raise ValueError(
+                f"{name} is left out; a trajectory needs {name}, {what}: jd.show(trajectory, params, dt=1 / 120)"
+            )
+    check_positive("dt", dt, "s")
+    check_params(params)
+    _check_size(flight.pos)
+    flight = jax.tree.map(np.asarray, flight.replace(aux={}))
+    if flight.pos.ndim not in (3, 4):
+        raise ValueError(
+            f"pos of the trajectory has shape {flight.pos.shape}; give (K, n, 3) of K times and n drones, or "
+            "(W, K, n, 3) of W worlds"
+        )
+    if flight.pos.ndim == 4 and of_trajectory["images"] is not None:
+        raise ValueError(
+            "images are given beside many worlds; show one world, jax.tree.map(lambda x: x[0], trajectory)"
+        )
+    if flight.pos.ndim == 3:
+        return [_record(flight, params, of_trajectory)]
+
+    def world(tree: Any, w: int, axes: int) -> Any:
+        """One world of a tree whose first array has so many axes if it has an axis of worlds."""
+        leaves = jax.tree.leaves(tree)
+        return jax.tree.map(lambda x: np.asarray(x)[w], tree) if leaves and np.ndim(leaves[0]) == axes else tree
+
+    targets = of_trajectory["targets"]
+    return [
+        _record(world(flight, w, 4), world(params, w, 2), of_trajectory | {"targets": world(targets, w, 4)})
+        for w in range(len(flight.pos))
+    ]
+
+
+def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Record:
+    """One world of arrays (K, n, ...)."""
+    steps, n = flight.pos.shape[:2]
+    if np.shape(params.mass) != (n,):
+        raise ValueError(
+            f"params are of a team of shape {np.shape(params.mass)} and the trajectory has {n} drones; give one drone "
+            "axis, for example by jaxdrones.repeat"
+        )
+    labels = of_trajectory["labels"]
+    labels = tuple(f"drone {i}" for i in range(n)) if labels is None else tuple(map(str, labels))
+    if len(labels) != n:
+        raise ValueError(f"labels are {len(labels)} names and there are {n} drones; give as many")
+    nowhere = np.full((steps, n, 3), np.nan)
+    targets = nowhere if of_trajectory["targets"] is None else of_trajectory["targets"]
+    try:
+        targets = np.broadcast_to(targets, nowhere.shape)
+    except ValueError:
+        raise ValueError(
+            f"targets have shape {targets.shape}; give (n, 3) or (K, n, 3) of {steps} times and {n} drones"
+        ) from None
+    dt = of_trajectory["dt"]
+    return Record(
+        t=dt * np.arange(1, steps + 1),
+        **{name: getattr(flight, name) for name in ("pos", "quat", "vel", "omega", "rpm")},
+        target_pos=targets,
+        target_vel=nowhere,
+        labels=labels,
+        conditions=LoggedConditions({}, f"{n} drone{'s' * (n > 1)}, {steps * dt:g} s"),
+        params=params,
+        images=_images(of_trajectory["images"] or {}, dt * np.arange(1, steps + 1), n),
+    )
+
+
+def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str, ImageSequence]:
+    """Images at every row, checked."""
+    for name, frames in images.items():
+        check_choice("kind of images", name, CHANNELS)
+        shape = np.shape(frames)
+        if shape[:2] != (len(t), n) or len(shape) != (5 if CHANNELS[name] else 4):
+            axes = "(K, n, height, width" + (", channels)" if CHANNELS[name] else ")")
+            raise ValueError(f"images {name!r} have shape {shape}; give {axes} of {len(t)} times and {n} drones")
+    return {name: ImageSequence(t, np.asarray(frames)) for name, frames in images.items()}
+
+
+def _check_size(*positions: ArrayLike) -> None:
+    """Raise if arrays of positions (..., 3) are more than a page plays."""
+    samples = sum(math.prod(np.shape(pos)[:-1]) for pos in positions)
+    if samples > _MOST:
+        raise ValueError(
+            f"the flights have {samples:,} states of drones, more than a page plays ({_MOST:,}); give "
+            "fewer worlds, or every tenth row: jax.tree.map(lambda x: x[::10], trajectory)"
+        )

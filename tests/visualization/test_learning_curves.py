@@ -1,0 +1,50 @@
+"""Learning curves show what runs have in common and how far they differ."""
+
+import numpy as np
+import pytest
+from helpers import mostly_slow
+
+from jaxdrones.visualization.learning_curves import save_curves, spread
+
+
+def history(seed, updates=12):
+    random = np.random.default_rng(seed)
+    rows = []
+    for update in range(1, updates + 1):
+        row = {"steps": 1000.0 * update, "reward": float(random.normal())}
+        if update % 3 == 0:
+            row |= {"evaluated_return": 10.0 * update, "success": update / updates, "evaluated_error": 1 / update}
+        rows.append(row)
+    return rows
+
+
+def test_the_band_holds_every_run_and_the_median_is_in_it():
+    random = np.random.default_rng(0)
+    curves = [np.stack([np.linspace(0, 10, k), random.normal(size=k)], axis=1) for k in (5, 8, 11)]
+    steps, median, lowest, highest = spread(curves)
+    for points in curves:
+        values = np.interp(steps, *points.T)
+        assert (lowest <= values).all() and (values <= highest).all()
+        assert np.isin(points[:, 0], steps).all()
+    assert (lowest <= median).all() and (median <= highest).all()
+
+
+def test_the_band_is_where_all_runs_have_values():
+    short, long = (np.array([[0.0, 1.0], [end, 1.0]]) for end in (4, 9))
+    steps, median, lowest, highest = spread([short, long])
+    assert steps[0] == 0 and steps[-1] == 4 and (median == 1).all() and (highest - lowest == 0).all()
+    assert spread([short, np.array([[5.0, 1.0], [9.0, 1.0]])])[0].size == 0
+
+
+@pytest.mark.parametrize("runs", mostly_slow([0, 1, 3, 9], [3]))
+def test_a_figure_is_drawn_of_any_number_of_runs(runs, tmp_path):
+    from matplotlib.image import imread
+
+    histories = {f"seed {seed}": history(seed) for seed in range(runs)}
+    save_curves(histories, tmp_path / "curve.png", "a title", lambda success: (success - 0.1, success + 0.1))
+    assert imread(tmp_path / "curve.png").shape[:2] == (990, 1430)
+
+
+def test_a_run_that_was_never_evaluated_is_drawn(tmp_path):
+    save_curves({"seed 0": history(0, updates=2)}, tmp_path / "curve.png", "a title")
+    assert (tmp_path / "curve.png").stat().st_size > 1000

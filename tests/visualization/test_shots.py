@@ -1,0 +1,97 @@
+"""The camera of a film is close to the team, has all of it in the picture, and moves calmly."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from jaxdrones.flights.fly import fly
+from jaxdrones.sensing import Cylinder, Scene, Sphere, ray, room
+from jaxdrones.visualization.overlay import Lens
+from jaxdrones.visualization.shots import FIELD_OF_VIEW, shoot
+
+SIZE = (1280, 720)
+TRUNKS = np.random.default_rng(0).uniform([0, -6, 2], [20, 6, 2], (30, 3))
+
+
+@pytest.fixture(scope="module")
+def circle():
+    return fly("circle", drones=3, duration=4.0)
+
+
+def along(record, path, scene=None):
+    """The record of a flight along a path, (K,) -> (K, 3), by drones half a meter apart."""
+    offsets = 0.5 * np.arange(record.pos.shape[1])[:, None] * [0, 1, 0]
+    pos = path(record.t)[:, None] + offsets
+    nowhere = np.full_like(pos, np.nan)
+    return dataclasses.replace(record, pos=pos, target_pos=nowhere, scene=jax.device_get(scene or Scene()))
+
+
+def straight(t):
+    return np.stack([5 * t, 0.4 * np.sin(3 * t), 1 + 0.2 * t], axis=1)
+
+
+def around(t):
+    return np.stack([2 * np.cos(t), 2 * np.sin(t), 1 + 0 * t], axis=1)
+
+
+FLIGHTS = {
+    "circle": lambda record: record,
+    "20 m": lambda record: along(record, straight),
+    "forest": lambda record: along(record, straight, Scene.of(Cylinder(pos=TRUNKS, radius=0.15, height=4.0))),
+    "room": lambda record: along(record, around, room()),
+}
+
+
+@pytest.fixture(scope="module", params=FLIGHTS)
+def filmed(request, circle):
+    record = FLIGHTS[request.param](circle)
+    return record, shoot(record, 24, SIZE[0] / SIZE[1])
+
+
+def lenses(shot):
+    return [Lens(eye, target, FIELD_OF_VIEW, SIZE) for eye, target in zip(shot.eyes, shot.targets, strict=True)]
+
+
+@pytest.mark.slow
+def test_every_drone_is_in_every_picture(filmed):
+    record, shot = filmed
+    for row, lens in zip(shot.rows, lenses(shot), strict=True):
+        pixels, depth = lens.project(record.pos[row])
+        assert (depth > 0).all() and (pixels > 0).all() and (pixels < SIZE).all()
+
+
+def test_drones_are_large_enough_to_be_seen(filmed):
+    record, shot = filmed
+    width = 2 * shot.scale * np.linalg.norm(record.params.rotor_pos[0], axis=-1).max()
+    for row, lens in zip(shot.rows, lenses(shot), strict=True):
+        depth = lens.project(record.pos[row])[1]
+        assert (width * SIZE[1] / 2 / np.tan(np.deg2rad(FIELD_OF_VIEW) / 2) / depth).min() > 12  # pixels
+
+
+def test_the_camera_moves_calmly(filmed):
+    """By less than a fifth of its distance in a tenth of a second, and without a jerk."""
+    _, shot = filmed
+    distance = np.linalg.norm(shot.eyes - shot.targets, axis=1).min()
+    speed = 24 * np.diff(shot.eyes, axis=0)
+    assert np.linalg.norm(speed, axis=1).max() < 2 * distance
+    assert np.linalg.norm(np.diff(speed, axis=0), axis=1).max() < 0.2 * distance  # m/s, from frame to frame
+
+
+def test_obstacles_hide_the_team_in_a_fifth_of_the_pictures_at_most(filmed):
+    record, shot = filmed
+    see = jax.jit(jax.vmap(lambda eye, ahead: ray(shot.scene.replace(ground=False), eye, ahead)))
+    free = [np.asarray(see(shot.eyes, record.pos[shot.rows, i] - shot.eyes)) >= 1 for i in range(3)]
+    assert np.mean(free) > 0.8
+
+
+def test_a_flight_that_fits_is_filmed_by_a_camera_that_stands_still(circle):
+    shot = shoot(circle, 24, 16 / 9)
+    assert len(shot.rows) == 96 and shot.scale == 1
+    assert np.ptp(shot.eyes, axis=0).max() == 0 and np.ptp(shot.targets, axis=0).max() == 0
+
+
+def test_obstacles_that_hide_nothing_stay(circle):
+    scene = jax.device_get(Scene.of(Sphere(pos=(0.0, 0.0, -0.5), radius=0.1), Sphere(pos=(0.0, 3.0, 0.5), radius=0.1)))
+    assert shoot(dataclasses.replace(circle, scene=scene), 24, 16 / 9).scene.count == 2

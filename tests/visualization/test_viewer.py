@@ -1,0 +1,236 @@
+"""What the page holds of a flight is what was flown."""
+
+import base64
+import dataclasses
+import hashlib
+import json
+import re
+from html import unescape
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from documents import ROOT
+from helpers import flying
+
+import jaxdrones as jd
+from jaxdrones.flights.fly import fly
+from jaxdrones.flights.record import ImageSequence, Record
+from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
+from jaxdrones.visualization.viewer import show
+from jaxdrones.visualization.viewer.payload import decode
+
+ARRAYS = ("pos", "quat", "vel", "omega", "rpm")
+SCENE = Scene.of(
+    Box(pos=(1.0, 0.0, 0.5), size=(0.2, 1.0, 1.0), quat=(0.0, 0.0, 0.6, 0.8), color=(0.9, 0.3, 0.1, 1.0)),
+    Sphere(pos=(0.0, 1.0, 0.5), radius=0.25),
+    Cylinder(pos=(-1.0, 0.0, 0.75), radius=0.1, height=1.5),
+    Capsule(pos=(0.0, -1.0, 0.5), radius=0.1, height=0.5, quat=(0.6, 0.0, 0.0, 0.8)),
+    ground=False,
+)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return fly("circle", drones=2, duration=0.5)
+
+
+@pytest.fixture(scope="module")
+def team():
+    return jd.repeat(jd.load_params("cf2x"), 3)
+
+
+def trajectory(params, steps=20, seed=0, spread=0.1):
+    """States of a team on straight lines, by no law of physics."""
+    state = flying(params, seed)
+    times = spread * jnp.arange(float(steps))
+    path = jax.vmap(lambda t: state.replace(pos=state.pos + t * state.vel))(times)
+    return jax.tree.map(np.asarray, path)
+
+
+def header(page):
+    return decode(page.payload)
+
+
+def test_positions_in_the_page_equal_the_record_to_a_tenth_of_a_millimetre(record):
+    world = header(show(record))["worlds"][0]
+    np.testing.assert_allclose(world["pos"], record.pos, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(world["targets"], record.target_pos, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(world["t"], record.t, rtol=1e-6)
+    for name in ("quat", "vel", "omega", "rpm"):  # half a step of 65,536 over what each column takes
+        half = np.ptp(getattr(record, name), axis=(0, 1)).max() / 65535 / 2
+        np.testing.assert_allclose(world[name], getattr(record, name), rtol=1e-6, atol=1.01 * half)
+
+
+@pytest.mark.parametrize("extent", [1e-3, 1.0, 6.0, 7.0, 400.0])
+def test_positions_are_as_exact_in_small_and_large_flights(team, extent):
+    path = trajectory(team)
+    path = path.replace(pos=extent * (path.pos - path.pos.min()) / np.ptp(path.pos))
+    world = header(show(path, team, dt=0.01))["worlds"][0]
+    np.testing.assert_allclose(world["pos"], path.pos, rtol=0, atol=1e-4)
+
+
+def test_a_drone_that_stands_still_or_breaks_is_in_the_page_as_it_is(team):
+    path = trajectory(team)
+    broken = np.array(path.pos)
+    broken[:, 0] = 1.25
+    broken[5:, 1] = np.nan
+    broken[7:, 2] = -3e38
+    world = header(show(path.replace(pos=broken), team, dt=0.01))["worlds"][0]
+    np.testing.assert_allclose(world["pos"], broken, rtol=1e-6)
+
+
+def test_a_trajectory_of_worlds_is_as_many_worlds(team):
+    paths = jax.tree.map(lambda *x: np.stack(x), *(trajectory(team, seed=seed) for seed in range(3)))
+    worlds = header(show(paths, team, dt=0.01))["worlds"]
+    assert [world["name"] for world in worlds] == ["world 0", "world 1", "world 2"]
+    for w, world in enumerate(worlds):
+        np.testing.assert_allclose(world["pos"], paths.pos[w], rtol=0, atol=1e-4)
+
+
+def test_worlds_may_have_vehicles_targets_and_lengths_of_their_own(team, record):
+    heavy = jd.stack([jd.load_params("racer"), jd.load_params("cf2x"), jd.load_params("cf2x")])
+    goals = np.arange(9.0).reshape(3, 3)
+    one = show(trajectory(heavy, steps=5), heavy, dt=0.01, targets=goals)
+    first = header(one)
+    assert first["worlds"][0]["vehicle"] == [0, 1, 1]
+    np.testing.assert_allclose(first["vehicles"][0]["rotor_pos"], heavy.rotor_pos[0])
+    np.testing.assert_allclose(first["worlds"][0]["targets"], np.broadcast_to(goals, (5, 3, 3)), rtol=0, atol=1e-4)
+    both = header(show({"short": record, "long": fly("circle", drones=1, duration=0.7)}))
+    assert [(world["name"], len(world["t"])) for world in both["worlds"]] == [("short", 60), ("long", 84)]
+    assert len(both["vehicles"]) == 1 and len(both["scenes"]) == 1
+
+
+def test_every_obstacle_of_the_scene_is_in_the_page(record):
+    scene = header(show(record, scene=SCENE))["scenes"][0]
+    assert scene["ground"] is False
+    assert [solid["kind"] for solid in scene["obstacles"]] == ["Box", "Sphere", "Cylinder", "Capsule"]
+    for entry, solid in zip(scene["obstacles"], SCENE.obstacles, strict=True):
+        for name in entry.keys() - {"kind"}:
+            np.testing.assert_allclose(entry[name], getattr(solid, name), rtol=1e-6)
+
+
+def test_obstacles_that_are_not_active_are_not_in_the_page(record):
+    scene = Scene.of(Sphere(pos=np.zeros((3, 3)), radius=0.1, active=[True, False, True]))
+    assert len(header(show(record, scene=scene))["scenes"][0]["obstacles"]) == 2
+
+
+def test_a_log_shows_what_its_record_shows(record, tmp_path):
+    record = dataclasses.replace(record, scene=SCENE)
+    record.save_npz(tmp_path / "log.npz")
+    assert show(tmp_path, title="").payload == show(str(tmp_path / "log.npz"), title="").payload
+    assert header(show(tmp_path, title="")) | {"worlds": []} == header(show(record, title="")) | {"worlds": []}
+    loaded = Record.load(tmp_path / "log.npz")
+    for name in (*ARRAYS, "t", "rpy", "target_pos", "labels"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(record, name))
+    for ours, theirs in zip(jax.tree.leaves(loaded.params), jax.tree.leaves(record.params), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    assert jax.tree.structure(loaded.scene) == jax.tree.structure(record.scene.replace(**_active(record.scene)))
+
+
+def _active(scene):
+    """A scene that was read says of all its obstacles that they are there, or of none."""
+    return {name: getattr(scene, name) for name in ("boxes", "spheres", "cylinders", "capsules")}
+
+
+def test_a_notebook_shows_the_same_page_in_a_frame_without_rights(record):
+    page = show(record, title="<b> & 'quotes'", height=321)
+    frame = page._repr_html_()
+    assert unescape(re.search(r'srcdoc="([^"]*)"', frame)[1]) == page.html
+    assert 'sandbox="allow-scripts"' in frame and "height: 321px" in frame
+    assert "<title>&lt;b&gt; &amp;" in page.html
+
+
+def test_the_page_asks_nothing_of_the_network_and_carries_its_licence(record):
+    page = show(record).html.replace(show(record).payload, "")
+    outside = {"http://www.w3.org/1999/xhtml", "http://www.w3.org/2000/svg"}  # names, not addresses
+    assert set(re.findall(r"https?://[\w./-]+", page)) <= outside | set(
+        re.findall(r"https?://[\w./-]+", page.split("<html")[0])
+    )
+    assert not re.search(r"""(?:src|href)=["'](?!data:)""", page.split("<script", 1)[0])
+    assert "Permission is hereby granted, free of charge" in page and "three.js authors" in page
+    assert len(page) < 1.5e6
+
+
+def test_the_page_was_built_from_its_sources():
+    folder = ROOT / "viewer"
+    files = [*sorted((folder / "src").iterdir()), folder / "build.mjs", folder / "package.json"]
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+    path = ROOT / "jaxdrones" / "visualization" / "viewer" / "page.html"
+    if not path.exists():
+        pytest.skip("the page is not built: there is no npm")
+    built = path.read_text()
+    assert f"sources sha256 {digest}" in built, "the sources of the viewer have changed; run `make viewer`"
+
+
+@pytest.mark.parametrize(
+    ("flight", "arguments", "message"),
+    [
+        (lambda path: path, {"dt": 0.01}, "params is left out; a trajectory needs params"),
+        (lambda path: path, {"params": "team"}, "dt is left out; a trajectory needs dt"),
+        (lambda path: path, {"params": "team", "dt": -1.0}, "dt"),
+        (lambda path: path, {"params": "one", "dt": 0.01}, r"params are of a team of shape \(\)"),
+        (lambda path: path, {"params": "team", "dt": 0.01, "targets": np.zeros((2, 3))}, "targets have shape"),
+        (lambda path: path, {"params": "team", "dt": 0.01, "labels": ["a"]}, "labels are 1 names"),
+        (lambda path: path, {"params": "team", "dt": 0.01, "others": "ghost"}, "did you mean 'ghosts'"),
+        (lambda path: jax.tree.map(lambda x: x[0], path), {"params": "team", "dt": 0.01}, r"shape \(3, 3\)"),
+        (lambda path: 3, {}, "3 cannot be shown"),
+        (lambda path: [], {}, "give at least one"),
+        (lambda path: "nowhere/log.npz", {}, "nowhere/log.npz is not there; fly first"),
+        (lambda path: __file__, {}, "is not the log of a flight"),
+    ],
+)
+def test_a_mistake_is_one_line_that_says_what_to_do(team, flight, arguments, message):
+    known = {"team": team, "one": jd.load_params("cf2x")}
+    arguments = {
+        name: known.get(value, value) if isinstance(value, str) else value for name, value in arguments.items()
+    }
+    with pytest.raises(ValueError, match=message) as error:
+        show(flight(trajectory(team)), **arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_an_argument_that_the_flight_knows_itself_is_refused(record):
+    with pytest.raises(ValueError, match="dt is given beside a flight that has its own; leave it out"):
+        show(record, dt=0.01)
+
+
+def test_more_than_a_browser_plays_is_refused(team):
+    path = jax.tree.map(lambda x: np.broadcast_to(x[0], (1_000_000, *x.shape[1:])), trajectory(team))
+    with pytest.raises(ValueError, match="more than a page plays"):
+        show(path, team, dt=0.01)
+
+
+def test_the_payload_is_json_and_numbers_that_any_reader_finds(record):
+    import zlib
+
+    data = zlib.decompress(base64.b64decode(show(record).payload))
+    entries = json.loads(data[4 : 4 + int.from_bytes(data[:4], "little")])
+    assert entries["worlds"][0]["labels"] == ["drone 0", "drone 1"]
+    assert entries["worlds"][0]["pos"]["shape"] == [60, 2, 3]
+
+
+def test_images_of_the_cameras_are_in_the_log_and_in_the_page(team, record, tmp_path):
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (20, 3, 4, 6, 3), np.uint8)
+    depth = np.where(rng.random((20, 3, 4, 6)) < 0.5, 2.0, np.inf)
+    page = header(show(trajectory(team), team, dt=0.01, images={"rgb": rgb, "depth": depth}))
+    colors, grey = page["worlds"][0]["images"]
+    assert (colors["name"], grey["name"]) == ("rgb", "depth")
+    np.testing.assert_array_equal(colors["frames"], rgb)
+    np.testing.assert_array_equal(grey["frames"][..., 0], 0)  # what is farthest is black
+    np.testing.assert_allclose(grey["t"], 0.01 * np.arange(1, 21), rtol=1e-6)
+    images = {"rgb": ImageSequence(np.arange(3.0), rgb[:3, :2])}
+    dataclasses.replace(record, images=images).save_npz(tmp_path / "log.npz")
+    loaded = Record.load(tmp_path / "log.npz").images["rgb"]
+    np.testing.assert_array_equal(loaded.frames, images["rgb"].frames)
+    np.testing.assert_array_equal(loaded.t, images["rgb"].t)
+    with pytest.raises(ValueError, match=r"images 'depth' have shape .* of 20 times and 3 drones"):
+        show(trajectory(team), team, dt=0.01, images={"depth": rgb})
+
+
+def test_near_is_bright_in_images_of_depth(team):
+    depth = np.broadcast_to([[0.0, 2.5], [5.0, 1000.0]], (20, 3, 2, 2))
+    grey = header(show(trajectory(team), team, dt=0.01, images={"depth": depth}))["worlds"][0]["images"][0]["frames"]
+    assert grey[0, 0, ..., 0].tolist() == [[255, 191], [128, 0]]  # black from 10 m on

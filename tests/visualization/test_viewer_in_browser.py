@@ -1,0 +1,146 @@
+"""The page in a real browser, drawn in software."""
+
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxdrones.flights.fly import fly
+from jaxdrones.flights.record import ImageSequence
+from jaxdrones.sensing import obstacles_2021
+from jaxdrones.visualization import browser
+from jaxdrones.visualization.overlay import Lens
+from jaxdrones.visualization.shots import FIELD_OF_VIEW, shoot
+from jaxdrones.visualization.viewer import show
+from jaxdrones.visualization.viewer.film import film
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")]
+
+
+@pytest.fixture(scope="module")
+def record():
+    return fly("circle", drones=4, duration=2.0)
+
+
+@pytest.fixture(scope="module")
+def tab(record, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("browser")
+    with browser.open_tab() as tab:
+        tab.open(show(record, scene=obstacles_2021()).save(folder / "flight.html"))
+        yield tab
+        tab.run("1")  # what the console still has to say
+        assert tab.problems == []
+
+
+@pytest.mark.parametrize("row", [0, 1, 100, 239])
+def test_the_scene_shows_the_drones_where_the_log_says(tab, record, row):
+    positions = tab.run(f"jaxdrones.positionsAt({record.t[row]!s})")
+    np.testing.assert_allclose(positions[0], record.pos[row], rtol=0, atol=1e-4)
+
+
+def test_between_two_rows_the_drones_are_between(tab, record):
+    time = (record.t[120] + record.t[121]) / 2
+    positions = tab.run(f"jaxdrones.positionsAt({time!s})")
+    np.testing.assert_allclose(positions[0], (record.pos[120] + record.pos[121]) / 2, rtol=0, atol=1e-4)
+
+
+def test_the_view_is_not_blank(tab):
+    tab.run("jaxdrones.positionsAt(1)")
+    with Image.open(io.BytesIO(tab.screenshot())) as image:
+        view = np.asarray(image.convert("RGB"))[:400]
+    assert view.std() > 12
+    assert len(np.unique(view.reshape(-1, 3), axis=0)) > 1000
+
+
+def test_images_of_the_cameras_are_shown_as_they_were_recorded(record, tmp_path):
+    rgb = np.random.default_rng(0).integers(0, 256, (3, 4, 6, 8, 3), np.uint8)
+    images = {"rgb": ImageSequence(np.array([0.0, 0.5, 1.0]), rgb)}
+    pixels = """(() => {
+        const shown = document.querySelector("#cameras canvas"), copy = document.createElement("canvas");
+        [copy.width, copy.height] = [shown.width, shown.height];
+        copy.getContext("2d").drawImage(shown, 0, 0);
+        return [...copy.getContext("2d").getImageData(0, 0, copy.width, copy.height).data];
+    })()"""
+    with browser.open_tab() as tab:
+        tab.open(show(dataclasses.replace(record, images=images)).save(tmp_path / "flight.html"))
+        for time, frame in ((0.0, 0), (0.49, 0), (0.5, 1), (1.9, 2)):
+            tab.run(f"jaxdrones.positionsAt({time})")
+            shown = np.array(tab.run(pixels)).reshape(6, 8, 4)
+            np.testing.assert_array_equal(shown[..., :3], rgb[frame, 0])
+        tab.press("n")
+        tab.run("jaxdrones.positionsAt(0)")
+        np.testing.assert_array_equal(np.array(tab.run(pixels)).reshape(6, 8, 4)[..., :3], rgb[0, 1])
+        assert tab.problems == []
+
+
+@pytest.mark.needs("imageio_ffmpeg")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_film_of_the_page_has_the_size_that_is_asked_for_and_moves(record, tmp_path):
+    import imageio_ffmpeg
+
+    assert film(show(record), tmp_path / "flight.mp4", fps=4, size=(320, 180)) == 8
+    frames = imageio_ffmpeg.read_frames(str(tmp_path / "flight.mp4"))
+    assert next(frames)["size"] == (320, 180)
+    pictures = [np.frombuffer(frame, np.uint8).astype(int) for frame in frames]
+    assert len(pictures) == 8 and pictures[0].std() > 10
+    assert np.abs(pictures[7] - pictures[1]).max() > 60
+
+
+def test_the_camera_of_a_film_sees_what_it_was_aimed_at(record, tmp_path):
+    shot = shoot(record, 4, 16 / 9)
+    at = "(x => jaxdrones.player.stage.project(jaxdrones.player.stage.orbit.target.clone().set(...x)))"
+    with browser.open_tab() as tab:
+        tab.open(show(record).save(tmp_path / "flight.html"), 1280, 720)
+        tab.run(f"jaxdrones.film('orbit', {shot.scale})")
+        tab.run(f"jaxdrones.frameAt(1, 0.25, {shot.eyes[4].tolist()}, {shot.targets[4].tolist()})")
+        seen = [tab.run(f"{at}({pos.tolist()})") for pos in record.pos[shot.rows[4]]]
+        assert tab.problems == []
+    lens = Lens(shot.eyes[4], shot.targets[4], FIELD_OF_VIEW, (1280, 720))
+    np.testing.assert_allclose(seen, lens.project(record.pos[shot.rows[4]])[0], atol=1)
+
+
+def test_keys_play_pause_step_and_choose(tab):
+    tab.run("jaxdrones.positionsAt(0.5)")
+    tab.press("ArrowRight")
+    assert tab.run("jaxdrones.player.time") == pytest.approx(0.5 + 1 / 120, abs=1e-5)
+    tab.press("ArrowLeft", shift=True)
+    assert tab.run("jaxdrones.player.time") == pytest.approx(0.5 - 9 / 120, abs=1e-5)
+    tab.press(" ")
+    tab.wait("jaxdrones.player.time > 0.6")
+    tab.press(" ")
+    time = tab.run("jaxdrones.player.time")
+    assert tab.run("new Promise((done) => setTimeout(() => done(jaxdrones.player.time), 200))") == time
+    for key, mode in (("2", "follow"), ("3", "board"), ("1", "orbit")):
+        tab.press(key)
+        assert tab.run("jaxdrones.player.stage.mode") == mode
+    tab.press("n")
+    assert tab.run("document.getElementById('drone').value") == "1"
+    tab.press("End")
+    assert tab.run("jaxdrones.player.time") == pytest.approx(2.0)
+
+
+def test_everything_that_can_be_used_has_a_name_for_screen_readers(tab):
+    tree = tab.call("Accessibility.getFullAXTree")["nodes"]
+    used = {"button", "slider", "combobox", "checkbox", "image", "img", "dialog", "toolbar", "group", "region"}
+    nodes = [node for node in tree if not node["ignored"] and node["role"]["value"] in used]
+    assert [node["role"]["value"] for node in nodes if not node.get("name", {}).get("value")] == []
+    names = {node["name"]["value"] for node in nodes}
+    assert {"Play", "Time in seconds", "Follow", "Drone", "Three-dimensional view of the flight"} <= names
+
+
+def test_worlds_are_ghosts_or_side_by_side(record, tmp_path):
+    flights = {"pid": record, "again": fly("circle", drones=4, duration=1.0, seed=1)}
+    with browser.open_tab() as tab:
+        tab.open(show(flights, others="side by side").save(tmp_path / "two.html"))
+        positions = tab.run("jaxdrones.positionsAt(0.5)")
+        row = int(np.abs(record.t - 0.5).argmin())
+        for flown, seen in zip(flights.values(), positions, strict=True):
+            np.testing.assert_allclose(seen, flown.pos[row], rtol=0, atol=1e-4)
+        tab.press("g")  # hidden
+        assert tab.run("jaxdrones.positionsAt(0.5)")[1] == [None] * 4
+        tab.press("g")  # ghosts
+        assert np.shape(tab.run("jaxdrones.positionsAt(0.5)")[1]) == (4, 3)
+        assert tab.problems == []

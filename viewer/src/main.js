@@ -1,0 +1,247 @@
+// The page: decodes the flight, builds the scene, and plays it.
+
+import { Vector3 } from "three";
+import { Arrows, FORCE, THRUST, TORQUE } from "./arrows.js";
+import { Fleet } from "./fleet.js";
+import { armOf, bounds, scratch, World } from "./flight.js";
+import { CameraImages } from "./camera.js";
+import { Panel } from "./panel.js";
+import { decode } from "./payload.js";
+import { Plot, short } from "./plots.js";
+import { solids } from "./solids.js";
+import { Stage } from "./stage.js";
+import { Trail } from "./trails.js";
+
+const NAMED = 24; // drones in a world of which all have their names in the view
+const STILL = 200; // ms without a change after which the picture is drawn in full resolution
+const SMALLEST = 0.012; // arm over the radius of the flight from which on a drone is drawn in its true size at first
+const find = (id) => document.getElementById(id);
+
+class Player {
+  constructor(header) {
+    this.worlds = header.worlds.map((entries, w) => new World(entries, header.vehicles, w));
+    this.end = Math.max(...this.worlds.map((world) => world.end));
+    this.title = header.title;
+    this.time = 0;
+    this.playing = false;
+    this.last = null;
+    this.colors = (w, i) => header.palette[(this.worlds[w].n > 1 || this.worlds.length === 1 ? i : w) % header.palette.length];
+    this.stage = new Stage(find("view"));
+    this.fleet = new Fleet(this.stage, this.worlds, header.vehicles, this.colors);
+    this.surroundings = header.scenes.map((scene) => ({ ...scene, groups: [] }));
+    this.trails = this.worlds.map((world, w) => new Trail(this.stage, world, (i) => this.colors(w, i)));
+    this.arrows = this.worlds.map((world, w) => new Arrows(this.stage, world, (i) => this.colors(w, i)));
+    this.panel = new Panel(this, this);
+    const first = this.worlds[0];
+    this.panel.set("trail", first.n > 60 ? "1" : "Infinity");
+    this.panel.set("layout", header.layout);
+    const { low, high } = bounds(this.worlds, this.surroundings), seen = armOf(first.kinds[0]) / (low.distanceTo(high) / 2);
+    this.panel.set("size", [1, 3].find((size) => size * seen > SMALLEST) ?? 10);
+    this.plots = [...document.querySelectorAll(".plot")].map((box, k) => new Plot(box, header.signals[k], (time) => this.seek(time)));
+    this.labels = [];
+    this.images = new CameraImages(find("cameras"));
+    this.frames = 0;
+    this.moved = 0;
+    new ResizeObserver(() => this.resize()).observe(find("stage"));
+    this.resize();
+    this.changed();
+    this.stage.home();
+    requestAnimationFrame((now) => this.frame(now));
+  }
+
+  resize() {
+    this.stage.resize();
+    for (const plot of this.plots ?? []) plot.stale = true;
+  }
+
+  /** Something was chosen: arrange everything anew. */
+  changed() {
+    const { panel, stage } = this, world = this.worlds[panel.world];
+    const key = `${panel.layout} ${panel.layout === "grid" ? "" : panel.world}`;
+    if (this.arranged !== key) {
+      this.arrange();
+      this.arranged = key;
+    }
+    this.fleet.scale = panel.size;
+    for (const plot of this.plots) plot.look(world, panel.drone, (i) => this.colors(panel.world, i), this.end);
+    this.pose(scratch.p, scratch.q);
+    if (stage.mode !== panel.mode) stage.setMode(panel.mode, scratch.p, panel.size * this.arm);
+    find("legend").innerHTML = this.legend();
+    this.labelNames();
+    stage.dirty = true;
+  }
+
+  /** Where each world is drawn, and the obstacles around it. */
+  arrange() {
+    const { panel, worlds, stage } = this, mode = worlds.length > 1 ? panel.layout : "ghosts";
+    const { low, high, points: corners } = bounds(worlds, this.surroundings), span = high.clone().sub(low), columns = Math.ceil(Math.sqrt(worlds.length));
+    const [dx, dy] = [1.25 * Math.max(span.x, 0.5), 1.25 * Math.max(span.y, 0.5)];
+    this.sideBySide = mode === "grid";
+    this.top = low.clone().add(high).multiplyScalar(0.5).setZ(high.z);
+    this.layout = worlds.map((_, w) => ({
+      offset: mode === "grid" ? new Vector3((w % columns) * dx, -Math.floor(w / columns) * dy, 0) : new Vector3(),
+      ghost: mode === "ghosts" && w !== panel.world,
+      hidden: mode === "alone" && w !== panel.world,
+    }));
+    for (const scene of this.surroundings) for (const group of scene.groups.splice(0)) stage.scene.remove(group);
+    worlds.forEach((world, w) => {
+      if (mode !== "grid" && w !== panel.world) return;
+      const scene = this.surroundings[world.scene], group = solids(scene);
+      group.position.copy(this.layout[w].offset);
+      scene.groups.push(group);
+      stage.scene.add(group);
+    });
+    const last = this.layout[worlds.length - 1].offset, wide = this.layout[Math.min(columns, worlds.length) - 1].offset;
+    const ground = this.surroundings.some((scene) => scene.ground);
+    low.z = ground ? Math.min(low.z, 0) : low.z;
+    const points = this.layout.flatMap(({ offset }) => corners.map((point) => point.clone().add(offset)));
+    if (mode === "grid") stage.fit(low.clone().setY(low.y + last.y), high.clone().setX(high.x + wide.x), ground, points);
+    else stage.fit(low, high, ground, points);
+  }
+
+  /** Pose of the drone that is looked at. */
+  pose(pos, quat) {
+    const { panel } = this, world = this.worlds[panel.world], [row, share] = world.at(this.time);
+    const there = world.position(row, share, panel.drone, pos);
+    pos.add(this.layout[panel.world].offset);
+    world.attitude(row, share, panel.drone, quat);
+    this.arm = armOf(world.kinds[panel.drone]);
+    return there;
+  }
+
+  seek(time) {
+    this.time = Math.max(0, Math.min(this.end, time));
+    this.stage.dirty = true;
+  }
+
+  step(rows) {
+    const world = this.worlds[this.panel.world], [row, share] = world.at(this.time);
+    this.playing = false;
+    this.seek(world.t[Math.max(0, Math.min(world.rows - 1, row + rows + (rows < 0 && share > 1e-6 ? 1 : 0)))]);
+  }
+
+  toggle() {
+    if (!this.playing && this.time >= this.end) this.time = 0;
+    this.playing = !this.playing;
+    this.stage.dirty = true;
+  }
+
+  home() {
+    this.panel.setMode("orbit");
+    this.stage.home();
+  }
+
+  frame(now) {
+    requestAnimationFrame((now) => this.frame(now));
+    const passed = this.last === null ? 0 : Math.min(0.25, (now - this.last) / 1000);
+    this.last = now;
+    if (this.playing) {
+      this.stage.adapt(passed);
+      this.time += passed * this.panel.speed;
+      if (this.time >= this.end) {
+        this.time = this.end;
+        this.playing = false;
+      }
+    }
+    if (this.playing || this.stage.dirty) {
+      if (!this.playing && !this.stage.sharp) this.moved = now;
+      this.draw(this.playing ? passed * this.panel.speed : 0);
+    } else if (now > this.moved + STILL) this.stage.setSharp(true);
+  }
+
+  draw(passed) {
+    const { panel, stage, time } = this, shown = panel.shown;
+    if (this.pose(scratch.p, scratch.q)) stage.track(scratch.p, scratch.q, panel.size * this.arm);
+    stage.orbit.update();
+    this.fleet.place(time, passed, this.layout);
+    this.trails.forEach((trail, w) => trail.show(time, panel.trail, this.layout[w], stage));
+    this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], panel.size));
+    stage.render();
+    this.placeNames();
+    if (!stage.hurried || this.frames % 4 === 0) {
+      for (const plot of this.plots) plot.draw(time);
+      this.images.show(this.worlds[panel.world], panel.drone, time);
+      panel.showTime(time, this.end, this.playing);
+    }
+    this.frames++;
+  }
+
+  legend() {
+    const { panel } = this, rows = [];
+    const row = (color, text) => rows.push(`<i style="background:${color}"></i>${text}`);
+    if (panel.shown.thrust) row(THRUST, "thrust of a rotor");
+    if (panel.shown.wrench) row(FORCE, "resultant force") && row(TORQUE, "resultant torque");
+    if (this.stage.cell && this.surroundings.some((scene) => scene.ground)) rows.push(`squares of ${short(this.stage.cell)} m`);
+    if (panel.size > 1) rows.push(`drones are drawn ${panel.size} times as large as they are`);
+    return rows.join("\n");
+  }
+
+  /** Names of drones above them, and of worlds that stand side by side. */
+  labelNames() {
+    const { panel } = this, world = this.worlds[panel.world], element = (text, color) => {
+      const label = document.createElement("span");
+      label.textContent = text;
+      label.style.borderColor = color;
+      return label;
+    };
+    const all = world.labels.map((_, i) => i), named = !panel.shown.names ? [] : world.n > NAMED ? [panel.drone] : all;
+    this.labels = named.map((drone) => ({ drone, element: element(world.labels[drone], this.colors(world.index, drone)) }));
+    if (this.sideBySide && panel.shown.names)
+      this.worlds.forEach(({ name }, w) => this.labels.push({ point: this.top.clone().add(this.layout[w].offset), element: element(name, "#444") }));
+    find("labels").replaceChildren(...this.labels.map(({ element }) => element));
+  }
+
+  placeNames() {
+    const { panel } = this, world = this.worlds[panel.world], [row, share] = world.at(this.time), { p } = scratch;
+    const up = 1.1 * panel.size * this.arm, { offset } = this.layout[panel.world];
+    this.labels.forEach(({ drone, point, element }) => {
+      if (!point && !world.position(row, share, drone, p)) return (element.hidden = true);
+      const at = this.stage.project(point ?? p.add(offset).setZ(p.z + up));
+      element.hidden = !at || (panel.mode === "board" && drone === panel.drone);
+      if (at) [element.style.left, element.style.top] = [`${at[0]}px`, `${at[1] - 4}px`];
+    });
+  }
+}
+
+async function start() {
+  find("status").textContent = "loading the flight …";
+  try {
+    const player = new Player(await decode(find("payload").textContent));
+    find("status").textContent = "";
+    window.jaxdrones = {
+      player,
+      /** Move to a time, draw, and read the positions back from the scene: [world][drone] = [x, y, z]. */
+      positionsAt(time) {
+        player.playing = false;
+        player.seek(time);
+        player.draw(0);
+        return player.worlds.map((_, w) => player.fleet.positions(w));
+      },
+    };
+    Object.assign(window.jaxdrones, {
+      /** Show nothing but the flight and a clock, by a camera; drones are `scale` times as large as they are, if given. */
+      async film(mode, scale) {
+        document.body.classList.add("film");
+        await new Promise(requestAnimationFrame);
+        player.resize();
+        if (scale) player.panel.set("size", scale);
+        player.panel.setMode(mode);
+        player.stage.home();
+      },
+      /** Draw one frame, from a point to another if given; it is on the screen when the promise is kept. */
+      async frameAt(time, passed, eye, target) {
+        player.seek(time);
+        if (eye) player.stage.look(eye, target);
+        player.draw(passed);
+        find("filmclock").textContent = `${time.toFixed(2)} s`;
+        await new Promise(requestAnimationFrame);
+      },
+    });
+    document.documentElement.dataset.ready = "true";
+  } catch (error) {
+    find("status").textContent = `The flight cannot be shown: ${error.message}`;
+    throw error;
+  }
+}
+
+start();

@@ -28,6 +28,7 @@ def test_fly_prints_a_table_and_writes_log_and_figure(tmp_path, capsys):
     assert json.loads(str(log["conditions"]))["control_hz"] == 120
 
 
+@pytest.mark.slow
 def test_json_is_one_object_and_nothing_else_on_stdout(tmp_path, capsys):
     assert main(["fly", "downwash", "--duration", "0.2", "--json", "--output", str(tmp_path)]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -35,6 +36,7 @@ def test_json_is_one_object_and_nothing_else_on_stdout(tmp_path, capsys):
     assert report["files"] == [str(tmp_path / "log.npz"), str(tmp_path / "flight.png")]
 
 
+@pytest.mark.slow
 def test_csv_and_pwm_come_on_request(tmp_path):
     assert main(["fly", "circle", *SHORT, "--csv", "--pwm", "--no-figure", "--output", str(tmp_path)]) == 0
     log = np.load(tmp_path / "log.npz")
@@ -132,6 +134,9 @@ def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
         (["fly", "circle", "--gui"], "only the bullet backend has one"),
         (["fly", "circle", "--video", "film.avi"], "films end in .mp4 or .gif"),
         (["compare", "circle", "--backends", "explicit"], "give two"),
+        (["explain", "hoover"], "unknown task 'hoover'; did you mean 'hover'"),
+        (["explain", "hover", "--set", "speeed=1"], "did you mean 'speed'"),
+        (["explain", "hover", "--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["fly"], "required: FLIGHT"),
         (["soar"], "invalid choice: 'soar'"),
     ],
@@ -184,6 +189,17 @@ def test_list_names_what_can_be_chosen(capsys):
     assert "integrators" in capsys.readouterr().out
 
 
+def test_explain_tells_what_the_numbers_are(capsys):
+    assert main(["explain", "hover", "--set", "drones=2", "--set", "reach=0.5"]) == 0
+    out = capsys.readouterr().out
+    assert "hover: fly to the goal" in out and "+-0.5 m of the goal" in out and "2 x cf2x" in out
+    assert main(["explain", "hover", "--realistic", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    first = told["observation"][0]
+    assert first["name"] == "x of the target, from the drone" and (first["unit"], first["frame"]) == ("m", "world")
+    assert told["physics"]["delay"].startswith("0.02 s") and told["rewards"][0]["weight"] == 2
+
+
 @pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_compare_prints_how_the_backends_part(capsys):
@@ -196,12 +212,15 @@ def test_compare_prints_how_the_backends_part(capsys):
     assert "attitude (rad)" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet", "imageio_ffmpeg")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_flight_in_bullet_is_filmed(tmp_path, capsys):
     film = tmp_path / "new" / "flight.mp4"
-    arguments = ["fly", "circle", *SHORT, "--backend", "bullet", "--obstacles", "--video", str(film), "--cameras"]
+    arguments = ["fly", "circle", *SHORT, "--backend", "bullet", "--obstacles", "--video", str(film)]
+    arguments += ["--renderer", "bullet", "--cameras"]
     assert main([*arguments, "--no-figure", "--output", str(tmp_path)]) == 0
-    assert film.stat().st_size > 1000 and (tmp_path / "cameras" / "drone 0" / "00000.png").exists()
+    about = next(__import__("imageio_ffmpeg").read_frames(str(film)))
+    assert about["size"] == (1280, 720) and (tmp_path / "cameras" / "drone 0" / "00000.png").exists()
     assert "Bullet at 240 Hz" in capsys.readouterr().out

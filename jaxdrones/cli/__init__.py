@@ -1,8 +1,9 @@
-"""The command line: `jaxdrones fly`, `train`, `eval`, `compare`, `list`; a file per command."""
+"""The command line: `jaxdrones fly`, `train`, `eval` and the others; a file per command."""
 
 import argparse
 
-from jaxdrones.cli import compare, evaluate, fly, names, train
+from jaxdrones.checks import UnexpectedKeyword
+from jaxdrones.cli import bench, compare, completion, doctor, evaluate, explain, fly, names, ros2, train, view
 from jaxdrones.cli.common import INTERRUPTED, Parser, print_error
 
 
@@ -21,13 +22,14 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError as error:
         unwritable = f"{error.filename}: {error.strerror}; choose another --output"
         return print_error(unwritable if error.filename else str(error))
-    except (ValueError, ImportError) as error:
+    except (ValueError, ImportError, UnexpectedKeyword) as error:
         return print_error(str(error))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="jaxdrones", description="Simulate teams of quadrotors.", allow_abbrev=False)
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
-    for command in (fly, train, evaluate, compare, names):
+    for command in (fly, train, evaluate, compare, view, ros2, explain, names, doctor, bench):
         command.add(commands)
+    completion.add(commands, parser)
     return parser

@@ -68,6 +68,11 @@ def folder(text: str) -> Path:
     return Path(text)
 
 
+def run_folder(task: str, ending: str = "") -> Path:
+    """The default folder of a run: `runs/hover`, or `runs/moving_box` of the task `my_task.py:moving_box`."""
+    return Path("runs") / (task.rpartition(":")[2] + ending)
+
+
 def as_json(results: dict[str, Any]) -> str:
     """One line of JSON; numbers that are not finite, which JSON lacks, are null."""
     return json.dumps(_finite(results), allow_nan=False)

@@ -2,8 +2,11 @@
 
 import argparse
 import math
+from typing import Any
 
 from jaxdrones.cli.common import as_json, folder
+from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.settings import asked_settings
 
 _FIRST_SEED = 1_000_000  # so that episodes differ from those of the training
 
@@ -13,12 +16,25 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "eval",
         help="evaluate a trained policy over many episodes",
-        description="Fly many episodes with the best policy of a run. Prints the success rate with its 95 % interval, "
-        "errors, and how episodes ended.",
+        description="Fly many episodes with the best policy of a run, or with a policy of your own (file.py:name). "
+        "Prints the success rate with its 95 % interval, errors, and how episodes ended.",
         allow_abbrev=False,
     )
     parser.add_argument(
-        "policy", type=folder, metavar="RUN", help="folder of `jaxdrones train`, for example runs/hover"
+        "policy",
+        type=folder,
+        metavar="RUN",
+        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name",
+    )
+    parser.add_argument("--task", metavar="TASK", help="with file.py:name: the task to fly, as for `jaxdrones train`")
+    parser.add_argument("--realistic", action="store_true", help="with file.py:name: make the task realistic")
+    parser.add_argument("--vehicle", help="with file.py:name: a bundled vehicle or a .urdf file (cf2x)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="with file.py:name: option of the environment (action, observation, drones, ...)",
     )
     parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
     parser.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
@@ -32,21 +48,29 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     from jaxdrones.learning import evaluate
     from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
-    from jaxdrones.training.open_run import open_run
     from jaxdrones.training.run import report_as_dict
 
     check_at_most("episodes", options.episodes, LARGEST_COUNT)
     check_seed("seed", options.seed)
-    run, name = open_run(options.policy), "last" if options.last else "best"
-    recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
-    env = recipe.env()
-    key = jax.random.key(_FIRST_SEED + options.seed)
-    report = report_as_dict(evaluate(env, run.policy(name, env), key, options.episodes))
+    run = open_policy(options.policy, options.task, options.realistic, asked_settings(options))
+    about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed}
+    if is_user_policy(options.policy):
+        recipe = run.recipe()
+        env = recipe.env()
+        policy = run.policy(env)
+        title = described(recipe)
+    else:
+        name = "last" if options.last else "best"
+        recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
+        env = recipe.env()
+        policy = run.policy(name, env)
+        title = f"{described(recipe)}: policy of update {update}"
+        about |= {"policy": name, "update": update}
+    report = report_as_dict(evaluate(env, policy, jax.random.key(_FIRST_SEED + options.seed), options.episodes))
     if options.json:
-        about = {"run": str(options.policy), "policy": name, "update": update, "seed": options.seed}
         print(as_json(about | {"recipe": recipe.as_dict(), "evaluation": report}))
     else:
-        print(f"{described(recipe)}: policy of update {update}")
+        print(title)
         print(evaluation_table(report))
     return 0
 

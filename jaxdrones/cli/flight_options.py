@@ -6,9 +6,8 @@ from typing import Any
 
 from jaxdrones import assets
 from jaxdrones.cli.common import bar, print_error
-from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
-from jaxdrones.flights.conditions import Conditions
+from jaxdrones.flights.conditions import CONTROLLERS, Conditions
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.record import Record
 from jaxdrones.urdf import load_params
@@ -65,7 +64,7 @@ def _names(text: str | None) -> list[str] | None:
 
 
 @contextlib.contextmanager
-def progress():
+def progress(what: str = "flying"):
     """A progress bar, as a function of the share that is done; `None` without tqdm, silent without a terminal."""
-    with bar(100, "flying", "%") as shown:
+    with bar(100, what, "%") as shown:
         yield None if shown is None else lambda share: shown.update(round(100 * share) - shown.n)

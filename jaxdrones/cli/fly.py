@@ -1,22 +1,25 @@
 """`jaxdrones fly`."""
 
 import argparse
+import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import as_json, check_writable, folder, print_error, table
+from jaxdrones.cli.common import as_json, check_writable, folder, print_error, run_folder, table
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
+from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.settings import parse_settings
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.flights.fly import scene_of
 from jaxdrones.flights.record import Record, check_pwm
 from jaxdrones.limits import check_seed
-from jaxdrones.sensing import Scene
-from jaxdrones.visualization import plots, video
+from jaxdrones.visualization import films, plots
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
+_OF_EXAMPLES = ("effects", "controller", "control_hz", "duration", "rotors", "integrator", "obstacles", "gui")
 
 
 def add(commands) -> None:
@@ -36,7 +39,18 @@ def add(commands) -> None:
     parser.add_argument("flight", metavar="FLIGHT", nargs="?", help=", ".join(FLIGHTS))
     add_conditions(parser)
     parser.add_argument(
-        "--policy", type=folder, metavar="RUN", help="in place of FLIGHT: a folder of `jaxdrones train`"
+        "--policy",
+        type=folder,
+        metavar="RUN",
+        help="in place of FLIGHT: a folder of `jaxdrones train`, or file.py:name",
+    )
+    parser.add_argument("--task", metavar="TASK", help="with --policy file.py:name: the task to fly")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="with --policy file.py:name: option of the environment (action, observation, ...)",
     )
     parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
     parser.add_argument(
@@ -45,7 +59,12 @@ def add(commands) -> None:
     parser.add_argument("--gui", action="store_true", help="show Bullet's window, with motor sliders (bullet)")
     parser.add_argument("--video", type=folder, metavar="FILE", help="film the flight as .mp4 or .gif; either backend")
     parser.add_argument(
-        "--cameras", action="store_true", help="write the pictures of each drone's camera as PNG; either backend"
+        "--renderer", help=f"of the film: {', '.join(films.RENDERERS)} (page where Chromium is installed, else jax)"
+    )
+    parser.add_argument(
+        "--cameras",
+        action="store_true",
+        help="write the pictures of each drone's camera as PNG and into the log; either backend",
     )
     parser.add_argument(
         "--output", type=folder, metavar="DIR", help="folder of log and figure (runs/FLIGHT, RUN/flight)"
@@ -60,20 +79,34 @@ def add(commands) -> None:
 def _fly(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if options.flight is None and options.policy is None:
         parser.error("the following arguments are required: FLIGHT, or --policy RUN")
-    if options.policy is not None:
-        own = ("flight", "drones", "vehicle", "effects", "controller", "control_hz", "duration", "rotors", "integrator")
-        for name in (*own, "obstacles", "gui"):
-            if getattr(options, name) != parser.get_default(name):
-                raise ValueError(
-                    f"{name} {getattr(options, name)} is given beside --policy; the run says what is flown"
-                )
+    _refuse(parser, options)
     if not options.no_figure:
         plots.check_matplotlib()
     if options.video:
-        video.check_video(options.video)
-    if options.video or options.cameras:
+        options.renderer = films.choose_renderer(options.renderer, options.video)
+    if options.cameras:
         from jaxdrones.visualization import replay  # noqa: F401  says which extra to install
     return _fly_policy(options) if options.policy is not None else _fly_example(options)
+
+
+def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Raise for options that the policy, or the example, says itself."""
+    if options.renderer is not None and options.video is None:
+        raise ValueError(f"--renderer {options.renderer} is given without --video FILE; give both or none")
+    if options.policy is None:
+        if options.set:
+            raise ValueError(f"--set {options.set[0]} is given without --policy file.py:name; give both or none")
+        if options.task is not None:
+            raise ValueError(
+                f"--task {options.task} is given without --policy file.py:name; leave it out, or give both"
+            )
+        return
+    own = is_user_policy(options.policy)
+    names = ["flight", *([] if own else ["drones", "vehicle"]), *_OF_EXAMPLES]
+    for name in names:
+        if getattr(options, name) != parser.get_default(name):
+            what = "the task" if own else "the run"
+            raise ValueError(f"{name} {getattr(options, name)} is given beside --policy; {what} says what is flown")
 
 
 def _fly_example(options: argparse.Namespace) -> int:
@@ -86,8 +119,8 @@ def _fly_example(options: argparse.Namespace) -> int:
     record = fly_options(options, backend=options.backend, obstacles=options.obstacles, gui=options.gui)
     example = FLIGHTS[options.flight]
     title = f"{options.flight}: {example.summary}"
-    files = _write(record, options, output, title, example.panels, scene_of(record.conditions))
-    _report(options, record, record.results(example.settling_time), files, record.diverged())
+    files = _write(record, options, output, title, example.panels)
+    _report(options, record, example.settling_time, files, record.diverged())
     return warn(record.diverged())
 
 
@@ -95,16 +128,17 @@ def _fly_policy(options: argparse.Namespace) -> int:
     import jax
 
     from jaxdrones.training.episode import EpisodeConditions, fly_episode, to_record
-    from jaxdrones.training.open_run import open_run
 
     check_choice("backend", options.backend, BACKENDS)
-    run, seed = open_run(options.policy), options.seed or 0
+    run, seed = open_policy(options.policy, options.task, False, _options_of_task(options)), options.seed or 0
     recipe = run.recipe()
     check_seed("seed", seed)
     vehicle = str(recipe.options.get("vehicle", "cf2x"))
     if options.pwm:
         check_pwm(vehicle)
-    output = options.output or options.policy / "flight"
+    output = options.output or (
+        run_folder(str(options.policy)) if is_user_policy(options.policy) else options.policy / "flight"
+    )
     with recipe.env(backend=options.backend) as env, progress() as report:
         policy = run.policy(env=env)
         _check_files(options, output)
@@ -121,8 +155,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
     )
     record = to_record(episode, conditions)
     title = f"{recipe.task}: {env.task.summary} ({recipe.trained_by}, {options.backend})"
-    files = _write(record, options, output, title, plots.POLICY_PANELS, episode.scene)
-    results = record.results(_SETTLING_SHARE * float(record.t[-1]))
+    files = _write(record, options, output, title, plots.POLICY_PANELS)
     end = {
         "success": episode.success,
         "return": float(episode.reward.sum(axis=0).mean()),
@@ -131,29 +164,41 @@ def _fly_policy(options: argparse.Namespace) -> int:
         "metrics": {name: x[-1].astype(float).tolist() for name, x in episode.metrics.items()},
     }
     broken = record.not_finite()
-    _report(options, record, results, files, broken, end)
+    _report(options, record, _SETTLING_SHARE * float(record.t[-1]), files, broken, end)
     return print_error(next(iter(broken.values())), 1) if broken else 0
+
+
+def _options_of_task(options: argparse.Namespace) -> dict[str, Any]:
+    """The options of `jaxdrones.make` for a policy of a user's file; for a run what --set gives, which is refused."""
+    chosen = parse_settings(options.set)
+    for name in ("drones", "vehicle"):
+        if name in chosen:
+            raise ValueError(f"--set {name}={chosen[name]} is given; give --{name} {chosen[name]} in its place")
+    if is_user_policy(options.policy):
+        chosen |= {"vehicle": options.vehicle} | ({} if options.drones is None else {"drones": options.drones})
+    return chosen
 
 
 def _report(
     options: argparse.Namespace,
     record: Record,
-    results: list,
+    after: float,
     files: list[Path],
     diverged: dict[str, str],
     end: dict | None = None,
 ) -> None:
-    """Print the results; `end` describes how an episode of a policy ended."""
+    """Print the results from a time on, s; `end` describes how an episode of a policy ended."""
+    results = record.results(after)
     if options.json:
         about = record.conditions.as_dict() | (end or {})
         print(as_json(about | {"results": results, "diverged": diverged, "files": list(map(str, files))}))
     else:
         print(record.conditions)
         print(table(results))
+        print(record.definitions(after))
         if end is not None:
             how = {True: "success", False: "no success", None: "done"}[end["success"]]
             why = f"ended by {', '.join(end['ended_by'])}" if end["ended_by"] else "to the end"
-            print(f"(from {_SETTLING_SHARE * end['duration']:.2f} s on)")
             print(f"{how}: return {end['return']:.1f}, {end['duration']:.2f} s, {why}")
         print("wrote " + ", ".join(map(str, files)))
 
@@ -172,9 +217,7 @@ def _check_files(options: argparse.Namespace, output: Path) -> None:
             raise ValueError(f"--video {options.video} cannot be written: {error.strerror}; choose another") from None
 
 
-def _write(
-    record: Record, options: argparse.Namespace, output: Path, title: str, panels: Sequence[str], scene: Scene
-) -> list[Path]:
+def _write(record: Record, options: argparse.Namespace, output: Path, title: str, panels: Sequence[str]) -> list[Path]:
     """Write log, figure, film and pictures, as asked for; returns their paths."""
     files = [output / "log.npz"]
     record.save_npz(files[0], options.pwm)
@@ -184,13 +227,14 @@ def _write(
     if not options.no_figure:
         files.append(output / "flight.png")
         plots.save_flight(record, files[-1], title, panels)
-    if options.video or options.cameras:
+    if options.video:
+        with progress("filming") as report:
+            films.film(record, options.video, title, options.renderer, on_frame=report or (lambda share: None))
+        files.append(options.video)
+    if options.cameras:
         from jaxdrones.visualization import replay  # needs pybullet
 
-        if options.video:
-            replay.film(record, options.video, scene)
-            files.append(options.video)
-        if options.cameras:
-            files.append(output / "cameras")
-            replay.save_cameras(record, files[-1], scene)
+        files.append(output / "cameras")
+        images = {"rgb": replay.save_cameras(record, files[-1])}
+        dataclasses.replace(record, images={**record.images, **images}).save_npz(files[0], options.pwm)
     return files

@@ -9,6 +9,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from jaxdrones.cli.common import run_folder
+
 HELP = (
     "All devices share the worlds. A CPU counts as N devices with\n"
     "XLA_FLAGS=--xla_force_host_platform_device_count=N. On several hosts, start the same command on each, with a\n"
@@ -37,8 +39,8 @@ def _on_hosts(train: Callable[[argparse.Namespace], int], options: argparse.Name
         return train(options)
     if None in asked:
         raise ValueError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
-    if options.library == "sb3":
-        raise ValueError("--library sb3 trains on one host; leave out --hosts, --host and --coordinator")
+    if options.library in ("rllib", "sb3"):
+        raise ValueError(f"--library {options.library} trains on one host; leave out --hosts, --host and --coordinator")
     from jaxdrones.training import distributed
 
     with contextlib.ExitStack() as stack:
@@ -46,7 +48,7 @@ def _on_hosts(train: Callable[[argparse.Namespace], int], options: argparse.Name
         if options.host > 0:
             stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
             copy = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
-            output = options.output or Path("runs") / options.task
+            output = options.output or run_folder(options.task)
             if options.resume and output.is_dir():
                 shutil.copytree(output, copy)
             options.output, options.no_figure = copy, True

@@ -4,14 +4,13 @@ import argparse
 import json
 
 from jaxdrones import assets
-from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
-from jaxdrones.flights.conditions import BACKENDS
+from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.training.algorithms import ALGORITHMS, SB3_ALGORITHMS
+from jaxdrones.training.algorithms import ALGORITHMS, RLLIB_ALGORITHMS, SB3_ALGORITHMS
 
-LIBRARIES = ("jaxdrones", "sb3")
+LIBRARIES = ("jaxdrones", "rllib", "sb3")
 
 
 def add(commands) -> None:
@@ -23,8 +22,9 @@ def add(commands) -> None:
     parser.set_defaults(run=_list)
 
 
-def _list(options: argparse.Namespace) -> int:
-    names = {
+def known_names() -> dict[str, list[str]]:
+    """The names to choose from, by kind."""
+    return {
         "flights": list(FLIGHTS),
         "vehicles": list(assets.vehicles()),
         "effects": list(EFFECTS | PAIRS),
@@ -36,8 +36,14 @@ def _list(options: argparse.Namespace) -> int:
         "actions": list(ACTIONS),
         "observations": list(OBSERVATIONS),
         "algorithms": list(ALGORITHMS),
+        "rllib": list(RLLIB_ALGORITHMS),
         "sb3": list(SB3_ALGORITHMS),
+        "libraries": list(LIBRARIES),
     }
+
+
+def _list(options: argparse.Namespace) -> int:
+    names = known_names()
     if options.json:
         print(json.dumps(names))
     else:

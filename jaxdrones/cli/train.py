@@ -1,26 +1,25 @@
 """`jaxdrones train`."""
 
 import argparse
-import dataclasses
 import time
-from pathlib import Path
 
+from jaxdrones import assets
 from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
-from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning
+from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
+from jaxdrones.cli.settings import asked_settings, user_mistakes
+from jaxdrones.cli.train_runs import episodes_of, recipe_of, runs_of
 from jaxdrones.cli.training import (
     ProgressDisplay,
-    check_free,
     draw_curves,
     merge_budget,
     parse_budget,
-    parse_settings,
     quiet,
     remaining_best,
     show_results,
-    user_mistakes,
+    warn_of_unknown_settings,
 )
 from jaxdrones.envs import TASKS
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
@@ -51,12 +50,17 @@ def add(commands) -> None:
         "A longer training continues as if all its updates had been asked for at the start: the learning rate rises\n"
         "to its value at this point of the longer schedule. The best policy is replaced only by a better one.\n\n"
         "With --library sb3, Stable-Baselines3 trains the paper's network (512-512-256-128, ReLU). The paper's task\n"
-        "is `hover-2021`. Such a training keeps no state to resume from.",
+        "is `hover-2021`. Such a training keeps no state to resume from.\n\n"
+        "A run of a task or vehicle of your own keeps the text of its file, and flies that text when it is resumed,\n"
+        "evaluated or flown: open runs of people you trust alone.",
         epilog="JAX_COMPILATION_CACHE_DIR=folder keeps compiled programs, so that the next training starts sooner.\n\n"
         + hosts.HELP,
         allow_abbrev=False,
     )
-    parser.add_argument("task", metavar="TASK", help=", ".join(TASKS))
+    parser.add_argument(
+        "task", metavar="TASK", help=f"{', '.join(TASKS)}; or file.py:function, a function of yours that returns a task"
+    )
+    parser.add_argument("--vehicle", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
     parser.add_argument("--library", default=LIBRARIES[0], help=f"{', '.join(LIBRARIES)} ({LIBRARIES[0]})")
     algorithms, sb3_algorithms = ", ".join(ALGORITHMS), ", ".join(SB3_ALGORITHMS)
     parser.add_argument("--algo", help=f"{algorithms} (bptt; gates: ppo); with sb3 {sb3_algorithms} (ppo)")
@@ -102,36 +106,37 @@ def _train(options: argparse.Namespace) -> int:
     from jaxdrones.learning import Diverged
     from jaxdrones.training import loop
     from jaxdrones.training.distributed import fail_together
+    from jaxdrones.training.presets import settings_known
     from jaxdrones.training.run import Run
-    from jaxdrones.training.trainer import Trainer
 
     begin = time.perf_counter()
     with fail_together():
         if not options.no_figure:
             plots.check_matplotlib()
-        output = options.output or Path("runs") / options.task
+        output = options.output or run_folder(options.task, _ending(options))
         _check_numbers(options)
         updates, seconds = parse_budget(options.budget, "updates", 300)
-        asked = merge_budget("updates", parse_settings(options.set), updates, seconds)
-        runs = _runs(options, output)
+        asked = merge_budget("updates", asked_settings(options), updates, seconds)
+        runs = runs_of(options, output)
         with user_mistakes(asked, options.task):
-            recipe = _resumed(options, runs, asked, seconds) if options.resume else _fresh(options, runs, output, asked)
-            trainer = Trainer(recipe, _episodes(options, runs))
+            recipe = recipe_of(options, runs, output, asked, seconds)
+            trainer = _trainer_type(options.library)(recipe, episodes_of(options, runs))
         resumed = [run for run in runs.values() if run.started and options.resume]
         for run in resumed:
             loop.check_resumable(trainer, run)
         for run in (*runs.values(), Run(output)):
             trainer.prepare(run)
     print_line = quiet if options.json else print
+    if not options.resume and not settings_known(recipe.task, recipe.algorithm, recipe.library):
+        warn_of_unknown_settings(recipe.task, recipe.trained_by)
     print_line(f"{_headline(recipe)}; compiling")
     trainer.compile()
     made = max((run.sidecar_entry("state", "update") for run in resumed), default=0)
     if seconds is not None:
         spent = 0.0 if options.resume else time.perf_counter() - begin
         if spent > seconds:
-            print_warning(
-                f"compiling took all of --budget {options.budget}, so one update is made; --resume continues it"
-            )
+            more = "; --resume continues it" * (options.library != "rllib")
+            print_warning(f"compiling took all of --budget {options.budget}, so one update is made{more}")
         trainer.fit_budget(seconds - spent, made)
     total = trainer.recipe.config.updates
     print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
@@ -147,19 +152,37 @@ def _train(options: argparse.Namespace) -> int:
             with display:
                 loop.train(trainer, run, seed, display.update)
         except KeyboardInterrupt:
-            if not run.started:
+            if not (run.folder / "last.json").exists():
                 return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
             draw_curves(options, {seed: run}, run.folder)
+            where = f"interrupted at update {run.sidecar_entry('last', 'update')}; {remaining_best(run)}"
+            if not run.started:
+                return print_error(where, INTERRUPTED)
             again = f"jaxdrones train {options.task} --output {output} --resume"
             again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
-            where = f"interrupted at update {run.sidecar_entry('state', 'update')}"
-            return print_error(f"{where}; {remaining_best(run)}; continue with: {again}", INTERRUPTED)
+            return print_error(f"{where}; continue with: {again}", INTERRUPTED)
         except Diverged as error:
             draw_curves(options, {seed: run}, run.folder)
             return print_error(
                 f"training diverged: {error}, for example --set learning_rate=1e-3; {remaining_best(run)}", 1
             )
     return show_results(options, runs, output)
+
+
+def _ending(options: argparse.Namespace) -> str:
+    """What the folder of a run has after the name of the task, where no folder is given."""
+    return "" if options.library == LIBRARIES[0] else f"-rllib-{options.algo or 'ppo'}"
+
+
+def _trainer_type(library: str):
+    """The class that trains by this library or by RLlib; raises with what to install."""
+    if library == "rllib":
+        from jaxdrones.training.rllib.trainer import RLlibTrainer
+
+        return RLlibTrainer
+    from jaxdrones.training.trainer import Trainer
+
+    return Trainer
 
 
 def _headline(recipe) -> str:
@@ -175,105 +198,7 @@ def _check_numbers(options: argparse.Namespace) -> None:
         check_seed("the last seed", options.seed + options.seeds - 1)
     if options.episodes is not None:
         check_at_most("episodes", options.episodes, LARGEST_COUNT)
+    if options.resume and options.library == "rllib":
+        raise ValueError("--resume is given with --library rllib, whose trainings are not continued here; leave it out")
     if options.resume and options.overwrite:
         raise ValueError("--resume and --overwrite are given; one continues a run, the other replaces it")
-
-
-def _runs(options: argparse.Namespace, output: Path) -> dict:
-    """The run of each seed."""
-    from jaxdrones.training.run import Run
-
-    run = Run(output)
-    if options.seeds > 1:
-        if options.resume and run.started:
-            raise ValueError(f"{output} holds the training of one seed; leave out --seeds to --resume it")
-        first = options.seed or 0
-        return {seed: Run(output / f"seed-{seed}") for seed in range(first, first + options.seeds)}
-    if options.resume and not run.started:
-        raise _nothing_to_resume(run)
-    seed = run.sidecar_entry("state", "seed") if options.resume else options.seed or 0
-    return {seed: run}
-
-
-def _nothing_to_resume(run) -> ValueError:
-    several = "give --seeds N, or " if list(run.folder.glob("seed-*/state.json")) else ""
-    return ValueError(f"{run.folder} holds no training to continue; {several}leave out --resume")
-
-
-def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
-    """The recipe that was asked for; raises if it would replace another run."""
-    from jaxdrones.training.presets import default_algorithm
-    from jaxdrones.training.recipe import Recipe
-    from jaxdrones.training.run import Run
-
-    algorithm = default_algorithm(options.task) if options.algo is None else options.algo
-    recipe = Recipe.of(options.task, algorithm, options.realistic, **asked)
-    for run in (*runs.values(), Run(output)):
-        check_free(run, options.overwrite)
-    return recipe
-
-
-def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: float | None):
-    """The recipe of the runs, with the number of updates asked for; all other settings have to be the same."""
-    from jaxdrones.training.recipe import Recipe
-
-    started = [run for run in runs.values() if run.started]
-    if not started:
-        raise _nothing_to_resume(next(iter(runs.values())))
-    for run in started:
-        run.verify("best")
-        run.verify("state")
-    recipes = [Recipe.from_dict(run.sidecar_entry("state", "recipe")) for run in started]
-    folder, recipe = started[0].folder, max(recipes, key=lambda recipe: recipe.config.updates)
-    had = {"task": recipe.task, "algo": recipe.algorithm, "realistic": recipe.realistic}
-    had |= vars(recipe.config) | recipe.options | {"episodes": started[0].sidecar_entry("state", "episodes")}
-    wanted = {"task": options.task, **asked}
-    wanted |= {} if options.algo is None else {"algo": options.algo}
-    wanted |= {"realistic": True} if options.realistic else {}
-    wanted |= {} if options.episodes is None else {"episodes": options.episodes}
-    if options.seed is not None and options.seeds == 1:
-        had, wanted = had | {"seed": next(iter(runs))}, wanted | {"seed": options.seed}
-    updates = wanted.pop("updates", None)
-    for name, x in wanted.items():
-        if had.get(name) != x:
-            raise ValueError(f"{folder} was started with {name} {had.get(name)}, not {x}; leave {name} out to --resume")
-    finished = len(started) == len(runs) and all(
-        run.finished and run.sidecar_entry("state", "update") >= recipe.config.updates for run in started
-    )
-    total = _total(recipe.config.updates, updates, options.budget is not None, finished)
-    if finished and seconds is None and total == recipe.config.updates:
-        raise ValueError(
-            f"{folder} is trained to the end, {total} updates; train it longer with --budget N or 60s, or "
-            "replace it with --overwrite instead of --resume"
-        )
-    return dataclasses.replace(recipe, config=dataclasses.replace(recipe.config, updates=total))
-
-
-def _total(had: int, asked: int | None, more: bool, finished: bool) -> int:
-    """Total number of updates of a run that is resumed.
-
-    Args:
-        had: total number of updates so far.
-        asked: number of updates asked for.
-        more: whether it is added to those of a finished run, as with --budget; otherwise, as with --set, it is the
-            total.
-        finished: whether all updates so far were made.
-    """
-    if asked is None:
-        return had
-    check_at_most("updates", asked, LARGEST_COUNT)
-    if more and finished:
-        asked += had
-    elif asked < had or (more and asked != had):
-        raise ValueError(
-            f"the run was started with updates {had}, not {asked}; leave updates out to --resume, or give a larger "
-            "number by --set updates=N"
-        )
-    check_at_most("updates", asked, LARGEST_COUNT)
-    return asked
-
-
-def _episodes(options: argparse.Namespace, runs: dict) -> int:
-    """Episodes of an evaluation; a resumed run keeps their number, so that its evaluations remain comparable."""
-    started = (run.sidecar_entry("state", "episodes") for run in runs.values() if run.started and options.resume)
-    return next(started, 1000 if options.episodes is None else options.episodes)

@@ -2,26 +2,25 @@
 
 import argparse
 import time
-from pathlib import Path
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import INTERRUPTED, print_error
+from jaxdrones.cli.common import INTERRUPTED, print_error, run_folder
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import SB3_ALGORITHMS
+from jaxdrones.cli.settings import asked_settings, user_mistakes
 from jaxdrones.cli.training import (
     ProgressDisplay,
     check_free,
     draw_curves,
     merge_budget,
     parse_budget,
-    parse_settings,
     quiet,
     remaining_best,
     show_results,
-    user_mistakes,
+    warn_of_unknown_settings,
 )
-from jaxdrones.envs import TASKS
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
+from jaxdrones.training import user_files
 from jaxdrones.visualization import plots
 
 _EPISODES = 100  # of an evaluation
@@ -38,21 +37,21 @@ def train(options: argparse.Namespace) -> int:
     _refuse(options)
     algorithm = "ppo" if options.algo is None else options.algo
     check_choice("algorithm of sb3", algorithm, SB3_ALGORITHMS)
-    check_choice("task", options.task, TASKS)
     episodes, seed = _EPISODES if options.episodes is None else options.episodes, options.seed or 0
     check_at_most("episodes", episodes, LARGEST_COUNT)
     check_seed("seed", seed)
     steps, seconds = parse_budget(options.budget, "control steps", 100_000)
-    asked = merge_budget("steps", parse_settings(options.set), steps, seconds)
+    asked = merge_budget("steps", asked_settings(options), steps, seconds)
     if not options.no_figure:
         plots.check_matplotlib()
-    from jaxdrones.training.stable_baselines import SB3Recipe, SB3Run  # says which extra to install
+    user_files.task_of(*user_files.take_task(options.task))  # a wrong name is said before what is not installed
+    from jaxdrones.training.stable_baselines import PRESET_TASK, SB3Recipe, SB3Run  # says which extra to install
 
     # isort: split
     from jaxdrones.learning import Diverged
     from jaxdrones.training.stable_baselines_trainer import SB3Trainer
 
-    run = SB3Run(options.output or Path("runs") / f"{options.task}-sb3-{algorithm}")
+    run = SB3Run(options.output or run_folder(options.task, f"-sb3-{algorithm}"))
     with user_mistakes(asked, options.task):
         recipe = SB3Recipe.of(options.task, algorithm, options.realistic, **asked)
     check_free(run, options.overwrite)
@@ -61,6 +60,8 @@ def train(options: argparse.Namespace) -> int:
     with user_mistakes(asked, options.task):
         trainer = SB3Trainer(recipe, seed, episodes)
     trainer.prepare(run)
+    if recipe.task != PRESET_TASK:
+        warn_of_unknown_settings(recipe.task, recipe.trained_by)
     run.clear()
     total = recipe.config["steps"] if seconds is None else None
     print_line(f"compiled in {trainer.compile_seconds:.1f} s; control steps: {total or 'as many as the time allows'}")

@@ -1,18 +1,16 @@
 """Arguments, progress and results of a training at the shell, for every library."""
 
 import argparse
-import ast
 import contextlib
 import sys
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import as_json, bar
+from jaxdrones.cli.common import as_json, bar, print_warning
 from jaxdrones.cli.evaluate import evaluation_table, percent
 from jaxdrones.limits import LARGEST_COUNT
-from jaxdrones.visualization import plots
+from jaxdrones.visualization import learning_curves
 
-_NO_SETTINGS = ("cls", "task", "algorithm", "realistic")  # arguments of `Recipe.of` that are options of the command
 _MAX_SECONDS = 3.6e6
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -35,43 +33,27 @@ def parse_budget(text: str | None, unit: str, example: int) -> tuple[int | None,
     )
 
 
-def parse_settings(texts: list[str]) -> dict[str, Any]:
-    """The name and value of every --set; of a name that is given twice, the last value."""
-    changes: dict[str, Any] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not (name and equals):
-            raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
-        if name in _NO_SETTINGS:
-            raise ValueError(
-                f"--set {name} is not a setting of a learner or of an environment; see jaxdrones train --help"
-            )
-        changes[name] = _value(value)
-    return changes
+def warn_of_unknown_settings(task: str, learner: str) -> None:
+    """Say that no settings are known with which a learner masters a task."""
+    print_warning(
+        f"no settings are known with which {learner} masters {task}; it may fail, then try "
+        "another --algo, --set learning_rate=... or horizon=..., or a longer --budget"
+    )
 
 
-def _value(text: str) -> Any:
-    """A Python literal, or else a string; `nan` and `inf` are numbers."""
-    try:
-        return ast.literal_eval(text)
-    except (ValueError, SyntaxError, RecursionError, MemoryError):
-        return float(text) if text.strip("+-") in ("nan", "inf") else text
-
-
-@contextlib.contextmanager
-def user_mistakes(changes: dict[str, Any], task: str):
-    """Turn errors that settings of a user cause into errors that name the settings.
-
-    Raises:
-        ValueError: in place of an error of Python or JAX.
-    """
-    try:
-        yield
-    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
-        if not changes:
-            raise
-        given = ", ".join(f"{name}={x}" for name, x in changes.items())
-        raise ValueError(f"--set {given} does not fit {task}: {error}") from error
+def warn_of_failure(run, report: dict[str, Any]) -> None:
+    """Say that a training did not succeed, if that is so, and what to try."""
+    advice = "try --seeds 3, a longer --budget, another --algo, or a smaller --set learning_rate"
+    successes = report["evaluation"]["successes"]
+    if report["best_update"] == 0:
+        print_warning(
+            f"{run.folder}: nothing was learned, the best policy is the untrained one of update 0 "
+            f"({percent(report['evaluation']['success'], report['evaluation']['episodes'])} success); {advice}"
+        )
+    elif successes == 0 and run.recipe().env().task.success is not None:
+        print_warning(
+            f"{run.folder}: the best policy succeeds in 0 of {report['evaluation']['episodes']:,} episodes; {advice}"
+        )
 
 
 def merge_budget(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:
@@ -152,11 +134,16 @@ def remaining_best(run) -> str:
 
 def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[Path]:
     """Draw the learning curves, unless --no-figure is given."""
+    from jaxdrones.learning.evaluation import wilson_interval
+
     if options.no_figure:
         return []
     histories = {f"seed {seed}": run.history() for seed, run in runs.items()}
     recipe = next(iter(runs.values())).recipe()
-    plots.save_curves(histories, folder / "curve.png", f"training {recipe.task} by {recipe.trained_by}")
+    episodes = next(iter(runs.values())).sidecar().get("episodes")
+    title = f"training {recipe.task} by {recipe.trained_by}"
+    interval = (lambda success: wilson_interval(round(success * episodes), episodes)) if episodes else None
+    learning_curves.save_curves(histories, folder / "curve.png", title, interval)
     return [folder / "curve.png"]
 
 
@@ -184,6 +171,7 @@ def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
     if options.json:
         result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
         print(as_json(result | {"files": list(map(str, files))}))
+        warn_of_failure(run, reports[best])
         return 0
     for seed, report in reports.items():
         spent = report["seconds"]
@@ -196,4 +184,5 @@ def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
         print(evaluation_table(report["evaluation"]))
     print("wrote " + ", ".join(map(str, files)))
     print(f"fly it: jaxdrones fly --policy {output}")
+    warn_of_failure(run, reports[best])
     return 0

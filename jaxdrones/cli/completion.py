@@ -1,0 +1,66 @@
+"""`jaxdrones completion`."""
+
+import argparse
+import functools
+from collections.abc import Iterator
+
+from jaxdrones.checks import check_choice
+from jaxdrones.cli.names import known_names
+
+SHELLS = ("bash", "zsh", "fish")
+_KINDS = {  # argument -> kind of the names that it takes
+    "task": "tasks",
+    "flight": "flights",
+    "vehicle": "vehicles",
+    "backend": "backends",
+    "controller": "controllers",
+    "rotors": "rotors",
+    "integrator": "integrators",
+    "algo": "algorithms",
+    "library": "libraries",
+}
+_FOLDERS, _FILES = ("DIR", "RUN", "BAG"), ("FILE",)  # metavars
+
+
+def add(commands, root: argparse.ArgumentParser) -> None:
+    """Add the command; the script completes all commands of `root`."""
+    parser = commands.add_parser(
+        "completion",
+        help="print a script that completes commands and names in a shell",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Print a script with which the tab key completes commands, options and names.\n\n"
+        "  bash   source <(jaxdrones completion bash)     in ~/.bashrc\n"
+        "  zsh    jaxdrones completion zsh > ~/.zfunc/_jaxdrones     with ~/.zfunc in $fpath before compinit\n"
+        "  fish   jaxdrones completion fish > ~/.config/fish/completions/jaxdrones.fish",
+        allow_abbrev=False,
+    )
+    parser.add_argument("shell", metavar="SHELL", help=", ".join(SHELLS))
+    parser.set_defaults(run=functools.partial(_completion, root))
+
+
+def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+    check_choice("shell", options.shell, SHELLS)
+    try:
+        import shtab
+    except ImportError:
+        raise ValueError('shtab is not installed, which writes the script; pip install "jaxdrones[cli]"') from None
+    names = known_names()
+    for action in _actions(root):
+        if action.dest == "shell":
+            action.choices = SHELLS
+        elif action.dest in _KINDS:
+            action.choices = names[_KINDS[action.dest]]
+        elif action.metavar in (*_FOLDERS, *_FILES):
+            vars(action)["complete"] = shtab.DIRECTORY if action.metavar in _FOLDERS else shtab.FILE
+    print(shtab.complete(root, options.shell))
+    return 0
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """The arguments of a parser and of its commands."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from _actions(command)
+        else:
+            yield action

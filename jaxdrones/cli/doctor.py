@@ -1,0 +1,166 @@
+"""`jaxdrones doctor`."""
+
+import argparse
+import importlib.metadata
+import re
+import shutil
+import time
+from typing import Any
+
+from jaxdrones.cli.common import as_json
+
+_LEFT_OUT = ("all", "dev", "docs")  # extras that only join others, or are for developers
+_COMPARISONS = {
+    "<=": lambda a, b: a <= b,
+    ">=": lambda a, b: a >= b,
+    "<": lambda a, b: a < b,
+    "==": lambda a, b: a == b,
+}
+_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[^]]*\])?\s*\(?(?P<versions>[^;)]*)\)?\s*(;(?P<marker>.*))?")
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "doctor",
+        help="versions, devices, extras, and a self-test of two seconds",
+        description="Print the versions, the devices and which extras are installed, and fly a second whose end is "
+        "known in closed form. The exit code is 1 where something is wrong; a missing extra is not.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    parser.set_defaults(run=_doctor)
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from jaxdrones.throughput import machine
+
+    wrong: list[str] = []
+    versions = machine.versions()
+    required, extras = _requirements(wrong)
+    for name, wanted in required.items():
+        wrong += _unfit(name, wanted)
+    devices = _devices(wrong)
+    present = {extra: _extra(extra, libraries, wrong) for extra, libraries in extras.items()}
+    tests = _self_tests(present, wrong) if devices else {}
+    result: dict[str, Any] = {"versions": versions, "processor": machine.processor(), "cores": machine.cores()}
+    result |= {"devices": devices, "notes": _notes(devices), "extras": present, "self_test": tests, "wrong": wrong}
+    print(as_json(result) if options.json else _text(result))
+    return 1 if wrong else 0
+
+
+def _text(result: dict[str, Any]) -> str:
+    lines = ["versions   " + ", ".join(f"{name} {version}" for name, version in result["versions"].items())]
+    lines.append(f"processor  {result['processor']}, {result['cores']} cores")
+    lines.append(f"devices    {', '.join(result['devices']) or 'none'}")
+    lines += [f"           {note}" for note in result["notes"]]
+    for title, (extra, entry) in zip(["extras", *[""] * len(result["extras"])], result["extras"].items(), strict=False):
+        missing = f"missing {', '.join(entry['missing'])}: {entry['install']}"
+        state = entry["unavailable"] or (missing if entry["missing"] else "present")
+        lines.append(f"{title:9}  {extra:10} {state}")
+    lines += [f"self-test  {backend:10} {said}" for backend, said in result["self_test"].items()]
+    lines += [f"wrong      {problem}" for problem in result["wrong"]] or ["all is well"]
+    return "\n".join(lines)
+
+
+def _requirements(wrong: list[str]) -> tuple[dict[str, str], dict[str, list[re.Match]]]:
+    """What the package needs, and what its extras need, as its own metadata say: name -> versions."""
+    try:
+        texts = importlib.metadata.requires("jaxdrones") or []
+    except importlib.metadata.PackageNotFoundError:
+        wrong.append(
+            "jaxdrones is imported from a folder and not installed; pip install it, for example with pip install -e ."
+        )
+        return {}, {}
+    core: dict[str, str] = {}
+    extras: dict[str, list[re.Match]] = {}
+    for text in texts:
+        found = _REQUIREMENT.fullmatch(text)
+        assert found is not None, text
+        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", found["marker"] or "")
+        if extra is None:
+            core[found["name"]] = found["versions"]
+        elif extra[1] not in _LEFT_OUT:
+            extras.setdefault(extra[1], []).append(found)
+    return core, extras
+
+
+def _extra(extra: str, libraries: list[re.Match], wrong: list[str]) -> dict[str, Any]:
+    """Which libraries of an extra are missing, and how to install them."""
+    import platform
+
+    missing, unavailable = [], []
+    for found in libraries:
+        limit = re.search(r"python_version (<=?|>=?) ['\"]([\d.]+)['\"]", found["marker"] or "")
+        if limit and not _COMPARISONS[limit[1]](_numbers(platform.python_version())[:2], _numbers(limit[2])):
+            unavailable.append(f"{found['name']} is for Python {limit[1]} {limit[2]}")
+        elif _version(found["name"]) is None:
+            missing.append(found["name"])
+        else:
+            wrong += _unfit(found["name"], found["versions"])
+    install = f'pip install "jaxdrones[{extra}]"'
+    return {
+        "present": not (missing or unavailable),
+        "missing": missing,
+        "unavailable": ", ".join(unavailable),
+        "install": install,
+    }
+
+
+def _unfit(name: str, wanted: str) -> list[str]:
+    """What is wrong with the version of a library; nothing if it is one of those wanted."""
+    found = _version(name)
+    if found is None:
+        return [f'{name} is not installed; pip install "{name}{wanted}"']
+    for limit in filter(None, (part.strip() for part in wanted.split(","))):
+        sign = re.match(r"[<>=]+", limit)
+        assert sign is not None, limit
+        if not _COMPARISONS[sign[0]](_numbers(found), _numbers(limit[sign.end() :])):
+            return [f'{name} is {found}, wanted is {wanted}; pip install "{name}{wanted}"']
+    return []
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """The numbers of a version, without what follows the release, such as `rc1`."""
+    found = re.match(r"\d+(\.\d+)*", version)
+    return tuple(map(int, found[0].split("."))) if found else ()
+
+
+def _devices(wrong: list[str]) -> list[str]:
+    from jaxdrones.throughput import machine
+
+    try:
+        return machine.devices()
+    except RuntimeError as error:  # of a driver that jax cannot use
+        wrong.append(f"jax finds no device: {error}; JAX_PLATFORMS=cpu leaves accelerators out")
+        return []
+
+
+def _notes(devices: list[str]) -> list[str]:
+    """What could be better though nothing is wrong."""
+    if devices and shutil.which("nvidia-smi") and all(device.startswith("cpu") for device in devices):
+        return ['an NVIDIA driver is there, but jax computes on the CPU; pip install "jax[cuda12]" for the GPU']
+    return []
+
+
+def _self_tests(extras: dict[str, dict[str, Any]], wrong: list[str]) -> dict[str, str]:
+    """The result of the self-test on every backend that is installed."""
+    from jaxdrones.flights.self_test import self_test
+
+    results = {}
+    for backend in ("explicit", *(["bullet"] if extras.get("bullet", {}).get("present") else [])):
+        begin = time.perf_counter()
+        try:
+            problem = self_test(backend)
+        except Exception as error:  # whatever a broken installation raises
+            problem = f"{type(error).__name__}: {error}"
+        results[backend] = problem or f"a second of flight as computed by hand ({time.perf_counter() - begin:.1f} s)"
+        wrong += [f"self-test on the {backend} backend: {problem}"] if problem else []
+    return results

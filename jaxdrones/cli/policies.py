@@ -1,0 +1,38 @@
+"""Policies at the shell: of a run of `jaxdrones train`, or of a user's file."""
+
+from pathlib import Path
+from typing import Any
+
+from jaxdrones.user_code import is_reference
+
+
+def is_user_policy(policy: Path) -> bool:
+    """Whether this is a policy of a user's file, `file.py:name`, and no folder of a run."""
+    return is_reference(str(policy))
+
+
+def open_policy(policy: Path, task: str | None, realistic: bool, options: dict[str, Any]) -> Any:
+    """The run in a folder, or the policy of a user's file, of which the same can be asked.
+
+    Args:
+        policy: the folder of a run, or `file.py:name`.
+        task: the task that a policy of a file flies; `None` for a run, which says it itself.
+        realistic: whether the task is made realistic; false for a run.
+        options: options of `jaxdrones.make`; none for a run.
+
+    Raises:
+        ValueError: the task is missing, or something is given that the run says itself.
+        ImportError: Stable-Baselines3 trained the run, and is not installed.
+    """
+    from jaxdrones.training.open_run import open_run
+    from jaxdrones.training.user_policy import UserPolicy
+
+    if is_user_policy(policy):
+        if task is None:
+            raise ValueError(f"--task is missing; say which task {policy} flies, for example --task hover")
+        return UserPolicy(str(policy), task, realistic, options)
+    given = {"--task": task, "--realistic": realistic, **{f"--set {name}": x for name, x in options.items()}}
+    for name, x in given.items():
+        if x not in (None, False):
+            raise ValueError(f"{name} is given beside the run {policy}, which says what is flown; leave it out")
+    return open_run(policy)

@@ -1,0 +1,146 @@
+"""`jaxdrones ros2`."""
+
+import argparse
+import contextlib
+import math
+import time
+from typing import Any
+
+from jaxdrones import assets
+from jaxdrones.checks import check_choice, check_number, check_positive, check_whole
+from jaxdrones.cli.common import as_json, folder, print_error, print_warning
+from jaxdrones.control import CONTROLLERS
+from jaxdrones.dynamics import drone_contact, ground_contact
+from jaxdrones.engine.explicit import make_step
+from jaxdrones.flights.conditions import BACKENDS, PHYSICS_HZ
+from jaxdrones.limits import check_at_most
+from jaxdrones.params import repeat
+from jaxdrones.ros2 import bag, topics
+from jaxdrones.ros2.failsafe import ACTIONS, Failsafe, PeerLost
+from jaxdrones.ros2.network import TRANSPORTS, open_transport
+from jaxdrones.ros2.node import Node
+from jaxdrones.ros2.simulation import Simulation
+from jaxdrones.ros2.transport import Transport
+from jaxdrones.sensing import Camera
+from jaxdrones.state import State
+from jaxdrones.urdf import load_params
+
+_SPACING = 0.5  # m between drones at the start, along y
+_MAX_HZ = 20_000
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser("ros2", help="fly a team on the topics of ROS 2", allow_abbrev=False)
+    parser.add_argument("--drones", type=int, default=1, metavar="N", help="number of drones (1)")
+    parser.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
+    parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
+    parser.add_argument("--controller", help=f"of positions, velocities: {', '.join(CONTROLLERS)} (the vehicle's own)")
+    parser.add_argument("--control-hz", type=int, default=100, metavar="HZ", help="control and message rate (100)")
+    parser.add_argument("--height", type=float, default=1.0, metavar="M", help="at which the drones start (1)")
+    pace = parser.add_mutually_exclusive_group()
+    pace.add_argument("--lockstep", action="store_true", help="advance by calls of the service /step")
+    pace.add_argument("--real-time", action="store_true", help="advance by the clock (default)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="simulated over real time (1)")
+    parser.add_argument("--duration", type=float, metavar="S", help="simulated seconds (until it is interrupted)")
+    parser.add_argument("--camera", metavar="WxH", help="a camera on every drone, of this resolution (none)")
+    parser.add_argument("--camera-hz", type=float, default=10.0, metavar="HZ", help="images per second (10)")
+    parser.add_argument("--timeout", type=float, default=1.0, metavar="S", help="longest time between commands (1)")
+    parser.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time until the first one (30)")
+    parser.add_argument("--failsafe", default="hover", help=f"without commands: {', '.join(ACTIONS)} (hover)")
+    parser.add_argument("--transport", default="auto", help=f"{', '.join(TRANSPORTS)} (rclpy if there, or cyclonedds)")
+    parser.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
+    parser.add_argument("--replay", type=folder, metavar="BAG", help="publish what a bag holds; nothing is simulated")
+    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    parser.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    with contextlib.closing(open_transport(options.transport)) as transport:
+        if options.replay:
+            return _replay(options, transport)
+        failsafe = Failsafe(options.failsafe, options.timeout, options.wait)
+        with contextlib.ExitStack() as stack:
+            simulation = _simulation(options, stack)
+            recorder = stack.enter_context(bag.Recorder(options.record)) if options.record else None
+            node = Node(
+                simulation,
+                transport,
+                lockstep=options.lockstep,
+                failsafe=failsafe,
+                speed=options.speed,
+                camera=_camera(options),
+                recorder=recorder,
+                warn=print_warning,
+            )
+            lost = None
+            try:
+                node.run(options.duration)
+            except PeerLost as error:
+                lost = str(error)
+        report: dict[str, Any] = vars(node.flown) | {"simulated_s": simulation.ns / 1e9}
+        _print(options, report)
+    return 0 if lost is None else print_error(lost, 1)
+
+
+def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:
+    if options.json:
+        print(as_json(report))
+    else:
+        print(", ".join(f"{name} {value:g}" for name, value in report.items()))
+
+
+def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Simulation:
+    """The team, hovering side by side."""
+    n, hz = options.drones, options.control_hz
+    check_whole("drones", n)
+    check_positive("speed", options.speed, "")
+    if options.duration is not None:
+        check_number("duration", options.duration, "s", at_least=0)
+    check_at_most("control rate (Hz)", hz, _MAX_HZ)
+    check_choice("backend", options.backend, BACKENDS)
+    check_number("height", options.height, "m", above=0)
+    if options.controller is not None:
+        check_choice("controller", options.controller, CONTROLLERS)
+    params = repeat(load_params(options.vehicle), n)
+    state = State.at_rest([[0.0, _SPACING * (i - (n - 1) / 2), options.height] for i in range(n)])
+    substeps = math.ceil(PHYSICS_HZ / hz)
+    dt = 1 / (hz * substeps)
+    if options.backend == "explicit":
+        pairs = (drone_contact,) if n > 1 else ()
+        step: Any = make_step((ground_contact,), pairs, dt=dt, substeps=substeps)
+    else:
+        from jaxdrones.engine import bullet  # optional
+
+        step = stack.enter_context(bullet.make_step(dt=dt, substeps=substeps))
+    return Simulation(step, params, state, hz, controller=options.controller)
+
+
+def _camera(options: argparse.Namespace) -> Camera | None:
+    if options.camera is None:
+        return None
+    width, _, height = options.camera.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise ValueError(f"--camera is {options.camera!r}; give width and height in pixels, for example 64x48")
+    return Camera(resolution=(int(width), int(height)), rate=options.camera_hz)
+
+
+def _replay(options: argparse.Namespace, transport: Transport) -> int:
+    """Publish a bag at the pace at which it was recorded."""
+    check_number("speed", options.speed, above=0)
+    known = {**topics.OUTPUTS, **topics.COMMANDS}
+    publishers: dict[str, Any] = {}
+    begin, published, ns = time.monotonic(), 0, 0
+    first: int | None = None
+    for name, ns, message in bag.read(options.replay):
+        first = ns if first is None else first
+        if name not in publishers:
+            qos = known.get(name.partition("/")[2], (None, topics.CLOCK.qos))[1]
+            publishers[name] = transport.publisher(topics.Topic(name, type(message), qos))
+        while (left := begin + (ns - first) / 1e9 / options.speed - time.monotonic()) > 0:
+            transport.spin(left)
+        publishers[name](message)
+        published += 1
+    transport.flush(2.0)
+    _print(options, {"published": published, "simulated_s": (ns - (first or 0)) / 1e9})
+    return 0

@@ -1,0 +1,62 @@
+"""Settings and options that the command line takes by name: --set NAME=VALUE and --vehicle."""
+
+import argparse
+import ast
+import contextlib
+from typing import Any
+
+# Arguments of `Recipe.of` that are options of the command.
+_NO_SETTINGS = ("cls", "task", "algorithm", "realistic", "library")
+
+
+def parse_settings(texts: list[str]) -> dict[str, Any]:
+    """The name and value of every --set; of a name that is given twice, the last value."""
+    changes: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals):
+            raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
+        if name in _NO_SETTINGS:
+            raise ValueError(
+                f"--set {name} is not a setting of a learner or of an environment; see jaxdrones train --help"
+            )
+        changes[name] = _value(value)
+    return changes
+
+
+def asked_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """What --set and --vehicle give.
+
+    Raises:
+        ValueError: both give the vehicle, or a --set is no NAME=VALUE.
+    """
+    changes = parse_settings(options.set)
+    if options.vehicle is None:
+        return changes
+    if "vehicle" in changes:
+        raise ValueError(f"--set vehicle={changes['vehicle']} is given beside --vehicle; give one of them")
+    return changes | {"vehicle": options.vehicle}
+
+
+def _value(text: str) -> Any:
+    """A Python literal, or else a string; `nan` and `inf` are numbers."""
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        return float(text) if text.strip("+-") in ("nan", "inf") else text
+
+
+@contextlib.contextmanager
+def user_mistakes(changes: dict[str, Any], task: str):
+    """Turn errors that settings of a user cause into errors that name the settings.
+
+    Raises:
+        ValueError: in place of an error of Python or JAX.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+        if not changes:
+            raise
+        given = ", ".join(f"{name}={x}" for name, x in changes.items())
+        raise ValueError(f"--set {given} does not fit {task}: {error}") from error

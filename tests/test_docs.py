@@ -5,9 +5,11 @@ import re
 
 import pytest
 from documents import LANGUAGES, PAGES, ROOT, blocks, run_python
+from helpers import mostly_slow
 
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 
+IN_TEST_README = ("README.md", "first-ten-minutes.md")
 PAGE = (ROOT / "docs" / "environments.md").read_text()
 
 
@@ -33,12 +35,22 @@ def test_every_file_that_a_page_names_is_there(page):
 
 
 @pytest.mark.parametrize(
-    "page",
-    [page for page in PAGES if blocks(page, "python") and page != ROOT / "README.md"],  # which has tests of its own
-    ids=lambda page: str(page.relative_to(ROOT)),
+    "name",
+    mostly_slow(
+        (str(page.relative_to(ROOT)) for page in PAGES if blocks(page, "python") and page.name not in IN_TEST_README),
+        quick=["docs/environments.md", "docs/from-gym-pybullet-drones.md"],
+    ),
 )
-def test_the_python_of_a_page_runs_from_top_to_bottom(page):
+def test_the_python_of_a_page_runs_from_top_to_bottom(name):
     skipped = []
-    run_python(page, skipped)
+    run_python(ROOT / name, skipped)
     if skipped:
         pytest.skip("; ".join(skipped))
+
+
+def test_every_result_of_a_training_is_on_the_page_of_a_task():
+    """The site's page of a task shows the rows of the table that begin with its name (website/tasks.py)."""
+    table = (ROOT / "docs" / "training.md").read_text().partition("| task, learner |")[2].partition("\n\n")[0]
+    named = [re.match(r"\| `([\w-]+)`[ ,]", row) for row in table.splitlines()[2:]]
+    assert len(named) > 10
+    assert {match and match[1] for match in named} <= TASKS.keys()

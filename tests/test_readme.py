@@ -1,4 +1,4 @@
-"""What the README says runs: its Python from top to bottom, and its commands, in short form."""
+"""What the README and the pages say runs: the README's Python from top to bottom, and every command, in short form."""
 
 import re
 import tomllib
@@ -6,24 +6,41 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from documents import ROOT, blocks, run_python
+from documents import PAGES, ROOT, blocks, run_python
 
 from jaxdrones.cli import main
 from jaxdrones.training.trainer import Trainer
 
-README = ROOT / "README.md"
-BLOCKS = blocks(README, "sh")
+ELSEWHERE = {  # page -> the tests that try its commands
+    "docs/own-policy.md": "tests/test_cli_user_code.py",
+    "docs/own-task.md": "tests/test_cli_user_code.py",
+    "docs/own-vehicle.md": "tests/test_cli_user_code.py",
+    "docs/ros2.md": "tests/ros2/test_cli_ros2.py",
+    "docs/viewer.md": "tests/visualization/test_viewer.py",
+}
+BLOCKS = [
+    block
+    for page in PAGES
+    if str(page.relative_to(ROOT)) not in ELSEWHERE
+    for block in blocks(page, "sh")
+    if not block.reason
+]
 
 
+@pytest.mark.slow
 def test_the_python_of_the_readme_runs_from_top_to_bottom():
-    skipped = []
-    names = run_python(README, skipped)
+    names = run_python(ROOT / "README.md", [])
+    assert (names["slope"] < 0).all()  # heavier drones fall
+    assert names["heights"].shape == (1000,)
+    assert (np.diff(names["heights"]) < 0).all()
+
+
+@pytest.mark.slow
+def test_the_python_of_the_first_ten_minutes_runs_from_top_to_bottom():
+    names = run_python(ROOT / "docs" / "first-ten-minutes.md", [])
     assert names["trajectory"].pos.shape == (1440, 4, 3)
     assert names["many"][1].pos.shape == (100, 1440, 4, 3)
     assert np.isfinite(names["d_mass"])
-    assert np.isfinite(names["hovering"].pos).all()
-    if skipped:
-        pytest.skip("; ".join(skipped))
 
 
 class Short(NamedTuple):
@@ -56,9 +73,18 @@ FLIGHTS = {
         "circle: 4 x cf2x ... Bullet at 240 Hz ... wrote .*circle.mp4", FLIGHT, FILM
     ),
     "compare circle": Short(r"circle: explicit against bullet ... t \(s\)  position ... 0\.20 ", FLIGHT, BULLET),
+    "explain hover": Short(
+        "hover: fly to the goal ... x of the target, from the drone +m +world ... speed of rotor 0 +RPM ... position "
+        "+-1 ... lost ... semi_implicit_euler ... 0.027 kg"
+    ),
     "list": Short("flights +circle, velocity ... vehicles +cf2p, cf2x, hb, racer"),
 }
-QUICK = ("fly circle", "compare circle", "list")
+FLIGHTS |= {
+    "fly circle --controller lqr": Short(f"circle: 4 x cf2x, lqr ... {LOGGED}", FLIGHT),
+    "doctor": Short("versions ... devices ... self-test"),
+    "bench": Short("jaxdrones", "--worlds 64 --seconds 1"),
+}
+QUICK = ("fly circle", "compare circle", "list", "explain hover")
 TRAININGS = {
     "train hover": Short(TRAINED, TRAINING),
     "train leader-follower --algo ppo --seeds 3 --budget 60s": Short(
@@ -76,6 +102,8 @@ TRAININGS = {
     "fly --policy runs/hover --backend bullet --video hover.mp4": Short(
         "hover by bptt, policy of runs/hover, on Bullet ... wrote .*hover.mp4", needs=FILM
     ),
+    "view runs/hover --output hover.html": Short(r"wrote hover\.html \([01]\.\d MB\)"),
+    "view runs/circle --output circle.html": Short(r"wrote circle\.html \([01]\.\d MB\)"),
     "train hover-2021 --library sb3 --algo ppo": Short(
         "trained in ", "--budget 64 --set n_steps=8 --set batch_size=32 --episodes 2", SB3
     ),
@@ -101,8 +129,11 @@ def tried(command: str, short: Short, capsys) -> None:
     assert re.search(short.prints.replace(" ... ", "(?s:.*)"), printed.out), printed.out
 
 
-def test_every_command_of_the_readme_is_tried():
+def test_every_command_of_a_page_is_tried():
     assert {command for block in BLOCKS for command in ours(block)} == FLIGHTS.keys() | TRAININGS.keys()
+    assert [
+        page for page, tests in ELSEWHERE.items() if not ((ROOT / page).is_file() and (ROOT / tests).is_file())
+    ] == []
 
 
 def test_what_sets_the_project_up_is_there():
@@ -115,7 +146,7 @@ def test_what_sets_the_project_up_is_there():
         if program == "make":
             assert set(arguments) <= set(targets)
         elif program == "pip":
-            assert (ROOT / arguments[arguments.index("-c") + 1]).is_file()
+            assert "-c" not in arguments or (ROOT / arguments[arguments.index("-c") + 1]).is_file()
             assert set(re.search(r"\[(.*)\]", command)[1].split(",")) <= set(extras)
         else:
             assert program in ("python3", "pytest")
@@ -132,7 +163,7 @@ def test_what_sets_the_project_up_is_there():
         for c, short in FLIGHTS.items()
     ],
 )
-def test_a_flight_of_the_readme_prints_what_it_is_for(command, tmp_path, monkeypatch, capsys):
+def test_a_flight_of_a_page_prints_what_it_is_for(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     tried(command, FLIGHTS[command], capsys)
 
@@ -142,11 +173,11 @@ def test_a_flight_of_the_readme_prints_what_it_is_for(command, tmp_path, monkeyp
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of imageio-ffmpeg's pipes
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
-    "block", [b for b in BLOCKS if set(ours(b)) & TRAININGS.keys()], ids=lambda b: f"line {b.line}"
+    "block",
+    {tuple(ours(b)): b for b in BLOCKS if set(ours(b)) & TRAININGS.keys()}.values(),  # each once
+    ids=lambda b: b.name,
 )
-def test_the_trainings_of_the_readme_can_be_interrupted_resumed_evaluated_and_flown(
-    block, tmp_path, monkeypatch, capsys
-):
+def test_the_trainings_of_a_page_can_be_interrupted_resumed_evaluated_and_flown(block, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     here = ours(block)
     shorts = {command: (TRAININGS | FLIGHTS)[command] for command in here}

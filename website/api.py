@@ -1,0 +1,27 @@
+"""A page for each room of the package: what its modules say of their public names."""
+
+from pathlib import Path
+
+_LEFT_OUT = ("cli", "_assets", "__pycache__")
+_HEAD = "# {name}\n\n{link}::: {name}\n    options:\n      members: false\n"
+_MODULE = "\n## {name}\n\n::: {name}\n    options:\n      heading_level: 3\n"
+_ROOT = (
+    "The names in `jaxdrones` itself come from the modules here and in the rooms: `jaxdrones.make_step`, for example, "
+    "from `jaxdrones.engine.explicit`.\n\n"
+)
+
+
+def pages(root: Path) -> dict[str, str]:
+    """Path -> Markdown; the package itself first."""
+    package = root / "jaxdrones"
+    rooms = [package, *(f for f in sorted(package.iterdir()) if f.is_dir() and f.name not in _LEFT_OUT)]
+    return {f"api/{room.name}.md": _page(root, room) for room in rooms}
+
+
+def _page(root: Path, room: Path) -> str:
+    name = ".".join(room.relative_to(root).parts)
+    inner = room.glob("*.py") if room.name == "jaxdrones" else room.rglob("*.py")
+    modules = [".".join(f.relative_to(root).with_suffix("").parts) for f in sorted(inner)]
+    shown = [module for module in modules if "__" not in module]
+    head = _HEAD.format(name=name, link=_ROOT if room.name == "jaxdrones" else "")
+    return head + "".join(_MODULE.format(name=module) for module in shown)

@@ -1,0 +1,88 @@
+"""A page for each task, from what `jd.explain` says of it and from the table of results in docs/training.md."""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import jaxdrones as jd
+from jaxdrones.envs import TASKS
+from jaxdrones.envs.explanation import Entry, Part, number
+from jaxdrones.training.presets import default_algorithm, settings_known
+
+_NUMBERS = "Where -1, 0 and 1 stand for something else than the number in its unit, the last columns say for what."
+_ONE_DRONE = "Of each drone, in each control step."
+
+
+def pages(root: Path) -> dict[str, str]:
+    """Path -> Markdown."""
+    results = (root / "docs" / "training.md").read_text()
+    pictured = {path.stem for path in (root / "docs" / "images" / "tasks").glob("*.png")}
+    return {f"tasks/{name}.md": _page(name, name in pictured, results) for name in TASKS}
+
+
+def _page(name: str, pictured: bool, results: str) -> str:
+    with jd.make(name) as env:
+        told = jd.explain(env)
+    team = [(key, text) for key, text in told.task.items() if key not in ("name", "summary") and text]
+    observation, action = (_count(x) for x in (told.observation, told.action))
+    sections = [
+        f"# {name}",
+        told.task["summary"].capitalize() + ".",
+        *([f"![The start of an episode](../images/tasks/{name}.png)"] if pictured else []),
+        _table(["", ""], team),
+        f"```sh\njaxdrones explain {name}\n{_training(name)}\n```",
+        f"## What was measured\n\n{_measured(name, results)}",
+        f"## Observation: {observation}\n\n{_ONE_DRONE} {_NUMBERS}\n\n{_entries(told.observation)}",
+        *([f"## Images\n\n{_table(['image', ''], told.images.items())}"] if told.images else []),
+        f"## Action: {action}\n\n{_ONE_DRONE}\n\n{_entries(told.action)}",
+        f"## Reward\n\nThe sum of weight times term. {_ONE_DRONE}\n\n{_parts(told.rewards)}",
+        "## Ends\n\nTerminations end an episode for good where one holds for one drone; truncations cut an episode "
+        f"that could go on.\n\n{_parts(told.terminations, 'termination')}\n\n{_parts(told.truncations, 'truncation')}",
+        f"## Metrics\n\nThey are not rewarded.\n\n{_parts(told.metrics, 'metric')}",
+        f"## Physics\n\n{_table(['', ''], told.physics.items())}",
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _training(name: str) -> str:
+    algorithm = default_algorithm(name)
+    known = settings_known(name, algorithm)
+    return f"jaxdrones train {name}{'' if known else '   # no settings are known with which it is mastered'}"
+
+
+def _measured(name: str, results: str) -> str:
+    """The rows of the table of results that are about a task."""
+    head, rows = re.search(r"^(\| task, learner .*\n\|[-|: ]+\n)((?:\|.*\n)+)", results, re.M).groups()
+    own = [row for row in rows.splitlines(keepends=True) if re.match(rf"\| `{name}`[ ,]", row)]
+    if not own:
+        return "Not measured."
+    return f"On 2 shared CPU cores; [Train a policy](../training.md#what-it-takes) says how.\n\n{head}{''.join(own)}"
+
+
+def _entries(entries: Sequence[Entry]) -> str:
+    scaled = any(entry.quantity.values for entry in entries)
+    head = ["", "term", "what", "unit", "frame", "range", *(["-1 is", "0 is", "1 is"] if scaled else [])]
+    rows = []
+    for i, entry in enumerate(entries):
+        what = entry.quantity
+        values = [number(x) for x in what.values] if what.values else [""] * 3
+        span = f"{number(entry.low)} to {number(entry.high)}"
+        rows.append([str(i), f"`{entry.term}`", what.name, what.unit, what.frame, span, *(values if scaled else [])])
+    return _table(head, rows)
+
+
+def _count(entries: Sequence[Entry]) -> str:
+    return "1 number" if len(entries) == 1 else f"{len(entries)} numbers"
+
+
+def _parts(parts: Sequence[Part], kind: str = "term") -> str:
+    if not parts:
+        return f"There is no {kind}."
+    weighted = parts[0].weight is not None
+    rows = ([f"`{part.name}`", *([number(part.weight)] if weighted else []), part.meaning] for part in parts)
+    return _table([kind, *(["weight"] if weighted else []), "meaning"], rows)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -1,8 +1,8 @@
 """What is right and what is fast on an accelerator, in one command of at most ten minutes?
 
-Some tests, the plant, environments, teams of eight drones and learners, each in a process of its own that has a share
-of the time; what it measured until then counts. The ratios are to figures that others publish (published.py), on the
-hardware that they name: they say how far apart the figures are, not how much of it is due to the code.
+Some tests, the plant, cameras, environments, teams of eight drones and learners, each in a process of its own that has
+a share of the time; what it measured until then counts. The ratios are to figures that others publish (published.py),
+on the hardware that they name: they say how far apart the figures are, not how much of it is due to the code.
 """
 
 import argparse
@@ -22,16 +22,17 @@ import published
 from common import about
 
 HERE = Path(__file__).parent
-SHARES = {"tests": 0.25, "plant": 0.3, "envs": 0.1, "swarm": 0.15, "learning": 0.2}
+SHARES = {"tests": 0.25, "plant": 0.25, "cameras": 0.1, "envs": 0.1, "swarm": 0.1, "learning": 0.2}
 """Of the time; what a section leaves, the next ones have."""
 
 TESTS = (
-    "tests/backends/test_devices.py",
-    "tests/backends/test_golden.py",
-    "tests/backends/test_explicit.py",
-    "tests/backends/test_gradients.py",
+    "tests/accelerate/test_devices.py",
+    "tests/engine/test_golden.py",
+    "tests/engine/test_explicit.py",
+    "tests/engine/test_gradients.py",
     "tests/dynamics/test_integrators.py",
     "tests/dynamics/test_aero.py",
+    "tests/sensing/test_images.py",
 )
 FEW_TESTS = ("tests/test_wrench.py",)
 WORLDS = (262_144, 16_384, 65_536, 1_024, 1_048_576)  # the first ones are what the figures of others are for
@@ -150,6 +151,18 @@ def swarm(quick: bool) -> Iterator[Row]:
     yield from stepped("swap-goals, eight drones, downwash", "swap-goals", quick, drones=8, pairs=("downwash",))
 
 
+def cameras(quick: bool) -> Iterator[Row]:
+    """Images per second, 64 x 48, with 20 solids and in a forest of 103; each camera in a world of its own."""
+    import cameras as benchmark
+
+    for scene in ("A",) if quick else ("A", "B"):
+        for count in (2,) if quick else (4096, 1024):
+            found = benchmark.rates(scene, (8, 6) if quick else (64, 48), count, repeats=1 if quick else 3)
+            for way, rate in found["rates"].items():
+                note = f"first call {found['compile'][way]:.1f} s"
+                yield row(f"scene {scene}, {way}", rate, None, worlds=count, unit="images/s", note=note)
+
+
 def envs(quick: bool) -> Iterator[Row]:
     """Environment steps per second, with observation, reward and fresh episodes, ten substeps of rk4 in each."""
     options = dict(rotors="lagging", integrator="rk4", substeps=10)
@@ -216,7 +229,7 @@ def row(what: str, value: float, figure: published.Figure | None, **more) -> Row
     return {"what": what, "value": value, "ratio": ratio, "published": theirs | {"source": figure.source}} | more
 
 
-MEASURES = {"tests": tests, "plant": plant, "envs": envs, "swarm": swarm, "learning": learning}
+MEASURES = {"tests": tests, "plant": plant, "cameras": cameras, "envs": envs, "swarm": swarm, "learning": learning}
 
 
 def table(result: dict) -> list[str]:

@@ -2,15 +2,14 @@
 
 import json
 import os
-import platform
-import statistics
 import subprocess
 import time
 
 import jax
-import jaxlib
 
-_SHORTEST = 0.02  # s, of a measurement
+from jaxdrones.throughput import timing
+from jaxdrones.throughput.machine import versions
+from jaxdrones.throughput.timing import seconds as seconds
 
 
 def about() -> dict[str, object]:
@@ -18,9 +17,7 @@ def about() -> dict[str, object]:
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     return {
         "commit": commit.stdout.strip(),
-        "jax": jax.__version__,
-        "jaxlib": jaxlib.__version__,
-        "python": platform.python_version(),
+        **{name: text for name, text in versions().items() if name in ("jax", "jaxlib", "python")},
         "device": str(jax.devices()[0]),
         "cores": os.cpu_count(),
     }
@@ -37,24 +34,7 @@ def compiled(function, *arguments, options: dict | None = None):
 def first_call(function, *arguments) -> float:
     """Seconds of the first call, in which a function compiles itself, the compilation cache switched off."""
     jax.config.update("jax_enable_compilation_cache", False)
-    start = time.perf_counter()
-    jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - start
-
-
-def seconds(program, *arguments, repeats: int) -> dict[str, float]:
-    """Median and best seconds of a call, after calls that warm up; short calls are timed many at a time."""
-
-    def of_calls(calls: int) -> float:
-        start = time.perf_counter()
-        for _ in range(calls):
-            jax.block_until_ready(program(*arguments))
-        return (time.perf_counter() - start) / calls
-
-    of_calls(1)
-    calls = 1 + int(_SHORTEST / of_calls(1))
-    times = [of_calls(calls) for _ in range(repeats)]
-    return {"median": statistics.median(times), "best": min(times)}
+    return timing.first_call(function, *arguments)
 
 
 def report(result: dict, as_json: bool, lines: list[str]) -> None:

@@ -4,17 +4,22 @@ Inside one compiled program; through gymnasium's `make_vec` with NumPy in and ou
 """
 
 import argparse
+import dataclasses
 import time
 
 import gymnasium
 import jax
 import numpy as np
+from cameras_scenes import objects20
 from common import about, compiled, report, seconds
 
 import jaxdrones.adapters.gymnasium  # noqa: F401 (registers the environments)
-from jaxdrones.envs import AutoReset, make
+from jaxdrones.envs import make
+from jaxdrones.tasks import forest
+from jaxdrones.throughput import programs
 
 STEPS = 50  # of a compiled call
+SLOW_CAMERA = dataclasses.replace(forest.camera, rate=15.0)
 
 
 def main() -> None:
@@ -32,6 +37,14 @@ def main() -> None:
         "hover, in jit: env-steps/s": in_jit(make("hover"), options),
         "hover, realistic, in jit: env-steps/s": in_jit(make("hover", realistic=True), options),
         "8 drones, downwash, in jit: drone-steps/s": 8 * in_jit(make("swap-goals", **swarm), options),
+        "forest, 16 x 12 depth at 15 Hz, in jit: env-steps/s": in_jit(
+            make("forest", control_hz=100, camera=SLOW_CAMERA), options
+        ),
+        "hover, 20 solids to touch and the same camera, in jit: env-steps/s": in_jit(
+            make("hover", scene=objects20(), effects=("obstacle_contact",), vision=("depth",), camera=SLOW_CAMERA),
+            options,
+        ),
+        "forest, no camera, in jit: env-steps/s": in_jit(make("forest", control_hz=100, vision=()), options),
         "hover, make_vec, NumPy in and out: env-steps/s": vector(options),
         "hover, one gymnasium environment: steps/s": single(options),
     }
@@ -43,24 +56,7 @@ def main() -> None:
 
 def in_jit(env, options) -> float:
     """Environment steps per second with random actions and autoreset; episodes start out of step."""
-    env = AutoReset(env)
-    keys = jax.random.split(jax.random.key(0), options.worlds)
-    _, episodes = jax.jit(jax.vmap(env.reset))(keys)
-    age = jax.random.randint(jax.random.key(1), (options.worlds,), 0, env.env.steps)
-    episodes = episodes.replace(world=episodes.world.replace(step=age))
-    actions = jax.random.uniform(
-        jax.random.key(2), (options.worlds, env.env.drones, env.env.action_size), minval=-0.1, maxval=0.1
-    )
-
-    def fly(episodes, key):
-        def advance(carry, key):
-            keys = jax.random.split(key, options.worlds)
-            obs, episodes, *outcome = jax.vmap(env.step)(keys, carry[0], actions)
-            return (episodes, obs, *outcome[:3]), None  # all that a learner takes is stored in every step
-
-        first = advance((episodes,), key)[0]
-        return jax.lax.scan(advance, first, jax.random.split(key, STEPS))[0]
-
+    fly, episodes = programs.episodes(env, options.worlds, STEPS)
     program, _ = compiled(fly, episodes, jax.random.key(3))
     return options.worlds * STEPS / seconds(program, episodes, jax.random.key(3), repeats=options.repeats)["median"]
 

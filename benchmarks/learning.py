@@ -10,7 +10,7 @@ import time
 import jax
 from common import about, report
 
-from jaxdrones.cli.training import parse_settings
+from jaxdrones.cli.settings import parse_settings
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.result import training_program
 from jaxdrones.training.algorithms import ALGORITHMS, learner

@@ -12,6 +12,7 @@ from common import about, first_call, report, seconds
 import jaxdrones as jd
 from jaxdrones.checks import check_choice
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.throughput.programs import crazyflies, held
 
 WORLDS = (1, 64, 1024, 16384, 262144)
 GRADIENT_STEPS = 100
@@ -79,18 +80,11 @@ def make_step(options) -> jd.Step:
 def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     """Rates in million drone-steps per second; the gradient is against the forward pass of the same rollout."""
     n = options.drones
-    params = jd.repeat(jd.load_params("cf2x"), n)
-    i = jnp.arange(n)
-    start = jd.State.at_rest(jnp.stack([0.2 * i, 0.0 * i, 1.0 + 0.3 * i], axis=-1))
-    starts = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)) + 0.0, start)
-    rpm = params.hover_rpm[0] * (1 + 0.01 * jax.random.normal(jax.random.key(0), (worlds, n, 4)))
+    params, starts, rpm = crazyflies(worlds, n)
     length = (
         10 if options.quick else max(GRADIENT_STEPS, min(20_000, STEPS_OF_A_CALL // (worlds * n * options.substeps)))
     )
     grad_length = 10 if options.quick else GRADIENT_STEPS
-
-    def fly(start, rpm):
-        return jax.lax.scan(lambda state, _: (step(params, state, rpm), None), start, length=length)[0].pos
 
     def loss(start, rpms):
         final, _ = jax.lax.scan(lambda state, rpm: (step(params, state, rpm), None), start, rpms)
@@ -99,7 +93,7 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     def many(world):
         return jax.jit(jax.vmap(world)) if options.vmap else jd.over_worlds(world)
 
-    forward = many(fly)
+    forward = many(held(step, params, length))
     first_forward = first_call(forward, starts, rpm)
     time = seconds(forward, starts, rpm, repeats=options.repeats)
     steps = worlds * n * options.substeps / 1e6

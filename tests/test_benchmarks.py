@@ -1,6 +1,7 @@
 """The benchmarks run and say what they measured."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -8,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from jaxdrones.visualization.browser import find_browser
+
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
-SECTIONS = {"tests", "plant", "envs", "swarm", "learning"}
+SECTIONS = {"tests", "plant", "cameras", "envs", "swarm", "learning"}
 HELPERS = {
     "cameras_scenes.py",
     "common.py",
@@ -66,9 +69,23 @@ def test_cameras_report_both_scenes_in_every_way():
 
 
 @pytest.mark.slow
-def test_envs_reports_five_rates():
+def test_optimal_reports_error_and_time_of_every_controller():
+    rows = quick("optimal.py")["rows"]
+    assert {"pid", "geometric", "lqr", "ilqr", "mppi"} <= {row["controller"] for row in rows}
+    assert all(0 < row["rms"] < 0.2 and row["ms"] > 0 for row in rows)
+
+
+@pytest.mark.slow
+def test_envs_reports_a_rate_of_every_environment():
     result = quick("envs.py")
-    assert len(result["rates"]) == 5 and min(result["rates"].values()) > 0
+    assert len(result["rates"]) == 8 and min(result["rates"].values()) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_browser() is None, reason="there is no Chromium")
+def test_viewer_reports_frames_per_second():
+    (row,) = quick("viewer.py")["rows"]
+    assert row["frames/s"] > 0 and 0 < row["share"] <= 1
 
 
 @pytest.mark.slow
@@ -92,6 +109,11 @@ def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_
     for row in result["rows"]:
         assert row["value"] > 0 and ("ratio" in row) == ("source" in row.get("published", {}))
     assert result["rows"][0]["failed"] == []
+
+
+def test_accelerator_names_tests_that_exist():
+    named = re.findall(r'"(tests/.*\.py)"', (BENCHMARKS / "accelerator.py").read_text())
+    assert len(named) > 5 and all((BENCHMARKS.parent / file).is_file() for file in named)
 
 
 def test_accelerator_stops_what_takes_longer_than_its_share(tmp_path):
@@ -125,6 +147,7 @@ def test_limit_in_c_flies_our_trajectory():
     assert all(row["share"] > 0 and len(row["rates"]) == 5 for row in result["rows"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted({path.name for path in BENCHMARKS.glob("*.py")} - HELPERS | {"limit"}))
 def test_every_benchmark_explains_itself(name):
     done = subprocess.run(

@@ -1,0 +1,81 @@
+"""How many frames per second does the viewer's page draw without a graphics processor?
+
+Crazyflies on circles, 1,000 rows at 100 Hz, played at normal speed in a headless Chromium that draws in software, in a
+window of 1,100 x 720 pixels. The page lowers the resolution of the view while frames take longer than 1/32 s; `share`
+is what is left of it along each side. Beside it the size of the page and the seconds to make and to load it.
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from common import about, report
+
+import jaxdrones as jd
+from jaxdrones.visualization.browser import find_browser, open_tab
+from jaxdrones.visualization.viewer import Page
+
+DT = 0.01  # s
+
+
+def page_of(drones: int, rows: int) -> tuple[Page, float]:
+    """A page of so many drones on circles around places of a grid, and the seconds that it takes to make it."""
+    side = int(np.ceil(np.sqrt(drones)))
+    places = 0.5 * np.stack([np.arange(drones) % side, np.arange(drones) // side, np.zeros(drones)], axis=-1)
+    t = DT * np.arange(rows)[:, None]
+    phase = t + np.arange(drones)
+    pos = places + np.stack([0.2 * np.cos(phase), 0.2 * np.sin(phase), 1 + 0.1 * np.sin(3 * phase)], axis=-1)
+    vel = np.gradient(pos, DT, axis=0)
+    quat = np.stack([0 * phase, 0 * phase, np.sin(phase / 2), np.cos(phase / 2)], axis=-1)
+    params = jd.repeat(jd.load_params("cf2x"), drones)
+    rpm = np.asarray(params.hover_rpm)[:, None] * np.ones((rows, drones, 4))
+    flight = jd.State(pos, quat, vel, np.zeros_like(vel), rpm)
+    start = time.perf_counter()
+    page = jd.show(flight, params, dt=DT)
+    return page, time.perf_counter() - start
+
+
+def measure(drones: int, rows: int) -> dict:
+    """Frames per second, and what belongs to them: half of the flight lets the page settle, a third is counted."""
+    page, made = page_of(drones, rows)
+    with tempfile.TemporaryDirectory() as folder, open_tab() as tab:
+        file = page.save(Path(folder) / "page.html")
+        start = time.perf_counter()
+        tab.open(file, 1100, 720)
+        loaded = time.perf_counter() - start
+        tab.run("jaxdrones.player.toggle()")
+        time.sleep(rows * DT / 2)
+        begun, first = time.perf_counter(), tab.run("jaxdrones.player.frames")
+        time.sleep(rows * DT / 3)
+        last, ended = tab.run("jaxdrones.player.frames"), time.perf_counter()
+        return {
+            "drones": drones,
+            "rows": rows,
+            "frames/s": (last - first) / (ended - begun),
+            "share": tab.run("jaxdrones.player.stage.share"),
+            "MB": file.stat().st_size / 1e6,
+            "made (s)": made,
+            "loaded (s)": loaded,
+        }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--drones", type=int, nargs="+", default=[4, 100, 1000])
+    parser.add_argument("--rows", type=int, default=1000)
+    parser.add_argument("--quick", action="store_true", help="few drones for a moment: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    if find_browser() is None:
+        parser.error("there is no Chromium")
+    drones, rows = ([4], 200) if options.quick else (options.drones, options.rows)
+    measured = [measure(count, rows) for count in drones]
+    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines += ["  ".join(f"{name} {value:.4g}" for name, value in row.items()) for row in measured]
+    report({"about": about(), "rows": measured}, options.json, lines)
+
+
+if __name__ == "__main__":
+    main()

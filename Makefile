@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fly train test test-slow lint
+.PHONY: fly train rllib test test-slow test-libraries test-rllib lint docs notebooks viewer
 
 fly: .venv/installed  ## four Crazyflies on the paper's circle
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
@@ -13,18 +13,52 @@ train: .venv/installed  ## full four-motor hover, by the gradient of the simulat
 	$(BIN)/jaxdrones train hover --output runs/hover
 	$(BIN)/jaxdrones fly --policy runs/hover
 
+rllib: .venv-rllib/installed  ## the paper's leader and follower by RLlib, three seeds, and a flight of the best
+	if [ -e runs/leader-follower-rllib-ppo ]; then mv runs/leader-follower-rllib-ppo runs/leader-follower-rllib-ppo-$$(date +%Y%m%d-%H%M%S); fi
+	.venv-rllib/bin/jaxdrones train leader-follower --library rllib --seeds 3
+	.venv-rllib/bin/jaxdrones fly --policy runs/leader-follower-rllib-ppo
+
 test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
 
 test-slow: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m slow
 
+test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Baselines3, gymnax and JaxMARL, in an environment of their own
+	.venv-libraries/bin/pytest tests/test_examples.py $(patsubst %,tests/adapters/test_%.py,other_libraries gymnasium gymnax jaxmarl sb3)
+
+test-rllib: .venv-rllib/installed
+	.venv-rllib/bin/pytest tests/adapters/test_rllib.py tests/training/test_rllib.py tests/test_cli_train_rllib.py tests/test_docs.py -k rllib
+
 lint: .venv/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+docs: .venv/installed  ## the site, into build/site; no network; a warning or a broken link is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+notebooks: .venv/installed  ## notebooks/*.ipynb with outputs, from notebooks/*.py; needs Chromium for pictures of the viewer
+	$(BIN)/python notebooks/build.py
+
+viewer:  ## the page of the viewer, from its sources; needs Node.js, which nothing else does
+	cd viewer && npm ci --no-audit --no-fund && npm run build
+
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet -c constraints.txt -e ".[dev]"
+	touch $@
+
+# gymnax and JaxMARL want an older gymnasium and a jax below 0.12; the newest that fit are taken.
+.venv-libraries/installed: pyproject.toml
+	$(PYTHON) -m venv .venv-libraries
+	.venv-libraries/bin/pip install --quiet torch==2.13.0
+	.venv-libraries/bin/pip install --quiet -e ".[pettingzoo,video]" torchrl==0.14.1 skrl==2.1.1 tianshou==2.0.1 stable-baselines3==2.9.2 \
+		gymnax==1.0.1 jaxmarl==0.2.0 six beartype pytest
+	touch $@
+
+# RLlib pins an older gymnasium.
+.venv-rllib/installed: pyproject.toml constraints-rllib.txt
+	$(PYTHON) -m venv .venv-rllib
+	.venv-rllib/bin/pip install --quiet -c constraints-rllib.txt -e ".[cli]" torch "ray[rllib]" beartype pytest
 	touch $@

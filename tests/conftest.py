@@ -1,13 +1,19 @@
 """Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
 
 import importlib.util
+import os
+import random
+import time
 from pathlib import Path
 
 import jax
 import jaxtyping
 import pytest
 
-jaxtyping.install_import_hook("jaxdrones", "shapes.checked")
+PACKAGE = Path(importlib.util.find_spec("jaxdrones").submodule_search_locations[0])
+MODULES = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in PACKAGE.rglob("*.py")}
+# Shapes are checked everywhere but where messages are translated: a check takes longer than a message.
+jaxtyping.install_import_hook(sorted(MODULES - {"jaxdrones.ros2.schema"}), "shapes.checked")
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -15,13 +21,37 @@ jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
+MINUTES = float(os.environ.get("TEST_MINUTES", "inf"))
+BEGIN = time.monotonic()
+
+
+def pytest_collection_modifyitems(items):
+    """With `TEST_SEED`, another file comes first: so that within `TEST_MINUTES` all tests have their day."""
+    if "TEST_SEED" in os.environ:
+        files = sorted({item.path for item in items})
+        random.Random(int(os.environ["TEST_SEED"])).shuffle(files)
+        items.sort(key=lambda item: files.index(item.path))
+
 
 def pytest_runtest_setup(item):
-    """Skip a test marked with `needs` where one of the optional libraries it names is not installed."""
+    """Skip a test when the time is over, or one marked with `needs` where a library that it names is not installed."""
+    if time.monotonic() > BEGIN + 60 * MINUTES:
+        pytest.skip(f"the {MINUTES:g} minutes are over")
     for mark in item.iter_markers("needs"):
         for library in mark.args:
             if importlib.util.find_spec(library) is None:
                 pytest.skip(f"{library} is not installed")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Skip a test of the viewer where its page could not be built, because there is no npm."""
+    try:
+        return (yield)
+    except ImportError as error:
+        if "page is not built" in str(error):
+            pytest.skip(str(error))
+        raise
 
 
 @pytest.fixture(autouse=True)

@@ -74,6 +74,13 @@ def assert_same_motion(actual: State, expected: State, atol: float) -> None:
     assert_close(actual.replace(quat=sign * actual.quat), expected, atol)
 
 
+def assert_same_kind(actual, expected) -> None:
+    """Two pytrees have the same structure, shapes and dtypes, as a scan asks of what it carries."""
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(actual), jax.tree.leaves(expected), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype), jax.tree_util.keystr(path)
+
+
 def assert_finite(tree) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         assert np.all(np.isfinite(leaf)), f"{jax.tree_util.keystr(path)} is not finite: {leaf}"

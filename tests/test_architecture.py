@@ -11,13 +11,27 @@ import jaxdrones
 
 PACKAGE = Path(jaxdrones.__file__).parent
 
-NOUNS = ("assets", "checks", "limits", "params", "rotation", "state", "urdf", "vector", "wrench")
+NOUNS = (
+    "assets",
+    "checks",
+    "limits",
+    "params",
+    "pytree",
+    "quantity",
+    "rotation",
+    "state",
+    "urdf",
+    "user_code",
+    "vector",
+    "wrench",
+)
 LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports another
     (NOUNS,),
     (("dynamics",), ("control",), ("sensing",), ("accelerate",)),
     (("engine",), ("tasks",)),
-    (("envs",), ("flights",)),
-    (("adapters",), ("learning",), ("visualization",)),
+    (("optimal",),),
+    (("envs",), ("flights",), ("symbolic",)),
+    (("adapters",), ("learning",), ("ros2",), ("throughput",), ("visualization",)),
     (("training",),),
     (("cli",),),
     (("",),),  # the package itself, which re-exports
@@ -25,7 +39,8 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
 PLACE = {
     module: (layer, peer) for layer, peers in enumerate(LAYERS) for peer, group in enumerate(peers) for module in group
 }
-OPTIONAL = ("gymnasium", "pettingzoo", "brax", "stable_baselines3", "torch", "pybullet", "matplotlib", "tqdm")
+OPTIONAL = ("gymnasium", "pettingzoo", "brax", "stable_baselines3", "torch", "pybullet", "matplotlib", "tqdm", "casadi")
+OPTIONAL += ("cyclonedds", "rosbags", "rclpy", "ray", "shtab", "tianshou")
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

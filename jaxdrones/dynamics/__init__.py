@@ -1,12 +1,41 @@
 """Wrenches and how they move a drone. The tables below are what the command line knows by name."""
 
-from jaxdrones.dynamics.aero import drag, drag_world_axes, external_force, ground_effect, ground_effect_2021
+from jaxdrones.dynamics.aero import (
+    drag,
+    drag_world_axes,
+    external_force,
+    ground_effect,
+    ground_effect_2021,
+    quadratic_drag,
+)
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
+from jaxdrones.dynamics.inflow import inflow_thrust
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021
 from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.power import (
+    Battery,
+    battery,
+    battery_current,
+    battery_power,
+    battery_voltage,
+    charge_at,
+    lithium_polymer,
+    open_circuit_voltage,
+)
+from jaxdrones.dynamics.propulsion import (
+    THRUST_CURVES,
+    Motors,
+    crazyflie_motors,
+    cubic_motors,
+    failing,
+    pwm_of_thrust,
+    pwm_rotors,
+    supply_voltage,
+)
 from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors, rotor_wrench
+from jaxdrones.dynamics.wind import clock, in_wind, logarithmic_wind
 
 EFFECTS = {
     f.__name__: f
@@ -15,6 +44,7 @@ EFFECTS = {
         drag_world_axes,
         ground_effect,
         ground_effect_2021,
+        inflow_thrust,
         ground_contact,
         obstacle_contact,
         external_force,
@@ -29,7 +59,18 @@ __all__ = [
     "INTEGRATORS",
     "PAIRS",
     "ROTORS",
+    "THRUST_CURVES",
+    "Battery",
     "Model",
+    "Motors",
+    "battery",
+    "battery_current",
+    "battery_power",
+    "battery_voltage",
+    "charge_at",
+    "clock",
+    "crazyflie_motors",
+    "cubic_motors",
     "downwash",
     "downwash_2021",
     "drag",
@@ -37,16 +78,26 @@ __all__ = [
     "drone_contact",
     "euler",
     "external_force",
+    "failing",
     "ground_contact",
     "ground_effect",
     "ground_effect_2021",
     "implicit_midpoint",
+    "in_wind",
+    "inflow_thrust",
     "instant_rotors",
     "lagging_rotors",
+    "lithium_polymer",
+    "logarithmic_wind",
     "newton_euler",
     "obstacle_contact",
+    "open_circuit_voltage",
+    "pwm_of_thrust",
+    "pwm_rotors",
+    "quadratic_drag",
     "quat_rate",
     "rk4",
     "rotor_wrench",
     "semi_implicit_euler",
+    "supply_voltage",
 ]

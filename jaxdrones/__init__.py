@@ -44,7 +44,7 @@ from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.rollout import rollout
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
-from jaxdrones.envs import explain, make
+from jaxdrones.envs import dryden, explain, make
 from jaxdrones.params import Params, repeat, stack
 from jaxdrones.sensing import Camera, Scene, Sensor, render
 from jaxdrones.state import State
@@ -79,6 +79,7 @@ __all__ = [
     "drag",
     "drag_world_axes",
     "drone_contact",
+    "dryden",
     "euler",
     "explain",
     "external_force",

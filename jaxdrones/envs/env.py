@@ -19,7 +19,7 @@ from jaxdrones.envs.construction import Constructed, constructed
 from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
 from jaxdrones.envs.process import check_process
-from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves
+from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves, prepared
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import ImageSpace, Vision, first_images, next_images, observation
 from jaxdrones.params import Params
@@ -90,8 +90,7 @@ class Env(Constructed):
         terms, randomize = check_terms(observation), check_randomizations(randomize)
         if noise is not None:
             check_callable("noise", noise, "sensor_noise()")
-        if disturbance is not None:
-            check_callable("disturbance", disturbance, "random_pushes(0.3)")
+        params, randomize = prepared(disturbance, params, randomize)
         self.scene = task.scene if scene is None else scene
         """Obstacles and ground, or the function that draws them."""
         obstacles = check_scene(self.scene, step, task)

@@ -1,6 +1,9 @@
 """Domain randomization: parameters drawn per episode, sensor noise, wind and random pushes. All compose."""
 
+import dataclasses
+import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +11,7 @@ from jaxtyping import Array
 
 from jaxdrones import rotation
 from jaxdrones.accelerate import compiler
-from jaxdrones.checks import POSITIVE, check_choice, check_number
+from jaxdrones.checks import POSITIVE, check_callable, check_choice, check_number
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
@@ -19,6 +22,41 @@ Noise = Callable[[jax.Array, State], State]
 """(key, state) of a team -> the state as its sensors show it."""
 Disturbance = Callable[[jax.Array, Params, float], Params]
 """(key, params, control period) of a team -> its parameters with the surroundings of the next control step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DisturbanceWithMemory:
+    """A disturbance that depends on what it did before; its memory is `params.aux[name]`."""
+
+    name: str
+    """Key of `Params.aux`."""
+    init: Callable[[jax.Array, Params], Any]
+    """`init(key, params)`: the memory of one drone at the start of an episode, a pytree of arrays."""
+    advance: Disturbance
+    """`advance(key, params, control period)` of a team: its parameters with new surroundings and a new memory."""
+    text: str
+    """What it does, for people."""
+
+    def __post_init__(self):
+        object.__setattr__(self, "__doc__", self.text)
+
+    def __call__(self, key: jax.Array, params: Params, dt: float) -> Params:
+        """The parameters of a team with the surroundings of the next control step."""
+        if self.name not in params.aux:
+            raise ValueError(
+                f"params.aux lacks {self.name!r}, the memory of a disturbance; start from its start(key, params)"
+            )
+        return self.advance(key, params, dt)
+
+    def start(self, key: jax.Array, params: Params) -> Params:
+        """The parameters of one drone with the memory at the start of an episode."""
+        return params.replace(aux=params.aux | {self.name: self.init(key, params)})
+
+    def nominal(self, params: Params) -> Params:
+        """The parameters of a team with a memory of zeros: the place for it."""
+        keys = jax.random.split(jax.random.key(0), len(params.mass))
+        shapes = jax.eval_shape(jax.vmap(self.init), keys, params)
+        return params.replace(aux=params.aux | {self.name: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)})
 
 
 def _check_range(field: str, low: float, high: float) -> None:
@@ -74,6 +112,22 @@ def constant_wind(speed: float) -> Randomization:
         return params.replace(wind=wind * jnp.array([1, 1, 0.25], wind.dtype))
 
     return described(f"wind U(-{speed:g}, {speed:g}) m/s along x and y, a quarter of it along z", randomize)
+
+
+def prepared(
+    disturbance: Disturbance | None, params: Params, randomize: Sequence[Randomization]
+) -> tuple[Params, tuple[Randomization, ...]]:
+    """Nominal parameters of a team and randomizations, with the memory of a disturbance that has one.
+
+    Raises:
+        ValueError: the disturbance is no function.
+    """
+    if disturbance is not None:
+        check_callable("disturbance", disturbance, "random_pushes(0.3)")
+    if isinstance(disturbance, DisturbanceWithMemory):
+        start = described(f"start of: {disturbance.text}", functools.partial(disturbance.start))
+        return disturbance.nominal(params), (*randomize, start)
+    return params, tuple(randomize)
 
 
 def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> Params:

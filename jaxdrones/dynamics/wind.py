@@ -13,7 +13,7 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
-WindField = Callable[[Float[Array, "3"]], Float[Array, "3"]] | Callable[..., Float[Array, "3"]]
+WindField = Callable[..., Float[Array, "3"]]
 """`(pos)` or `(pos, time)`, m and s -> velocity of the air there, m/s, world."""
 Effect = Callable[[Params, State], Wrench]
 

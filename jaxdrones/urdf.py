@@ -37,13 +37,23 @@ _PROPERTIES = {  # attribute: (length, meaning and unit, range)
     "rotor_fall_time": (1, "rotor time constant when slowing down, s", _TIME_CONSTANT),
     "rotor_inertia": (1, "moment of inertia of a rotor about its axis, kg m^2", (0, 1e6)),
     "drag_coeff": (3, "rotor drag, N per m/s and rad/s", (0, 1)),
+    "flapping_coeff": (2, "moment of rotors that move along x and y, N m per m/s and rad/s", (-0.1, 0.1)),
+    "flapping_climb": (3, "share of that moment lost per m/s of climb, and gained per its square", (-10, 10)),
+    "rate_damping": (3, "torque against the angular velocity, N m per rad/s", (0, 1e6)),
+    "trim_torque": (3, "constant torque, N m", (-1e6, 1e6)),
     "ground_effect_coeff": (1, "k_G of equation 5", (0, 100)),
     "downwash_coeff": (3, "k_D1 (N), k_D2, k_D3 (m) of equation 6", (-1e6, 1e6)),
     "inflow_loss": (1, "share of thrust lost per m/s of downwash, s/m", (0, 10)),
     "prop_radius": (1, "propeller radius, m", _LENGTH),
 }
 """The ranges are those of anything from an insect to an airliner; within them single precision holds a flight."""
-_DEFAULTS = {"rotor_inertia": "0"}
+_DEFAULTS = {
+    "rotor_inertia": "0",
+    "flapping_coeff": "0 0",
+    "flapping_climb": "0 0 0",
+    "rate_damping": "0 0 0",
+    "trim_torque": "0 0 0",
+}
 
 _MASS = (1e-6, 1e6)  # kg
 _INERTIA = (1e-15, 1e9)  # kg m^2
@@ -107,6 +117,10 @@ def _params(urdf: "_Urdf") -> Params:
         wind=[0, 0, 0],
         external_force=[0, 0, 0],
         drag_coeff=properties["drag_coeff"],
+        flapping_coeff=properties["flapping_coeff"],
+        flapping_climb=properties["flapping_climb"],
+        rate_damping=properties["rate_damping"],
+        trim_torque=properties["trim_torque"],
         ground_effect_coeff=properties["ground_effect_coeff"],
         downwash_coeff=properties["downwash_coeff"],
         inflow_loss=properties["inflow_loss"],

@@ -9,6 +9,7 @@ from jaxdrones.dynamics.aero import (
     quadratic_drag,
 )
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
+from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
 from jaxdrones.dynamics.inflow import inflow_thrust
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021
@@ -45,6 +46,9 @@ EFFECTS = {
         ground_effect,
         ground_effect_2021,
         inflow_thrust,
+        flapping_moment,
+        rate_damping,
+        trim_torque,
         ground_contact,
         obstacle_contact,
         external_force,
@@ -79,6 +83,7 @@ __all__ = [
     "euler",
     "external_force",
     "failing",
+    "flapping_moment",
     "ground_contact",
     "ground_effect",
     "ground_effect_2021",
@@ -96,8 +101,10 @@ __all__ = [
     "pwm_rotors",
     "quadratic_drag",
     "quat_rate",
+    "rate_damping",
     "rk4",
     "rotor_wrench",
     "semi_implicit_euler",
     "supply_voltage",
+    "trim_torque",
 ]

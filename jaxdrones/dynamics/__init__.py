@@ -11,7 +11,7 @@ from jaxdrones.dynamics.aero import (
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
 from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
 from jaxdrones.dynamics.inflow import inflow_thrust
-from jaxdrones.dynamics.integrators import euler, implicit_midpoint, rk4, semi_implicit_euler
+from jaxdrones.dynamics.integrators import euler, implicit_midpoint, midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.power import (
@@ -56,7 +56,7 @@ EFFECTS = {
 }
 PAIRS = {f.__name__: f for f in (downwash, downwash_2021, drone_contact)}
 ROTORS = {"instant": instant_rotors, "lagging": lagging_rotors}
-INTEGRATORS = {f.__name__: f for f in (semi_implicit_euler, euler, rk4, implicit_midpoint)}
+INTEGRATORS = {f.__name__: f for f in (semi_implicit_euler, euler, midpoint, rk4, implicit_midpoint)}
 
 __all__ = [
     "EFFECTS",
@@ -94,6 +94,7 @@ __all__ = [
     "lagging_rotors",
     "lithium_polymer",
     "logarithmic_wind",
+    "midpoint",
     "newton_euler",
     "obstacle_contact",
     "open_circuit_voltage",

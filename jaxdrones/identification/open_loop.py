@@ -1,0 +1,200 @@
+"""Open loop: from a state of a log, how far a model is from the flight after it was given the same rotor speeds."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.dynamics import Motors, drag, flapping_moment, midpoint, rate_damping, trim_torque
+from jaxdrones.dynamics.propulsion import FULL_PWM
+from jaxdrones.engine.explicit import make_derivative
+from jaxdrones.identification.log import PERIOD, FlightLog
+from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.vector import atan2, dot, safe_sqrt
+
+HORIZONS = (10, 25, 50)
+"""Rows after the start at which a prediction is compared, 0.01 s each."""
+QUANTITIES = ("pos", "vel", "rot", "omega")
+"""Whose errors are in m, m/s, rad and rad/s."""
+EFFECTS = (drag, flapping_moment, rate_damping, trim_torque)
+"""What acts on a vehicle beside its rotors and its weight."""
+
+_LENGTH = HORIZONS[-1]
+_BEFORE = 30  # rows, in which rotors with a lag come to their speed
+_REACH = 6  # rows, by which inputs can be delayed
+_HALF = 0.5  # rows
+
+
+class Windows(NamedTuple):
+    """Pieces of a flight, each from its start to the last horizon; a leading axis over n pieces on every array."""
+
+    start: State
+    """As logged, of one drone."""
+    command: Float[Array, "n rows 4"]
+    """RPM, from some time before the start to some time after the end: measured, or that PWM and battery ask for."""
+    truth: State
+    """As logged at the horizons, a second axis."""
+
+
+def windows(log: FlightLog, kf: float, motors: Motors, starts: np.ndarray) -> Windows:
+    """The pieces of a log that begin in some rows.
+
+    Args:
+        log: of the flight.
+        kf: thrust coefficient that turns the thrust of PWM into speed, N/RPM^2; not used where speeds were measured.
+        motors: of a log of PWM.
+        starts: (n,) rows, from `starts_of`.
+    """
+    command = log.rpm if log.rpm is not None else _commanded_speed(log, kf, motors)
+    padded = np.pad(command, ((_BEFORE + _REACH, _REACH + 1), (0, 0)), mode="edge")
+    rows = starts[:, None] + np.arange(_BEFORE + _LENGTH + 2 * _REACH + 1)
+    at = starts[:, None] + np.array(HORIZONS)
+
+    def state(rows: np.ndarray) -> State:
+        fields = (log.pos, log.quat, log.vel, log.omega, command)
+        return State(*(jnp.asarray(x[np.minimum(rows, len(x) - 1)], float) for x in fields))
+
+    return Windows(state(starts), jnp.asarray(padded[rows], float), state(at))
+
+
+def starts_of(log: FlightLog, stride: int = 1) -> np.ndarray:
+    """The rows from which the whole horizon is in flight, every `stride`-th one.
+
+    Raises:
+        ValueError: there are none.
+    """
+    flying = np.convolve(~log.in_flight, np.ones(_LENGTH + 1), mode="valid") == 0
+    starts = np.flatnonzero(flying)[::stride]
+    if not len(starts):
+        raise ValueError(f"{log.name}: the motors never run for {_LENGTH * PERIOD:g} s on end; give a log of a flight")
+    return starts
+
+
+def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows 4"], lag: bool) -> State:
+    """The states of one drone at the horizons, as they would be logged.
+
+    Args:
+        vehicle: with its instruments.
+        start: as logged.
+        command: a row of `Windows.command`.
+        lag: whether rotors follow the command with the lag of the vehicle; measured speeds are those of the rotors.
+    """
+    params, instruments = vehicle.params, vehicle.instruments
+    speed, rate = _rotor_speed(vehicle, command, lag)
+    team = jax.tree.map(lambda x: x[None], params)
+    state = start.replace(quat=instruments.true_attitude(start.quat), rpm=speed[0])
+
+    def advance(state: State, given: tuple[Array, Array]) -> tuple[State, State]:
+        rotors = jnp.concatenate(given)[None]
+        after = midpoint(lambda s: _derivative(team, s, rotors), jax.tree.map(lambda x: x[None], state), PERIOD)
+        after = jax.tree.map(lambda x: x[0], after)
+        return after, after
+
+    _, states = jax.lax.scan(advance, state, (speed, rate))
+    at = jax.tree.map(lambda x: x[np.array(HORIZONS) - 1], states)
+    return at.replace(
+        pos=jax.vmap(instruments.logged_position, (0, None))(at.pos, start.pos),
+        quat=jax.vmap(instruments.logged_attitude)(at.quat),
+    )
+
+
+def residuals(predicted: State, truth: State) -> Float[Array, "4 3"]:
+    """Errors of one state: position, velocity, rotation vector (body), angular velocity."""
+    between = rotation.multiply(rotation.conjugate(truth.quat), predicted.quat)
+    turn = 2 * jnp.where(between[3] < 0, -1, 1) * between[:3]  # twice the sine of half the angle
+    return jnp.stack(
+        [predicted.pos - truth.pos, predicted.vel - truth.vel, turn, predicted.omega - truth.omega],
+    )
+
+
+def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> Float[np.ndarray, "horizons 4"]:
+    """Mean errors of a vehicle over all starts of a log.
+
+    Args:
+        log: of the flight.
+        vehicle: that is flown.
+        motors: of a log of PWM.
+
+    Returns:
+        Euclidean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular velocity
+        (rad/s), by horizon.
+    """
+    pieces = windows(log, float(vehicle.params.kf), motors, starts_of(log))
+    return np.asarray(_errors(vehicle, pieces, not log.has_rotor_speeds))
+
+
+def held_errors(log: FlightLog, motors: Motors) -> Float[np.ndarray, "horizons 4"]:
+    """`open_loop_errors` of a model that stays in the state of the start."""
+    pieces = windows(log, 1.0, motors, starts_of(log))
+    return np.asarray(_held_errors(pieces.start, pieces.truth))
+
+
+@jax.jit
+def _held_errors(start: State, truth: State) -> Array:
+    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), start, truth)
+    return jnp.mean(jax.vmap(jax.vmap(_error))(held, truth), axis=0)
+
+
+@jax.jit(static_argnums=2)
+def _errors(vehicle: Vehicle, pieces: Windows, lag: bool) -> Array:
+    def of_piece(piece: Windows) -> Array:
+        return jax.vmap(_error)(predict(vehicle, piece.start, piece.command, lag), piece.truth)
+
+    return jnp.mean(jax.vmap(of_piece)(pieces), axis=0)
+
+
+def _error(predicted: State, truth: State) -> Float[Array, "4"]:
+    between = rotation.multiply(rotation.conjugate(truth.quat), predicted.quat)
+    x, y, z, w = between
+    angle = 2 * atan2(safe_sqrt(x * x + y * y + z * z), jnp.abs(w))
+    pos, vel, _, omega = residuals(predicted, truth)
+    return jnp.stack([safe_sqrt(dot(pos, pos)), safe_sqrt(dot(vel, vel)), angle, safe_sqrt(dot(omega, omega))])
+
+
+def _rotor_speed(vehicle: Vehicle, command: Array, lag: bool) -> tuple[Float[Array, "rows 4"], Float[Array, "rows 4"]]:
+    """Speed of the rotors in each row of a piece and its rate, RPM and RPM/s."""
+    delay = vehicle.instruments.delay / PERIOD
+    if not lag:
+        measured = command[_BEFORE:]
+        middle, early, late = (_shifted(measured, delay + shift)[:_LENGTH] for shift in (0, _HALF, -_HALF))
+        return middle, (late - early) / PERIOD
+    asked = _shifted(command, delay)
+
+    def follow(speed: Array, asked: Array) -> tuple[Array, Array]:
+        params = vehicle.params
+        time_constant = jnp.where(asked > speed, params.rotor_rise_time, params.rotor_fall_time)
+        after = asked + (speed - asked) * jnp.exp(-PERIOD / time_constant)
+        return after, ((speed + after) / 2, (after - speed) / PERIOD)
+
+    _, flown = jax.lax.scan(follow, asked[0], asked)
+    speed, rate = (x[_BEFORE : _BEFORE + _LENGTH] for x in flown)
+    return speed, rate
+
+
+def _shifted(x: Float[Array, "rows 4"], delay: Array) -> Float[Array, "inner 4"]:
+    """The rows between the first and last few of x, some rows later; linear in between."""
+    n = len(x) - 2 * _REACH
+    shifts = range(-_REACH, _REACH + 1)
+    weights = [jnp.maximum(1 - jnp.abs(delay - shift), 0) for shift in shifts]
+    return sum(weight * x[_REACH - shift : _REACH - shift + n] for weight, shift in zip(weights, shifts, strict=True))
+
+
+def _commanded_speed(log: FlightLog, kf: float, motors: Motors) -> np.ndarray:
+    """Rotor speeds that PWM and the voltage of the battery come to, RPM."""
+    voltage = log.pwm / FULL_PWM * log.vbat[:, None]
+    return np.sqrt(np.asarray(motors.thrust(jnp.asarray(voltage, float))) / kf)
+
+
+def _recorded(params: Params, state: State, command: Float[Array, "8"]) -> tuple[Array, Array]:
+    """Rotors whose speed and its rate are given."""
+    return command[:4], command[4:]
+
+
+_derivative = make_derivative(effects=EFFECTS, rotors=_recorded)

@@ -14,7 +14,7 @@ from jaxdrones.identification.open_loop import HORIZONS, Windows, predict, resid
 from jaxdrones.identification.parameters import with_parameters
 from jaxdrones.identification.vehicle import Vehicle
 
-_OUTLIER = 2.0  # mean square of a piece's weighted residuals beyond which it counts less (Geman-McClure to Cauchy)
+_OUTLIER = 1.0  # mean square of the weighted residuals of a piece, beyond which it counts ever less (Cauchy)
 _MEDIAN_SQUARE = 0.455  # of a standard normal number
 
 

@@ -32,12 +32,13 @@ _ROUNDS = 4  # in which the spreads are those that were found
 _STEPS = 4  # of each round
 _DAMPING = 1e-3  # of the first step
 _PRIOR = 1e-2  # inverse variance of x, in pieces: holds what the flights do not tell
-_UNTOLD = 1.0  # standard error of x beyond which flights do not tell a parameter
+_PRIOR_OF_LOGARITHMS = 1.0
+_UNTOLD = 0.5  # standard error over value, beyond which flights do not tell a parameter
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """What flights tell of a parameter; of one that differs from flight to flight, of its mean."""
+    """What flights tell of a parameter; of one that differs from flight to flight, of its median."""
 
     value: float
     """SI units."""
@@ -109,9 +110,11 @@ class _Problem:
         self.names, self.flights = self.common + self.own, [log.name for log in logs]
         starts = [starts_of(log, _STRIDE) for log in logs]
         most = max(map(len, starts))
-        self.pieces = [_filled(windows(log, float(params.kf), motors, s), most) for log, s in zip(logs, starts, strict=True)]
+        self.pieces = [_filled(windows(log, motors, s), most) for log, s in zip(logs, starts, strict=True)]
         self.counts = [jnp.asarray(np.arange(most) < len(s), float) for s in starts]
         self.size = len(self.common) + len(logs) * len(self.own)
+        names = self.common + self.own * len(logs)
+        self.prior = np.array([_PRIOR_OF_LOGARITHMS if PARAMETERS[n].unit is None else _PRIOR for n in names])
 
     def indices(self, flight: int) -> np.ndarray:
         """Of the coordinates that a flight depends on."""
@@ -120,8 +123,8 @@ class _Problem:
 
     def normal(self, x: np.ndarray, spreads: list[np.ndarray]) -> tuple[Normal, list[np.ndarray]]:
         """Normal equations of all flights, with the prior, and the spreads that were found."""
-        matrix, gradient, found = _PRIOR * np.eye(self.size), _PRIOR * x, []
-        loss = _PRIOR * float(x @ x)
+        matrix, gradient, found = np.diag(self.prior), self.prior * x, []
+        loss = float(self.prior @ x**2)
         for i, (pieces, counts) in enumerate(zip(self.pieces, self.counts, strict=True)):
             at = self.indices(i)
             part = normal_equations(self.start, self.names, x[at], spreads[i], pieces, counts, self.lag)
@@ -132,9 +135,9 @@ class _Problem:
         return Normal(matrix, gradient, loss, np.stack(found)), found
 
     def vehicle(self, x: np.ndarray) -> Vehicle:
-        """The vehicle with the means of what differs from flight to flight."""
+        """The vehicle with the medians of what differs from flight to flight."""
         own = x[len(self.common) :].reshape(len(self.flights), len(self.own))
-        return with_parameters(self.start, self.names, list(np.concatenate([x[: len(self.common)], own.mean(axis=0)])))
+        return with_parameters(self.start, self.names, list(np.concatenate([x[: len(self.common)], np.median(own, axis=0)])))
 
     def solve(self, validate: Sequence[FlightLog], asked: bool, progress: Callable[[str], None]) -> Report:
         """Near horizons first, then all of them with spreads that were found; the best round by the validation."""
@@ -183,10 +186,10 @@ class _Problem:
         vehicle, errors = self.vehicle(x), np.sqrt(np.diag(np.linalg.inv(normal.matrix)))
         common, own = errors[: len(self.common)], errors[len(self.common) :].reshape(len(self.flights), len(self.own))
         by_name = np.concatenate([common, np.sqrt(np.sum(own**2, axis=0)) / len(self.flights)])
-        found = {
-            name: Estimate(value_of(vehicle, name), error * step_of(vehicle, name), bool(error < _UNTOLD))
-            for name, error in zip(self.names, by_name, strict=True)
-        }
+        found = {}
+        for name, error in zip(self.names, by_name, strict=True):
+            value, step = value_of(vehicle, name), step_of(vehicle, name)
+            found[name] = Estimate(value, error * step, bool(error * step < max(step, _UNTOLD * abs(value))))
         untold = [f"{name} ({shown(e.value)} +- {e.error:.2g})" for name, e in found.items() if not e.told]
         if untold and asked:
             raise ValueError(f"the flights do not tell {', '.join(untold)}; leave out of --parameters what they do not tell")

@@ -38,28 +38,27 @@ class Windows(NamedTuple):
     start: State
     """As logged, of one drone."""
     command: Float[Array, "n rows 4"]
-    """RPM, from some time before the start to some time after the end: measured, or that PWM and battery ask for."""
+    """From some time before the start to some time after the end: measured speeds, RPM, or commanded thrusts, N."""
     truth: State
     """As logged at the horizons, a second axis."""
 
 
-def windows(log: FlightLog, kf: float, motors: Motors, starts: np.ndarray) -> Windows:
+def windows(log: FlightLog, motors: Motors, starts: np.ndarray) -> Windows:
     """The pieces of a log that begin in some rows.
 
     Args:
         log: of the flight.
-        kf: thrust coefficient that turns the thrust of PWM into speed, N/RPM^2; not used where speeds were measured.
         motors: of a log of PWM.
         starts: (n,) rows, from `starts_of`.
     """
-    command = log.rpm if log.rpm is not None else _commanded_speed(log, kf, motors)
+    command = log.rpm if log.rpm is not None else commanded_thrust(log, motors)
     padded = np.pad(command, ((_BEFORE + _REACH, _REACH + 1), (0, 0)), mode="edge")
     rows = starts[:, None] + np.arange(_BEFORE + _LENGTH + 2 * _REACH + 1)
     at = starts[:, None] + np.array(HORIZONS)
 
     def state(rows: np.ndarray) -> State:
-        fields = (log.pos, log.quat, log.vel, log.omega, command)
-        return State(*(jnp.asarray(x[np.minimum(rows, len(x) - 1)], float) for x in fields))
+        fields = (log.pos, log.quat, log.vel, log.omega, np.zeros_like(command))
+        return State(*(jnp.asarray(x[rows], float) for x in fields))
 
     return Windows(state(starts), jnp.asarray(padded[rows], float), state(at))
 
@@ -84,7 +83,7 @@ def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows 4"], lag
         vehicle: with its instruments.
         start: as logged.
         command: a row of `Windows.command`.
-        lag: whether rotors follow the command with the lag of the vehicle; measured speeds are those of the rotors.
+        lag: whether the command is thrust, which rotors follow with the lag of the vehicle, and not their speed.
     """
     params, instruments = vehicle.params, vehicle.instruments
     speed, rate = _rotor_speed(vehicle, command, lag)
@@ -126,13 +125,13 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> Float[
         Euclidean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular velocity
         (rad/s), by horizon.
     """
-    pieces = windows(log, float(vehicle.params.kf), motors, starts_of(log))
+    pieces = windows(log, motors, starts_of(log))
     return np.asarray(_errors(vehicle, pieces, not log.has_rotor_speeds))
 
 
 def held_errors(log: FlightLog, motors: Motors) -> Float[np.ndarray, "horizons 4"]:
     """`open_loop_errors` of a model that stays in the state of the start."""
-    pieces = windows(log, 1.0, motors, starts_of(log))
+    pieces = windows(log, motors, starts_of(log))
     return np.asarray(_held_errors(pieces.start, pieces.truth))
 
 
@@ -165,7 +164,7 @@ def _rotor_speed(vehicle: Vehicle, command: Array, lag: bool) -> tuple[Float[Arr
         measured = command[_BEFORE:]
         middle, early, late = (_shifted(measured, delay + shift)[:_LENGTH] for shift in (0, _HALF, -_HALF))
         return middle, (late - early) / PERIOD
-    asked = _shifted(command, delay)
+    asked = safe_sqrt(_shifted(command, delay) / vehicle.params.kf)
 
     def follow(speed: Array, asked: Array) -> tuple[Array, Array]:
         params = vehicle.params
@@ -186,10 +185,10 @@ def _shifted(x: Float[Array, "rows 4"], delay: Array) -> Float[Array, "inner 4"]
     return sum(weight * x[_REACH - shift : _REACH - shift + n] for weight, shift in zip(weights, shifts, strict=True))
 
 
-def _commanded_speed(log: FlightLog, kf: float, motors: Motors) -> np.ndarray:
-    """Rotor speeds that PWM and the voltage of the battery come to, RPM."""
+def commanded_thrust(log: FlightLog, motors: Motors) -> Float[np.ndarray, "rows 4"]:
+    """Thrusts that PWM and the voltage of the battery come to, N."""
     voltage = log.pwm / FULL_PWM * log.vbat[:, None]
-    return np.sqrt(np.asarray(motors.thrust(jnp.asarray(voltage, float))) / kf)
+    return np.asarray(motors.thrust(jnp.asarray(voltage, float)))
 
 
 def _recorded(params: Params, state: State, command: Float[Array, "8"]) -> tuple[Array, Array]:

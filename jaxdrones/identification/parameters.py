@@ -27,13 +27,13 @@ class Parameter:
     name: str
     """For example `inertia_x`."""
     field: str
-    """Of `Params`, of `Instruments`, or `center_of_mass`."""
+    """Of `Params`, of `Instruments`, `center_of_mass`, or `rotor_lag`, the time constant up and down."""
     entries: int | slice | tuple[()]
     """Those of the field's array that are this number."""
     unit: float | None = None
     """What a step of 1 changes; `None` for a positive number, of which it is the logarithm."""
     of_flight: bool = False
-    """Whether it differs from flight to flight: the vehicle has the mean."""
+    """Whether it differs from flight to flight: the vehicle has the median."""
 
 
 def _axes(field: str, unit: float | None = None, of_flight: bool = False, axes: str = "xyz") -> list[Parameter]:
@@ -48,8 +48,7 @@ PARAMETERS = {
         Parameter("km", "km", ()),
         *_axes("inertia"),
         Parameter("rotor_inertia", "rotor_inertia", (), 1e-8),
-        Parameter("rotor_rise_time", "rotor_rise_time", ()),
-        Parameter("rotor_fall_time", "rotor_fall_time", ()),
+        Parameter("rotor_lag", "rotor_lag", ()),
         *_axes("drag_coeff", 1e-7),
         *_axes("flapping_coeff", 1e-4 / _SUMMED_SPEED, axes="xy"),
         Parameter("flapping_climb_x", "flapping_climb", 0, 0.1),
@@ -66,9 +65,9 @@ PARAMETERS = {
 }
 """Every number that can be fitted, by name."""
 
-_KEPT = ("mass", "inertia_z")  # on thrust over mass and yaw torque over inertia alone does a flight depend
-_OF_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in (*_KEPT, "rotor_rise_time", "rotor_fall_time"))
-_OF_PWM = tuple(name for name in PARAMETERS if name not in (*_KEPT, "rotor_inertia", "rotor_fall_time"))
+# A flight depends on thrust over mass and on yaw torque over inertia: one of each is kept. PWM tells thrusts, not speeds.
+_OF_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in ("mass", "inertia_z", "rotor_lag"))
+_OF_PWM = tuple(name for name in PARAMETERS if name not in ("kf", "inertia_z", "rotor_inertia"))
 
 
 def default_parameters(has_rotor_speeds: bool) -> tuple[str, ...]:
@@ -103,6 +102,8 @@ def value_of(vehicle: Vehicle, name: str) -> float:
     parameter = PARAMETERS[name]
     if parameter.field == "center_of_mass":
         return float(-jnp.mean(vehicle.params.rotor_pos[:, parameter.entries]))
+    if parameter.field == "rotor_lag":
+        return float(vehicle.params.rotor_rise_time)
     array = getattr(getattr(vehicle, _part(parameter)), parameter.field)
     return float(jnp.mean(array[parameter.entries]))
 
@@ -125,6 +126,9 @@ def _with(vehicle: Vehicle, parameter: Parameter, x: Array) -> Vehicle:
     if parameter.field == "center_of_mass":
         rotor_pos = vehicle.params.rotor_pos.at[:, parameter.entries].add(-parameter.unit * x)
         return vehicle.replace(params=vehicle.params.replace(rotor_pos=rotor_pos))
+    if parameter.field == "rotor_lag":
+        lag = vehicle.params.rotor_rise_time * jnp.exp(x)
+        return vehicle.replace(params=vehicle.params.replace(rotor_rise_time=lag, rotor_fall_time=lag))
     part = _part(parameter)
     owner = getattr(vehicle, part)
     place = getattr(owner, parameter.field).at[parameter.entries]

@@ -53,7 +53,7 @@ class Params(PyTreeNode):
     flapping_coeff: Array
     """(2,) moment of rotors that move along body x and y, N m per m/s of air speed and rad/s of summed rotor speed."""
     flapping_climb: Array
-    """(3,) share of that moment lost per m/s of climb, along x and along y, s/m; share gained per its square, s^2/m^2."""
+    """(3,) share of that moment lost per m/s of climb, along x and y, s/m; share gained per its square, s^2/m^2."""
     rate_damping: Array
     """(3,) torque against the angular velocity, N m per rad/s, body."""
     trim_torque: Array

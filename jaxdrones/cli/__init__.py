@@ -3,7 +3,21 @@
 import argparse
 
 from jaxdrones.checks import UnexpectedKeyword
-from jaxdrones.cli import bench, compare, completion, doctor, evaluate, explain, fit, fly, names, ros2, score, train, view
+from jaxdrones.cli import (
+    bench,
+    compare,
+    completion,
+    doctor,
+    evaluate,
+    explain,
+    fit,
+    fly,
+    names,
+    ros2,
+    score,
+    train,
+    view,
+)
 from jaxdrones.cli.common import INTERRUPTED, Parser, print_error
 
 

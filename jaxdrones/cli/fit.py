@@ -6,6 +6,8 @@ from pathlib import Path
 
 from jaxdrones.cli.common import as_json, check_writable, folder
 
+_FIGURE = "errors.png"
+
 
 def add(commands) -> None:
     """Add the command."""
@@ -19,7 +21,10 @@ def add(commands) -> None:
     )
     parser.add_argument("logs", nargs="+", type=Path, metavar="FLIGHT.npz", help="flights to fit")
     parser.add_argument(
-        "--vehicle", default="cf2x", metavar="NAME|URDF", help="where the search starts: a bundled vehicle or URDF (cf2x)"
+        "--vehicle",
+        default="cf2x",
+        metavar="NAME|URDF",
+        help="where the search starts: a bundled vehicle or URDF (cf2x)",
     )
     parser.add_argument(
         "--parameters", metavar="NAME,...", help="what to fit, such as kf,inertia,drag_coeff (all that the logs tell)"
@@ -40,6 +45,7 @@ def _fit(options: argparse.Namespace) -> int:
     from jaxdrones.identification import FlightLog, fit
     from jaxdrones.identification.files import REPORT, report_as_dict, write_vehicle
     from jaxdrones.urdf import load_params
+    from jaxdrones.visualization.residuals import save_errors
 
     params = load_params(options.vehicle)
     motors = crazyflie_motors(options.propellers)
@@ -48,11 +54,12 @@ def _fit(options: argparse.Namespace) -> int:
     check_writable(options.output / REPORT)
     report = fit(logs, params, names, validate, motors, progress=lambda line: print(line, file=sys.stderr))
     write_vehicle(options.output, report, options.vehicle)
+    save_errors(report.errors, options.output / _FIGURE)
     if options.json:
         print(as_json(report_as_dict(report) | {"output": str(options.output)}))
     else:
         print(parameter_table(report))
-        print(f"{options.output}: vehicle.urdf, {REPORT}")
+        print(f"{options.output}: vehicle.urdf, {REPORT}, {_FIGURE}")
     return 0
 
 

@@ -25,6 +25,7 @@ from jaxdrones.dynamics.power import (
     open_circuit_voltage,
 )
 from jaxdrones.dynamics.propulsion import (
+    FULL_PWM,
     THRUST_CURVES,
     Motors,
     crazyflie_motors,
@@ -60,6 +61,7 @@ INTEGRATORS = {f.__name__: f for f in (semi_implicit_euler, euler, midpoint, rk4
 
 __all__ = [
     "EFFECTS",
+    "FULL_PWM",
     "INTEGRATORS",
     "PAIRS",
     "ROTORS",

@@ -29,7 +29,7 @@ def flapping_moment(params: Params, state: State) -> Wrench:
 
 
 def rate_damping(params: Params, state: State) -> Wrench:
-    """Torque of the air against the angular velocity: the rotor that goes down gains thrust, the one that rises loses it."""
+    """Torque against the angular velocity: a rotor that goes down gains thrust, one that rises loses it."""
     return Wrench.of_torque(-params.rate_damping * state.omega)
 
 

@@ -1,6 +1,6 @@
 """Recorded flights: how well a vehicle repeats them, and which vehicle repeats them best."""
 
-
+from jaxdrones.identification.closed_loop import Twin, fly_again
 from jaxdrones.identification.fit import Estimate, Report, fit
 from jaxdrones.identification.instruments import Instruments
 from jaxdrones.identification.log import FlightLog
@@ -16,8 +16,10 @@ __all__ = [
     "FlightLog",
     "Instruments",
     "Report",
+    "Twin",
     "Vehicle",
     "fit",
+    "fly_again",
     "held_errors",
     "open_loop_errors",
 ]

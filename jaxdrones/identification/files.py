@@ -27,7 +27,9 @@ def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
     """Write `vehicle.urdf` and `report.json`; the folder is made, files of an earlier fit are replaced."""
     folder.mkdir(parents=True, exist_ok=True)
     flights = ", ".join(report.of_flights) or "flights"
-    comment = f"Identified by `jaxdrones fit` from {started_from} and {flights}.\n     {REPORT} has the standard errors."
+    comment = (
+        f"Identified by `jaxdrones fit` from {started_from} and {flights}.\n     {REPORT} has the standard errors."
+    )
     (folder / URDF).write_text(to_urdf(report.vehicle.params, "identified", comment.replace("--", "- -")))
     (folder / REPORT).write_text(json.dumps(report_as_dict(report) | {"started_from": started_from}, indent=1) + "\n")
 
@@ -46,7 +48,9 @@ def report_as_dict(report: Report) -> dict[str, Any]:
 
 def errors_as_dict(errors: np.ndarray) -> dict[str, dict[str, float]]:
     """Open-loop errors (horizons, 4) by horizon in rows of 0.01 s and by quantity."""
-    return {str(h): dict(zip(QUANTITIES, map(float, row), strict=True)) for h, row in zip(HORIZONS, errors, strict=True)}
+    return {
+        str(h): dict(zip(QUANTITIES, map(float, row), strict=True)) for h, row in zip(HORIZONS, errors, strict=True)
+    }
 
 
 def load_vehicle(vehicle: str | os.PathLike) -> Vehicle:

@@ -22,6 +22,7 @@ from jaxdrones.identification.parameters import (
     value_of,
     with_parameters,
 )
+from jaxdrones.identification.path_fit import fit_path
 from jaxdrones.identification.vehicle import Vehicle
 from jaxdrones.params import Params
 
@@ -75,10 +76,11 @@ def fit(
 
     Every piece of half a second is flown from its logged start, and the squares of the differences after 0.1, 0.25 and
     0.5 s are made small by Gauss-Newton steps: first for the nearest horizon, then for all of them. Each residual is
-    divided by its spread in its flight, and a piece that fits badly counts less.
+    divided by its spread in its flight, and a piece that fits badly counts less. Flights on set-points without rotor
+    speeds are fitted as a whole, flown by the firmware's PID, unless parameters are named: see `fit_path`.
 
     Args:
-        logs: flights to fit.
+        logs: flights to fit, all with rotor speeds or all without.
         params: of one drone, where the search starts.
         names: of `PARAMETERS`; all that such logs tell when left out.
         validate: flights that are not fitted, and on which the best step is chosen.
@@ -95,22 +97,47 @@ def fit(
     kinds = {log.has_rotor_speeds for log in (*logs, *validate)}
     if len(kinds) > 1:
         raise ValueError("some logs have rotor speeds and others only PWM; fit them one after the other")
+    motors = motors or crazyflie_motors()
+    if not asked and all(log.has_set_points for log in logs):
+        return _fit_paths(logs, params, validate, motors, progress)
     names = asked_parameters(names) if asked else default_parameters(kinds.pop())
-    return _Problem(logs, params, names, motors or crazyflie_motors()).solve(validate, asked, progress)
+    return _Problem(logs, params, names, motors).solve(validate, asked, progress)
+
+
+def _fit_paths(
+    logs: Sequence[FlightLog],
+    params: Params,
+    validate: Sequence[FlightLog],
+    motors: Motors,
+    progress: Callable[[str], None],
+) -> Report:
+    if validate:
+        raise ValueError(
+            "flights on set-points are fitted without validation; leave --validate out, or name --parameters"
+        )
+    vehicle, errors = fit_path(logs, Vehicle.of(params), motors, progress)
+    found = {name: _estimate(vehicle, name, error) for name, error in errors.items()}
+    return Report(vehicle, found, {}, (), {log.name: open_loop_errors(log, vehicle, motors) for log in logs})
+
+
+def _estimate(vehicle: Vehicle, name: str, error: float) -> Estimate:
+    """The estimate of a parameter by the standard error of its coordinate."""
+    value, step = value_of(vehicle, name), step_of(vehicle, name)
+    return Estimate(value, error * step, bool(error * step < max(step, _UNTOLD * abs(value))))
 
 
 class _Problem:
     """The coordinates are those of the vehicle, then those of each flight."""
 
     def __init__(self, logs: Sequence[FlightLog], params: Params, names: tuple[str, ...], motors: Motors):
-        self.logs, self.start, self.motors = logs, Vehicle.of(params), motors
-        self.lag = not logs[0].has_rotor_speeds
+        self.logs, self.start = logs, Vehicle.of(params)
+        self.motors = None if logs[0].has_rotor_speeds else motors
         self.common = tuple(name for name in names if not PARAMETERS[name].of_flight)
         self.own = tuple(name for name in names if PARAMETERS[name].of_flight)
         self.names, self.flights = self.common + self.own, [log.name for log in logs]
         starts = [starts_of(log, _STRIDE) for log in logs]
         most = max(map(len, starts))
-        self.pieces = [_filled(windows(log, motors, s), most) for log, s in zip(logs, starts, strict=True)]
+        self.pieces = [_filled(windows(log, s), most) for log, s in zip(logs, starts, strict=True)]
         self.counts = [jnp.asarray(np.arange(most) < len(s), float) for s in starts]
         self.size = len(self.common) + len(logs) * len(self.own)
         names = self.common + self.own * len(logs)
@@ -127,7 +154,7 @@ class _Problem:
         loss = float(self.prior @ x**2)
         for i, (pieces, counts) in enumerate(zip(self.pieces, self.counts, strict=True)):
             at = self.indices(i)
-            part = normal_equations(self.start, self.names, x[at], spreads[i], pieces, counts, self.lag)
+            part = normal_equations(self.start, self.names, x[at], spreads[i], pieces, counts, self.motors)
             matrix[np.ix_(at, at)] += part.matrix
             gradient[at] += part.gradient
             loss += part.loss
@@ -137,7 +164,9 @@ class _Problem:
     def vehicle(self, x: np.ndarray) -> Vehicle:
         """The vehicle with the medians of what differs from flight to flight."""
         own = x[len(self.common) :].reshape(len(self.flights), len(self.own))
-        return with_parameters(self.start, self.names, list(np.concatenate([x[: len(self.common)], np.median(own, axis=0)])))
+        return with_parameters(
+            self.start, self.names, list(np.concatenate([x[: len(self.common)], np.median(own, axis=0)]))
+        )
 
     def solve(self, validate: Sequence[FlightLog], asked: bool, progress: Callable[[str], None]) -> Report:
         """Near horizons first, then all of them with spreads that were found; the best round by the validation."""
@@ -175,7 +204,7 @@ class _Problem:
     def _validation_loss(self, x: np.ndarray, validate: Sequence[FlightLog]) -> float:
         """Mean of the errors at the last horizon over those of a model that stays where it starts."""
         vehicle = self.vehicle(x)
-        return float(np.mean([self._errors(log, vehicle)[-1] / held_errors(log, self.motors)[-1] for log in validate]))
+        return float(np.mean([self._errors(log, vehicle)[-1] / held_errors(log)[-1] for log in validate]))
 
     def _errors(self, log: FlightLog, vehicle: Vehicle) -> np.ndarray:
         return open_loop_errors(log, vehicle, self.motors)
@@ -186,13 +215,12 @@ class _Problem:
         vehicle, errors = self.vehicle(x), np.sqrt(np.diag(np.linalg.inv(normal.matrix)))
         common, own = errors[: len(self.common)], errors[len(self.common) :].reshape(len(self.flights), len(self.own))
         by_name = np.concatenate([common, np.sqrt(np.sum(own**2, axis=0)) / len(self.flights)])
-        found = {}
-        for name, error in zip(self.names, by_name, strict=True):
-            value, step = value_of(vehicle, name), step_of(vehicle, name)
-            found[name] = Estimate(value, error * step, bool(error * step < max(step, _UNTOLD * abs(value))))
+        found = {name: _estimate(vehicle, name, error) for name, error in zip(self.names, by_name, strict=True)}
         untold = [f"{name} ({shown(e.value)} +- {e.error:.2g})" for name, e in found.items() if not e.told]
         if untold and asked:
-            raise ValueError(f"the flights do not tell {', '.join(untold)}; leave out of --parameters what they do not tell")
+            raise ValueError(
+                f"the flights do not tell {', '.join(untold)}; leave out of --parameters what they do not tell"
+            )
         of_flights = {}
         for i, flight in enumerate(self.flights):
             at_flight = with_parameters(self.start, self.names, list(x[self.indices(i)]))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones.dynamics import Motors
 from jaxdrones.identification.open_loop import HORIZONS, Windows, predict, residuals
 from jaxdrones.identification.parameters import with_parameters
 from jaxdrones.identification.vehicle import Vehicle
@@ -30,10 +31,18 @@ class Normal(NamedTuple):
     """(horizons, 4) robust standard deviation of the unweighted residuals, by horizon and quantity."""
 
 
-@functools.partial(jax.jit, static_argnums=(1, 6))
-def _normal(vehicle: Vehicle, names: tuple[str, ...], x: Array, spread: Array, pieces: Windows, counts: Array, lag: bool):
+@functools.partial(jax.jit, static_argnums=1)
+def _normal(
+    vehicle: Vehicle,
+    names: tuple[str, ...],
+    x: Array,
+    spread: Array,
+    pieces: Windows,
+    counts: Array,
+    motors: Motors | None,
+):
     def weighted(x: Array, piece: Windows) -> Float[Array, "horizons 4 3"]:
-        flown = predict(with_parameters(vehicle, names, list(x)), piece.start, piece.command, lag)
+        flown = predict(with_parameters(vehicle, names, list(x)), piece.start, piece.command, motors)
         return jax.vmap(residuals)(flown, piece.truth) / spread[:, :, None]
 
     def of_piece(piece: Windows, counts: Array):
@@ -53,7 +62,13 @@ def _normal(vehicle: Vehicle, names: tuple[str, ...], x: Array, spread: Array, p
 
 
 def normal_equations(
-    vehicle: Vehicle, names: tuple[str, ...], x: np.ndarray, spread: np.ndarray, pieces: Windows, counts: Array, lag: bool
+    vehicle: Vehicle,
+    names: tuple[str, ...],
+    x: np.ndarray,
+    spread: np.ndarray,
+    pieces: Windows,
+    counts: Array,
+    motors: Motors | None,
 ) -> Normal:
     """Normal equations of one flight.
 
@@ -64,7 +79,9 @@ def normal_equations(
         spread: (horizons, 4) by which residuals are divided.
         pieces: of the flight.
         counts: (pieces,) 1 for a piece, 0 for one that only fills the array.
-        lag: see `predict`.
+        motors: see `predict`.
     """
-    matrix, gradient, loss, found = _normal(vehicle, names, jnp.asarray(x, float), jnp.asarray(spread, float), pieces, counts, lag)
+    matrix, gradient, loss, found = _normal(
+        vehicle, names, jnp.asarray(x, float), jnp.asarray(spread, float), pieces, counts, motors
+    )
     return Normal(np.asarray(matrix, float), np.asarray(gradient, float), float(loss), np.asarray(found, float))

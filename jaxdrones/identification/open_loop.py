@@ -37,27 +37,27 @@ class Windows(NamedTuple):
 
     start: State
     """As logged, of one drone."""
-    command: Float[Array, "n rows 4"]
-    """From some time before the start to some time after the end: measured speeds, RPM, or commanded thrusts, N."""
+    command: Float[Array, "n rows 4"] | Float[Array, "n rows 5"]
+    """From some time before the start to some time after the end: measured speeds, RPM; or duty cycles, 0 to 1, and the
+    voltage of the battery."""
     truth: State
     """As logged at the horizons, a second axis."""
 
 
-def windows(log: FlightLog, motors: Motors, starts: np.ndarray) -> Windows:
+def windows(log: FlightLog, starts: np.ndarray) -> Windows:
     """The pieces of a log that begin in some rows.
 
     Args:
         log: of the flight.
-        motors: of a log of PWM.
         starts: (n,) rows, from `starts_of`.
     """
-    command = log.rpm if log.rpm is not None else commanded_thrust(log, motors)
+    command = log.rpm if log.rpm is not None else np.column_stack([log.pwm / FULL_PWM, log.vbat])
     padded = np.pad(command, ((_BEFORE + _REACH, _REACH + 1), (0, 0)), mode="edge")
     rows = starts[:, None] + np.arange(_BEFORE + _LENGTH + 2 * _REACH + 1)
     at = starts[:, None] + np.array(HORIZONS)
 
     def state(rows: np.ndarray) -> State:
-        fields = (log.pos, log.quat, log.vel, log.omega, np.zeros_like(command))
+        fields = (log.pos, log.quat, log.vel, log.omega, command[:, :4])
         return State(*(jnp.asarray(x[rows], float) for x in fields))
 
     return Windows(state(starts), jnp.asarray(padded[rows], float), state(at))
@@ -76,17 +76,18 @@ def starts_of(log: FlightLog, stride: int = 1) -> np.ndarray:
     return starts
 
 
-def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows 4"], lag: bool) -> State:
+def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows columns"], motors: Motors | None) -> State:
     """The states of one drone at the horizons, as they would be logged.
 
     Args:
         vehicle: with its instruments.
         start: as logged.
         command: a row of `Windows.command`.
-        lag: whether the command is thrust, which rotors follow with the lag of the vehicle, and not their speed.
+        motors: that turn duty cycles into thrust, which rotors come to with the lag of the vehicle; `None` where the
+            command is their speed.
     """
     params, instruments = vehicle.params, vehicle.instruments
-    speed, rate = _rotor_speed(vehicle, command, lag)
+    speed, rate = _rotor_speed(vehicle, command, motors)
     team = jax.tree.map(lambda x: x[None], params)
     state = start.replace(quat=instruments.true_attitude(start.quat), rpm=speed[0])
 
@@ -125,13 +126,12 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> Float[
         Euclidean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular velocity
         (rad/s), by horizon.
     """
-    pieces = windows(log, motors, starts_of(log))
-    return np.asarray(_errors(vehicle, pieces, not log.has_rotor_speeds))
+    return np.asarray(_errors(vehicle, windows(log, starts_of(log)), None if log.has_rotor_speeds else motors))
 
 
-def held_errors(log: FlightLog, motors: Motors) -> Float[np.ndarray, "horizons 4"]:
+def held_errors(log: FlightLog) -> Float[np.ndarray, "horizons 4"]:
     """`open_loop_errors` of a model that stays in the state of the start."""
-    pieces = windows(log, motors, starts_of(log))
+    pieces = windows(log, starts_of(log))
     return np.asarray(_held_errors(pieces.start, pieces.truth))
 
 
@@ -141,10 +141,10 @@ def _held_errors(start: State, truth: State) -> Array:
     return jnp.mean(jax.vmap(jax.vmap(_error))(held, truth), axis=0)
 
 
-@jax.jit(static_argnums=2)
-def _errors(vehicle: Vehicle, pieces: Windows, lag: bool) -> Array:
+@jax.jit
+def _errors(vehicle: Vehicle, pieces: Windows, motors: Motors | None) -> Array:
     def of_piece(piece: Windows) -> Array:
-        return jax.vmap(_error)(predict(vehicle, piece.start, piece.command, lag), piece.truth)
+        return jax.vmap(_error)(predict(vehicle, piece.start, piece.command, motors), piece.truth)
 
     return jnp.mean(jax.vmap(of_piece)(pieces), axis=0)
 
@@ -157,27 +157,29 @@ def _error(predicted: State, truth: State) -> Float[Array, "4"]:
     return jnp.stack([safe_sqrt(dot(pos, pos)), safe_sqrt(dot(vel, vel)), angle, safe_sqrt(dot(omega, omega))])
 
 
-def _rotor_speed(vehicle: Vehicle, command: Array, lag: bool) -> tuple[Float[Array, "rows 4"], Float[Array, "rows 4"]]:
+def _rotor_speed(
+    vehicle: Vehicle, command: Array, motors: Motors | None
+) -> tuple[Float[Array, "rows 4"], Float[Array, "rows 4"]]:
     """Speed of the rotors in each row of a piece and its rate, RPM and RPM/s."""
     delay = vehicle.instruments.delay / PERIOD
-    if not lag:
+    if motors is None:
         measured = command[_BEFORE:]
         middle, early, late = (_shifted(measured, delay + shift)[:_LENGTH] for shift in (0, _HALF, -_HALF))
         return middle, (late - early) / PERIOD
-    asked = safe_sqrt(_shifted(command, delay) / vehicle.params.kf)
+    given = _shifted(command, delay)
+    duty, battery = given[:, :4], given[:, 4:]
+    thrust = motors.thrust(duty * vehicle.instruments.motor_supply(battery))
 
-    def follow(speed: Array, asked: Array) -> tuple[Array, Array]:
-        params = vehicle.params
-        time_constant = jnp.where(asked > speed, params.rotor_rise_time, params.rotor_fall_time)
-        after = asked + (speed - asked) * jnp.exp(-PERIOD / time_constant)
+    def follow(speed: Array, thrust: Array) -> tuple[Array, tuple[Array, Array]]:
+        after = lagging(vehicle.params, speed, thrust, PERIOD)
         return after, ((speed + after) / 2, (after - speed) / PERIOD)
 
-    _, flown = jax.lax.scan(follow, asked[0], asked)
+    _, flown = jax.lax.scan(follow, safe_sqrt(thrust[0] / vehicle.params.kf), thrust)
     speed, rate = (x[_BEFORE : _BEFORE + _LENGTH] for x in flown)
     return speed, rate
 
 
-def _shifted(x: Float[Array, "rows 4"], delay: Array) -> Float[Array, "inner 4"]:
+def _shifted(x: Float[Array, "rows n"], delay: Array) -> Float[Array, "inner n"]:
     """The rows between the first and last few of x, some rows later; linear in between."""
     n = len(x) - 2 * _REACH
     shifts = range(-_REACH, _REACH + 1)
@@ -185,10 +187,11 @@ def _shifted(x: Float[Array, "rows 4"], delay: Array) -> Float[Array, "inner 4"]
     return sum(weight * x[_REACH - shift : _REACH - shift + n] for weight, shift in zip(weights, shifts, strict=True))
 
 
-def commanded_thrust(log: FlightLog, motors: Motors) -> Float[np.ndarray, "rows 4"]:
-    """Thrusts that PWM and the voltage of the battery come to, N."""
-    voltage = log.pwm / FULL_PWM * log.vbat[:, None]
-    return np.asarray(motors.thrust(jnp.asarray(voltage, float)))
+def lagging(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"], dt: float) -> Float[Array, "4"]:
+    """Rotor speeds a time later, on the way to those that give a thrust (N)."""
+    asked = safe_sqrt(thrust / params.kf)
+    time_constant = jnp.where(asked > rpm, params.rotor_rise_time, params.rotor_fall_time)
+    return asked + (rpm - asked) * jnp.exp(-dt / time_constant)
 
 
 def _recorded(params: Params, state: State, command: Float[Array, "8"]) -> tuple[Array, Array]:

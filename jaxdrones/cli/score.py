@@ -15,8 +15,8 @@ def add(commands) -> None:
         "score",
         help="compare a vehicle with recorded flights",
         description="Fly a vehicle from every state of flight logs on the recorded inputs, and print how far it is "
-        "from the flight after 0.1, 0.25 and 0.5 s, beside a model that stays where it starts and the nominal vehicle. A "
-        "log with set-points is also flown as a whole, by the firmware's PID.",
+        "from the flight after 0.1, 0.25 and 0.5 s, beside a model that stays where it starts and the nominal vehicle. "
+        "A log with set-points is also flown as a whole, by the firmware's PID.",
         allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=Path, metavar="FLIGHT.npz", help="flight logs")

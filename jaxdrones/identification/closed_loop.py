@@ -12,11 +12,9 @@ from jaxtyping import Array, Float
 
 from jaxdrones.control import Setpoint, firmware_pid
 from jaxdrones.dynamics import FULL_PWM, Motors, midpoint
-from jaxdrones.engine.explicit import make_derivative
 from jaxdrones.identification.log import PERIOD, FlightLog
-from jaxdrones.identification.open_loop import EFFECTS, lagging
+from jaxdrones.identification.open_loop import lagging, motion
 from jaxdrones.identification.vehicle import Vehicle
-from jaxdrones.params import Params
 from jaxdrones.state import State
 
 _SUBSTEPS = 5  # per row: the loops of attitude and rates run at 500 Hz
@@ -80,10 +78,9 @@ def rows_in_the_air(log: FlightLog) -> slice:
     Raises:
         ValueError: the log has no set-points and battery, or the drone is never near the height of its set-point.
     """
-    if not log.has_set_points:
-        raise ValueError(f"{log.name}: has no set-points; add ref_pos, ref_yaw and vbat to fly it again")
+    ref_pos, *_ = log.orders
     height = log.pos[:, 2]
-    up = log.in_flight & (height > _LOW) & (np.abs(height - log.ref_pos[:, 2]) < _NEAR)
+    up = log.in_flight & (height > _LOW) & (np.abs(height - ref_pos[:, 2]) < _NEAR)
     if not up.any():
         raise ValueError(f"{log.name}: is never within {_NEAR:g} m of the height of its set-point; give another flight")
     return slice(int(np.argmax(up)), int(np.flatnonzero(log.in_flight & (height > _LOW))[-1]) + 1)
@@ -92,11 +89,13 @@ def rows_in_the_air(log: FlightLog) -> slice:
 def course(log: FlightLog) -> Course:
     """Start, set-points and battery of a log, from `rows_in_the_air` on."""
     air = rows_in_the_air(log)
-    start = State(*(jnp.asarray(x[air.start], float) for x in (log.pos, log.quat, log.vel, log.omega)), jnp.zeros(4))
+    ref_pos, ref_yaw, _, vbat = log.orders
+    pos, quat, vel, omega = (jnp.asarray(x[air.start], float) for x in (log.pos, log.quat, log.vel, log.omega))
+    start = State(pos, quat, vel, omega, jnp.zeros(4))
     length = -(-(air.stop - air.start) // _BLOCK) * _BLOCK
     rows = np.minimum(np.arange(air.start, air.start + length), air.stop - 1)
-    setpoint = Setpoint.at(jnp.asarray(log.ref_pos[rows], float), yaw=jnp.asarray(log.ref_yaw[rows], float))
-    return Course(start, setpoint, jnp.asarray(log.vbat[rows], float))
+    setpoint = Setpoint.at(jnp.asarray(ref_pos[rows], float), yaw=jnp.asarray(ref_yaw[rows], float))
+    return Course(start, setpoint, jnp.asarray(vbat[rows], float))
 
 
 def fly_again(log: FlightLog, vehicle: Vehicle, motors: Motors, gains: firmware_pid.Gains) -> Twin:
@@ -116,8 +115,9 @@ def fly_again(log: FlightLog, vehicle: Vehicle, motors: Motors, gains: firmware_
         ValueError: see `rows_in_the_air`.
     """
     rows = rows_in_the_air(log)
+    ref_pos, _, recorded, _ = log.orders
     pos, pwm = (np.asarray(x)[: rows.stop - rows.start] for x in _fly(vehicle, motors, gains, course(log)))
-    return Twin(log.name, log.t[rows], log.pos[rows], pos, log.ref_pos[rows], log.pwm[rows], pwm)
+    return Twin(log.name, log.t[rows], log.pos[rows], pos, ref_pos[rows], recorded[rows], pwm)
 
 
 def fly(
@@ -126,7 +126,7 @@ def fly(
     """Positions (m) and PWM of a repetition."""
     params, instruments = vehicle.params, vehicle.instruments
     team = jax.tree.map(lambda x: x[None], params)
-    dt = PERIOD / _SUBSTEPS
+    dt, derivative = PERIOD / _SUBSTEPS, motion(jnp.zeros(4))
 
     def substep(carry, setpoint, battery):
         memory, state = carry
@@ -134,7 +134,7 @@ def fly(
         thrust = motors.thrust(command.pwm / FULL_PWM * instruments.motor_supply(battery))
         rpm = lagging(params, state.rpm, thrust, dt)
         world = jax.tree.map(lambda x: x[None], state.replace(rpm=rpm))
-        after = midpoint(lambda s: _derivative(team, s, rpm[None]), world, dt)
+        after = midpoint(lambda s: derivative(team, s, rpm[None]), world, dt)
         return (memory, jax.tree.map(lambda x: x[0], after)), command.pwm
 
     def row(carry, given):
@@ -154,11 +154,3 @@ def fly(
 
 
 _fly = jax.jit(fly)
-
-
-def _given(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Array, Array]:
-    """Rotors whose speed is given."""
-    return command, jnp.zeros_like(command)
-
-
-_derivative = make_derivative(effects=EFFECTS, rotors=_given)

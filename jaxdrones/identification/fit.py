@@ -131,6 +131,7 @@ class _Problem:
 
     def __init__(self, logs: Sequence[FlightLog], params: Params, names: tuple[str, ...], motors: Motors):
         self.logs, self.start = logs, Vehicle.of(params)
+        self.given_motors = motors
         self.motors = None if logs[0].has_rotor_speeds else motors
         self.common = tuple(name for name in names if not PARAMETERS[name].of_flight)
         self.own = tuple(name for name in names if PARAMETERS[name].of_flight)
@@ -172,8 +173,10 @@ class _Problem:
         """Near horizons first, then all of them with spreads that were found; the best round by the validation."""
         scale = np.array(HORIZONS)[:, None] / HORIZONS[-1] * _FIRST_SPREAD
         seen = [np.where(np.arange(len(HORIZONS)) <= k, 1, _UNSEEN)[:, None] for k in range(len(HORIZONS))]
-        x, found = np.zeros(self.size), []
-        history, best = [], (np.inf, x, None)
+        x = np.zeros(self.size)
+        found: list[np.ndarray] = []
+        history: list[float] = []
+        best: tuple[float, np.ndarray, Normal | None] = (np.inf, x, None)
         for k in range(len(seen) + _ROUNDS):
             spreads = [scale * seen[k]] * len(self.flights) if k < len(seen) else found
             x, normal, found = self._descend(x, spreads)
@@ -184,8 +187,9 @@ class _Problem:
             if not validate or loss < best[0]:
                 best = (loss, x, normal)
             history.append(loss)
-        _, x, normal = best
-        return self._report(x, normal, tuple(history), validate, asked)
+        _, x, last = best
+        assert last is not None  # of at least one round
+        return self._report(x, last, tuple(history), validate, asked)
 
     def _descend(self, x: np.ndarray, spreads: list[np.ndarray]) -> tuple[np.ndarray, Normal, list[np.ndarray]]:
         """Some steps of Levenberg and Marquardt."""
@@ -207,7 +211,7 @@ class _Problem:
         return float(np.mean([self._errors(log, vehicle)[-1] / held_errors(log)[-1] for log in validate]))
 
     def _errors(self, log: FlightLog, vehicle: Vehicle) -> np.ndarray:
-        return open_loop_errors(log, vehicle, self.motors)
+        return open_loop_errors(log, vehicle, self.given_motors)
 
     def _report(
         self, x: np.ndarray, normal: Normal, history: tuple[float, ...], validate: Sequence[FlightLog], asked: bool

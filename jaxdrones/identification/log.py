@@ -97,7 +97,18 @@ class FlightLog:
     @property
     def has_set_points(self) -> bool:
         """Whether the flight can be flown again on its set-points."""
-        return self.ref_pos is not None and self.vbat is not None
+        return self.ref_pos is not None and self.pwm is not None
+
+    @property
+    def orders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What a flight on set-points was given: `ref_pos`, `ref_yaw`, `pwm` and `vbat`.
+
+        Raises:
+            ValueError: the log lacks one of them.
+        """
+        if self.ref_pos is None or self.ref_yaw is None or self.pwm is None or self.vbat is None:
+            raise ValueError(f"{self.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat to fly it again")
+        return self.ref_pos, self.ref_yaw, self.pwm, self.vbat
 
     @property
     def in_flight(self) -> np.ndarray:

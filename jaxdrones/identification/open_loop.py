@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.dynamics import Motors, drag, flapping_moment, midpoint, rate_damping, trim_torque
 from jaxdrones.dynamics.propulsion import FULL_PWM
-from jaxdrones.engine.explicit import make_derivative
+from jaxdrones.engine.explicit import Derivative, make_derivative
 from jaxdrones.identification.log import PERIOD, FlightLog
 from jaxdrones.identification.vehicle import Vehicle
 from jaxdrones.params import Params
@@ -51,14 +51,14 @@ def windows(log: FlightLog, starts: np.ndarray) -> Windows:
         log: of the flight.
         starts: (n,) rows, from `starts_of`.
     """
-    command = log.rpm if log.rpm is not None else np.column_stack([log.pwm / FULL_PWM, log.vbat])
+    command = log.rpm if log.rpm is not None else _duty_and_voltage(log)
     padded = np.pad(command, ((_BEFORE + _REACH, _REACH + 1), (0, 0)), mode="edge")
     rows = starts[:, None] + np.arange(_BEFORE + _LENGTH + 2 * _REACH + 1)
     at = starts[:, None] + np.array(HORIZONS)
 
     def state(rows: np.ndarray) -> State:
-        fields = (log.pos, log.quat, log.vel, log.omega, command[:, :4])
-        return State(*(jnp.asarray(x[rows], float) for x in fields))
+        pos, quat, vel, omega = (jnp.asarray(x[rows], float) for x in (log.pos, log.quat, log.vel, log.omega))
+        return State(pos, quat, vel, omega, jnp.zeros((*rows.shape, 4)))
 
     return Windows(state(starts), jnp.asarray(padded[rows], float), state(at))
 
@@ -92,8 +92,10 @@ def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows columns"
     state = start.replace(quat=instruments.true_attitude(start.quat), rpm=speed[0])
 
     def advance(state: State, given: tuple[Array, Array]) -> tuple[State, State]:
-        rotors = jnp.concatenate(given)[None]
-        after = midpoint(lambda s: _derivative(team, s, rotors), jax.tree.map(lambda x: x[None], state), PERIOD)
+        speed, rate = given
+        derivative = motion(rate)
+        world = jax.tree.map(lambda x: x[None], state)
+        after = midpoint(lambda s: derivative(team, s, speed[None]), world, PERIOD)
         after = jax.tree.map(lambda x: x[0], after)
         return after, after
 
@@ -114,7 +116,7 @@ def residuals(predicted: State, truth: State) -> Float[Array, "4 3"]:
     )
 
 
-def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> Float[np.ndarray, "horizons 4"]:
+def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.ndarray:
     """Mean errors of a vehicle over all starts of a log.
 
     Args:
@@ -129,7 +131,7 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> Float[
     return np.asarray(_errors(vehicle, windows(log, starts_of(log)), None if log.has_rotor_speeds else motors))
 
 
-def held_errors(log: FlightLog) -> Float[np.ndarray, "horizons 4"]:
+def held_errors(log: FlightLog) -> np.ndarray:
     """`open_loop_errors` of a model that stays in the state of the start."""
     pieces = windows(log, starts_of(log))
     return np.asarray(_held_errors(pieces.start, pieces.truth))
@@ -184,7 +186,17 @@ def _shifted(x: Float[Array, "rows n"], delay: Array) -> Float[Array, "inner n"]
     n = len(x) - 2 * _REACH
     shifts = range(-_REACH, _REACH + 1)
     weights = [jnp.maximum(1 - jnp.abs(delay - shift), 0) for shift in shifts]
-    return sum(weight * x[_REACH - shift : _REACH - shift + n] for weight, shift in zip(weights, shifts, strict=True))
+    moved = [weight * x[_REACH - shift :][:n] for weight, shift in zip(weights, shifts, strict=True)]
+    return jnp.sum(jnp.stack(moved), axis=0)
+
+
+def motion(rpm_rate: Float[Array, "4"]) -> Derivative:
+    """The law of motion of a team of one whose rotors have the commanded speed, which changes at a rate (RPM/s)."""
+
+    def given(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Array, Array]:
+        return command, rpm_rate
+
+    return make_derivative(effects=EFFECTS, rotors=given)
 
 
 def lagging(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"], dt: float) -> Float[Array, "4"]:
@@ -194,9 +206,6 @@ def lagging(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"], d
     return asked + (rpm - asked) * jnp.exp(-dt / time_constant)
 
 
-def _recorded(params: Params, state: State, command: Float[Array, "8"]) -> tuple[Array, Array]:
-    """Rotors whose speed and its rate are given."""
-    return command[:4], command[4:]
-
-
-_derivative = make_derivative(effects=EFFECTS, rotors=_recorded)
+def _duty_and_voltage(log: FlightLog) -> np.ndarray:
+    assert log.pwm is not None and log.vbat is not None  # a log has these or rotor speeds
+    return np.column_stack([log.pwm / FULL_PWM, log.vbat])

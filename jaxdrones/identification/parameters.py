@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
 
 from jaxdrones.checks import check_choice
 from jaxdrones.identification.vehicle import Vehicle
@@ -94,7 +94,7 @@ def asked_parameters(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def with_parameters(vehicle: Vehicle, names: Sequence[str], x: Sequence[Array] | Float[Array, " n"]) -> Vehicle:
+def with_parameters(vehicle: Vehicle, names: Sequence[str], x: Sequence[ArrayLike]) -> Vehicle:
     """The vehicle whose parameters are x from those that it is given with."""
     for name, value in zip(names, x, strict=True):
         vehicle = _with(vehicle, PARAMETERS[name], value)
@@ -126,9 +126,10 @@ def _part(parameter: Parameter) -> str:
     return "params" if parameter.field in _PARAMS else "instruments"
 
 
-def _with(vehicle: Vehicle, parameter: Parameter, x: Array) -> Vehicle:
+def _with(vehicle: Vehicle, parameter: Parameter, x: ArrayLike) -> Vehicle:
     if parameter.field == "center_of_mass":
-        rotor_pos = vehicle.params.rotor_pos.at[:, parameter.entries].add(-parameter.unit * x)
+        moved = -(parameter.unit or 0.0) * x
+        rotor_pos = vehicle.params.rotor_pos.at[:, parameter.entries].add(moved)
         return vehicle.replace(params=vehicle.params.replace(rotor_pos=rotor_pos))
     if parameter.field == "rotor_lag":
         lag = vehicle.params.rotor_rise_time * jnp.exp(x)

@@ -36,7 +36,7 @@ Residuals = Callable[[Array], Float[Array, " n"]]
 
 def fit_path(
     logs: Sequence[FlightLog], start: Vehicle, motors: Motors, progress: Callable[[str], None]
-) -> tuple[Vehicle, dict[str, tuple[float, str]]]:
+) -> tuple[Vehicle, dict[str, float]]:
     """Fit a vehicle to flights on set-points.
 
     First the mass and what the motors get of the battery's voltage, by the balance of the vertical forces in every
@@ -52,8 +52,8 @@ def fit_path(
         The vehicle, and the standard error of each parameter's coordinate.
     """
     seconds = [_seconds(log) for log in logs]
-    together = [jnp.asarray(np.concatenate(parts), float) for parts in zip(*seconds, strict=True)]
-    balance = functools.partial(_balance, start, motors, *together)
+    duty, battery, up, acc = (jnp.asarray(np.concatenate(parts), float) for parts in zip(*seconds, strict=True))
+    balance = functools.partial(_balance, start, motors, duty, battery, up, acc)
     x, balance_errors = _least_squares(balance, len(BALANCE), np.inf)
     progress(f"balance of forces: {_rms(balance(x)) * _FORCE:.1%} of the weight")
     vehicle = with_parameters(start, BALANCE, list(x))
@@ -75,7 +75,8 @@ def _seconds(log: FlightLog) -> tuple[np.ndarray, ...]:
     rows = starts[:, None] + np.arange(_SECOND)
     up = np.asarray(jax.vmap(rotation.z_axis)(jnp.asarray(log.quat, float)))[:, 2]
     acc = (log.vel[starts + _SECOND, 2] - log.vel[starts, 2]) / (_SECOND * PERIOD)
-    return log.pwm[rows] / FULL_PWM, log.vbat[rows], up[rows], acc
+    _, _, pwm, vbat = log.orders
+    return pwm[rows] / FULL_PWM, vbat[rows], up[rows], acc
 
 
 def _balance(start: Vehicle, motors: Motors, duty: Array, battery: Array, up: Array, acc: Array, x: Array) -> Array:

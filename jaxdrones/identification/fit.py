@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -153,14 +155,18 @@ class _Problem:
         """Normal equations of all flights, with the prior, and the spreads that were found."""
         matrix, gradient, found = np.diag(self.prior), self.prior * x, []
         loss = float(self.prior @ x**2)
-        for i, (pieces, counts) in enumerate(zip(self.pieces, self.counts, strict=True)):
-            at = self.indices(i)
-            part = normal_equations(self.start, self.names, x[at], spreads[i], pieces, counts, self.motors)
+        coordinates = [self.indices(i) for i in range(len(self.flights))]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:  # a program of one flight keeps one core busy
+            parts = pool.map(self._of_flight, (x[at] for at in coordinates), spreads, self.pieces, self.counts)
+        for at, part in zip(coordinates, parts, strict=True):
             matrix[np.ix_(at, at)] += part.matrix
             gradient[at] += part.gradient
             loss += part.loss
             found.append(part.spread)
         return Normal(matrix, gradient, loss, np.stack(found)), found
+
+    def _of_flight(self, x: np.ndarray, spread: np.ndarray, pieces: Windows, counts: jax.Array) -> Normal:
+        return normal_equations(self.start, self.names, x, spread, pieces, counts, self.motors)
 
     def vehicle(self, x: np.ndarray) -> Vehicle:
         """The vehicle with the medians of what differs from flight to flight."""

@@ -23,6 +23,7 @@ NOUNS = (
     "urdf",
     "user_code",
     "vector",
+    "vehicles",
     "wrench",
 )
 LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports another

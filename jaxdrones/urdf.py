@@ -66,7 +66,7 @@ def load_params(vehicle: str | os.PathLike) -> Params:
     """The constants of one drone.
 
     Args:
-        vehicle: a bundled vehicle (`cf2x`, `cf2p`, `hb`, `racer`) or the path of a URDF.
+        vehicle: a bundled vehicle (`jaxdrones.assets.vehicles()` names all) or the path of a URDF.
 
     Raises:
         ValueError: an unknown vehicle, or a URDF that lacks something or holds nonsense; says what.

@@ -24,6 +24,7 @@ NOUNS = (
     "urdf_writer",
     "user_code",
     "vector",
+    "vehicles",
     "wrench",
 )
 LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports another

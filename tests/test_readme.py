@@ -78,7 +78,7 @@ FLIGHTS = {
         "hover: fly to the goal ... x of the target, from the drone +m +world ... speed of rotor 0 +RPM ... position "
         "+-1 ... lost ... semi_implicit_euler ... 0.027 kg"
     ),
-    "list": Short("flights +circle, velocity ... vehicles +cf2p, cf2x, hb, racer"),
+    "list": Short("flights +circle, velocity ... vehicles +agilicious, bebop, cf21, cf21_brushless"),
 }
 FLIGHTS |= {
     "fly circle --controller lqr": Short(f"circle: 4 x cf2x, lqr ... {LOGGED}", FLIGHT),

@@ -11,15 +11,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxdrones.checks import check_callable, check_finite, check_key, check_shape
+from jaxdrones.checks import check_finite, check_key, check_shape
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs.action import Action
-from jaxdrones.envs.arguments import check_randomizations, check_team, check_terms, delay_steps, episode_steps
+from jaxdrones.envs.arguments import check_draws, check_team, check_terms, delay_steps, episode_steps
 from jaxdrones.envs.construction import Constructed, constructed
 from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
 from jaxdrones.envs.process import check_process
-from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves, prepared
+from jaxdrones.envs.randomize import (
+    Disturbance,
+    Noise,
+    Randomization,
+    delayed,
+    draw,
+    drawn_leaves,
+    prepared,
+    scaling_params,
+)
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import ImageSpace, Vision, first_images, next_images, observation
 from jaxdrones.params import Params
@@ -87,9 +96,7 @@ class Env(Constructed):
         """
         check_process()
         check_team(task, params, action, dt)
-        terms, randomize = check_terms(observation), check_randomizations(randomize)
-        if noise is not None:
-            check_callable("noise", noise, "sensor_noise()")
+        terms, randomize = check_terms(observation), check_draws(randomize, noise, disturbance)
         params, randomize = prepared(disturbance, params, randomize)
         self.scene = task.scene if scene is None else scene
         """Obstacles and ground, or the function that draws them."""
@@ -217,7 +224,8 @@ class Env(Constructed):
         """The world at the start of an episode, before the first measurement."""
         params = draw(self.randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
         scene = self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE))
-        drones, variables = self.task.begin(jax.random.fold_in(key, START), self.params, scene)
+        known = scaling_params(self.randomize, params, self.params)
+        drones, variables = self.task.begin(jax.random.fold_in(key, START), known, scene)
         return World(
             params=params,
             drones=self.physics.init(params, drones),
@@ -262,7 +270,8 @@ class Env(Constructed):
             return self.action.rpm(params, memory, state, action, setpoint, self.dt)
 
         flown = delayed(actions, self.delay), self.task.target_now(world)
-        memory, rpm = jax.vmap(of_drone)(self.params, world.memory, world.drones, *flown)
+        known = scaling_params(self.randomize, params, self.params)
+        memory, rpm = jax.vmap(of_drone)(known, world.memory, world.drones, *flown)
         return world.replace(memory=memory), rpm
 
     def _outcome(self, key: Key, world: World, rate: State | None):

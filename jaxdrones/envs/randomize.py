@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
-from jaxdrones.checks import POSITIVE, check_callable, check_choice, check_number
+from jaxdrones.checks import POSITIVE, check_choice, check_number
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
@@ -117,17 +117,53 @@ def constant_wind(speed: float) -> Randomization:
 def prepared(
     disturbance: Disturbance | None, params: Params, randomize: Sequence[Randomization]
 ) -> tuple[Params, tuple[Randomization, ...]]:
-    """Nominal parameters of a team and randomizations, with the memory of a disturbance that has one.
-
-    Raises:
-        ValueError: the disturbance is no function.
-    """
-    if disturbance is not None:
-        check_callable("disturbance", disturbance, "random_pushes(0.3)")
+    """Nominal parameters of a team and randomizations, with the memory of a disturbance that has one."""
     if isinstance(disturbance, DisturbanceWithMemory):
         start = described(f"start of: {disturbance.text}", functools.partial(disturbance.start))
         return disturbance.nominal(params), (*randomize, start)
     return params, tuple(randomize)
+
+
+@dataclasses.dataclass(frozen=True)
+class AnyVehicle:
+    """Any quadrotor that could be built, of 20 g to 3 kg where no other masses are given (`jaxdrones.vehicles`).
+
+    What other randomizations draw is hidden from starts and actions, which are scaled by the nominal vehicle. This one
+    draws the vehicle itself, and they are scaled by what it draws, so that an action of 0 hovers. In `jaxdrones.make`
+    the median vehicle is the nominal one.
+
+    Raises:
+        ValueError: masses out of range, or the heaviest first.
+    """
+
+    lightest: float = vehicles.LIGHTEST
+    """kg."""
+    heaviest: float = vehicles.HEAVIEST
+    """kg."""
+
+    def __post_init__(self):
+        vehicles.check_masses(self.lightest, self.heaviest)
+        object.__setattr__(self, "__doc__", f"any quadrotor of {self.lightest:g} to {self.heaviest:g} kg")
+
+    def __call__(self, key: jax.Array, params: Params) -> Params:
+        """The drawn vehicle, in the surroundings of `params`."""
+        return vehicles.draw(key, params, self.lightest, self.heaviest)
+
+    def median(self, params: Params) -> Params:
+        """A team of the median vehicle, in the surroundings of the team `params`."""
+        return jax.vmap(lambda one: vehicles.median(one, self.lightest, self.heaviest))(params)
+
+
+def nominal_params(randomize: Sequence[Randomization], params: Params) -> Params:
+    """The parameters of a team before anything is drawn: those given, or the median of the vehicles that are drawn."""
+    for one in randomize:
+        params = one.median(params) if isinstance(one, AnyVehicle) else params
+    return params
+
+
+def scaling_params(randomize: Sequence[Randomization], drawn: Params, nominal: Params) -> Params:
+    """What starts and actions are scaled by: the nominal parameters, or the drawn ones where a vehicle is drawn."""
+    return drawn if any(isinstance(one, AnyVehicle) for one in randomize) else nominal
 
 
 def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> Params:

@@ -76,6 +76,14 @@ def test_optimal_reports_error_and_time_of_every_controller():
 
 
 @pytest.mark.slow
+def test_firmware_reports_agreement_and_cost():
+    result = quick("firmware.py")
+    (row,) = result["rows"]
+    assert max(row["roll"], row["pitch"]) < 0.3 and abs(row["pwm_ratio"] - 1) < 0.01
+    assert min(cost["seconds"] for cost in result["costs"].values()) > 0
+
+
+@pytest.mark.slow
 def test_envs_reports_a_rate_of_every_environment():
     result = quick("envs.py")
     assert len(result["rates"]) == 8 and min(result["rates"].values()) > 0

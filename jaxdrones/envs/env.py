@@ -99,7 +99,7 @@ class Env(Constructed):
         """Shape, dtype and bounds of every image of a drone, by name."""
         self.steps = episode_steps(task, dt)
         """Number of control steps after which an episode is truncated."""
-        self.sensors = check_sensors(sensors)
+        self.sensors = check_sensors(sensors, dt)
         self.terms, self.randomize, self.noise, self.disturbance = terms, randomize, noise, disturbance
         self.delay = delay_steps(task, delay, dt)  # control steps
         self._history = max(math.ceil(self.delay) + 1, *(term.history for term in terms))

@@ -1,12 +1,17 @@
 """What stands around, who touches it, and what the drones measure."""
 
+from jaxdrones.sensing import kalman
 from jaxdrones.sensing.builders import BEAMS, forest, gate, obstacles_2021, room, track
 from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
 from jaxdrones.sensing.depth_noise import DepthNoise
 from jaxdrones.sensing.distances import Surface
+from jaxdrones.sensing.estimator import state_estimate
 from jaxdrones.sensing.files import Mesh, Urdf
 from jaxdrones.sensing.images import Images, photograph, render
+from jaxdrones.sensing.inertial import BMI088, MPU9250, ImuPart, imu
+from jaxdrones.sensing.mocap import VICON, MotionCaptureSystem, motion_capture
+from jaxdrones.sensing.noise import Noise, allan_deviation
 from jaxdrones.sensing.range_finders import (
     downward_range,
     lidar,
@@ -23,6 +28,9 @@ from jaxdrones.sensing.urdf_scene import from_urdf
 
 __all__ = [
     "BEAMS",
+    "BMI088",
+    "MPU9250",
+    "VICON",
     "Box",
     "Camera",
     "Capsule",
@@ -30,19 +38,26 @@ __all__ = [
     "Cylinder",
     "DepthNoise",
     "Images",
+    "ImuPart",
     "Mesh",
+    "MotionCaptureSystem",
+    "Noise",
     "Scene",
     "Sensor",
     "Sphere",
     "Surface",
     "Urdf",
+    "allan_deviation",
     "camera_2021",
     "collisions",
     "downward_range",
     "forest",
     "from_urdf",
     "gate",
+    "imu",
+    "kalman",
     "lidar",
+    "motion_capture",
     "multi_ranger",
     "obstacles_2021",
     "optical_flow",
@@ -51,6 +66,7 @@ __all__ = [
     "ray",
     "render",
     "room",
+    "state_estimate",
     "time_of_flight",
     "track",
 ]

@@ -55,6 +55,9 @@ class Sensor:
     """Measurements per second, between which the reading stays; one every control step when left out."""
     entries: tuple[Quantity, ...] = ()
     """What each number of the flattened reading stands for, for `jaxdrones.explain`; none where it does not say."""
+    clocked: bool = False
+    """Whether it counts on exactly 1 / `rate` between measurements, as what integrates over time does. An environment
+    then refuses a rate that does not divide that of its control steps."""
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
@@ -67,6 +70,8 @@ class Sensor:
         check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
         if self.rate is not None:
             check_positive(f"rate of sensor {self.name!r}", self.rate, "1/s")
+        if self.clocked and self.rate is None:
+            raise ValueError(f"sensor {self.name!r} is clocked, but has no rate; give rate in measurements per second")
 
     def is_due(self, step: jax.Array, dt: float) -> jax.Array:
         """Whether there is a measurement after so many control steps of an episode.
@@ -83,8 +88,8 @@ class Sensor:
         return count > before
 
 
-def check_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
-    """The sensors of a team, or an error if one is none or two have the same name."""
+def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[Sensor, ...]:
+    """The sensors of a team; raises if one is none, two have the same name, or one does not fit `dt`, s, of control."""
     if isinstance(sensors, Sensor):
         raise ValueError(f"sensors is the single sensor {sensors.name!r}; give a sequence, for example (sensor,)")
     sensors = check_sequence("sensors", sensors, "sensor")
@@ -95,7 +100,20 @@ def check_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"two sensors have the name {twice[0]!r}; give every sensor a name of its own")
+    if dt is not None:
+        _check_clocks(sensors, dt)
     return sensors
+
+
+def _check_clocks(sensors: Sequence[Sensor], dt: float) -> None:
+    """Raise unless the rates of all clocked sensors divide that of the control steps."""
+    for sensor in sensors:
+        steps = 1 / (sensor.rate * dt) if sensor.clocked and sensor.rate else 1.0
+        if round(steps) < 1 or abs(steps - round(steps)) > _ROUNDING * steps:
+            raise ValueError(
+                f"sensor {sensor.name!r} measures at {sensor.rate:g} Hz, which does not divide the {1 / dt:g} Hz of "
+                "the control steps; give it a rate that does, or another control_hz"
+            )
 
 
 def init_sensors(sensors: Sequence[Sensor], key: jax.Array, params: Params) -> dict[str, Any]:

@@ -1,0 +1,176 @@
+"""The state of a drone as its own filter knows it, from an IMU and motion capture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_number, check_positive, check_switch, shown
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.quantity import quantities
+from jaxdrones.sensing import inertial, kalman
+from jaxdrones.sensing.inertial import BMI088, ImuPart
+from jaxdrones.sensing.mocap import VICON, MotionCaptureSystem
+from jaxdrones.sensing.noise import Errors
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.state import State
+
+_ROUNDING = 1e-6  # of a number of periods
+
+
+class Sample(PyTreeNode):
+    """What is measured at an instant."""
+
+    acc: Array
+    """(3,) specific force, m/s^2, body."""
+    gyro: Array
+    """(3,) rad/s, body."""
+    pos: Array
+    """(3,) m, world."""
+    quat: Array
+    """(4,) body to world."""
+    fresh: Array
+    """() whether there is a pose."""
+
+
+class Memory(PyTreeNode):
+    """What the sensor `state_estimate` remembers."""
+
+    estimate: kalman.Estimate
+    """As of the pose that arrived last, or was due."""
+    imu: dict[str, Errors]
+    """Errors of the IMU."""
+    samples: Sample
+    """The latest samples with a leading axis, the oldest one first: one before that of the estimate, and all since."""
+    count: Array
+    """() number of measurements."""
+
+
+def imu_noise(part: ImuPart) -> kalman.ImuNoise:
+    """The noise that the filter expects of an IMU; a Gauss-Markov bias is taken for a random walk."""
+    densities = part.gyro.density, part.acc.density, part.gyro.bias_walk, part.acc.bias_walk
+    return kalman.ImuNoise(*(jnp.asarray(density, float) for density in densities))
+
+
+def state_estimate(
+    part: ImuPart = BMI088,
+    system: MotionCaptureSystem = VICON,
+    rate: float = 100.0,
+    *,
+    attitude: bool = True,
+    start: tuple[float, float, float] = (0.001, 0.02, 0.01),
+    name: str = "state_estimate",
+) -> Sensor:
+    """The state that an error-state Kalman filter knows; its reading is a `State` for policies and controllers.
+
+    The filter, `jaxdrones.sensing.kalman`, fuses an IMU in the center of mass with motion capture. It lives in the
+    past, at the instant of the poses that arrive, and the IMU's samples since then bring its estimate to the present.
+    The reading's `rpm` is that of the drone, as telemetry knows it, and its `aux` is empty. The memory's `estimate` has
+    the covariance. The filter knows nothing of errors of scale, saturation, or poses whose errors are not white.
+
+    Args:
+        part: errors of the IMU.
+        system: rate, delay, dropouts and noise of the poses; rate and delay are multiples of the IMU's period.
+        rate: of the IMU and of the estimates, 1/s; control steps of the environment are as frequent or a multiple.
+        attitude: whether the attitude of the poses is used, or the position alone.
+        start: standard deviations of the first estimate's position (m), velocity (m/s) and angle (rad).
+        name: by which observation terms ask for the reading.
+
+    Raises:
+        ValueError: a number out of range, or a rate or delay of the poses that does not fit that of the IMU.
+    """
+    inertial.check_part(part)
+    if not isinstance(system, MotionCaptureSystem):
+        raise ValueError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
+    check_positive(f"rate of {name}", rate, "1/s")
+    check_switch(f"attitude of {name}", attitude)
+    if not isinstance(start, tuple | list) or len(start) != 3:
+        raise ValueError(f"start of {name} is {shown(start)}; give deviations of position (m), velocity (m/s), angle")
+    for what, unit, value in zip(("position", "velocity", "angle"), ("m", "m/s", "rad"), start, strict=True):
+        check_positive(f"start of {name}, {what},", value, unit)
+    check_number(f"pos_noise of {name}", system.pos_noise, "m", above=0)
+    if attitude:
+        check_number(f"angle_noise of {name}", system.angle_noise, "rad", above=0)
+    every = _whole(name, "rate", rate / system.rate, f"{system.rate:g} Hz", rate, at_least=1)
+    late = _whole(name, "delay", system.delay * rate, f"{system.delay:g} s", rate, at_least=0)
+    dt = 1 / rate
+
+    def init(key: jax.Array, params: Params) -> Memory:
+        zero = jnp.zeros(3, params.mass.dtype)
+        level = jnp.zeros(4, zero.dtype).at[3].set(1)
+        sample = Sample(zero, zero, zero, level, jnp.zeros((), bool))
+        return Memory(
+            estimate=kalman.init(zero, zero, level, jnp.zeros(15, zero.dtype)),
+            imu=inertial.begin(part, key, params),
+            samples=jax.tree.map(lambda x: jnp.tile(x[None], (late + 2, *[1] * x.ndim)), sample),
+            count=jnp.zeros((), jnp.int32),
+        )
+
+    def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: Memory):
+        start_key, imu_key, pose_key, arrival_key = jax.random.split(key, 4)
+        errors, read = inertial.read(part, imu_key, memory.imu, inertial.motion(params, state, rate), dt)
+        pos, quat = system.noisy(pose_key, state.pos, state.quat)
+        fresh = (memory.count % every == 0) & system.arrives(arrival_key)
+        sample = Sample(read["acc"], read["gyro"], pos, quat, fresh)
+        samples = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), memory.samples, sample)
+
+        first = begin(start_key, state)
+        moved = advanced(memory.estimate, samples, params.gravity)
+        estimate = _chosen(memory.count == 0, first, _chosen(memory.count > late, moved, memory.estimate))
+        now = estimate
+        for k in range(1, late + 1):
+            step = kalman.move(now, *_between(samples, k), params.gravity, dt)
+            now = _chosen(memory.count > late - k, step, now)
+        after = Memory(estimate, errors, samples, memory.count + 1)
+        return after, State(now.pos, now.quat, now.vel, sample.gyro - now.gyro_bias, state.rpm)
+
+    def begin(key: jax.Array, state: State) -> kalman.Estimate:
+        """The first estimate: the truth with errors."""
+        dtype = state.pos.dtype
+        deviation = jnp.repeat(jnp.asarray([*start, part.gyro.bias, part.acc.bias], dtype), 3)
+        error = deviation[:9] * jax.random.normal(key, (9,), dtype)
+        quat = rotation.multiply(state.quat, rotation.exp(error[kalman.ANGLE]))
+        return kalman.init(state.pos + error[kalman.POS], state.vel + error[kalman.VEL], quat, deviation)
+
+    def advanced(estimate: kalman.Estimate, samples: Sample, gravity: Array) -> kalman.Estimate:
+        """The estimate one period later, with the pose of then if it arrived."""
+        predicted = kalman.predict(imu_noise(part), estimate, *_between(samples, 0), gravity, dt)
+        updated = kalman.update_position(predicted, samples.pos[1], system.pos_noise)
+        if attitude:
+            updated = kalman.update_attitude(updated, samples.quat[1], system.angle_noise)
+        return _chosen(samples.fresh[1], updated, predicted)
+
+    entries = (
+        *quantities("position estimated", "m", "world"),
+        *quantities("attitude estimated (quaternion, body to world)", parts="xyzw"),
+        *quantities("velocity estimated", "m/s", "world"),
+        *quantities("body rates estimated", "rad/s", "body"),
+        *quantities("rotors", "RPM", parts=("speed of rotor 0", "1", "2", "3")),
+    )
+    return Sensor(name, measure, init, rate=rate, entries=entries, clocked=True)
+
+
+def _between(samples: Sample, k: int) -> tuple[Array, Array]:
+    """Mean angular velocity and specific force between sample k and the next."""
+    return (samples.gyro[k] + samples.gyro[k + 1]) / 2, (samples.acc[k] + samples.acc[k + 1]) / 2
+
+
+def _chosen(condition: Array, a: Any, b: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
+def _whole(name: str, what: str, periods: float, given: str, rate: float, at_least: int) -> int:
+    """A number of periods of the IMU that has to be whole."""
+    whole = round(periods)
+    if whole < at_least or abs(periods - whole) > _ROUNDING * max(periods, 1):
+        raise ValueError(
+            f"{what} of the poses of {name} is {given}, {periods:g} periods of the IMU at {rate:g} Hz; "
+            "give one that is a whole number of them"
+        )
+    return whole

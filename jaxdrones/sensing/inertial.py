@@ -1,0 +1,135 @@
+"""Inertial measurement units: accelerometer and gyroscope, with the errors of named parts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_finite, check_positive, shown
+from jaxdrones.params import Params
+from jaxdrones.quantity import quantities
+from jaxdrones.sensing.noise import Errors, Noise
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.state import State
+from jaxdrones.vector import along_z, cross
+
+STANDARD_GRAVITY = 9.80665
+"""m/s^2; what a data sheet calls g."""
+_DEGREE = math.pi / 180
+
+
+@dataclasses.dataclass(frozen=True)
+class ImuPart:
+    """The errors of an inertial measurement unit."""
+
+    acc: Noise
+    """Of the accelerometer, m/s^2."""
+    gyro: Noise
+    """Of the gyroscope, rad/s."""
+
+
+PERFECT = ImuPart(Noise(), Noise())
+"""A unit without errors."""
+BMI088 = ImuPart(
+    acc=Noise(density=175e-6 * STANDARD_GRAVITY, turn_on=20e-3 * STANDARD_GRAVITY, limit=24 * STANDARD_GRAVITY),
+    gyro=Noise(density=0.014 * _DEGREE, instability=2 / 3600 * _DEGREE, turn_on=1 * _DEGREE, limit=2000 * _DEGREE),
+)
+"""Of the Crazyflie 2.1, at the ranges of its firmware (24 g, 2000 degrees/s): Bosch BST-BMI088-DS001 gives 175 ug and
+0.014 degrees/s per sqrt(Hz), offsets of +-20 mg and +-1 degree/s, taken for standard deviations, and a gyroscope stable
+to 2 degrees/h, whose correlation time of 100 s is assumed. It is silent on the stability of the accelerometer."""
+MPU9250 = ImuPart(
+    acc=Noise(density=300e-6 * STANDARD_GRAVITY, turn_on=60e-3 * STANDARD_GRAVITY, limit=16 * STANDARD_GRAVITY),
+    gyro=Noise(density=0.01 * _DEGREE, turn_on=5 * _DEGREE, limit=2000 * _DEGREE),
+)
+"""Of the Crazyflie 2.0, at 16 g and 2000 degrees/s: InvenSense PS-MPU-9250A-01 gives 300 ug and 0.01 degrees/s per
+sqrt(Hz) and offsets of +-60 mg and +-5 degrees/s, taken for standard deviations. It is silent on their stability."""
+
+
+def imu(
+    part: ImuPart = BMI088,
+    rate: float = 100.0,
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    name: str = "imu",
+) -> Sensor:
+    """An inertial measurement unit; its reading is `acc` (3,), specific force, m/s^2, and `gyro` (3,), rad/s, body.
+
+    What is read is the motion at the instant, without the unit's low-pass filter, so white noise has the density of the
+    part and the deviation density times sqrt(`rate`).
+
+    Args:
+        part: the errors.
+        rate: measurements per second; control steps of the environment are as frequent or a multiple of it.
+        offset: (3,) of the unit from the center of mass, m, body.
+        name: by which observation terms ask for the reading.
+
+    Raises:
+        ValueError: something else than a part, or a number out of range.
+    """
+    check_part(part)
+    check_positive(f"rate of {name}", rate, "1/s")
+    if np.shape(offset) != (3,):
+        raise ValueError(f"offset of {name} is {shown(offset)}; give 3 numbers")
+    check_finite(f"offset of {name}", offset)
+    at_center = not np.any(np.asarray(offset))
+
+    def measure(key: jax.Array, params: Params, state: State, rate_: State, scene: Scene, memory: dict[str, Errors]):
+        place = None if at_center else jnp.asarray(offset, state.pos.dtype)
+        return read(part, key, memory, motion(params, state, rate_, place), 1 / rate)
+
+    def init(key: jax.Array, params: Params) -> dict[str, Errors]:
+        return begin(part, key, params)
+
+    entries = (*quantities("specific force", "m/s^2", "body"), *quantities("body rates measured", "rad/s", "body"))
+    bound = max(part.acc.limit, part.gyro.limit)
+    return Sensor(name, measure, init, bound=bound, rate=rate, entries=entries, clocked=True)
+
+
+def check_part(part: ImuPart) -> None:
+    """Raise unless `part` is one."""
+    if not isinstance(part, ImuPart):
+        raise ValueError(f"part of an IMU is {shown(part)}; give jaxdrones.sensing.BMI088 or ImuPart(acc, gyro)")
+
+
+def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:
+    """The errors of a unit at the start of an episode: of `acc` and of `gyro`."""
+    keys = dict(zip(("acc", "gyro"), jax.random.split(key), strict=True))
+    return {name: getattr(part, name).init(keys[name], (3,), params.mass.dtype) for name in keys}
+
+
+def read(
+    part: ImuPart, key: jax.Array, errors: dict[str, Errors], true: dict[str, Array], dt: float
+) -> tuple[dict[str, Errors], dict[str, Array]]:
+    """The errors of this measurement of a unit, and the reading of the motion `true`.
+
+    Args:
+        part: the unit.
+        key: random key of this measurement.
+        errors: of the previous measurement, as `begin` returns them.
+        true: as `motion` returns it.
+        dt: time between measurements, s.
+    """
+    keys = dict(zip(("acc", "gyro"), jax.random.split(key), strict=True))
+    result = {name: getattr(part, name).measure(keys[name], errors[name], true[name], dt) for name in keys}
+    return {name: result[name][0] for name in keys}, {name: result[name][1] for name in keys}
+
+
+def motion(params: Params, state: State, rate: State, offset: Float[Array, "3"] | None = None) -> dict[str, Array]:
+    """What a unit without errors reads: `acc` R^T (a - g) + dw/dt x r + w x (w x r), m/s^2, and `gyro` w, rad/s, body.
+
+    Args:
+        params: of the drone.
+        state: of the drone.
+        rate: its time derivative.
+        offset: (3,) r of the unit from the center of mass, m, body; none when left out.
+    """
+    acc = rotation.rotate_inverse(state.quat, rate.vel + along_z(params.gravity))
+    if offset is not None:
+        acc += cross(rate.omega, offset) + cross(state.omega, cross(state.omega, offset))
+    return {"acc": acc, "gyro": state.omega}

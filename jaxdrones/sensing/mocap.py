@@ -1,0 +1,119 @@
+"""Motion capture: the pose of a drone as cameras around it see it, late and with gaps."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_number, check_positive, shown
+from jaxdrones.params import Params
+from jaxdrones.quantity import Quantity, quantities
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.state import State
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MotionCaptureSystem:
+    """How often, how late and how well poses are measured."""
+
+    rate: float = 100.0
+    """Poses per second."""
+    delay: float = 0.0
+    """Age of a pose when it arrives, s."""
+    dropout: float = 0.0
+    """Share of the poses that do not arrive."""
+    pos_noise: float = 0.0
+    """Standard deviation of each coordinate, m."""
+    angle_noise: float = 0.0
+    """Standard deviation of the attitude about each axis, rad."""
+
+    def __post_init__(self):
+        check_positive("rate of a motion capture", self.rate, "1/s")
+        check_number("delay of a motion capture", self.delay, "s", at_least=0)
+        check_number("dropout of a motion capture", self.dropout, at_least=0, at_most=1)
+        check_number("pos_noise of a motion capture", self.pos_noise, "m", at_least=0)
+        check_number("angle_noise of a motion capture", self.angle_noise, "rad", at_least=0)
+
+    def noisy(
+        self, key: jax.Array, pos: Float[Array, "3"], quat: Float[Array, "4"]
+    ) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
+        """The pose with errors."""
+        pos_key, angle_key = jax.random.split(key)
+        pos = pos + self.pos_noise * jax.random.normal(pos_key, (3,), pos.dtype)
+        turn = self.angle_noise * jax.random.normal(angle_key, (3,), quat.dtype)
+        return pos, rotation.multiply(quat, rotation.exp(turn))
+
+    def arrives(self, key: jax.Array) -> Array:
+        """Whether a pose arrives at all."""
+        return jax.random.bernoulli(key, 1 - self.dropout)
+
+
+VICON = MotionCaptureSystem(rate=100.0, delay=0.01, pos_noise=0.5e-3, angle_noise=0.01)
+"""A Vicon system around a Crazyflie. Merriaux et al., "A Study of Vicon System Positioning Performance", Sensors 17(7),
+2017, found 0.15 mm at rest and up to 2 mm in motion. The error of the attitude is that of small markers: 0.4 to 1.1
+degrees in NanoBench's flights (docs/sensors.md). The delay is assumed."""
+
+
+def motion_capture(system: MotionCaptureSystem = VICON, name: str = "motion_capture") -> Sensor:
+    """The pose from outside; its reading is `pos` (3,), m, world, `quat` (4,), body to world, and `fresh`.
+
+    `fresh` () tells whether a pose arrived; where none did, the last one stays. Between two poses that were measured, a
+    delay that is no multiple of their period reads a mean of the two. Before its start the drone is taken to have been
+    where it starts.
+
+    Args:
+        system: rate, delay, dropouts and noise; control steps of the environment are as frequent or a multiple of it.
+        name: by which observation terms ask for the reading.
+
+    Raises:
+        ValueError: something else than a system.
+    """
+    if not isinstance(system, MotionCaptureSystem):
+        raise ValueError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
+    periods = system.delay * system.rate
+    late = math.ceil(periods - 1e-6)
+    share = late - periods  # of the later one of the two poses that are `late` and `late` - 1 periods old
+
+    def init(key: jax.Array, params: Params) -> dict[str, Array]:
+        dtype = params.mass.dtype
+        poses = {"pos": jnp.zeros((late + 1, 3), dtype), "quat": jnp.zeros((late + 1, 4), dtype)}
+        return {
+            **poses,
+            "last_pos": jnp.zeros(3, dtype),
+            "last_quat": jnp.zeros(4, dtype),
+            "begun": jnp.zeros((), bool),
+        }
+
+    def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: dict[str, Array]):
+        noise_key, arrival_key = jax.random.split(key)
+
+        def queue(old: Array, new: Array) -> Array:
+            return jnp.where(memory["begun"], jnp.concatenate([old[1:], new[None]]), jnp.tile(new[None], (late + 1, 1)))
+
+        pos, quat = queue(memory["pos"], state.pos), queue(memory["quat"], state.quat)
+        later = min(1, late)
+        nearer = jnp.where(quat[0] @ quat[later] < 0, -quat[later], quat[later])
+        seen = system.noisy(
+            noise_key,
+            (1 - share) * pos[0] + share * pos[later],
+            rotation.normalize((1 - share) * quat[0] + share * nearer),
+        )
+        fresh = system.arrives(arrival_key) | ~memory["begun"]
+        last_pos, last_quat = (
+            jnp.where(fresh, new, old) for new, old in zip(seen, (memory["last_pos"], memory["last_quat"]), strict=True)
+        )
+        after = {"pos": pos, "quat": quat, "last_pos": last_pos, "last_quat": last_quat, "begun": jnp.ones((), bool)}
+        return after, {"pos": last_pos, "quat": last_quat, "fresh": fresh}
+
+    entries = (
+        Quantity("arrival of a pose", "-"),
+        *quantities("position measured", "m", "world"),
+        *quantities("attitude measured (quaternion, body to world)", parts="xyzw"),
+    )
+    return Sensor(name, measure, init, rate=system.rate, entries=entries, clocked=True)

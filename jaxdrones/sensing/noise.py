@@ -1,0 +1,153 @@
+"""Errors of a sensor's channels, in the terms of an Allan deviation: white noise, bias instability, random walk."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jaxdrones.checks import check_finite, check_number, check_positive, check_whole
+from jaxdrones.pytree import PyTreeNode
+
+_FLICKER_FLOOR = math.sqrt(2 * math.log(2) / math.pi)  # Allan deviation of flicker noise over its bias instability
+_PEAK = 0.61736  # the largest Allan deviation of a Gauss-Markov process over its standard deviation, at 1.89 times T
+
+
+class Errors(PyTreeNode):
+    """What a channel's error remembers from one measurement to the next; arrays of the reading's shape."""
+
+    turn_on: Array
+    """The bias since power-on, in units of the reading."""
+    drift: Array
+    """The Gauss-Markov part of the bias, in units of the reading."""
+    walk: Array
+    """The random walk of the bias, in units of the reading."""
+    scale: Array
+    """The error of the scale factor; a reading of 1 becomes 1 + `scale`."""
+
+    @property
+    def bias(self) -> Array:
+        """The sum of the three parts of the bias, in units of the reading."""
+        return self.turn_on + self.drift + self.walk
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Noise:
+    """The errors of each channel of a sensor that reads in some unit u; channels are independent.
+
+    The names are those of IEEE 952 and of Kalibr's noise model. A data sheet's noise density is a one-sided spectral
+    density, and by the letter of that the Allan deviation of white noise is smaller by a root of 2; as is customary,
+    the number is taken for `density`, and the noise of a part is rather too large than too small.
+    """
+
+    density: float = 0.0
+    """White noise, u/sqrt(Hz): its Allan deviation over t seconds is density / sqrt(t)."""
+    instability: float = 0.0
+    """Bias instability B, u: the Allan deviation of the bias is at most 0.664 B, which it is at 1.89 `correlation`."""
+    correlation: float = 100.0
+    """Correlation time of the Gauss-Markov process that stands for the bias instability, s."""
+    random_walk: float = 0.0
+    """Random walk K of the bias, u/s/sqrt(Hz): its Allan deviation over t seconds is K sqrt(t / 3)."""
+    turn_on: float = 0.0
+    """Standard deviation of the bias that is drawn at the start of an episode, u."""
+    scale: float = 0.0
+    """Standard deviation of the scale factor's error, which is drawn at the start of an episode."""
+    limit: float = math.inf
+    """The largest reading, u, at which a channel saturates."""
+
+    def __post_init__(self):
+        for name in "density", "instability", "random_walk", "turn_on", "scale":
+            check_number(f"{name} of a noise", getattr(self, name), at_least=0)
+        check_positive("correlation of a noise", self.correlation, "s")
+        check_number("limit of a noise", self.limit, above=0, infinite=True)
+
+    @property
+    def drift(self) -> float:
+        """Standard deviation of the Gauss-Markov part of the bias, u."""
+        return _FLICKER_FLOOR / _PEAK * self.instability
+
+    @property
+    def bias_walk(self) -> float:
+        """Density of the noise that drives the bias, u/s/sqrt(Hz): the random walk that a filter takes it for."""
+        return math.hypot(self.random_walk, self.drift * math.sqrt(2 / self.correlation))
+
+    @property
+    def bias(self) -> float:
+        """Standard deviation of the bias at the start of an episode, u."""
+        return math.hypot(self.turn_on, self.drift)
+
+    def init(self, key: jax.Array, shape: tuple[int, ...], dtype: DTypeLike) -> Errors:
+        """The errors at the start of an episode.
+
+        Args:
+            key: random key.
+            shape: of a reading.
+            dtype: of a reading.
+        """
+        turn_on, drift, scale = (jax.random.normal(k, shape, dtype) for k in jax.random.split(key, 3))
+        return Errors(self.turn_on * turn_on, self.drift * drift, jnp.zeros(shape, dtype), self.scale * scale)
+
+    def measure(
+        self, key: jax.Array, errors: Errors, true: Float[Array, "*shape"], dt: float
+    ) -> tuple[Errors, Float[Array, "*shape"]]:
+        """The errors of this measurement, and the reading.
+
+        Args:
+            key: random key of this measurement.
+            errors: of the previous measurement.
+            true: what is measured, u.
+            dt: time between measurements, s.
+        """
+        white, driven, step = (jax.random.normal(k, true.shape, true.dtype) for k in jax.random.split(key, 3))
+        kept = math.exp(-dt / self.correlation)
+        errors = errors.replace(
+            drift=kept * errors.drift + self.drift * math.sqrt(1 - kept**2) * driven,
+            walk=errors.walk + self.random_walk * math.sqrt(dt) * step,
+        )
+        reading = (1 + errors.scale) * true + errors.bias + self.density / math.sqrt(dt) * white
+        return errors, jnp.clip(reading, -self.limit, self.limit)
+
+    def allan_deviation(self, time: ArrayLike) -> np.ndarray:
+        """The Allan deviation of the readings of something that does not move, u.
+
+        White noise, Gauss-Markov process and random walk add in quadrature (IEEE 952, annex C).
+
+        Args:
+            time: (...) averaging times, s.
+        """
+        t = np.asarray(time, float)
+        ratio = self.correlation / t
+        decay = 3 - 4 * np.exp(-1 / ratio) + np.exp(-2 / ratio)
+        drift = 2 * self.drift**2 * ratio * (1 - ratio / 2 * decay)
+        return np.sqrt(self.density**2 / t + drift + self.random_walk**2 * t / 3)
+
+
+def allan_deviation(readings: ArrayLike, dt: float, samples: int) -> np.ndarray:
+    """The overlapping Allan deviation of readings, in units of a reading.
+
+    Args:
+        readings: (n, ...) readings of something that does not move; further axes are channels.
+        dt: time between readings, s.
+        samples: number of readings in an average; the averaging time is `samples` times `dt`, s.
+
+    Returns:
+        (...) deviations of the channels.
+
+    Raises:
+        ValueError: numbers that are not finite, or fewer than 2 `samples` + 1 readings.
+    """
+    readings = np.asarray(readings, float)
+    check_finite("readings", readings)
+    check_positive("dt of an Allan deviation", dt, "s")
+    check_whole("samples of an Allan deviation", samples)
+    if readings.ndim < 1 or len(readings) <= 2 * samples:
+        raise ValueError(f"{readings.shape} readings are too few to average {samples}; give at least {2 * samples + 1}")
+    angle = np.concatenate([np.zeros_like(readings[:1]), np.cumsum(readings - readings.mean(axis=0), axis=0)]) * dt
+    change = angle[2 * samples :] - 2 * angle[samples:-samples] + angle[: -2 * samples]
+    return np.sqrt(np.mean(change**2, axis=0) / 2) / (samples * dt)

@@ -20,6 +20,7 @@ NOUNS = (
     "quantity",
     "rotation",
     "state",
+    "thrust_curves",
     "urdf",
     "urdf_writer",
     "user_code",

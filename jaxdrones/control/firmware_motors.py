@@ -13,18 +13,16 @@ from jaxtyping import Array, Float
 from jaxdrones import vector
 from jaxdrones.checks import check_choice
 from jaxdrones.pytree import PyTreeNode
+from jaxdrones.thrust_curves import THRUST_CURVES, voltage_for
 
 FULL = 65535.0
 """The largest command and the duty cycle of a motor that is always on."""
 
 _MIXER = ((-0.5, -0.5, -1.0), (-0.5, 0.5, 1.0), (0.5, 0.5, -1.0), (0.5, -0.5, 1.0))
 _LEAST_VOLTAGE = 2.0  # V; below it a reading of the battery is not believed, and the motors stop
-_PROPELLERS = {  # N/V^0..3, N at full command, N below which a motor stands still
-    "2.1": ((-0.014830745, 0.047244652, -0.018473644, 0.005960924), 0.12, 0.012817578),
-    "2.1+": ((-0.024765379, 0.065237935, -0.026792505, 0.006776789), 0.12, 0.012817578),
-    "thrust upgrade kit": ((-0.039782216, 0.109797389, -0.055453043, 0.016215002), 0.18, 0.019226368),
-}
-PROPELLERS = tuple(_PROPELLERS)
+_COMMANDS = {"2.1": (0.12, 0.012817578), "2.1+": (0.12, 0.012817578), "thrust upgrade": (0.18, 0.019226368)}
+"""N at full command, N below which a motor stands still."""
+PROPELLERS = tuple(_COMMANDS)
 
 
 class Motor(PyTreeNode):
@@ -45,31 +43,14 @@ def motor(propellers: str = "2.1+") -> Motor:
         ValueError: unknown propellers.
     """
     check_choice("propellers", propellers, PROPELLERS)
-    thrust, most, least = _PROPELLERS[propellers]
-    return Motor(jnp.array(thrust), jnp.array(most), jnp.array(least))
-
-
-def thrust_at(motor: Motor, voltage: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Thrust of a motor (N) at a mean voltage across it (V)."""
-    a, b, c, d = motor.thrust
-    return a + voltage * (b + voltage * (c + voltage * d))
-
-
-def voltage_for(motor: Motor, thrust: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The voltage (V) that gives a thrust (N): the real root of a cubic that rises (Cardano)."""
-    a, b, c, d = motor.thrust
-    center = -c / (3 * d)
-    p = b / (3 * d) - center**2
-    q = (thrust - a - center * (b + center * (c + center * d))) / (2 * d)
-    u = jnp.cbrt(q + jnp.sqrt(q * q + p**3))
-    return center + u - p / u
+    return Motor(jnp.array(THRUST_CURVES[propellers]), *(jnp.array(x) for x in _COMMANDS[propellers]))
 
 
 def duty_cycle(motor: Motor, command: Float[Array, "4"], battery: Float[Array, ""]) -> Float[Array, "4"]:
     """Duty cycle (0 to 65535 and above) that makes of a battery's voltage (V) the thrust of a 16-bit command."""
     thrust = command * (motor.max_thrust / FULL)
     turning = (thrust >= motor.min_thrust) & (battery >= _LEAST_VOLTAGE)
-    return jnp.where(turning, voltage_for(motor, thrust) * (FULL / jnp.maximum(battery, _LEAST_VOLTAGE)), 0)
+    return jnp.where(turning, voltage_for(motor.thrust, thrust) * (FULL / jnp.maximum(battery, _LEAST_VOLTAGE)), 0)
 
 
 def mix(

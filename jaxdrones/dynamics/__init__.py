@@ -26,7 +26,6 @@ from jaxdrones.dynamics.power import (
 )
 from jaxdrones.dynamics.propulsion import (
     FULL_PWM,
-    THRUST_CURVES,
     Motors,
     crazyflie_motors,
     cubic_motors,
@@ -65,7 +64,6 @@ __all__ = [
     "INTEGRATORS",
     "PAIRS",
     "ROTORS",
-    "THRUST_CURVES",
     "Battery",
     "Model",
     "Motors",

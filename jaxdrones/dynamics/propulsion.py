@@ -15,19 +15,13 @@ from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.vector import components, safe_sqrt
+from jaxdrones.thrust_curves import THRUST_CURVES, thrust_at, voltage_for
+from jaxdrones.vector import safe_sqrt
 
 Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
 
 FULL_PWM = 65535
 """The command of a motor that is always on."""
-
-THRUST_CURVES = {
-    "2.1": (-0.014830745, 0.047244652, -0.018473644, 0.005960924),
-    "2.1+": (-0.024765379, 0.065237935, -0.026792505, 0.006776789),
-    "thrust upgrade": (-0.039782216, 0.109797389, -0.055453043, 0.016215002),
-}
-"""Thrust of one motor of the Crazyflie by its voltage, N/V^0 to N/V^3, by propellers: the firmware's constants."""
 
 
 class Motors(PyTreeNode):
@@ -40,17 +34,11 @@ class Motors(PyTreeNode):
 
     def thrust(self, voltage: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Thrust of one motor at a mean voltage (V), N; none where the cubic is negative, at low voltage."""
-        a, b, c, d = components(self.coefficients)
-        return jnp.maximum(a + voltage * (b + voltage * (c + voltage * d)), 0)
+        return jnp.maximum(thrust_at(self.coefficients, voltage), 0)
 
     def voltage(self, thrust: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Voltage that gives a thrust (N), V: the one root of a cubic that rises everywhere."""
-        a, b, c, d = components(self.coefficients)
-        middle = -c / (3 * d)  # where the cubic is least steep
-        p = b / d - 3 * middle**2
-        q = (a + middle * (b + middle * (c + middle * d)) - thrust) / d
-        scale = jnp.sqrt(p / 3)
-        return middle - 2 * scale * jnp.sinh(jnp.arcsinh(q / (2 * scale**3)) / 3)
+        return voltage_for(self.coefficients, thrust)
 
 
 def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:

@@ -14,6 +14,7 @@ import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.control import Setpoint, firmware_motors, firmware_pid, for_team
 from jaxdrones.control.allocation import mixer
+from jaxdrones.thrust_curves import thrust_at, voltage_for
 
 RECORDED = Path(__file__).parent / "recorded" / "B10_lissajous_slow_rep1_from_take_off.npz"  # NanoBench, BSD-3
 DT = 0.002
@@ -65,7 +66,7 @@ def test_duty_cycles_make_the_thrust_that_was_logged_at_every_voltage(flown):
     motor = firmware_motors.motor("2.1+")
     flying = slice(500, None)
     voltage = np.array(jax.jit(filtered)(log["vbat"]))
-    thrust = firmware_motors.thrust_at(motor, log["pwm"] / 65535 * voltage[:, None]).mean(axis=1)[flying]
+    thrust = thrust_at(motor.thrust, log["pwm"] / 65535 * voltage[:, None]).mean(axis=1)[flying]
     np.testing.assert_allclose(np.mean(thrust / log["cmd"][flying, 3] * 65535), motor.max_thrust, rtol=1e-3)
     again = np.asarray(command.pwm).mean(axis=1)[flying].mean()
     np.testing.assert_allclose(again, log["pwm"].mean(axis=1)[flying].mean(), rtol=0.02)
@@ -80,12 +81,12 @@ def filtered(vbat):
 def test_the_voltage_for_a_thrust_gives_that_thrust(propellers):
     motor = firmware_motors.motor(propellers)
     thrust = jnp.linspace(motor.min_thrust, motor.max_thrust, 50)
-    voltage = firmware_motors.voltage_for(motor, thrust)
-    np.testing.assert_allclose(firmware_motors.thrust_at(motor, voltage), thrust, rtol=1e-11)
+    voltage = voltage_for(motor.thrust, thrust)
+    np.testing.assert_allclose(thrust_at(motor.thrust, voltage), thrust, rtol=1e-11)
     assert jnp.all(jnp.diff(voltage) > 0) and 0 < voltage[0] < voltage[-1] < 4.2
     duty = firmware_motors.duty_cycle(motor, 30000 * jnp.ones(4), jnp.array(3.7))
     np.testing.assert_allclose(
-        firmware_motors.thrust_at(motor, duty / 65535 * 3.7), 30000 / 65535 * motor.max_thrust, rtol=1e-11
+        thrust_at(motor.thrust, duty / 65535 * 3.7), 30000 / 65535 * motor.max_thrust, rtol=1e-11
     )
     assert not jnp.any(firmware_motors.duty_cycle(motor, jnp.full(4, 30000.0), jnp.array(1.0)))
     assert not jnp.any(firmware_motors.duty_cycle(motor, jnp.full(4, 1000.0), jnp.array(3.7)))

@@ -7,7 +7,8 @@ import pytest
 from helpers import assert_finite, make_step
 
 import jaxdrones as jd
-from jaxdrones.dynamics import ROTORS, THRUST_CURVES
+from jaxdrones.dynamics import ROTORS
+from jaxdrones.thrust_curves import THRUST_CURVES
 
 CF2X = jd.load_params("cf2x")
 STATE = jax.tree.map(lambda x: x[0], jd.State.at_rest([[0.0, 0, 1]]))

@@ -15,6 +15,7 @@ CONTROLLERS = {
     "geometric": geometric,
     "rates": rates,
     "firmware_pid": firmware_pid,
+    "mrac": mrac,
 }
 
 __all__ = [

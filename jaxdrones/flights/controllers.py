@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import control, optimal
-from jaxdrones.control import Setpoint, firmware_pid, for_team, mrac, pid, velocity
+from jaxdrones.control import Setpoint, firmware_pid, for_team, mellinger, mrac, pid, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, ROTORS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.flights.conditions import Conditions
@@ -19,7 +19,7 @@ from jaxdrones.state import State
 from jaxdrones.tasks.curves import setpoint_on
 from jaxdrones.urdf import load_params
 
-_SCALED = (firmware_pid, mrac)  # whose gains depend on the vehicle
+_SCALED = (firmware_pid, mellinger)  # to vehicles that are no Crazyflies
 
 
 class Controller(NamedTuple):
@@ -51,7 +51,9 @@ def _gains(module: ModuleType, vehicle: str) -> Any:
     """The gains of a controller for a vehicle."""
     if module in (pid, velocity):
         return pid.gains(vehicle)
-    return module.gains(load_params(vehicle)) if module in _SCALED else module.gains()
+    if module is mrac or (module in _SCALED and vehicle not in pid.VEHICLES):
+        return module.gains(load_params(vehicle))
+    return module.gains()
 
 
 def _optimal(conditions: Conditions) -> Controller:

@@ -21,7 +21,7 @@ import rivals_ours as ours
 from common import about, report, seconds
 
 import jaxdrones as jd
-from jaxdrones.control import Setpoint, firmware_pid, for_team
+from jaxdrones.control import Setpoint, firmware_motors, firmware_pid, for_team
 
 BUNDLED = Path(__file__).parent.parent / "tests/control/recorded/B10_lissajous_slow_rep1_from_take_off.npz"
 DT = 0.002  # s
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 @jax.jit
-def commanded(log: dict[str, jax.Array]) -> firmware_pid.Command:
+def commanded(log: dict[str, jax.Array]) -> firmware_motors.Command:
     def row(memory, now):
         quat = jd.rotation.normalize(now["est_quat"])
         state = jd.State(now["est_pos"], quat, now["est_vel"], now["gyro"], jnp.zeros(4))

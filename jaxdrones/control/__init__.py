@@ -5,7 +5,17 @@ of one drone; `velocity.control` takes an action in place of the setpoint. A tea
 memory is `for_team(init(), n)`. The table lists the controllers by the names that the command line uses.
 """
 
-from jaxdrones.control import firmware_motors, firmware_pid, geometric, pid, rates, simple_pid, velocity
+from jaxdrones.control import (
+    firmware_motors,
+    firmware_pid,
+    geometric,
+    mellinger,
+    mrac,
+    pid,
+    rates,
+    simple_pid,
+    velocity,
+)
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.team import for_team
 
@@ -15,6 +25,8 @@ CONTROLLERS = {
     "geometric": geometric,
     "rates": rates,
     "firmware_pid": firmware_pid,
+    "mellinger": mellinger,
+    "mrac": mrac,
 }
 
 __all__ = [
@@ -24,6 +36,8 @@ __all__ = [
     "firmware_pid",
     "for_team",
     "geometric",
+    "mellinger",
+    "mrac",
     "pid",
     "rates",
     "simple_pid",

@@ -11,14 +11,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import vector
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import check_choice, check_shape
+from jaxdrones.control.allocation import mixer
+from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.thrust_curves import THRUST_CURVES, voltage_for
+from jaxdrones.vector import safe_sqrt
 
 FULL = 65535.0
 """The largest command and the duty cycle of a motor that is always on."""
 
 _MIXER = ((-0.5, -0.5, -1.0), (-0.5, 0.5, 1.0), (0.5, 0.5, -1.0), (0.5, -0.5, 1.0))
+_BATTERY_FILTER = 0.99  # share of the last voltage that the filter of the battery keeps in 1 ms
+_WEIGHT = 0.029 * 9.81  # N, of a Crazyflie 2.1 with 2.1+ propellers by its firmware
+_LEVERS = (0.0325, 0.0325, 0.00699)  # m, to its motors along y and x; of torque over thrust by its firmware
+_INERTIA = (16.6e-6, 16.7e-6, 29.3e-6)  # kg m^2; Foerster 2015
+_ACCELERATION = tuple(
+    _WEIGHT * lever * share / inertia for lever, share, inertia in zip(_LEVERS, (0.5, 0.5, 1), _INERTIA, strict=True)
+)  # 1/s^2, as below
 _LEAST_VOLTAGE = 2.0  # V; below it a reading of the battery is not believed, and the motors stop
 _COMMANDS = {"2.1": (0.12, 0.012817578), "2.1+": (0.12, 0.012817578), "thrust upgrade": (0.18, 0.019226368)}
 """N at full command, N below which a motor stands still."""
@@ -34,6 +44,19 @@ class Motor(PyTreeNode):
     """() N at full command."""
     min_thrust: Array
     """() N; a motor that is told to push less stands still."""
+
+
+class Command(PyTreeNode):
+    """What the firmware commands, and logs."""
+
+    attitude: Array
+    """(3,) desired roll, pitch, yaw, degrees; pitch is positive nose up. Of set-points of rates the present ones."""
+    thrust: Array
+    """() of each motor, 16 bit."""
+    torque: Array
+    """(3,) roll, pitch, yaw, 16 bit, right-handed body axes."""
+    pwm: Array
+    """(4,) duty cycles of the motors, 0 to 65535: front right, back right, back left, front left."""
 
 
 def motor(propellers: str = "2.1+") -> Motor:
@@ -70,3 +93,56 @@ def mix(
 def within_range(commands: Float[Array, "4"]) -> Float[Array, "4"]:
     """Commands from 0 to 65535: where one is too high all are lowered, so that thrust is lost and not attitude."""
     return jnp.maximum(commands - jnp.maximum(jnp.max(commands) - FULL, 0), 0)
+
+
+def duty_cycles(
+    motor: Motor,
+    thrust: Float[Array, ""],
+    torque: Float[Array, "3"],
+    battery: Float[Array, ""] | float | None,
+    voltage: Float[Array, ""],
+    dt: float,
+) -> tuple[Float[Array, ""], Float[Array, "4"]]:
+    """The voltage behind the filter of the battery, V, and duty cycles from 0 to 65535.
+
+    Args:
+        motor: of the vehicle.
+        thrust: 16 bit, of each motor.
+        torque: roll, pitch, yaw, 16 bit, right-handed body axes.
+        battery: voltage, V; without it, and with the compensation switched off, a duty cycle is the command itself.
+        voltage: behind the filter at the last call, V; zero at the first.
+        dt: time since then, s.
+
+    Raises:
+        ValueError: the voltages of a team (use `jax.vmap`).
+    """
+    commands = mix(thrust, torque)
+    if battery is None:
+        return voltage, within_range(commands)
+    check_shape("battery", battery, (), "one voltage for one drone; use jax.vmap for a team")
+    kept = jnp.where(voltage > 0, _BATTERY_FILTER ** (dt / 0.001), 0)
+    voltage = battery + kept * (voltage - battery)
+    return voltage, within_range(duty_cycle(motor, commands, voltage))
+
+
+def rotor_speeds(
+    motor: Motor, params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]
+) -> Float[Array, "4"]:
+    """Speeds (RPM, up to `max_rpm`) at which rotors make the thrusts of 16-bit commands, mixed by their geometry."""
+    commands = within_range(mix(thrust, torque, mixer(params)))
+    return jnp.minimum(safe_sqrt(commands * (motor.max_thrust / FULL) / params.kf), params.max_rpm)
+
+
+def scale(params: Params) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    """What the firmware's numbers are to be multiplied by so that a vehicle answers as a Crazyflie does.
+
+    The thrust of a command by the first, its weight over that of a Crazyflie; then torque commands by the second.
+    """
+    return params.weight / _WEIGHT, jnp.array(_ACCELERATION) / _acceleration(params)
+
+
+def _acceleration(params: Params) -> Float[Array, "3"]:
+    """Angular acceleration by a torque command as large as the thrust command that carries the weight, 1/s^2."""
+    x, y, _ = params.rotor_pos.T
+    levers = jnp.stack([y, -x, params.rotor_spin * params.km / params.kf])
+    return params.weight * jnp.sum(levers * mixer(params).T, axis=1) / params.inertia / 4

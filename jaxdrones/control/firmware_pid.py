@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_positive, check_shape
 from jaxdrones.control import firmware_motors as motors
-from jaxdrones.control.allocation import mixer
 from jaxdrones.control.firmware_loops import (
     Gains,
     Memory,
@@ -31,11 +30,8 @@ from jaxdrones.control.single import check_memory, check_single, check_state
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.urdf import load_params
-from jaxdrones.vector import safe_sqrt
 
 _SLOW = 0.01  # s, period of the loops of position and velocity
-_BATTERY_FILTER = 0.99  # share of the last voltage that the filter of the battery keeps in 1 ms
 
 
 class Velocity(PyTreeNode):
@@ -68,24 +64,11 @@ class Rates(PyTreeNode):
 AnySetpoint = Setpoint | Velocity | Attitude | Rates
 
 
-class Command(PyTreeNode):
-    """What the firmware commands, and logs."""
-
-    attitude: Array
-    """(3,) desired roll, pitch, yaw, degrees; pitch is positive nose up. Of set-points of rates the present ones."""
-    thrust: Array
-    """() of each motor, 16 bit."""
-    torque: Array
-    """(3,) roll, pitch, yaw, 16 bit, right-handed body axes."""
-    pwm: Array
-    """(4,) duty cycles of the motors, 0 to 65535: front right, back right, back left, front left."""
-
-
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
     """The gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
 
-    Scaled ones give every command the share of weight and the angular acceleration that it gives to `cf2x`. What the
-    firmware believes of the voltage of its motors is not scaled.
+    Scaled ones give every command the share of weight and the angular acceleration that it gives to a Crazyflie. What
+    the firmware believes of the voltage of its motors is not scaled.
 
     Args:
         params: of the drone to scale to; a Crazyflie when left out.
@@ -96,9 +79,8 @@ def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
     """
     torque, motor = jnp.ones(3), motors.motor(propellers)
     if params is not None:
-        crazyflie = load_params("cf2x")
-        torque = _acceleration(crazyflie) / _acceleration(params)
-        motor = motor.replace(max_thrust=motor.max_thrust * params.weight / crazyflie.weight)
+        weight, torque = motors.scale(params)
+        motor = motor.replace(max_thrust=motor.max_thrust * weight)
     return Gains(
         pos_p=jnp.array([2.0, 2.0, 2.0]),
         pos_i=jnp.array([0.0, 0.0, 0.5]),
@@ -119,13 +101,6 @@ def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
         gyro_cutoff=jnp.array(80.0),
         motor=motor,
     )
-
-
-def _acceleration(params: Params) -> Float[Array, "3"]:
-    """Angular acceleration of a torque of the size of the thrust that carries the vehicle, 1/s^2."""
-    x, y, _ = params.rotor_pos.T
-    levers = jnp.stack([y, -x, params.rotor_spin * params.km / params.kf])
-    return params.weight * jnp.sum(levers * mixer(params).T, axis=1) / params.inertia
 
 
 def init() -> Memory:
@@ -176,9 +151,7 @@ def control(
     """
     check_single(params, state)
     memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
-    commands = motors.within_range(motors.mix(thrust, torque, mixer(params)))
-    rpm = safe_sqrt(commands * (gains.motor.max_thrust / motors.FULL) / params.kf)
-    return memory, jnp.minimum(rpm, params.max_rpm)
+    return memory, motors.rotor_speeds(gains.motor, params, thrust, torque)
 
 
 def pwm(
@@ -189,7 +162,7 @@ def pwm(
     battery: Float[Array, ""] | float | None = None,
     *,
     dt: float = 0.002,
-) -> tuple[Memory, Command]:
+) -> tuple[Memory, motors.Command]:
     """What the firmware of one Crazyflie commands: desired attitude, thrust, and the duty cycles of its motors.
 
     Args:
@@ -204,16 +177,9 @@ def pwm(
     Raises:
         ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
     """
-    first = jnp.isinf(memory.age)
     memory, attitude, thrust, torque = _fly(gains, memory, state, setpoint, dt)
-    duty = motors.mix(thrust, torque)
-    if battery is not None:
-        check_shape("battery", battery, (), "one voltage for one drone; use jax.vmap for a team")
-        kept = jnp.where(first, 0, _BATTERY_FILTER ** (dt / 0.001))
-        voltage = battery + kept * (memory.battery - battery)
-        memory = memory.replace(battery=voltage)
-        duty = motors.duty_cycle(gains.motor, duty, voltage)
-    return memory, Command(attitude, thrust, torque, motors.within_range(duty))
+    voltage, duty = motors.duty_cycles(gains.motor, thrust, torque, battery, memory.battery, dt)
+    return memory.replace(battery=voltage), motors.Command(attitude, thrust, torque, duty)
 
 
 def _fly(

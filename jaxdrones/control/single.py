@@ -18,8 +18,8 @@ def check_single(params: Params, state: State, setpoint: Setpoint | None = None,
     """Raise `ValueError` unless the arrays are those of one drone; `None` is not checked."""
     check_state(state)
     check_shape("params.mass", params.mass, (), _HINT)
-    for name, shape in _SETPOINT.items() if setpoint is not None else ():
-        check_shape(f"setpoint.{name}", getattr(setpoint, name), shape, "one target for one drone")
+    if setpoint is not None:
+        check_setpoint(setpoint)
     for name, value in vars(memory).items() if memory is not None else ():
         check_shape(f"memory.{name}", value, (3,), _HINT)
 
@@ -29,6 +29,12 @@ def check_state(state: State) -> None:
     for name, shape in _STATE.items():
         check_shape(f"state.{name}", getattr(state, name), shape, _HINT)
     check_quaternion("state.quat", state.quat)
+
+
+def check_setpoint(setpoint: Setpoint) -> None:
+    """Raise `ValueError` unless the arrays of a setpoint are those of one drone."""
+    for name, shape in _SETPOINT.items():
+        check_shape(f"setpoint.{name}", getattr(setpoint, name), shape, "one target for one drone")
 
 
 def check_memory(memory: Any, like: Any) -> None:

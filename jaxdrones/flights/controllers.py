@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import control, optimal
-from jaxdrones.control import Setpoint, firmware_pid, for_team, pid, velocity
+from jaxdrones.control import Setpoint, firmware_pid, for_team, mellinger, mrac, pid, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, ROTORS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.flights.conditions import Conditions
@@ -18,6 +18,8 @@ from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks.curves import setpoint_on
 from jaxdrones.urdf import load_params
+
+_SCALED = (firmware_pid, mellinger)  # to vehicles that are no Crazyflies
 
 
 class Controller(NamedTuple):
@@ -49,7 +51,9 @@ def _gains(module: ModuleType, vehicle: str) -> Any:
     """The gains of a controller for a vehicle."""
     if module in (pid, velocity):
         return pid.gains(vehicle)
-    return firmware_pid.gains(load_params(vehicle)) if module is firmware_pid else module.gains()
+    if module is mrac or (module in _SCALED and vehicle not in pid.VEHICLES):
+        return module.gains(load_params(vehicle))
+    return module.gains()
 
 
 def _optimal(conditions: Conditions) -> Controller:

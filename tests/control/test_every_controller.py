@@ -14,7 +14,7 @@ from helpers import VEHICLES, assert_close, assert_finite, flying
 from jax.flatten_util import ravel_pytree
 
 from jaxdrones import rotation
-from jaxdrones.control import firmware_pid, for_team, geometric, pid, rates, simple_pid, velocity
+from jaxdrones.control import firmware_pid, for_team, geometric, mellinger, mrac, pid, rates, simple_pid, velocity
 from jaxdrones.control.setpoint import Setpoint
 
 DT = 1 / 240
@@ -42,8 +42,10 @@ SIMPLE_PID = loops(simple_pid, "hb")
 GEOMETRIC = loops(geometric, *VEHICLES)
 RATES = loops(rates, *VEHICLES)
 FIRMWARE = loops(firmware_pid, "cf2x")
+MELLINGER = loops(mellinger, "cf2x")
+MRAC = loops(mrac, "cf2x")
 EVERY_PAIR = [*PID, *VELOCITY, *SIMPLE_PID, *GEOMETRIC, *RATES]
-EVERY_CONTROLLER = [PID[0], VELOCITY[0], SIMPLE_PID[0], GEOMETRIC[0], RATES[0], *FIRMWARE]
+EVERY_CONTROLLER = [PID[0], VELOCITY[0], SIMPLE_PID[0], GEOMETRIC[0], RATES[0], *FIRMWARE, *MELLINGER, *MRAC]
 
 each_pair = pytest.mark.parametrize("loop", EVERY_PAIR, ids=repr)
 each_controller = pytest.mark.parametrize("loop", EVERY_CONTROLLER, ids=repr)
@@ -147,8 +149,9 @@ def test_without_weight_and_error_there_is_nothing_to_do(loop):
     """No rotor turns, but for the idle speed of the PID's motors and what the firmware takes for the weight."""
     team = team_of(*N * [loop.vehicle]).replace(gravity=jnp.zeros(N))
     _, rpm = call(loop.control, loop.gains(), team, for_team(loop.init(), N), hovering(team), stay(loop, team))
-    base = jnp.sqrt(36000 / 65535 * 0.12 / team.kf[0])
-    expected = 9440.3 if loop in (*PID, *VELOCITY) else base if loop in FIRMWARE else 0
+    believed = 36000 if loop in FIRMWARE else 132000 * 0.029 * 9.81 if loop in MELLINGER else 0
+    idle = 9440.3 if loop in (*PID, *VELOCITY, *MRAC) else 0
+    expected = idle + jnp.sqrt(believed / 65535 * 0.12 / team.kf[0])
     np.testing.assert_allclose(rpm, expected, rtol=1e-12)
 
 

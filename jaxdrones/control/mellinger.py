@@ -1,0 +1,211 @@
+"""The tracking controller of Mellinger and Kumar (2011), as the Crazyflie's firmware flies it.
+
+The law is that of Hoenig and Preiss in Bitcraze's firmware: position with an integral, the error of the attitude on
+SO(3), and a derivative of the rates of roll and pitch. It runs at 500 Hz and follows velocity, acceleration and rates
+of the set-point, too. Thrust and torque are 16-bit numbers, limited as in the firmware but not rounded. It needs rotors
+that lag by less than 0.1 s: with the 0.25 s in which those of `cf2x` fall, it swings.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones import rotation, vector
+from jaxdrones.checks import check_positive
+from jaxdrones.control import attitude
+from jaxdrones.control import firmware_motors as motors
+from jaxdrones.control.firmware_loops import degrees, low_pass, settled
+from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.control.single import check_memory, check_setpoint, check_single, check_state
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+
+_GRAVITY = 9.81  # m/s^2
+_MAX_TORQUE = 32000.0  # 16 bit
+_MASSES = {"2.1": 0.029, "2.1+": 0.029, "thrust upgrade kit": 0.0325}  # kg, that the firmware believes
+
+
+class Gains(PyTreeNode):
+    """Gains and limits of position and attitude, and what the firmware believes of the vehicle."""
+
+    pos_p: Array
+    """(3,) N/m, world."""
+    pos_i: Array
+    """(3,) N/(m s)."""
+    pos_d: Array
+    """(3,) N s/m."""
+    max_pos_integral: Array
+    """(3,) m s."""
+    attitude_p: Array
+    """(3,) 16 bit per half radian, body."""
+    attitude_i: Array
+    """(3,) 16 bit per half radian and second."""
+    max_attitude_integral: Array
+    """(3,) half radians s."""
+    rate_p: Array
+    """(3,) 16 bit per rad/s."""
+    rate_d: Array
+    """(3,) 16 bit per rad/s^2."""
+    weight: Array
+    """() N."""
+    mass: Array
+    """() kg."""
+    thrust: Array
+    """() 16 bit of each motor per N of all."""
+    gyro_cutoff: Array
+    """() of the low-pass (Butterworth, second order) through which the rates are measured, Hz."""
+    motor: motors.Motor
+    """Of which a command is a share of the thrust."""
+
+
+class Memory(PyTreeNode):
+    """What the controller of one drone keeps between calls; zero before the first."""
+
+    pos_integral: Array
+    """(3,) integrated position error, m s."""
+    attitude_integral: Array
+    """(3,) integrated attitude error, half radians s."""
+    rate_error: Array
+    """(3,) error of the body rates at the last call, rad/s."""
+    gyro: Array
+    """(2, 3) state of the low-pass of the body rates, rad/s."""
+    battery: Array
+    """() voltage of the battery behind its filter, V."""
+    running: Array
+    """() 1 after the first call."""
+
+
+def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
+    """The gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
+
+    Scaled ones give every error the acceleration, linear and angular, that it gives to a Crazyflie.
+
+    Args:
+        params: of the drone to scale to; a Crazyflie when left out.
+        propellers: of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
+
+    Raises:
+        ValueError: unknown propellers.
+    """
+    motor = motors.motor(propellers)
+    force, torque = jnp.ones(()), jnp.ones(3)
+    mass = jnp.array(_MASSES[propellers])
+    weight = mass * _GRAVITY
+    if params is not None:
+        force, torque = motors.scale(params)
+        mass, weight = params.mass, params.weight
+        motor = motor.replace(max_thrust=motor.max_thrust * force)
+    return Gains(
+        pos_p=force * jnp.array([0.4, 0.4, 1.25]),
+        pos_i=force * jnp.array([0.05, 0.05, 0.05]),
+        pos_d=force * jnp.array([0.2, 0.2, 0.4]),
+        max_pos_integral=jnp.array([2.0, 2.0, 0.4]),
+        attitude_p=torque * jnp.array([70000.0, 70000.0, 60000.0]),
+        attitude_i=torque * jnp.array([0.0, 0.0, 500.0]),
+        max_attitude_integral=jnp.array([1.0, 1.0, 1500.0]),
+        rate_p=torque * jnp.array([20000.0, 20000.0, 12000.0]),
+        rate_d=torque * jnp.array([200.0, 200.0, 0.0]),
+        weight=weight,
+        mass=mass,
+        thrust=132000 / force,
+        gyro_cutoff=jnp.array(80.0),
+        motor=motor,
+    )
+
+
+def init() -> Memory:
+    """The memory of a drone before the first call."""
+    zero = jnp.zeros(3)
+    return Memory(zero, zero, zero, jnp.zeros((2, 3)), jnp.zeros(()), jnp.zeros(()))
+
+
+def control(
+    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
+) -> tuple[Memory, Float[Array, "4"]]:
+    """Rotor speeds of one drone, RPM, up to `max_rpm`: those that make the thrusts that the firmware commands.
+
+    Args:
+        gains: of position and attitude.
+        params: of the drone.
+        memory: of the last call.
+        state: of the drone, as it is estimated.
+        setpoint: pos, vel, acc, yaw and omega.
+        dt: time between calls, s; 0.002 on the vehicle.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+    """
+    check_single(params, state)
+    memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
+    return memory, motors.rotor_speeds(gains.motor, params, thrust, torque)
+
+
+def pwm(
+    gains: Gains,
+    memory: Memory,
+    state: State,
+    setpoint: Setpoint,
+    battery: Float[Array, ""] | float | None = None,
+    *,
+    dt: float = 0.002,
+) -> tuple[Memory, motors.Command]:
+    """What the firmware of one Crazyflie commands: desired attitude, thrust, and the duty cycles of its motors.
+
+    Args:
+        gains: of position and attitude.
+        memory: of the last call.
+        state: of the drone, as it is estimated.
+        setpoint: pos, vel, acc, yaw and omega.
+        battery: voltage, V, for which duty cycles are compensated; without it a duty cycle is the command itself.
+        dt: time between calls, s.
+
+    Raises:
+        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+    """
+    memory, axes, thrust, torque = _fly(gains, memory, state, setpoint, dt)
+    voltage, duty = motors.duty_cycles(gains.motor, thrust, torque, battery, memory.battery, dt)
+    asked = degrees(rotation.to_rpy(rotation.from_matrix(jnp.stack(axes, axis=-1))))
+    return memory.replace(battery=voltage), motors.Command(asked, thrust, torque, duty)
+
+
+def _fly(
+    gains: Gains, memory: Memory, state: State, setpoint: Setpoint, dt: float
+) -> tuple[Memory, attitude.Axes, Float[Array, ""], Float[Array, "3"]]:
+    """Memory, desired body axes, thrust and torque (16 bit)."""
+    check_positive("dt", dt, "s")
+    check_state(state)
+    check_setpoint(setpoint)
+    check_memory(memory, init())
+    first = memory.running == 0
+
+    pos_error = setpoint.pos - state.pos
+    pos_integral = _limited(memory.pos_integral + dt * pos_error, gains.max_pos_integral)
+    force = gains.pos_p * pos_error + gains.pos_d * (setpoint.vel - state.vel) + gains.pos_i * pos_integral
+    force = force + gains.mass * setpoint.acc + vector.along_z(gains.weight)
+    axes, target = rotation.axes(state.quat), attitude.from_thrust(force, setpoint.yaw)
+    thrust = jnp.clip(gains.thrust * vector.dot(force, axes[2]), 0, motors.FULL)
+
+    gyro = jnp.where(first, settled(state.omega, gains.gyro_cutoff, dt), memory.gyro)
+    gyro, omega = low_pass(gyro, state.omega, gains.gyro_cutoff, dt)
+    error = 2 * attitude.error(axes, target)
+    integral = _limited(memory.attitude_integral - dt * error, gains.max_attitude_integral)
+    rate_error = setpoint.omega - omega
+    change = (rate_error - jnp.where(first, rate_error, memory.rate_error)) / dt
+    torque = -gains.attitude_p * error + gains.attitude_i * integral
+    torque = torque + gains.rate_p * rate_error + gains.rate_d * change
+    flying = thrust > 0  # else the motors stand still and the integrators are emptied
+    memory = Memory(
+        pos_integral=jnp.where(flying, pos_integral, 0),
+        attitude_integral=jnp.where(flying, integral, 0),
+        rate_error=rate_error,
+        gyro=gyro,
+        battery=memory.battery,
+        running=jnp.ones_like(memory.running),
+    )
+    return memory, target, thrust, jnp.where(flying, jnp.clip(torque, -_MAX_TORQUE, _MAX_TORQUE), 0)
+
+
+def _limited(x: Float[Array, "3"], limit: Float[Array, "3"]) -> Float[Array, "3"]:
+    return jnp.clip(x, -limit, limit)

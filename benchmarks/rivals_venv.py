@@ -27,6 +27,12 @@ def run_here(script: str, *arguments: str) -> dict:
     return _run(Path(sys.executable), script, *arguments)
 
 
+def add(package: str) -> bool:
+    """Install a package into the environment of the rivals where it can be; whether it is there now."""
+    pip = [str(_python()), "-m", "pip", "install", "--quiet", package]
+    return subprocess.run(pip, stdout=sys.stderr, check=False).returncode == 0
+
+
 def _run(python: Path, script: str, *arguments: str) -> dict:
     command = [str(python), str(_HERE / script), *arguments, "--json"]
     with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it runs

@@ -14,6 +14,7 @@ from jaxdrones.visualization.browser import find_browser
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 SECTIONS = {"tests", "plant", "cameras", "envs", "swarm", "learning"}
 HELPERS = {
+    "agreement_switches.py",
     "cameras_scenes.py",
     "common.py",
     "figure.py",
@@ -138,6 +139,15 @@ def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():
     result = quick("transfer.py")
     assert [row["plant"] for row in result["rows"]] == ["own", "bullet, damping 0.04"]
     assert all(0 <= row["success"] <= 1 and row["error p50"] > 0 for row in result["rows"])
+
+
+@pytest.mark.slow
+def test_agreement_explains_every_difference_from_recorded_flights():
+    rows = quick("agreement.py")["rows"]
+    assert len(rows) == 5 and all(row["explained"] for row in rows)
+    for row in rows:
+        worth = [max(cause[name] for name in ("pos", "angle", "vel", "omega")) for cause in row["causes"]]
+        assert all(w > 1e3 * row["rounding"] for w in worth)  # each cause is one
 
 
 @pytest.mark.slow

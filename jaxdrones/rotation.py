@@ -81,6 +81,16 @@ def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
     return jnp.append(v * (a * b / 2 / norm), 1 - 2 * s * b * b / norm)
 
 
+def log(q: Float[Array, "4"]) -> Float[Array, "3"]:
+    """The rotation vector (rad) of a unit quaternion, at most half a turn: the inverse of `exp`, as smooth at zero."""
+    sign = jnp.where(q[3] < 0, -1, 1)
+    v, w = sign * q[:3], sign * q[3]
+    square = dot(v, v)
+    small = square < 1e-6
+    sine = jnp.sqrt(jnp.where(small, 1, square))
+    return v * jnp.where(small, 2 + square / 3 + 3 / 20 * square**2, 2 * atan2(sine, w) / sine)
+
+
 def to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """The rotation matrix R."""
     return jnp.stack(axes(q), axis=-1)

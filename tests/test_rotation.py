@@ -81,6 +81,20 @@ def test_exp_is_smooth_at_zero():
     np.testing.assert_allclose(curvature, np.concatenate([np.zeros((3, 3, 3)), -np.eye(3)[None] / 4]), rtol=3e-16)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 2e-3, 0.1, 2.0, 3.1])
+def test_log_is_the_inverse_of_exp(angle):
+    turns = angle * vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    quat = each(rotation.exp, turns)
+    for sign in 1, -1:
+        np.testing.assert_allclose(each(rotation.log, sign * quat), turns, rtol=0, atol=2e-14)
+
+
+def test_log_is_smooth_at_zero():
+    through = jax.jit(jax.jacobian(lambda turn: rotation.log(rotation.exp(turn))))
+    for angle in 0.0, 1e-4, 1e-2:
+        np.testing.assert_allclose(through(jnp.array([angle, 0, 0])), np.eye(3), atol=1e-12)
+
+
 def test_roll_pitch_yaw_come_back():
     rpy = np.random.default_rng(3).uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (50, 3))
     np.testing.assert_allclose(each(rotation.to_rpy, each(rotation.from_rpy, rpy)), rpy, atol=1e-12)

@@ -6,10 +6,11 @@ from jaxdrones.sensing.camera import Camera, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
 from jaxdrones.sensing.depth_noise import DepthNoise
 from jaxdrones.sensing.distances import Surface
+from jaxdrones.sensing.environment import BMP388, EUROPE, LIS3MDL, barometer, magnetometer
 from jaxdrones.sensing.estimator import state_estimate
 from jaxdrones.sensing.files import Mesh, Urdf
 from jaxdrones.sensing.images import Images, photograph, render
-from jaxdrones.sensing.inertial import BMI088, MPU9250, ImuPart, imu
+from jaxdrones.sensing.inertial import BMI088, MPU9250, PERFECT, ImuPart, imu
 from jaxdrones.sensing.mocap import VICON, MotionCaptureSystem, motion_capture
 from jaxdrones.sensing.noise import Noise, allan_deviation
 from jaxdrones.sensing.range_finders import (
@@ -29,7 +30,11 @@ from jaxdrones.sensing.urdf_scene import from_urdf
 __all__ = [
     "BEAMS",
     "BMI088",
+    "BMP388",
+    "EUROPE",
+    "LIS3MDL",
     "MPU9250",
+    "PERFECT",
     "VICON",
     "Box",
     "Camera",
@@ -48,6 +53,7 @@ __all__ = [
     "Surface",
     "Urdf",
     "allan_deviation",
+    "barometer",
     "camera_2021",
     "collisions",
     "downward_range",
@@ -57,6 +63,7 @@ __all__ = [
     "imu",
     "kalman",
     "lidar",
+    "magnetometer",
     "motion_capture",
     "multi_ranger",
     "obstacles_2021",

@@ -25,12 +25,12 @@ _ROUNDING = 1e-6  # of a number of periods
 
 
 class Sample(PyTreeNode):
-    """What is measured at an instant."""
+    """What is measured: the IMU's means over the period before an instant, and the pose at the instant."""
 
-    acc: Array
-    """(3,) specific force, m/s^2, body."""
     gyro: Array
     """(3,) rad/s, body."""
+    acc: Array
+    """(3,) specific force, m/s^2, body."""
     pos: Array
     """(3,) m, world."""
     quat: Array
@@ -47,7 +47,11 @@ class Memory(PyTreeNode):
     imu: dict[str, Errors]
     """Errors of the IMU."""
     samples: Sample
-    """The latest samples with a leading axis, the oldest one first: one before that of the estimate, and all since."""
+    """The samples of the estimate's instant and of all instants since, with a leading axis, the oldest one first."""
+    quat: Array
+    """(4,) attitude at the latest instant, at which the IMU begins to integrate."""
+    vel: Array
+    """(3,) velocity at the latest instant, m/s, world."""
     count: Array
     """() number of measurements."""
 
@@ -69,8 +73,9 @@ def state_estimate(
 ) -> Sensor:
     """The state that an error-state Kalman filter knows; its reading is a `State` for policies and controllers.
 
-    The filter, `jaxdrones.sensing.kalman`, fuses an IMU in the center of mass with motion capture. It lives in the
-    past, at the instant of the poses that arrive, and the IMU's samples since then bring its estimate to the present.
+    The filter, `jaxdrones.sensing.kalman`, fuses an IMU in the center of mass with motion capture. The IMU integrates
+    over its period, as those of flight controllers do. The filter lives in the past, at the instant of the poses that
+    arrive, and the IMU's samples since then bring its estimate to the present.
     The reading's `rpm` is that of the drone, as telemetry knows it, and its `aux` is empty. The memory's `estimate` has
     the covariance. The filter knows nothing of errors of scale, saturation, or poses whose errors are not white.
 
@@ -108,27 +113,36 @@ def state_estimate(
         return Memory(
             estimate=kalman.init(zero, zero, level, jnp.zeros(15, zero.dtype)),
             imu=inertial.begin(part, key, params),
-            samples=jax.tree.map(lambda x: jnp.tile(x[None], (late + 2, *[1] * x.ndim)), sample),
+            samples=jax.tree.map(lambda x: jnp.tile(x[None], (late + 1, *[1] * x.ndim)), sample),
+            quat=level,
+            vel=zero,
             count=jnp.zeros((), jnp.int32),
         )
 
     def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: Memory):
         start_key, imu_key, pose_key, arrival_key = jax.random.split(key, 4)
-        errors, read = inertial.read(part, imu_key, memory.imu, inertial.motion(params, state, rate), dt)
+        true = inertial.mean_motion(params, memory.quat, memory.vel, state, dt)
+        true = _chosen(memory.count == 0, inertial.motion(params, state, rate), true)
+        errors, read = inertial.read(part, imu_key, memory.imu, true, dt)
         pos, quat = system.noisy(pose_key, state.pos, state.quat)
         fresh = (memory.count % every == 0) & system.arrives(arrival_key)
-        sample = Sample(read["acc"], read["gyro"], pos, quat, fresh)
+        sample = Sample(read["gyro"], read["acc"], pos, quat, fresh)
         samples = jax.tree.map(lambda old, new: jnp.concatenate([old[1:], new[None]]), memory.samples, sample)
 
         first = begin(start_key, state)
         moved = advanced(memory.estimate, samples, params.gravity)
         estimate = _chosen(memory.count == 0, first, _chosen(memory.count > late, moved, memory.estimate))
-        now = estimate
-        for k in range(1, late + 1):
-            step = kalman.move(now, *_between(samples, k), params.gravity, dt)
-            now = _chosen(memory.count > late - k, step, now)
-        after = Memory(estimate, errors, samples, memory.count + 1)
-        return after, State(now.pos, now.quat, now.vel, sample.gyro - now.gyro_bias, state.rpm)
+
+        def forward(now: kalman.Estimate, since: tuple[Array, Sample]) -> tuple[kalman.Estimate, None]:
+            number, sample = since
+            return _chosen(number > 0, kalman.move(now, sample.gyro, sample.acc, params.gravity, dt), now), None
+
+        numbers = memory.count - late + jnp.arange(late + 1)  # of the samples; negative where there was none yet
+        since = jax.tree.map(lambda x: x[1:], (numbers, samples))
+        now = jax.lax.scan(forward, estimate, since)[0]
+        omega = state.omega + (read["gyro"] - true["gyro"]) - now.gyro_bias
+        after = Memory(estimate, errors, samples, state.quat, state.vel, memory.count + 1)
+        return after, State(now.pos, now.quat, now.vel, omega, state.rpm)
 
     def begin(key: jax.Array, state: State) -> kalman.Estimate:
         """The first estimate: the truth with errors."""
@@ -140,11 +154,12 @@ def state_estimate(
 
     def advanced(estimate: kalman.Estimate, samples: Sample, gravity: Array) -> kalman.Estimate:
         """The estimate one period later, with the pose of then if it arrived."""
-        predicted = kalman.predict(imu_noise(part), estimate, *_between(samples, 0), gravity, dt)
-        updated = kalman.update_position(predicted, samples.pos[1], system.pos_noise)
+        now = jax.tree.map(lambda x: x[0], samples)
+        predicted = kalman.predict(imu_noise(part), estimate, now.gyro, now.acc, gravity, dt)
+        updated = kalman.update_position(predicted, now.pos, system.pos_noise)
         if attitude:
-            updated = kalman.update_attitude(updated, samples.quat[1], system.angle_noise)
-        return _chosen(samples.fresh[1], updated, predicted)
+            updated = kalman.update_attitude(updated, now.quat, system.angle_noise)
+        return _chosen(now.fresh, updated, predicted)
 
     entries = (
         *quantities("position estimated", "m", "world"),
@@ -154,11 +169,6 @@ def state_estimate(
         *quantities("rotors", "RPM", parts=("speed of rotor 0", "1", "2", "3")),
     )
     return Sensor(name, measure, init, rate=rate, entries=entries, clocked=True)
-
-
-def _between(samples: Sample, k: int) -> tuple[Array, Array]:
-    """Mean angular velocity and specific force between sample k and the next."""
-    return (samples.gyro[k] + samples.gyro[k + 1]) / 2, (samples.acc[k] + samples.acc[k + 1]) / 2
 
 
 def _chosen(condition: Array, a: Any, b: Any) -> Any:

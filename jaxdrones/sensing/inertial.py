@@ -120,6 +120,28 @@ def read(
     return {name: result[name][0] for name in keys}, {name: result[name][1] for name in keys}
 
 
+def mean_motion(
+    params: Params, quat: Float[Array, "4"], vel: Float[Array, "3"], state: State, dt: float
+) -> dict[str, Array]:
+    """What a unit without errors reads on average over a step, as one that integrates: `acc` and `gyro`, body.
+
+    The step's turn and gain of velocity by means of these, with `acc` in the axes of its middle, are exact.
+
+    Args:
+        params: of the drone.
+        quat: (4,) attitude at the begin of the step.
+        vel: (3,) velocity at the begin of the step, m/s, world.
+        state: at the end.
+        dt: length of the step, s.
+    """
+    turn = rotation.log(rotation.multiply(rotation.conjugate(quat), state.quat))
+    middle = rotation.multiply(quat, rotation.exp(turn / 2))
+    return {
+        "acc": rotation.rotate_inverse(middle, (state.vel - vel) / dt + along_z(params.gravity)),
+        "gyro": turn / dt,
+    }
+
+
 def motion(params: Params, state: State, rate: State, offset: Float[Array, "3"] | None = None) -> dict[str, Array]:
     """What a unit without errors reads: `acc` R^T (a - g) + dw/dt x r + w x (w x r), m/s^2, and `gyro` w, rad/s, body.
 

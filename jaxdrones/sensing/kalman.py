@@ -78,7 +78,7 @@ def predict(
         noise: of the IMU.
         estimate: at the begin of the step.
         gyro: mean reading in the step, rad/s, body; the mean of the readings at its begin and end will do.
-        acc: mean reading in the step, specific force, m/s^2, body.
+        acc: mean reading in the step, specific force, m/s^2, in the body axes of the middle of the step.
         gravity: m/s^2.
         dt: time step, s.
     """
@@ -214,9 +214,8 @@ def error(
 
 
 def angle(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "3"]:
-    """The small rotation from attitude a to attitude b, rad, in the axes of a; exact to the third order."""
-    turn = rotation.multiply(rotation.conjugate(a), b)
-    return 2 * jnp.where(turn[3] < 0, -1, 1) * turn[:3]
+    """The rotation from attitude a to attitude b as a vector, rad, in the axes of a."""
+    return rotation.log(rotation.multiply(rotation.conjugate(a), b))
 
 
 def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -89,7 +89,7 @@ class Sensor:
 
 
 def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[Sensor, ...]:
-    """The sensors of a team; raises if one is none, two have the same name, or one does not fit `dt`, s, of control."""
+    """The sensors of a team; raises if one is none, two have the same name, or one does not fit steps of `dt` s."""
     if isinstance(sensors, Sensor):
         raise ValueError(f"sensors is the single sensor {sensors.name!r}; give a sequence, for example (sensor,)")
     sensors = check_sequence("sensors", sensors, "sensor")

@@ -1,0 +1,94 @@
+"""Barometer and magnetometer: the height and the heading that the Earth gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones import rotation
+from jaxdrones.checks import check_finite, check_positive, shown
+from jaxdrones.params import Params
+from jaxdrones.quantity import Quantity, quantities
+from jaxdrones.sensing.noise import Errors, Noise
+from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.state import State
+
+_PASCAL = 1 / 12.013  # m; height at sea level over which the pressure of the ISA falls by 1 Pa: 1 / (1.225 x 9.80665)
+
+BMP388 = Noise(density=0.03 * _PASCAL, turn_on=8 * _PASCAL)
+"""Barometer of the Crazyflie 2.1, as height in m: Bosch BST-BMP388-DS001 gives a relative accuracy of +-8 Pa, taken for
+the standard deviation of the bias, and a noise of 0.03 Pa at its slowest setting, here taken for a density per
+sqrt(Hz)."""
+LIS3MDL = Noise(density=0.08, turn_on=3.0, limit=1200.0)
+"""Magnetometer at 12 gauss, in uT: STMicroelectronics DocID024204 gives a noise of 3.2 (x, y) and 4.1 mgauss (z) in a
+reading, 0.36 uT, which is this density at 20 Hz. The bias, of iron and currents around, is assumed."""
+EUROPE = (0.0, 21.5, -43.0)
+"""uT; about the magnetic field at a latitude of 47 degrees in central Europe, with x east, y north and z up (WMM)."""
+
+
+def barometer(errors: Noise = BMP388, rate: float = 50.0, name: str = "barometer") -> Sensor:
+    """The height above the origin by the pressure of the air; its reading is (1,), m.
+
+    Args:
+        errors: in m; 1 Pa is 0.083 m at sea level. Wind and rotors disturb a real barometer by more.
+        rate: measurements per second; control steps of the environment are as frequent or a multiple of it.
+        name: by which observation terms ask for the reading.
+
+    Raises:
+        ValueError: errors that are no `Noise`, or a rate that is not positive.
+    """
+    entries = (Quantity("height measured", "m", "world"),)
+    return _noisy(name, errors, rate, 1, lambda state: state.pos[2:], entries)
+
+
+def magnetometer(
+    errors: Noise = LIS3MDL,
+    field: tuple[float, float, float] = EUROPE,
+    rate: float = 20.0,
+    name: str = "magnetometer",
+) -> Sensor:
+    """The magnetic field in body axes; its reading is (3,), uT.
+
+    Args:
+        errors: in uT.
+        field: (3,) magnetic field, uT, world.
+        rate: measurements per second; control steps of the environment are as frequent or a multiple of it.
+        name: by which observation terms ask for the reading.
+
+    Raises:
+        ValueError: errors that are no `Noise`, a rate that is not positive, or a field that is no vector.
+    """
+    if np.shape(field) != (3,):
+        raise ValueError(f"field of {name} is {shown(field)}; give 3 numbers (uT, world)")
+    check_finite(f"field of {name}", field)
+
+    def true(state: State) -> jax.Array:
+        return rotation.rotate_inverse(state.quat, jnp.asarray(field, state.quat.dtype))
+
+    return _noisy(name, errors, rate, 3, true, quantities("magnetic field measured", "uT", "body"))
+
+
+def _noisy(
+    name: str,
+    errors: Noise,
+    rate: float,
+    size: int,
+    true: Callable[[State], jax.Array],
+    entries: tuple[Quantity, ...],
+) -> Sensor:
+    """A sensor of what a function `true(state) -> (size,)` says."""
+    if not isinstance(errors, Noise):
+        raise ValueError(f"errors of {name} is {shown(errors)}; give jaxdrones.sensing.Noise(density=...)")
+    check_positive(f"rate of {name}", rate, "1/s")
+
+    def init(key: jax.Array, params: Params) -> Errors:
+        return errors.init(key, (size,), params.mass.dtype)
+
+    def measure(key: jax.Array, params: Params, state: State, rate_: State, scene: Scene, memory: Errors):
+        return errors.measure(key, memory, true(state), 1 / rate)
+
+    return Sensor(name, measure, init, bound=errors.limit, rate=rate, entries=entries, clocked=True)

@@ -1,0 +1,82 @@
+"""Errors of sensors have the Allan deviation that their parameters say, and nothing else."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones.sensing import BMI088, MPU9250, Noise, allan_deviation
+
+KEY = jax.random.key(0)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def readings(noise, dt, length, channels=3):
+    """Readings (length, channels) of what is zero."""
+    begin, key = jax.random.split(KEY)
+    zero = jnp.zeros(channels)
+
+    def measure(errors, key):
+        return noise.measure(key, errors, zero, dt)
+
+    return jax.lax.scan(measure, noise.init(begin, (channels,), float), jax.random.split(key, length))[1]
+
+
+@pytest.mark.parametrize(
+    ("noise", "samples"),
+    [
+        (Noise(density=0.02), [1, 10, 100]),
+        (Noise(random_walk=0.3), [10, 100]),
+        (Noise(instability=0.5, correlation=1.0), [30, 100, 189, 400]),
+        (Noise(density=0.02, instability=0.05, correlation=2.0, random_walk=0.01), [1, 10, 100, 400]),
+    ],
+)
+def test_the_allan_deviation_is_that_of_the_parameters(noise, samples):
+    """64 channels over 200 s."""
+    made = readings(noise, 0.01, 20_000, 64)
+    found = [np.sqrt(np.mean(allan_deviation(made, 0.01, k) ** 2)) for k in samples]
+    np.testing.assert_allclose(found, noise.allan_deviation(0.01 * np.array(samples)), rtol=0.03)
+
+
+def test_each_parameter_is_read_off_its_own_part_of_the_curve():
+    """IEEE 952: density at 1 s of white noise, K at 3 s of the random walk, 0.664 B at the top of the instability."""
+    np.testing.assert_allclose(Noise(density=0.3).allan_deviation(1.0), 0.3)
+    np.testing.assert_allclose(Noise(random_walk=0.3).allan_deviation(3.0), 0.3)
+    curve = Noise(instability=0.3, correlation=10.0).allan_deviation(np.geomspace(0.1, 1000, 2000))
+    np.testing.assert_allclose(curve.max(), 0.3 * np.sqrt(2 * np.log(2) / np.pi), rtol=1e-4)
+
+
+@pytest.mark.parametrize("part", [BMI088, MPU9250], ids=["BMI088", "MPU9250"])
+def test_a_part_has_the_noise_of_its_data_sheet(part):
+    for noise in part.acc, part.gyro:
+        made = readings(noise, 0.01, 20_000, 64)
+        found = np.sqrt(np.mean(allan_deviation(made, 0.01, 100) ** 2))
+        np.testing.assert_allclose(found, noise.allan_deviation(1.0), rtol=0.03)
+        np.testing.assert_allclose(noise.allan_deviation(1.0), noise.density, rtol=0.01)
+
+
+def test_bias_and_scale_are_drawn_and_a_channel_saturates():
+    noise = Noise(turn_on=2.0, scale=0.1, limit=50.0)
+    errors = noise.init(KEY, (4000,), float)
+    read = noise.measure(KEY, errors, jnp.full(4000, 10.0), 0.01)[1]
+    np.testing.assert_allclose(read, 10 * (1 + errors.scale) + errors.bias)
+    np.testing.assert_allclose([np.std(errors.bias), np.std(errors.scale)], [2, 0.1], rtol=0.05)
+    for true in 1e3, -1e3:
+        np.testing.assert_array_equal(noise.measure(KEY, errors, jnp.full(4000, true), 0.01)[1], np.sign(true) * 50)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Noise(density=-1), "density of a noise is -1; give a number of at least 0"),
+        (lambda: Noise(correlation=0), "correlation of a noise is 0"),
+        (lambda: Noise(limit=0), "limit of a noise is 0"),
+        (lambda: allan_deviation(np.zeros(20), 0.01, 10), r"\(20,\) readings are too few to average 10; give at least"),
+        (lambda: allan_deviation(np.full(30, np.nan), 0.01, 10), "readings is not finite"),
+    ],
+)
+def test_nonsense_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -57,12 +57,12 @@ LAWS = {
     "thrust_to_weight": Law(2.87, 0.281, 1.5, 5.0),  # at 1 kg, times kg^-0.143; limits of RAPTOR
     "prop_radius": Law(0.553, 0.079, 0.508, 0.638),  # over the arm
     "thrust_coefficient": Law(0.106, 0.327, 0.066, 0.179),  # C_T
-    "figure_of_merit": Law(0.406, 0.279, 0.252, 0.635),
+    "figure_of_merit": Law(0.390, 0.290, 0.252, 0.635),
     "drag": Law(2.36, 0.235, 1.72, 3.69),  # times k_F / R
     "vertical_drag": Law(1.55, 0.304, 1.14, 2.72),  # along z over that along x and y
     "rise_time": Law(0.147, 0.427, 0.03, 0.10),  # s at thrust to weight 1, times its power -1.07; limits of RAPTOR
     "fall_time": Law(1.09, 0.268, 0.788, 2.0),  # over the rise time; at least 0.03 s, as in RAPTOR
-    "rotor_inertia": Law(1.56e-3, 0.276, 1.18e-3, 2.06e-3),  # over m R^2
+    "rotor_inertia": Law(1.60e-3, 0.232, 1.18e-3, 2.06e-3),  # over m R^2
 }
 ARM_POWER, THRUST_POWER, LAG_POWER = 0.423, 0.143, -1.07
 _SHORTEST_LAG = 0.03  # s

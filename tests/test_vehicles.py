@@ -103,7 +103,7 @@ def test_the_bebop_accelerates_as_in_the_model_of_its_paper():
     ("vehicle", "kf", "kappa", "thrust"),  # N/(rad/s)^2, m, N of all rotors
     [
         ("hummingbird", 5.57e-6, 1.36e-7 / 5.57e-6, 20),
-        ("agilicious", 1.562522e-6, 0.016, 34),
+        ("agilicious", 1.562522e-6, 0.022, 34),
         ("x500", 8.54858e-6, 0.016, 63.704),
     ],
 )

@@ -3,7 +3,16 @@
 from jaxdrones import rotation, vector
 from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.dynamics import (
+    Battery,
     Model,
+    Motors,
+    battery,
+    battery_current,
+    battery_voltage,
+    charge_at,
+    clock,
+    crazyflie_motors,
+    cubic_motors,
     downwash,
     downwash_2021,
     drag,
@@ -11,22 +20,32 @@ from jaxdrones.dynamics import (
     drone_contact,
     euler,
     external_force,
+    failing,
     ground_contact,
     ground_effect,
     ground_effect_2021,
     implicit_midpoint,
+    in_wind,
+    inflow_thrust,
     instant_rotors,
     lagging_rotors,
+    lithium_polymer,
+    logarithmic_wind,
+    midpoint,
     obstacle_contact,
+    pwm_of_thrust,
+    pwm_rotors,
+    quadratic_drag,
     rk4,
     semi_implicit_euler,
+    supply_voltage,
 )
 from jaxdrones.engine.explicit import make_derivative, make_step
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.rollout import rollout
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
-from jaxdrones.envs import explain, make
+from jaxdrones.envs import dryden, explain, make
 from jaxdrones.params import Params, repeat, stack
 from jaxdrones.sensing import Camera, Scene, Sensor, render
 from jaxdrones.state import State
@@ -35,9 +54,11 @@ from jaxdrones.visualization.viewer import show
 from jaxdrones.wrench import Wrench
 
 __all__ = [
+    "Battery",
     "Camera",
     "Effect",
     "Model",
+    "Motors",
     "NeighborGrid",
     "Pair",
     "Params",
@@ -47,26 +68,43 @@ __all__ = [
     "Step",
     "TeamEffect",
     "Wrench",
+    "battery",
+    "battery_current",
+    "battery_voltage",
+    "charge_at",
+    "clock",
+    "crazyflie_motors",
+    "cubic_motors",
     "downwash",
     "downwash_2021",
     "drag",
     "drag_world_axes",
     "drone_contact",
+    "dryden",
     "euler",
     "explain",
     "external_force",
+    "failing",
     "ground_contact",
     "ground_effect",
     "ground_effect_2021",
     "implicit_midpoint",
+    "in_wind",
+    "inflow_thrust",
     "instant_rotors",
     "lagging_rotors",
+    "lithium_polymer",
     "load_params",
+    "logarithmic_wind",
     "make",
     "make_derivative",
     "make_step",
+    "midpoint",
     "obstacle_contact",
     "over_worlds",
+    "pwm_of_thrust",
+    "pwm_rotors",
+    "quadratic_drag",
     "render",
     "repeat",
     "rk4",
@@ -75,5 +113,6 @@ __all__ = [
     "semi_implicit_euler",
     "show",
     "stack",
+    "supply_voltage",
     "vector",
 ]

@@ -130,10 +130,10 @@ def check_whole(name: str, value: int, minimum: int = 1) -> None:
         raise ValueError(f"{name} is {shown(value)}; give a whole number of at least {minimum}")
 
 
-def check_switch(name: str, value: bool) -> None:
-    """Raise unless `value` is true or false."""
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} is {shown(value)}; give True or False")
+def check_switch(name: str, value: bool | str, others: tuple[str, ...] = ()) -> None:
+    """Raise unless `value` is true or false, or one of the `others`."""
+    if not isinstance(value, bool | np.bool_) and not (isinstance(value, str) and value in others):
+        raise ValueError(f"{name} is {shown(value)}; give {' or '.join(['True', 'False', *map(repr, others)])}")
 
 
 def check_choice(kind: str, name: str, known: Iterable[str]) -> None:

@@ -50,6 +50,14 @@ class Params(PyTreeNode):
     """(3,) force on the center of mass, N, world; acts through the effect `external_force`."""
     drag_coeff: Array
     """(3,) rotor drag per axis, N per m/s of air speed and rad/s of summed rotor speed."""
+    flapping_coeff: Array
+    """(2,) moment of rotors that move along body x and y, N m per m/s of air speed and rad/s of summed rotor speed."""
+    flapping_climb: Array
+    """(3,) share of that moment lost per m/s of climb, along x and y, s/m; share gained per its square, s^2/m^2."""
+    rate_damping: Array
+    """(3,) torque against the angular velocity, N m per rad/s, body."""
+    trim_torque: Array
+    """(3,) constant torque of a vehicle that is not in balance, N m, body."""
     ground_effect_coeff: Array
     """() k_G of equation 5 of the paper."""
     downwash_coeff: Array

@@ -37,13 +37,19 @@ _PROPERTIES = {  # attribute: (length, meaning and unit, range)
     "rotor_fall_time": (1, "rotor time constant when slowing down, s", _TIME_CONSTANT),
     "rotor_inertia": (1, "moment of inertia of a rotor about its axis, kg m^2", (0, 1e6)),
     "drag_coeff": (3, "rotor drag, N per m/s and rad/s", (0, 1)),
+    "flapping_coeff": (2, "moment of rotors that move along x and y, N m per m/s and rad/s", (-0.1, 0.1)),
+    "flapping_climb": (3, "share of that moment lost per m/s of climb, and gained per its square", (-10, 10)),
+    "rate_damping": (3, "torque against the angular velocity, N m per rad/s", (0, 1e6)),
+    "trim_torque": (3, "constant torque, N m", (-1e6, 1e6)),
     "ground_effect_coeff": (1, "k_G of equation 5", (0, 100)),
     "downwash_coeff": (3, "k_D1 (N), k_D2, k_D3 (m) of equation 6", (-1e6, 1e6)),
     "inflow_loss": (1, "share of thrust lost per m/s of downwash, s/m", (0, 10)),
     "prop_radius": (1, "propeller radius, m", _LENGTH),
 }
 """The ranges are those of anything from an insect to an airliner; within them single precision holds a flight."""
-_DEFAULTS = {"rotor_inertia": "0"}
+_OTHER_WORDS = ("thrust2weight", "max_speed_kmh")  # for `max_rpm` and `max_speed`
+_DEFAULTS = {"rotor_inertia": "0", "flapping_coeff": "0 0"}
+_DEFAULTS |= dict.fromkeys(("flapping_climb", "rate_damping", "trim_torque"), "0 0 0")
 
 _MASS = (1e-6, 1e6)  # kg
 _INERTIA = (1e-15, 1e9)  # kg m^2
@@ -60,7 +66,7 @@ def load_params(vehicle: str | os.PathLike) -> Params:
     """The constants of one drone.
 
     Args:
-        vehicle: a bundled vehicle (`cf2x`, `cf2p`, `hb`, `racer`) or the path of a URDF.
+        vehicle: a bundled vehicle (`jaxdrones.assets.vehicles()` names all) or the path of a URDF.
 
     Raises:
         ValueError: an unknown vehicle, or a URDF that lacks something or holds nonsense; says what.
@@ -88,29 +94,18 @@ def _params(urdf: "_Urdf") -> Params:
     properties = {name: urdf.property(name) for name in _PROPERTIES}
     mass = urdf.number(f"{inertial}/mass", "value", "mass, kg", _MASS)
     kf, thrust2weight = properties["kf"], properties["thrust2weight"]
-    values = dict(
+    values = {name: value for name, value in properties.items() if name not in _OTHER_WORDS} | dict(
         mass=mass,
         inertia=[urdf.number(f"{inertial}/inertia", f"i{a}{a}", "moment of inertia, kg m^2", _INERTIA) for a in "xyz"],
         rotor_pos=[
             urdf.numbers(f"joint[@name='rotor{i}']/origin", "xyz", 3, f"position of rotor {i}, m", _PLACE)
             for i in range(4)
         ],
-        rotor_spin=properties["rotor_spin"],
-        kf=kf,
-        km=properties["km"],
         max_rpm=np.sqrt(thrust2weight * mass * GRAVITY / (4 * kf)),
-        rotor_rise_time=properties["rotor_rise_time"],
-        rotor_fall_time=properties["rotor_fall_time"],
-        rotor_inertia=properties["rotor_inertia"],
         gravity=GRAVITY,
         air_density=AIR_DENSITY,
         wind=[0, 0, 0],
         external_force=[0, 0, 0],
-        drag_coeff=properties["drag_coeff"],
-        ground_effect_coeff=properties["ground_effect_coeff"],
-        downwash_coeff=properties["downwash_coeff"],
-        inflow_loss=properties["inflow_loss"],
-        prop_radius=properties["prop_radius"],
         max_speed=properties["max_speed_kmh"] / 3.6,
         collision_radius=urdf.number(cylinder, "radius", "collision radius, m", _LENGTH),
         collision_height=urdf.number(cylinder, "length", "collision height, m", _LENGTH),

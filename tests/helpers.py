@@ -13,6 +13,7 @@ import jaxdrones
 from jaxdrones import Params, State
 
 VEHICLES = ("cf2x", "cf2p", "hb", "racer")
+"""The vehicles of gym-pybullet-drones; tests/test_vehicles.py flies all bundled ones."""
 INTEGRATORS = (jaxdrones.euler, jaxdrones.semi_implicit_euler, jaxdrones.implicit_midpoint, jaxdrones.rk4)
 
 

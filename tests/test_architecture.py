@@ -20,9 +20,12 @@ NOUNS = (
     "quantity",
     "rotation",
     "state",
+    "thrust_curves",
     "urdf",
+    "urdf_writer",
     "user_code",
     "vector",
+    "vehicles",
     "wrench",
 )
 LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports another
@@ -30,7 +33,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("dynamics",), ("control",), ("sensing",), ("accelerate",)),
     (("engine",), ("tasks",)),
     (("optimal",),),
-    (("envs",), ("flights",), ("symbolic",)),
+    (("envs",), ("flights",), ("identification",), ("symbolic",)),
     (("adapters",), ("learning",), ("ros2",), ("throughput",), ("visualization",)),
     (("training",),),
     (("cli",),),

@@ -76,6 +76,14 @@ def test_optimal_reports_error_and_time_of_every_controller():
 
 
 @pytest.mark.slow
+def test_firmware_reports_agreement_and_cost():
+    result = quick("firmware.py")
+    (row,) = result["rows"]
+    assert max(row["roll"], row["pitch"]) < 0.3 and abs(row["pwm_ratio"] - 1) < 0.01
+    assert min(cost["seconds"] for cost in result["costs"].values()) > 0
+
+
+@pytest.mark.slow
 def test_envs_reports_a_rate_of_every_environment():
     result = quick("envs.py")
     assert len(result["rates"]) == 8 and min(result["rates"].values()) > 0
@@ -159,7 +167,7 @@ def test_every_benchmark_explains_itself(name):
 @pytest.mark.slow
 def test_the_state_estimate_of_a_recorded_flight_has_a_tilt_below_a_degree():
     """Against Vicon's attitude less the mean, which is how the markers were declared level."""
-    (row,) = quick("state_estimate.py", str(BENCHMARKS.parent / "tests/sensing/nanobench_B10_lissajous_slow_rep1.npz"))[
-        "rows"
-    ]
+    (row,) = quick(
+        "state_estimate.py", str(BENCHMARKS.parent / "tests/golden/nanobench/B10_lissajous_slow_rep1_imu.npz")
+    )["rows"]
     assert row["tilt"] < 1 and row["as logged"] < 1.5 and row["with attitude"] < 0.5

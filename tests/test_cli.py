@@ -182,7 +182,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_flight(name, tmp
 def test_list_names_what_can_be_chosen(capsys):
     assert main(["list", "--json"]) == 0
     names = json.loads(capsys.readouterr().out)
-    assert {"cf2x", "cf2p", "hb", "racer"} == set(names["vehicles"])
+    assert {"cf2x", "cf2p", "hb", "racer", "cf21", "bebop"} <= set(names["vehicles"])
     assert {"drag", "ground_effect", "downwash", "downwash_2021"} <= set(names["effects"])
     assert names["algorithms"] == list(algorithms.ALGORITHMS)
     assert main(["list"]) == 0

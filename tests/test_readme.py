@@ -15,6 +15,7 @@ ELSEWHERE = {  # page -> the tests that try its commands
     "docs/own-policy.md": "tests/test_cli_user_code.py",
     "docs/own-task.md": "tests/test_cli_user_code.py",
     "docs/own-vehicle.md": "tests/test_cli_user_code.py",
+    "docs/reality.md": "tests/identification/test_fit.py",
     "docs/ros2.md": "tests/ros2/test_cli_ros2.py",
     "docs/viewer.md": "tests/visualization/test_viewer.py",
 }
@@ -77,7 +78,7 @@ FLIGHTS = {
         "hover: fly to the goal ... x of the target, from the drone +m +world ... speed of rotor 0 +RPM ... position "
         "+-1 ... lost ... semi_implicit_euler ... 0.027 kg"
     ),
-    "list": Short("flights +circle, velocity ... vehicles +cf2p, cf2x, hb, racer"),
+    "list": Short("flights +circle, velocity ... vehicles +agilicious, bebop, cf21, cf21_brushless"),
 }
 FLIGHTS |= {
     "fly circle --controller lqr": Short(f"circle: 4 x cf2x, lqr ... {LOGGED}", FLIGHT),

@@ -76,7 +76,9 @@ def test_constants_have_the_default_precision():
 
 
 def test_an_unknown_vehicle_lists_the_known_ones():
-    with pytest.raises(ValueError, match=r"unknown vehicle 'cf3x'; did you mean 'cf2x'.*cf2p, cf2x, hb, racer"):
+    with pytest.raises(
+        ValueError, match=r"unknown vehicle 'cf3x'; did you mean 'cf2x'.*cf2p, cf2x, hb, hummingbird, racer"
+    ):
         jaxdrones.load_params("cf3x")
 
 

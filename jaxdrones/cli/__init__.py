@@ -3,7 +3,21 @@
 import argparse
 
 from jaxdrones.checks import UnexpectedKeyword
-from jaxdrones.cli import bench, compare, completion, doctor, evaluate, explain, fly, names, ros2, train, view
+from jaxdrones.cli import (
+    bench,
+    compare,
+    completion,
+    doctor,
+    evaluate,
+    explain,
+    fit,
+    fly,
+    names,
+    ros2,
+    score,
+    train,
+    view,
+)
 from jaxdrones.cli.common import INTERRUPTED, Parser, print_error
 
 
@@ -29,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="jaxdrones", description="Simulate teams of quadrotors.", allow_abbrev=False)
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
-    for command in (fly, train, evaluate, compare, view, ros2, explain, names, doctor, bench):
+    for command in (fly, train, evaluate, compare, view, fit, score, ros2, explain, names, doctor, bench):
         command.add(commands)
     completion.add(commands, parser)
     return parser

@@ -9,13 +9,13 @@ from typing import Any
 from jaxdrones import assets
 from jaxdrones.checks import check_choice, check_number, check_positive, check_whole
 from jaxdrones.cli.common import as_json, folder, print_error, print_warning
-from jaxdrones.control import CONTROLLERS
 from jaxdrones.dynamics import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.flights.conditions import BACKENDS, PHYSICS_HZ
 from jaxdrones.limits import check_at_most
 from jaxdrones.params import repeat
 from jaxdrones.ros2 import bag, topics
+from jaxdrones.ros2.command import CONTROLLERS
 from jaxdrones.ros2.failsafe import ACTIONS, Failsafe, PeerLost
 from jaxdrones.ros2.network import TRANSPORTS, open_transport
 from jaxdrones.ros2.node import Node

@@ -5,10 +5,27 @@ of one drone; `velocity.control` takes an action in place of the setpoint. A tea
 memory is `for_team(init(), n)`. The table lists the controllers by the names that the command line uses.
 """
 
-from jaxdrones.control import geometric, pid, rates, simple_pid, velocity
+from jaxdrones.control import firmware_motors, firmware_pid, geometric, pid, rates, simple_pid, velocity
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.team import for_team
 
-CONTROLLERS = {"pid": pid, "simple_pid": simple_pid, "geometric": geometric, "rates": rates}
+CONTROLLERS = {
+    "pid": pid,
+    "simple_pid": simple_pid,
+    "geometric": geometric,
+    "rates": rates,
+    "firmware_pid": firmware_pid,
+}
 
-__all__ = ["CONTROLLERS", "Setpoint", "for_team", "geometric", "pid", "rates", "simple_pid", "velocity"]
+__all__ = [
+    "CONTROLLERS",
+    "Setpoint",
+    "firmware_motors",
+    "firmware_pid",
+    "for_team",
+    "geometric",
+    "pid",
+    "rates",
+    "simple_pid",
+    "velocity",
+]

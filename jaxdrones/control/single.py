@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 from jaxdrones.checks import check_quaternion, check_shape
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.params import Params
@@ -14,11 +16,22 @@ _SETPOINT: dict[str, tuple[int, ...]] = {"pos": (3,), "vel": (3,), "acc": (3,), 
 
 def check_single(params: Params, state: State, setpoint: Setpoint | None = None, memory: Any = None) -> None:
     """Raise `ValueError` unless the arrays are those of one drone; `None` is not checked."""
-    for name, shape in _STATE.items():
-        check_shape(f"state.{name}", getattr(state, name), shape, _HINT)
-    check_quaternion("state.quat", state.quat)
+    check_state(state)
     check_shape("params.mass", params.mass, (), _HINT)
     for name, shape in _SETPOINT.items() if setpoint is not None else ():
         check_shape(f"setpoint.{name}", getattr(setpoint, name), shape, "one target for one drone")
     for name, value in vars(memory).items() if memory is not None else ():
         check_shape(f"memory.{name}", value, (3,), _HINT)
+
+
+def check_state(state: State) -> None:
+    """Raise `ValueError` unless the arrays of a state are those of one drone."""
+    for name, shape in _STATE.items():
+        check_shape(f"state.{name}", getattr(state, name), shape, _HINT)
+    check_quaternion("state.quat", state.quat)
+
+
+def check_memory(memory: Any, like: Any) -> None:
+    """Raise `ValueError` unless a memory has the shapes of another, that of one drone."""
+    for name, value in vars(memory).items():
+        check_shape(f"memory.{name}", value, np.shape(getattr(like, name)), _HINT)

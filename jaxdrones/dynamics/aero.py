@@ -9,25 +9,37 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.dynamics.rotors import thrust
+from jaxdrones.dynamics.model import constants
+from jaxdrones.dynamics.rotors import summed_speed, thrust
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
 from jaxdrones.wrench import Wrench
 
-_RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
 _FLOOR = 1.63  # propeller radii; below this height ground effect levels off, as for the Crazyflie of (2021)
 
 
 def drag(params: Params, state: State) -> Wrench:
     """Rotor drag, -k_D sum(rotor speed) v with v the velocity relative to the air and k_D along the body axes."""
     air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
-    return Wrench.of_force(-params.drag_coeff * _summed_rotor_speed(state) * air_velocity)
+    return Wrench.of_force(-params.drag_coeff * summed_speed(state) * air_velocity)
+
+
+def quadratic_drag(params: Params, state: State) -> Wrench:
+    """Drag of the body, -rho/2 A |v| v with v the velocity relative to the air.
+
+    A is `params.aux["drag_area"]`, (3,) m^2 along the body axes: the drag coefficient times the area seen from there.
+    It acts beside the rotors' `drag`, which is linear and governs below some 5 m/s.
+    """
+    area = constants(params, "drag_area", "jax.numpy.array([2e-3, 2e-3, 6e-3])")
+    air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
+    speed = safe_sqrt(vector.dot(air_velocity, air_velocity))
+    return Wrench.of_force(-params.air_density / 2 * area * speed * air_velocity)
 
 
 def drag_world_axes(params: Params, state: State) -> Wrench:
     """Rotor drag as in gym-pybullet-drones, with the coefficients along the world axes."""
-    force = -params.drag_coeff * _summed_rotor_speed(state) * (state.vel - params.wind)
+    force = -params.drag_coeff * summed_speed(state) * (state.vel - params.wind)
     return Wrench.of_force(rotation.rotate_inverse(state.quat, force))
 
 
@@ -60,11 +72,6 @@ def ground_effect_2021(params: Params, state: State) -> Wrench:
 def external_force(params: Params, state: State) -> Wrench:
     """The force `params.external_force` on the center of mass."""
     return Wrench.of_force(rotation.rotate_inverse(state.quat, params.external_force))
-
-
-def _summed_rotor_speed(state: State) -> Float[Array, ""]:
-    """Sum of the four rotor speeds, rad/s."""
-    return _RADIANS_PER_SECOND * vector.total(state.rpm)
 
 
 def _rotor_heights(params: Params, state: State) -> Float[Array, "4"]:

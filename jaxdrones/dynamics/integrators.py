@@ -35,6 +35,12 @@ def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> Stat
     return after.replace(pos=pos, quat=quat)
 
 
+def midpoint(derivative: Derivative, state: State, dt: float) -> State:
+    """The explicit midpoint rule, order 2, on the whole state, with one normalization per step."""
+    halfway = _add(state, dt / 2, derivative(state))
+    return _normalized(_add(state, dt, derivative(halfway)))
+
+
 def rk4(derivative: Derivative, state: State, dt: float) -> State:
     """The classical Runge-Kutta method, order 4, on the whole state, with one normalization per step."""
     k1 = derivative(state)

@@ -58,5 +58,19 @@ class Model:
         return rate
 
 
+def constants(params: Params, name: str, example: str) -> Any:
+    """`params.aux[name]`, the constants of a model that is not in the core.
+
+    Raises:
+        ValueError: there are none; says what to give, `example`.
+    """
+    if name not in params.aux:
+        found = ", ".join(params.aux) or "nothing"
+        raise ValueError(
+            f"params.aux lacks {name!r}; found {found}; give params.replace(aux=params.aux | {{{name!r}: {example}}})"
+        )
+    return params.aux[name]
+
+
 def _type(tree: Any) -> tuple:
     return jax.tree.structure(tree), [(x.shape, x.dtype) for x in jax.tree.leaves(tree)]

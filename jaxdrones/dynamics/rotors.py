@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import along_z, components, dot
+from jaxdrones.vector import along_z, components, dot, total
 from jaxdrones.wrench import Wrench
 
 _RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
@@ -42,6 +42,11 @@ def lagging_rotors(
 def thrust(params: Params, state: State) -> Float[Array, "4"]:
     """Thrust of each rotor, N along body z: F_i = k_F P_i^2."""
     return params.kf * state.rpm**2
+
+
+def summed_speed(state: State) -> Float[Array, ""]:
+    """Sum of the four rotor speeds, rad/s."""
+    return _RADIANS_PER_SECOND * total(state.rpm)
 
 
 def rotor_wrench(params: Params, state: State) -> Wrench:

@@ -20,6 +20,10 @@ _SHAPES = {
     "wind": (3,),
     "external_force": (3,),
     "drag_coeff": (3,),
+    "flapping_coeff": (2,),
+    "flapping_climb": (3,),
+    "rate_damping": (3,),
+    "trim_torque": (3,),
     "downwash_coeff": (3,),
 }
 _STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}

@@ -10,6 +10,7 @@ from jaxdrones.envs.explanation import Explanation
 from jaxdrones.envs.named_tasks import TASKS
 from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.envs.registry import make
+from jaxdrones.envs.turbulence import dryden
 from jaxdrones.tasks.task import ObservationTerm
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "Explanation",
     "ObservationTerm",
     "check_env",
+    "dryden",
     "explain",
     "make",
 ]

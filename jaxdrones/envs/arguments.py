@@ -52,6 +52,17 @@ def check_randomizations(randomize: Sequence[Callable]) -> tuple[Callable, ...]:
     return randomize
 
 
+def check_draws(
+    randomize: Sequence[Callable], noise: Callable | None, disturbance: Callable | None
+) -> tuple[Callable, ...]:
+    """The randomizations, or an error if one of them, the noise or the disturbance is no function."""
+    if noise is not None:
+        check_callable("noise", noise, "sensor_noise()")
+    if disturbance is not None:
+        check_callable("disturbance", disturbance, "random_pushes(0.3)")
+    return check_randomizations(randomize)
+
+
 def delay_steps(task: Task, delay: float, dt: float) -> float:
     """A delay in control steps; 0.02 s at 100 Hz are two, whatever the rounding.
 

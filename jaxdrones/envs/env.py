@@ -11,15 +11,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxdrones.checks import check_callable, check_finite, check_key, check_shape
+from jaxdrones.checks import check_finite, check_key, check_shape
 from jaxdrones.engine.step import HostStep, Step
+from jaxdrones.envs import randomize as draws
 from jaxdrones.envs.action import Action
-from jaxdrones.envs.arguments import check_randomizations, check_team, check_terms, delay_steps, episode_steps
+from jaxdrones.envs.arguments import check_draws, check_team, check_terms, delay_steps, episode_steps
 from jaxdrones.envs.construction import Constructed, constructed
 from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
 from jaxdrones.envs.process import check_process
-from jaxdrones.envs.randomize import Disturbance, Noise, Randomization, delayed, draw, drawn_leaves
 from jaxdrones.envs.surroundings import DrawScene, check_scene, scene_for_step
 from jaxdrones.envs.vision import ImageSpace, Vision, first_images, next_images, observation
 from jaxdrones.params import Params
@@ -54,9 +54,9 @@ class Env(Constructed):
         dt: float,
         action: Action,
         observation: Sequence[ObservationTerm],
-        randomize: Sequence[Randomization] = (),
-        noise: Noise | None = None,
-        disturbance: Disturbance | None = None,
+        randomize: Sequence[draws.Randomization] = (),
+        noise: draws.Noise | None = None,
+        disturbance: draws.Disturbance | None = None,
         delay: float = 0.0,
         vision: Vision | None = None,
         sensors: Sequence[Sensor] = (),
@@ -87,11 +87,8 @@ class Env(Constructed):
         """
         check_process()
         check_team(task, params, action, dt)
-        terms, randomize = check_terms(observation), check_randomizations(randomize)
-        if noise is not None:
-            check_callable("noise", noise, "sensor_noise()")
-        if disturbance is not None:
-            check_callable("disturbance", disturbance, "random_pushes(0.3)")
+        terms, randomize = check_terms(observation), check_draws(randomize, noise, disturbance)
+        params, randomize = draws.prepared(disturbance, params, randomize)
         self.scene = task.scene if scene is None else scene
         """Obstacles and ground, or the function that draws them."""
         obstacles = check_scene(self.scene, step, task)
@@ -106,7 +103,7 @@ class Env(Constructed):
         self.terms, self.randomize, self.noise, self.disturbance = terms, randomize, noise, disturbance
         self.delay = delay_steps(task, delay, dt)  # control steps
         self._history = max(math.ceil(self.delay) + 1, *(term.history for term in terms))
-        self._drawn = drawn_leaves(randomize, params)
+        self._drawn = draws.drawn_leaves(randomize, params)
         self.observation_bound = bounds(terms, self.term_sizes())
         """(d,) largest magnitude of every entry of the observation."""
         self.observation_size = len(self.observation_bound)
@@ -216,9 +213,10 @@ class Env(Constructed):
 
     def _start(self, key: jax.Array) -> World:
         """The world at the start of an episode, before the first measurement."""
-        params = draw(self.randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
+        params = draws.draw(self.randomize, jax.random.fold_in(key, RANDOMIZE), self.params)
         scene = self.scene if isinstance(self.scene, Scene) else self.scene(jax.random.fold_in(key, SCENE))
-        drones, variables = self.task.begin(jax.random.fold_in(key, START), self.params, scene)
+        known = draws.scaling_params(self.randomize, params, self.params)
+        drones, variables = self.task.begin(jax.random.fold_in(key, START), known, scene)
         return World(
             params=params,
             drones=self.physics.init(params, drones),
@@ -262,8 +260,9 @@ class Env(Constructed):
         def of_drone(params, memory, state, action, setpoint):
             return self.action.rpm(params, memory, state, action, setpoint, self.dt)
 
-        flown = delayed(actions, self.delay), self.task.target_now(world)
-        memory, rpm = jax.vmap(of_drone)(self.params, world.memory, world.drones, *flown)
+        flown = draws.delayed(actions, self.delay), self.task.target_now(world)
+        known = draws.scaling_params(self.randomize, params, self.params)
+        memory, rpm = jax.vmap(of_drone)(known, world.memory, world.drones, *flown)
         return world.replace(memory=memory), rpm
 
     def _outcome(self, key: Key, world: World, rate: State | None):

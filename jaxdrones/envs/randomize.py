@@ -1,12 +1,15 @@
 """Domain randomization: parameters drawn per episode, sensor noise, wind and random pushes. All compose."""
 
+import dataclasses
+import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones import rotation
+from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
 from jaxdrones.checks import POSITIVE, check_choice, check_number
 from jaxdrones.params import Params
@@ -19,6 +22,41 @@ Noise = Callable[[jax.Array, State], State]
 """(key, state) of a team -> the state as its sensors show it."""
 Disturbance = Callable[[jax.Array, Params, float], Params]
 """(key, params, control period) of a team -> its parameters with the surroundings of the next control step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DisturbanceWithMemory:
+    """A disturbance that depends on what it did before; its memory is `params.aux[name]`."""
+
+    name: str
+    """Key of `Params.aux`."""
+    init: Callable[[jax.Array, Params], Any]
+    """`init(key, params)`: the memory of one drone at the start of an episode, a pytree of arrays."""
+    advance: Disturbance
+    """`advance(key, params, control period)` of a team: its parameters with new surroundings and a new memory."""
+    text: str
+    """What it does, for people."""
+
+    def __post_init__(self):
+        object.__setattr__(self, "__doc__", self.text)
+
+    def __call__(self, key: jax.Array, params: Params, dt: float) -> Params:
+        """The parameters of a team with the surroundings of the next control step."""
+        if self.name not in params.aux:
+            raise ValueError(
+                f"params.aux lacks {self.name!r}, the memory of a disturbance; start from its start(key, params)"
+            )
+        return self.advance(key, params, dt)
+
+    def start(self, key: jax.Array, params: Params) -> Params:
+        """The parameters of one drone with the memory at the start of an episode."""
+        return params.replace(aux=params.aux | {self.name: self.init(key, params)})
+
+    def nominal(self, params: Params) -> Params:
+        """The parameters of a team with a memory of zeros: the place for it."""
+        keys = jax.random.split(jax.random.key(0), len(params.mass))
+        shapes = jax.eval_shape(jax.vmap(self.init), keys, params)
+        return params.replace(aux=params.aux | {self.name: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)})
 
 
 def _check_range(field: str, low: float, high: float) -> None:
@@ -74,6 +112,58 @@ def constant_wind(speed: float) -> Randomization:
         return params.replace(wind=wind * jnp.array([1, 1, 0.25], wind.dtype))
 
     return described(f"wind U(-{speed:g}, {speed:g}) m/s along x and y, a quarter of it along z", randomize)
+
+
+def prepared(
+    disturbance: Disturbance | None, params: Params, randomize: Sequence[Randomization]
+) -> tuple[Params, tuple[Randomization, ...]]:
+    """Nominal parameters of a team and randomizations, with the memory of a disturbance that has one."""
+    if isinstance(disturbance, DisturbanceWithMemory):
+        start = described(f"start of: {disturbance.text}", functools.partial(disturbance.start))
+        return disturbance.nominal(params), (*randomize, start)
+    return params, tuple(randomize)
+
+
+@dataclasses.dataclass(frozen=True)
+class AnyVehicle:
+    """Any quadrotor that could be built, of 20 g to 3 kg where no other masses are given (`jaxdrones.vehicles`).
+
+    What other randomizations draw is hidden from starts and actions, which are scaled by the nominal vehicle. This one
+    draws the vehicle itself, and they are scaled by what it draws, so that an action of 0 hovers. In `jaxdrones.make`
+    the median vehicle is the nominal one.
+
+    Raises:
+        ValueError: masses out of range, or the heaviest first.
+    """
+
+    lightest: float = vehicles.LIGHTEST
+    """kg."""
+    heaviest: float = vehicles.HEAVIEST
+    """kg."""
+
+    def __post_init__(self):
+        vehicles.check_masses(self.lightest, self.heaviest)
+        object.__setattr__(self, "__doc__", f"any quadrotor of {self.lightest:g} to {self.heaviest:g} kg")
+
+    def __call__(self, key: jax.Array, params: Params) -> Params:
+        """The drawn vehicle, in the surroundings of `params`."""
+        return vehicles.draw(key, params, self.lightest, self.heaviest)
+
+    def median(self, params: Params) -> Params:
+        """A team of the median vehicle, in the surroundings of the team `params`."""
+        return jax.vmap(lambda one: vehicles.median(one, self.lightest, self.heaviest))(params)
+
+
+def nominal_params(randomize: Sequence[Randomization], params: Params) -> Params:
+    """The parameters of a team before anything is drawn: those given, or the median of the vehicles that are drawn."""
+    for one in randomize:
+        params = one.median(params) if isinstance(one, AnyVehicle) else params
+    return params
+
+
+def scaling_params(randomize: Sequence[Randomization], drawn: Params, nominal: Params) -> Params:
+    """What starts and actions are scaled by: the nominal parameters, or the drawn ones where a vehicle is drawn."""
+    return drawn if any(isinstance(one, AnyVehicle) for one in randomize) else nominal
 
 
 def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> Params:

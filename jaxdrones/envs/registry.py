@@ -45,9 +45,11 @@ from jaxdrones.envs.process import check_process
 from jaxdrones.envs.randomize import (
     REALISTIC_DELAY,
     REALISTIC_RANDOMIZATION,
+    AnyVehicle,
     Disturbance,
     Noise,
     Randomization,
+    nominal_params,
     sensor_noise,
 )
 from jaxdrones.envs.surroundings import DrawScene, are_solid
@@ -66,12 +68,12 @@ def make(
     task: str | Task | Callable[..., Task],
     *,
     backend: str = "explicit",
-    vehicle: str | os.PathLike | Params = "cf2x",
+    vehicle: str | os.PathLike | Params | None = None,
     action: str | Action | None = None,
     observation: Sequence[str | ObservationTerm] | None = None,
     vision: Sequence[str] | None = None,
     camera: Camera | None = None,
-    realistic: bool = False,
+    realistic: bool | str = False,
     effects: Sequence[str | Callable] | None = None,
     pairs: Sequence[str | Callable] = (),
     team_effects: Sequence[TeamEffect] = (),
@@ -93,14 +95,15 @@ def make(
     Args:
         task: a name of `TASKS`; `file.py:function` of a function that returns a task, or this function; or a task.
         backend: `explicit` or `bullet`, which must be closed: use the environment in a `with` block.
-        vehicle: a bundled vehicle, the path of a URDF, or the parameters of one drone.
+        vehicle: a bundled vehicle, the path of a URDF, or the parameters of one drone; `cf2x` when left out.
         action: a name of `ACTIONS` or an action type; the task's own when left out.
         observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
             out.
         vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, as images of a camera on every
             drone; the task's own when left out.
         camera: that camera, with its rate, latency and noise; the task's own when left out, or else a `Camera()`.
-        realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here.
+        realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here;
+            `any` draws another vehicle of 20 g to 3 kg for every episode in place of random parameters.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
         team_effects: functions `(params, state) -> Wrench` of the whole team.
@@ -127,17 +130,21 @@ def make(
     """
     check_process()
     check_choice("backend", backend, BACKENDS)
-    check_switch("realistic", realistic)
+    check_switch("realistic", realistic, ("any",))
     task = make_task(task, options, _OWN_OPTIONS)
     control_hz = task.control_hz if control_hz is None else control_hz
     substeps = task.substeps if substeps is None else substeps
     check_positive("control_hz", control_hz, "1/s")
     check_whole("substeps", substeps)
     dt = 1 / control_hz
+    preset = _REALISTIC if realistic else _PLAIN
+    if randomize is None and realistic != "any":
+        randomize = preset["randomize"]
+    randomize = _randomizations(task, realistic == "any", randomize or (), vehicle)
+    vehicle = "cf2x" if vehicle is None else vehicle
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
     check_finite("vehicle", nominal)
-
-    preset = _REALISTIC if realistic else _PLAIN
+    nominal = nominal_params(randomize, nominal)
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
     if disturbance is not None:
@@ -181,17 +188,14 @@ def make(
         dt=dt,
         action=action,
         observation=[_named("observation", term, known) for term in observation],
-        randomize=(
-            *task.randomize,
-            *check_randomizations(preset["randomize"] if randomize is None else randomize),
-        ),
+        randomize=randomize,
         noise=preset["noise"] if noise is None else noise,
         disturbance=disturbance,
         delay=preset["delay"] if delay is None else delay,
         vision=_vision(task, step, vision, camera, dt, scene),
         sensors=sensors,
         scene=scene,
-        vehicle="drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem,
+        vehicle=_name(vehicle, randomize),
     )
 
 
@@ -202,6 +206,27 @@ _REALISTIC: dict[str, Any] = dict(
 
 
 _OWN_OPTIONS = {name for name in inspect.signature(make).parameters if name not in ("task", "options")}
+
+
+def _randomizations(
+    task: Task, any_vehicle: bool, given: Sequence[Randomization], vehicle: Any
+) -> tuple[Randomization, ...]:
+    """All randomizations of an environment; first those that draw whole vehicles, which the others then change."""
+    preset: list[Randomization] = [AnyVehicle()] if any_vehicle else []
+    chosen: list[Randomization] = [*preset, *task.randomize, *check_randomizations(given)]
+    whole = [one for one in chosen if isinstance(one, AnyVehicle)]
+    rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
+    if len(whole) > 1 or (whole and vehicle is not None):
+        other = "another AnyVehicle" if len(whole) > 1 else f"vehicle={shown(vehicle)}"
+        raise ValueError(f"{other} is given, but every episode draws a vehicle already; leave out one of them")
+    return (*whole, *rest)
+
+
+def _name(vehicle: str | os.PathLike | Params, randomize: Sequence[Randomization]) -> str:
+    """The name of the vehicle, for people."""
+    if any(isinstance(one, AnyVehicle) for one in randomize):
+        return "any vehicle"
+    return "drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem
 
 
 def _all_named(kind: str, values, table: dict, others: dict) -> list:

@@ -17,6 +17,8 @@ BACKENDS = ("explicit", "bullet")
 CONTROLLERS = (*control.CONTROLLERS, *optimal.CONTROLLERS)
 PHYSICS_HZ = 240  # lowest rate; raised to a multiple of the control rate
 
+_FIRMWARE_HZ = 500  # of the inner loops of the firmware's PID
+
 _MAX_HZ = 20_000  # above it the step of 1 mm/s is lost in the rounding of a float32 position of 1 m
 _MAX_DURATION = 1e5  # s; from there on float32 times are further apart than control steps at 120 Hz
 _LOG_BYTES = 400  # per drone and control step: trajectory, log, figure
@@ -62,6 +64,8 @@ class Conditions:
             drones=flight.drones, effects=flight.effects, control_hz=flight.control_hz, duration=flight.duration
         )
         default["controller"] = "pid" if self.flight == "velocity" or self.vehicle in pid.VEHICLES else "geometric"
+        if self.controller == "firmware_pid":
+            default["control_hz"] = _FIRMWARE_HZ
         for name, value in default.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)

@@ -2,13 +2,14 @@
 
 import functools
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxdrones import control, optimal
-from jaxdrones.control import Setpoint, for_team, pid, velocity
+from jaxdrones.control import Setpoint, firmware_pid, for_team, pid, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, ROTORS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.flights.conditions import Conditions
@@ -16,6 +17,7 @@ from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks.curves import setpoint_on
+from jaxdrones.urdf import load_params
 
 
 class Controller(NamedTuple):
@@ -33,7 +35,7 @@ def controller_of(conditions: Conditions) -> Controller:
         return _optimal(conditions)
     example, n = FLIGHTS[conditions.flight], conditions.drones
     module = velocity if conditions.flight == "velocity" else control.CONTROLLERS[conditions.controller]
-    gains = pid.gains(conditions.vehicle) if module in (pid, velocity) else module.gains()
+    gains = _gains(module, conditions.vehicle)
     memory = for_team((pid if module is velocity else module).init(), n)
     one = functools.partial(module.control, gains, dt=conditions.dt)
 
@@ -41,6 +43,13 @@ def controller_of(conditions: Conditions) -> Controller:
         return jax.vmap(one)(params, memory, state, example.target(n, t, conditions.duration))
 
     return Controller(lambda params, start: memory, fly)
+
+
+def _gains(module: ModuleType, vehicle: str) -> Any:
+    """The gains of a controller for a vehicle."""
+    if module in (pid, velocity):
+        return pid.gains(vehicle)
+    return firmware_pid.gains(load_params(vehicle)) if module is firmware_pid else module.gains()
 
 
 def _optimal(conditions: Conditions) -> Controller:

@@ -11,10 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.control import CONTROLLERS, Setpoint, rates
+from jaxdrones.control import CONTROLLERS as ALL_CONTROLLERS
+from jaxdrones.control import Setpoint, firmware_pid, rates
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import sin_cos
+
+CONTROLLERS = {name: module for name, module in ALL_CONTROLLERS.items() if module is not firmware_pid}
+"""The controllers that fly velocities of a `Setpoint`, which the firmware's does not."""
 
 
 class Mode(enum.IntEnum):

@@ -12,12 +12,12 @@ import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_callable, check_choice, check_whole
-from jaxdrones.control import CONTROLLERS, pid
+from jaxdrones.control import pid
 from jaxdrones.dynamics.rigid_body import specific_force
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.params import Params
 from jaxdrones.ros2 import command as commands
-from jaxdrones.ros2.command import Command, Mode
+from jaxdrones.ros2.command import CONTROLLERS, Command, Mode
 from jaxdrones.ros2.convert import Measurement
 from jaxdrones.sensing import Camera, Scene, render
 from jaxdrones.state import State

@@ -14,7 +14,7 @@ from helpers import VEHICLES, assert_close, assert_finite, flying
 from jax.flatten_util import ravel_pytree
 
 from jaxdrones import rotation
-from jaxdrones.control import for_team, geometric, pid, rates, simple_pid, velocity
+from jaxdrones.control import firmware_pid, for_team, geometric, pid, rates, simple_pid, velocity
 from jaxdrones.control.setpoint import Setpoint
 
 DT = 1 / 240
@@ -41,8 +41,9 @@ VELOCITY = [Loop(velocity.control, pid.gains, pid.init, vehicle) for vehicle in 
 SIMPLE_PID = loops(simple_pid, "hb")
 GEOMETRIC = loops(geometric, *VEHICLES)
 RATES = loops(rates, *VEHICLES)
+FIRMWARE = loops(firmware_pid, "cf2x")
 EVERY_PAIR = [*PID, *VELOCITY, *SIMPLE_PID, *GEOMETRIC, *RATES]
-EVERY_CONTROLLER = [PID[0], VELOCITY[0], SIMPLE_PID[0], GEOMETRIC[0], RATES[0]]
+EVERY_CONTROLLER = [PID[0], VELOCITY[0], SIMPLE_PID[0], GEOMETRIC[0], RATES[0], *FIRMWARE]
 
 each_pair = pytest.mark.parametrize("loop", EVERY_PAIR, ids=repr)
 each_controller = pytest.mark.parametrize("loop", EVERY_CONTROLLER, ids=repr)
@@ -143,10 +144,12 @@ def test_gradients_of_a_call_agree_with_differences(loop):
 
 @each_controller
 def test_without_weight_and_error_there_is_nothing_to_do(loop):
-    """No rotor turns, but for the idle speed of the PID's motors."""
+    """No rotor turns, but for the idle speed of the PID's motors and what the firmware takes for the weight."""
     team = team_of(*N * [loop.vehicle]).replace(gravity=jnp.zeros(N))
     _, rpm = call(loop.control, loop.gains(), team, for_team(loop.init(), N), hovering(team), stay(loop, team))
-    np.testing.assert_allclose(rpm, 9440.3 if loop in (*PID, *VELOCITY) else 0, rtol=1e-12)
+    base = jnp.sqrt(36000 / 65535 * 0.12 / team.kf[0])
+    expected = 9440.3 if loop in (*PID, *VELOCITY) else base if loop in FIRMWARE else 0
+    np.testing.assert_allclose(rpm, expected, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -16,12 +16,13 @@ from jaxdrones import (
     implicit_midpoint,
     instant_rotors,
     lagging_rotors,
+    midpoint,
     rk4,
     rotation,
     semi_implicit_euler,
 )
 
-ORDER = {euler: 1, semi_implicit_euler: 1, implicit_midpoint: 2, rk4: 4}
+ORDER = {euler: 1, semi_implicit_euler: 1, midpoint: 2, implicit_midpoint: 2, rk4: 4}
 params = jaxdrones.load_params("cf2x")
 
 

@@ -1,0 +1,38 @@
+"""Torques that recorded flights show and a rigid body with four thrusts has not: flapping, rate damping, trim."""
+
+import jax.numpy as jnp
+
+from jaxdrones import rotation
+from jaxdrones.dynamics.rotors import summed_speed
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.vector import components, safe_sqrt
+from jaxdrones.wrench import Wrench
+
+_MOST_CLIMB = 3.0  # m/s, beyond which the loss does not follow; the flights it was found in climb at up to 2 m/s
+
+
+def flapping_moment(params: Params, state: State) -> Wrench:
+    """Moment of rotors that move through the air: their discs tilt back, and their drag acts above the center of mass.
+
+    M = sum(rotor speed) (c_y v g_y, -c_x u g_x, 0) with u, v, w the velocity relative to the air along the body axes: a
+    drone that flies forward is pitched nose up. It changes with the climb by g = 1 - l w + k w^2, as flights of the
+    Crazyflie 2.1 brushless show (docs/reality.md).
+    """
+    u, v, w = components(rotation.rotate_inverse(state.quat, state.vel - params.wind))
+    climb = w / safe_sqrt(1 + (w / _MOST_CLIMB) ** 2)
+    loss_x, loss_y, gain = components(params.flapping_climb)
+    c_x, c_y = components(params.flapping_coeff)
+    about_x = c_y * v * (1 - loss_y * climb + gain * climb**2)
+    about_y = -c_x * u * (1 - loss_x * climb + gain * climb**2)
+    return Wrench.of_torque(summed_speed(state) * jnp.stack([about_x, about_y, jnp.zeros_like(u)]))
+
+
+def rate_damping(params: Params, state: State) -> Wrench:
+    """Torque against the angular velocity: a rotor that goes down gains thrust, one that rises loses it."""
+    return Wrench.of_torque(-params.rate_damping * state.omega)
+
+
+def trim_torque(params: Params, state: State) -> Wrench:
+    """The constant torque `params.trim_torque` of a vehicle that is not in balance."""
+    return Wrench.of_torque(params.trim_torque)

@@ -1,0 +1,184 @@
+"""A lithium-polymer battery: its charge, and its voltage under the load of the rotors.
+
+The circuit is an open-circuit voltage, a resistance, and one pair of resistance and capacitance in series (Thevenin).
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_number
+from jaxdrones.dynamics.model import Model, constants
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+from jaxdrones.vector import safe_sqrt, total
+
+# Open-circuit voltage of one cell by its state of charge s (Chen and Rincon-Mora, IEEE Trans. Energy Conversion 2006,
+# equation 2), its linear term raised by 0.097 V so that a full cell has 4.2 V:
+# -1.031 exp(-35 s) + 3.685 + 0.3126 s - 0.1178 s^2 + 0.3201 s^3
+_KNEE, _KNEE_RATE = 1.031, 35.0  # V, 1
+_CUBIC = (3.685, 0.3126, -0.1178, 0.3201)  # V
+_BISECTIONS = 30
+_SMALLEST_VOLTAGE = 1e-6  # V; of a battery that is empty, so that nothing is divided by zero
+
+
+class Battery(PyTreeNode):
+    """Constants of a battery and of what it feeds, `Params.aux["battery"]`; `lithium_polymer` makes them."""
+
+    capacity: Array
+    """() charge when full, A s."""
+    cells: Array
+    """() number of cells in series."""
+    resistance: Array
+    """() of battery, plug and wires: the part of the voltage drop that comes at once, ohm."""
+    slow_resistance: Array
+    """() the part that comes and goes with the time constant, ohm."""
+    slow_time: Array
+    """() time constant, s."""
+    efficiency: Array
+    """() power that the rotors' thrust takes in an ideal hover over the electrical power of the motors."""
+    idle_power: Array
+    """() power of the electronics, W."""
+
+
+def lithium_polymer(
+    capacity: ArrayLike = 900.0,
+    cells: ArrayLike = 1,
+    resistance: ArrayLike = 0.26,
+    slow_resistance: ArrayLike = 0.0,
+    slow_time: ArrayLike = 10.0,
+    efficiency: ArrayLike = 0.3,
+    idle_power: ArrayLike = 0.5,
+) -> Battery:
+    """A battery by its numbers; those of a Crazyflie 2.1 with 250 mAh where left out.
+
+    Resistance and efficiency are fitted to flights of NanoBench (Ullah and Baca 2026): at an efficiency of 0.3 the
+    batteries of its flights have 0.20 to 0.49 ohm, and no slow part that could be measured. So give the resistance of
+    your own. The idle power is an estimate.
+
+    Args:
+        capacity: charge when full, A s; 3.6 times the mAh on the label.
+        cells: in series.
+        resistance: of battery, plug and wires, all cells together, ohm.
+        slow_resistance: the part of the resistance whose drop lags behind the current, ohm.
+        slow_time: time constant of this lag, s.
+        efficiency: power of an ideal rotor with the same thrust over the electrical power of a motor.
+        idle_power: power of the electronics, W.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+    for name, value, unit in (
+        ("capacity", capacity, "A s"),
+        ("cells", cells, "in series"),
+        ("slow_time", slow_time, "s"),
+        ("efficiency", efficiency, "a share"),
+    ):
+        check_number(f"{name} of the battery", value, unit, above=0)
+    for name, value, unit in (
+        ("resistance", resistance, "ohm"),
+        ("slow_resistance", slow_resistance, "ohm"),
+        ("idle_power", idle_power, "W"),
+    ):
+        check_number(f"{name} of the battery", value, unit, at_least=0)
+    numbers = capacity, cells, resistance, slow_resistance, slow_time, efficiency, idle_power
+    return Battery(*(jnp.asarray(x, float) for x in numbers))
+
+
+def battery() -> Model:
+    """The model of a battery that is full at the start; its constants are `Params.aux["battery"]`.
+
+    `state.aux["battery"]` holds `charge` () in A s and `slow_drop` (), the part of the voltage drop that follows the
+    current with a lag, V. The charge falls by the integral of `battery_current`, and by nothing else.
+    """
+    return Model("battery", _full, _rate)
+
+
+def battery_power(params: Params, state: State) -> Float[Array, ""]:
+    """Electrical power that motors and electronics ask for, W.
+
+    By momentum theory a rotor needs F sqrt(F / (2 rho A)) for its thrust F = k_F P^2 in hover; `efficiency` is the
+    share of the electrical power that this is. It holds the losses of rotor, motor and driver.
+    """
+    cell = _constants(params)
+    area = jnp.pi * params.prop_radius**2
+    per_cube = params.kf * jnp.sqrt(params.kf / (2 * params.air_density * area))
+    return cell.idle_power + per_cube / cell.efficiency * total(jnp.abs(state.rpm) ** 3)
+
+
+def battery_current(params: Params, state: State) -> Float[Array, ""]:
+    """Current I that gives the power, A: I (E - R I) = P, with E the voltage without the resistance R.
+
+    A battery gives E^2 / (4 R) at most; where more is asked for, I is that of the highest power, E / (2 R).
+    """
+    source, power, resistance = _source(params, state), battery_power(params, state), _constants(params).resistance
+    product = 4 * resistance * power
+    enough = product < source**2
+    given = 2 * power / (source + safe_sqrt(source**2 - product))
+    return jnp.where(enough, given, source / jnp.where(enough, 1, 2 * resistance))
+
+
+def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
+    """Voltage at the terminals under the load of the rotors as they turn, V.
+
+    Args:
+        params: of the drone, with the constants of the battery in `aux["battery"]`.
+        state: of the drone, with the state of the model `battery()`.
+    """
+    return _source(params, state) - _constants(params).resistance * battery_current(params, state)
+
+
+def open_circuit_voltage(battery: Battery, charge: Float[Array, ""]) -> Float[Array, ""]:
+    """Voltage of a battery at rest, V, at a charge in A s (Chen and Rincon-Mora 2006).
+
+    It falls to zero just below no charge, where also the current ends.
+    """
+    share = charge / battery.capacity
+    a, b, c, d = _CUBIC
+    return battery.cells * (a + share * (b + share * (c + share * d)) - _KNEE * jnp.exp(-_KNEE_RATE * share))
+
+
+def charge_at(battery: Battery, voltage: Float[ArrayLike, ""]) -> Float[Array, ""]:
+    """Charge of a battery at rest with this voltage, A s: for a flight that starts with a measured voltage.
+
+    Voltages beyond those of a full and of an empty battery give the charge of these. The derivative is exact between.
+    """
+    voltage = jnp.asarray(voltage, battery.capacity.dtype)
+
+    def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bounds
+        middle = (low + high) / 2
+        below = open_circuit_voltage(battery, middle) < voltage
+        return jnp.where(below, middle, low), jnp.where(below, high, middle)
+
+    bounds = jnp.zeros_like(battery.capacity), battery.capacity
+    low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, jax.lax.stop_gradient(bounds))
+    charge = (low + high) / 2
+    slope = jax.grad(open_circuit_voltage, argnums=1)(battery, charge)
+    newton = charge + (voltage - open_circuit_voltage(battery, charge)) / slope
+    return jnp.clip(newton, 0, battery.capacity)
+
+
+def _full(params: Params) -> dict[str, Array]:
+    capacity = _constants(params).capacity
+    return {"charge": capacity, "slow_drop": jnp.zeros_like(capacity)}
+
+
+def _rate(params: Params, state: State, command: Float[Array, "4"]) -> dict[str, Array]:
+    cell, current = _constants(params), battery_current(params, state)
+    change = cell.slow_resistance * current - state.aux["battery"]["slow_drop"]
+    return {"charge": -current, "slow_drop": change / cell.slow_time}
+
+
+def _source(params: Params, state: State) -> Float[Array, ""]:
+    """Voltage behind the resistance, V."""
+    memory = state.aux["battery"]
+    voltage = open_circuit_voltage(_constants(params), memory["charge"]) - memory["slow_drop"]
+    return jnp.maximum(voltage, _SMALLEST_VOLTAGE)
+
+
+def _constants(params: Params) -> Battery:
+    battery: Battery = constants(params, "battery", "jaxdrones.lithium_polymer()")
+    return battery

@@ -1,0 +1,134 @@
+"""Motors that are commanded by PWM, and motors that fail."""
+
+import functools
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_choice, check_finite, check_number, check_shape, is_known, shown
+from jaxdrones.dynamics.model import constants
+from jaxdrones.dynamics.power import battery_voltage
+from jaxdrones.dynamics.rotors import lagging_rotors
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+from jaxdrones.thrust_curves import THRUST_CURVES, thrust_at, voltage_for
+from jaxdrones.vector import safe_sqrt
+
+Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
+
+FULL_PWM = 65535
+"""The command of a motor that is always on."""
+
+
+class Motors(PyTreeNode):
+    """What turns PWM into thrust, `Params.aux["motors"]`; `crazyflie_motors` and `cubic_motors` make it."""
+
+    coefficients: Array
+    """(4,) of the thrust of one motor as a cubic of its voltage, N/V^0 to N/V^3."""
+    supply: Array
+    """() V, where no battery is simulated."""
+
+    def thrust(self, voltage: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Thrust of one motor at a mean voltage (V), N; none where the cubic is negative, at low voltage."""
+        return jnp.maximum(thrust_at(self.coefficients, voltage), 0)
+
+    def voltage(self, thrust: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Voltage that gives a thrust (N), V: the one root of a cubic that rises everywhere."""
+        return voltage_for(self.coefficients, thrust)
+
+
+def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
+    """Motors by the coefficients of their thrust curve.
+
+    Args:
+        coefficients: (4,) of the powers 0 to 3 of the voltage, N/V^0 to N/V^3.
+        supply: voltage where no battery is simulated, V.
+
+    Raises:
+        ValueError: a wrong shape, numbers that are not finite, a curve that does not rise everywhere, or a supply that
+            is not positive.
+    """
+    check_shape("coefficients of the thrust curve", coefficients, (4,), "those of the powers 0 to 3 of the voltage")
+    check_finite("coefficients of the thrust curve", coefficients)
+    check_number("supply of the motors", supply, "V", above=0)
+    if is_known(coefficients):
+        _, b, c, d = np.asarray(coefficients, float)
+        if not (d > 0 and c * c < 3 * b * d):
+            raise ValueError(
+                f"the thrust curve {shown(coefficients)} does not rise everywhere; give a cubic whose slope is positive"
+            )
+    return Motors(jnp.asarray(coefficients, float), jnp.asarray(supply, float))
+
+
+def crazyflie_motors(propellers: str = "2.1+", supply: ArrayLike = 3.7) -> Motors:
+    """Motors of the Crazyflie with the firmware's thrust curve.
+
+    Args:
+        propellers: a name of `THRUST_CURVES`: `2.1`, `2.1+` or `thrust upgrade`.
+        supply: voltage where no battery is simulated, V.
+
+    Raises:
+        ValueError: unknown propellers, or a supply that is not positive.
+    """
+    check_choice("propellers", propellers, THRUST_CURVES)
+    return cubic_motors(np.array(THRUST_CURVES[propellers]), supply)
+
+
+def pwm_rotors(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
+    """Rotors with a first-order lag whose command is the PWM of each motor, 0 to 65535.
+
+    The mean voltage of a motor is that share of the supply: of `battery()` under its load, or of the motors' `supply`
+    where this model is not among the step's. Thrust follows by the motors' cubic, and speed from thrust by `kf`.
+
+    Args:
+        params: of the drone, with `Motors` in `aux["motors"]`.
+        state: of the drone.
+        command: (4,) PWM, limited to 0 .. 65535.
+
+    Returns:
+        Rotor speeds and their rates, RPM and RPM/s.
+    """
+    thrust = _motors(params).thrust(_duty(command) * supply_voltage(params, state))
+    return lagging_rotors(params, state, safe_sqrt(thrust / params.kf))
+
+
+def pwm_of_thrust(params: Params, state: State, thrust: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The PWM with which `pwm_rotors` come to a thrust (4,) in N, limited to 0 .. 65535: battery compensation."""
+    return FULL_PWM * _duty(FULL_PWM * _motors(params).voltage(thrust) / supply_voltage(params, state))
+
+
+def supply_voltage(params: Params, state: State) -> Float[Array, ""]:
+    """Voltage that the motors get at full PWM, V."""
+    return battery_voltage(params, state) if "battery" in state.aux else _motors(params).supply
+
+
+def failing(rotors: Rotors) -> Rotors:
+    """Rotors that may fail: each takes the share `params.aux["rotor_health"]` (4,) of its command.
+
+    1 is sound, and a rotor of health 0 runs down and stays still. As any constant the health may be drawn for an
+    episode, change in flight, and have a gradient.
+
+    Args:
+        rotors: `lagging_rotors`, `pwm_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
+    """
+
+    @functools.wraps(rotors)
+    def with_health(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Array, Array]:
+        health = constants(params, "rotor_health", "jax.numpy.ones(4)")
+        return rotors(params, state, health * command)
+
+    return with_health
+
+
+def _duty(pwm: Float[Array, "4"]) -> Float[Array, "4"]:
+    """The share of the time in which a motor is on, with the derivative of a limit that a gradient finds back from."""
+    return jnp.where(pwm < 0, 0, jnp.where(pwm > FULL_PWM, 1, pwm / FULL_PWM))
+
+
+def _motors(params: Params) -> Motors:
+    motors: Motors = constants(params, "motors", "jaxdrones.crazyflie_motors()")
+    return motors

@@ -1,0 +1,92 @@
+"""Wind that depends on place and time."""
+
+import functools
+import inspect
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_arguments, check_callable, check_number
+from jaxdrones.dynamics.model import Model
+from jaxdrones.params import Params
+from jaxdrones.state import State
+from jaxdrones.wrench import Wrench
+
+WindField = Callable[..., Float[Array, "3"]]
+"""`(pos)` or `(pos, time)`, m and s -> velocity of the air there, m/s, world."""
+Effect = Callable[[Params, State], Wrench]
+
+
+def clock() -> Model:
+    """The model of time: `state.aux["clock"]` () is the time since the start, s."""
+    return Model(
+        "clock", lambda params: jnp.zeros_like(params.mass), lambda params, state, _: jnp.ones_like(params.mass)
+    )
+
+
+def in_wind(field: WindField, effect: Effect) -> Effect:
+    """An effect in a wind field, which adds to `params.wind` where the drone is.
+
+    Args:
+        field: `(pos) -> wind` or `(pos, time) -> wind`, of one drone, (3,) m/s, world; the latter needs the model
+            `clock()` among the step's.
+        effect: `(params, state) -> Wrench` that depends on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`.
+
+    Raises:
+        ValueError: an argument that is not such a function; in flight, a field of time without a clock.
+    """
+    check_callable("field", field, "jaxdrones.logarithmic_wind(5.0)")
+    check_callable("effect", effect, "jaxdrones.drag")
+    arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
+    check_arguments("field", field, arguments)
+    check_arguments("effect", effect, ("params", "state"))
+
+    @functools.wraps(effect)
+    def blown(params: Params, state: State) -> Wrench:
+        if len(arguments) == 2 and "clock" not in state.aux:
+            raise ValueError(
+                "the wind field depends on time and state.aux lacks 'clock'; give models=(jaxdrones.clock(),)"
+            )
+        wind = field(state.pos, state.aux["clock"]) if len(arguments) == 2 else field(state.pos)
+        return effect(params.replace(wind=params.wind + wind), state)
+
+    return blown
+
+
+def logarithmic_wind(
+    speed: float, height: float = 6.1, roughness: float = 0.0457, direction: float = 0.0
+) -> Callable[[Float[Array, "3"]], Float[Array, "3"]]:
+    """The mean wind over flat ground, which grows with the logarithm of the height (MIL-F-8785C, 3.7.3.1).
+
+    It is u ln(z / z_0) / ln(h / z_0) at the height z, and none below z_0.
+
+    Args:
+        speed: u, m/s, at `height`.
+        height: h, m; 20 ft where left out.
+        roughness: z_0, m; 0.15 ft, which the specification has for take-off and landing, where left out (else 2 ft).
+        direction: that it blows to, rad from the x axis towards the y axis.
+
+    Raises:
+        ValueError: a height that is not above the roughness, or numbers that are not positive.
+    """
+    check_number("speed of the wind", speed, "m/s", at_least=0)
+    check_number("roughness of the ground", roughness, "m", above=0)
+    check_number("height of the wind's speed", height, "m", above=roughness)
+    check_number("direction of the wind", direction, "rad")
+
+    def logarithmic(pos: Float[Array, "3"]) -> Float[Array, "3"]:
+        at_height = speed * jnp.log(jnp.maximum(pos[2], roughness) / roughness) / jnp.log(height / roughness)
+        return at_height * jnp.stack([jnp.cos(direction), jnp.sin(direction), 0.0]).astype(pos.dtype)
+
+    return logarithmic
+
+
+def _arguments(function: Callable) -> int:
+    """How many positional arguments a function has without defaults; one without a signature has one."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return 1
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in positional and p.default is inspect.Parameter.empty for p in parameters)

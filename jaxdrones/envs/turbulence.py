@@ -1,0 +1,138 @@
+"""Turbulence of the air near the ground, after Dryden (MIL-F-8785C, 3.7.2 and 3.7.3)."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.checks import check_number
+from jaxdrones.envs.randomize import DisturbanceWithMemory
+from jaxdrones.params import Params
+
+_FOOT = 0.3048  # m
+_LOWEST, _HIGHEST = 10 * _FOOT, 1000 * _FOOT  # m, of the specification's model at low altitude
+_ROUGHNESS, _REFERENCE = 0.15 * _FOOT, 20 * _FOOT  # m, of the specification's mean wind
+_SQRT3 = math.sqrt(3.0)
+_TERMS = 40  # of a series that is used up to 1
+
+
+def dryden(speed: float, altitude: float = 6.096, airspeed: float | None = None) -> DisturbanceWithMemory:
+    """Dryden turbulence at low altitude: gusts that are added to the wind with which an episode starts.
+
+    Along the mean wind (along x where there is none), across it and upwards the gusts of each drone, independent of
+    those of the others, have the spectra of MIL-F-8785C,
+
+        u: s_u^2 (2 L_u / pi) / (1 + (L_u W)^2),  v, w: s^2 (L / pi) (1 + 3 (L W)^2) / (1 + (L W)^2)^2,
+
+    over the spatial frequency W >= 0, rad/m, with L_w = h, L_u = L_v = h / (0.177 + 0.000823 h)^1.2 (h in feet),
+    s_w = 0.1 W_20 and s_u = s_v = s_w / (0.177 + 0.000823 h)^0.4. The filters are discretized exactly, so that
+    intensities and spectra do not depend on the control rate, and an episode starts within the turbulence. Gusts of
+    rotation are left out: they matter for wings that are long beside L.
+
+    It acts through the effects that depend on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`. The state of
+    the filters and the mean wind are in `params.aux["dryden"]`.
+
+    Args:
+        speed: W_20, that of the mean wind 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe. It sets
+            the intensity alone; the mean wind itself is `params.wind`.
+        altitude: h, m, 3.048 to 304.8.
+        airspeed: speed at which a drone meets the gusts, m/s. When left out, that of the specification's mean wind at
+            the altitude, as for a drone that hovers.
+
+    Raises:
+        ValueError: a speed that is not positive, or an altitude out of range.
+    """
+    check_number("speed of the wind at 20 ft", speed, "m/s", above=0)
+    check_number("altitude of the turbulence", altitude, "m", at_least=_LOWEST, at_most=_HIGHEST)
+    mean = speed * math.log(altitude / _ROUGHNESS) / math.log(_REFERENCE / _ROUGHNESS)
+    airspeed = mean if airspeed is None else airspeed
+    check_number("airspeed", airspeed, "m/s", above=0)
+    (length, across), (height, upwards) = (scales(speed, altitude)[axis] for axis in "uw")
+
+    def init(key: jax.Array, params: Params) -> dict[str, Array]:
+        along, v1, v2, w1, w2 = jax.random.normal(key, (5,), params.wind.dtype)
+        return {"mean": params.wind, "u": along, "v": _correlated(v1, v2, math.inf), "w": _correlated(w1, w2, math.inf)}
+
+    def advance(key: jax.Array, params: Params, dt: float) -> Params:
+        def blow(memory: dict[str, Array], noise: Float[Array, "5"]) -> tuple[dict[str, Array], Float[Array, "3"]]:
+            memory = _next(dt * airspeed / length, dt * airspeed / height, memory, noise)
+            gust = jnp.stack([across * memory["u"], across * _shaped(memory["v"]), upwards * _shaped(memory["w"])])
+            return memory, memory["mean"] + _along(memory["mean"], gust)
+
+        noise = jax.random.normal(key, (len(params.mass), 5), params.wind.dtype)
+        memory, wind = jax.vmap(blow)(params.aux["dryden"], noise)
+        return params.replace(wind=wind, aux=params.aux | {"dryden": memory})
+
+    text = f"Dryden turbulence of {speed:g} m/s at 20 ft, at {altitude:g} m, met at {airspeed:.3g} m/s"
+    return DisturbanceWithMemory("dryden", init, advance, text)
+
+
+def scales(speed: float, altitude: float) -> dict[str, tuple[float, float]]:
+    """Length scale (m) and intensity (m/s) of the gusts by axis, u along the mean wind, v across, w upwards.
+
+    Args:
+        speed: of the mean wind at 20 ft, m/s.
+        altitude: m.
+    """
+    feet = altitude / _FOOT
+    ratio = 0.177 + 0.000823 * feet
+    horizontal = altitude / ratio**1.2, 0.1 * speed / ratio**0.4
+    return {"u": horizontal, "v": horizontal, "w": (altitude, 0.1 * speed)}
+
+
+def _next(along: float, up: float, memory: dict[str, Array], noise: Float[Array, "5"]) -> dict[str, Array]:
+    """The filters' states after a step of that many time constants.
+
+    Of u the filter is 1 / (1 + s), of v and w a chain z1 = n / (1 + s), z2 = z1 / (1 + s); s in units of the time
+    constant. In a stationary wind u has the variance 1, z1 and z2 have 1/2 and 1/4, and their covariance is 1/4.
+    """
+    n0, n1, n2, n3, n4 = noise
+    kept = math.exp(-along)
+    chain = {axis: _decayed(memory[axis], step) for axis, step in (("v", along), ("w", up))}
+    return {
+        "mean": memory["mean"],
+        "u": kept * memory["u"] + math.sqrt(-math.expm1(-2 * along)) * n0,
+        "v": chain["v"] + _correlated(n1, n2, along),
+        "w": chain["w"] + _correlated(n3, n4, up),
+    }
+
+
+def _decayed(z: Float[Array, "2"], step: float) -> Float[Array, "2"]:
+    """What is left of the states of a chain."""
+    return math.exp(-step) * jnp.stack([z[0], z[1] + step * z[0]])
+
+
+def _correlated(n1: Float[Array, ""], n2: Float[Array, ""], step: float) -> Float[Array, "2"]:
+    """What white noise adds to the states of a chain in a step: two normal numbers by the root of its covariance.
+
+    The covariance is the integral of exp(-2 s) (1, s; s, s^2) from 0 to the step; that of an infinite step is the
+    stationary one.
+    """
+    a, b, c = (_tail(k, 2 * step) * weight for k, weight in ((1, 1 / 2), (2, 1 / 4), (3, 1 / 4)))
+    first = math.sqrt(a)
+    return jnp.stack([first * n1, b / first * n1 + math.sqrt(c - b * b / a) * n2])
+
+
+def _shaped(z: Float[Array, "2"]) -> Float[Array, ""]:
+    """The output of (1 + sqrt(3) s) / (1 + s)^2, of variance 1."""
+    return _SQRT3 * z[0] + (1 - _SQRT3) * z[1]
+
+
+def _along(mean: Float[Array, "3"], gust: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A gust (along, across, upwards) in world axes."""
+    x, y, _ = mean
+    square = x * x + y * y
+    calm = square == 0
+    length = jnp.sqrt(jnp.where(calm, 1, square))
+    cos, sin = jnp.where(calm, 1, x / length), jnp.where(calm, 0, y / length)
+    return jnp.stack([cos * gust[0] - sin * gust[1], sin * gust[0] + cos * gust[1], gust[2]])
+
+
+def _tail(k: int, x: float) -> float:
+    """1 - exp(-x) (1 + x + ... + x^(k-1) / (k-1)!), without cancellation for small x."""
+    if math.isinf(x):
+        return 1.0
+    if x > 1:
+        return 1 - math.exp(-x) * sum(x**i / math.factorial(i) for i in range(k))
+    return math.exp(-x) * sum(x**i / math.factorial(i) for i in range(k, _TERMS))

@@ -1,0 +1,71 @@
+"""The folder of an identified vehicle: `vehicle.urdf`, `report.json` and a figure of the residuals."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.identification.fit import Report
+from jaxdrones.identification.instruments import Instruments
+from jaxdrones.identification.open_loop import HORIZONS, QUANTITIES
+from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.urdf import load_params
+from jaxdrones.urdf_writer import to_urdf
+
+URDF = "vehicle.urdf"
+REPORT = "report.json"
+_INSTRUMENTS = tuple(field.name for field in dataclasses.fields(Instruments))
+
+
+def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
+    """Write `vehicle.urdf` and `report.json`; the folder is made, files of an earlier fit are replaced."""
+    folder.mkdir(parents=True, exist_ok=True)
+    flights = ", ".join(report.of_flights) or "flights"
+    comment = (
+        f"Identified by `jaxdrones fit` from {started_from} and {flights}.\n     {REPORT} has the standard errors."
+    )
+    (folder / URDF).write_text(to_urdf(report.vehicle.params, "identified", comment.replace("--", "- -")))
+    (folder / REPORT).write_text(json.dumps(report_as_dict(report) | {"started_from": started_from}, indent=1) + "\n")
+
+
+def report_as_dict(report: Report) -> dict[str, Any]:
+    """What a fit found, for JSON; SI units."""
+    instruments = report.vehicle.instruments
+    return {
+        "parameters": {name: dataclasses.asdict(estimate) for name, estimate in report.parameters.items()},
+        "instruments": {name: np.asarray(getattr(instruments, name), float).tolist() for name in _INSTRUMENTS},
+        "of_flights": report.of_flights,
+        "losses": list(report.losses),
+        "errors": {flight: errors_as_dict(errors) for flight, errors in report.errors.items()},
+    }
+
+
+def errors_as_dict(errors: np.ndarray) -> dict[str, dict[str, float]]:
+    """Open-loop errors (horizons, 4) by horizon in rows of 0.01 s and by quantity."""
+    return {
+        str(h): dict(zip(QUANTITIES, map(float, row), strict=True)) for h, row in zip(HORIZONS, errors, strict=True)
+    }
+
+
+def load_vehicle(vehicle: str | os.PathLike) -> Vehicle:
+    """A bundled vehicle, that of a URDF, or that of a folder of `jaxdrones fit`, with its instruments.
+
+    Raises:
+        ValueError: there is none, or it holds nonsense.
+    """
+    folder = Path(vehicle)
+    if not folder.is_dir():
+        return Vehicle.of(load_params(vehicle))
+    report = folder / REPORT
+    try:
+        entries = json.loads(report.read_text())["instruments"]
+        instruments = Instruments(**{name: jnp.asarray(entries[name], float) for name in _INSTRUMENTS})
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{report}: cannot be read ({error!r}); give the --output folder of `jaxdrones fit`") from None
+    return Vehicle(load_params(folder / URDF), instruments)

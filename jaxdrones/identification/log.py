@@ -1,0 +1,191 @@
+"""Recorded flights as arrays, and what is wrong with those that are none."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxdrones.checks import shown
+
+PERIOD = 0.01  # s, of the rows of a log
+_TOLERANCE = 0.2  # of the period, by which the median of the time between rows may differ
+_LONGEST_GAP = 0.05  # s
+_FEWEST = 100  # rows
+_FULL_PWM = 65535
+_MOST_RATES = 60.0  # rad/s; gyroscopes of small quadrotors end at 35
+_MOST_VOLTAGE = 60.0  # V
+_MOST_RPM = 1e6
+_LEAST_RPM = 2700.0  # median; rotors of small quadrotors that turn slower do not lift, and 16,000 RPM are 1,700 rad/s
+_MOST_PERCENT = 100.0
+
+_COLUMNS = {  # name: (numbers per row, meaning)
+    "t": (1, "time, s"),
+    "pos": (3, "position, m, world"),
+    "quat": (4, "attitude, quaternion x, y, z, w, body to world"),
+    "vel": (3, "velocity, m/s, world"),
+    "omega": (3, "angular velocity, rad/s, body"),
+    "rpm": (4, "rotor speeds, RPM"),
+    "pwm": (4, "duty cycles of the motors, 0 to 65535"),
+    "vbat": (1, "voltage of the battery, V"),
+    "ref_pos": (3, "set-points of the position, m, world"),
+    "ref_yaw": (1, "set-points of the heading, rad"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightLog:
+    """A recorded flight of one drone: T rows at 100 Hz.
+
+    Either the rotor speeds are known, or the PWM of the motors and the voltage of the battery.
+    """
+
+    name: str
+    t: np.ndarray
+    """(T,) s."""
+    pos: np.ndarray
+    """(T, 3) m, world."""
+    quat: np.ndarray
+    """(T, 4) unit quaternions (x, y, z, w), body to world."""
+    vel: np.ndarray
+    """(T, 3) m/s, world."""
+    omega: np.ndarray
+    """(T, 3) rad/s, body."""
+    rpm: np.ndarray | None = None
+    """(T, 4) RPM; motors front right, back right, back left, front left."""
+    pwm: np.ndarray | None = None
+    """(T, 4) 0 to 65535."""
+    vbat: np.ndarray | None = None
+    """(T,) V."""
+    ref_pos: np.ndarray | None = None
+    """(T, 3) set-points that the drone flew to, m, world."""
+    ref_yaw: np.ndarray | None = None
+    """(T,) rad."""
+
+    @classmethod
+    def load(cls, file: str | os.PathLike) -> FlightLog:
+        """Read a log from an .npz file.
+
+        Columns are `t`, `pos`, `quat`, `vel`, `omega` (or `gyro`), and either `rpm` or `pwm` with `vbat`; a flight on
+        set-points has `ref_pos` and `ref_yaw`. Others are ignored.
+
+        Raises:
+            ValueError: the file is no log, lacks a column, or holds what no flight does: NaN, times that run
+                backwards, another rate than 100 Hz, other units, too few rows.
+        """
+        path = Path(file)
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                columns = {name: np.asarray(arrays[name]) for name in arrays.files if name in (*_COLUMNS, "gyro")}
+        except OSError as error:
+            raise ValueError(f"{path}: cannot be read ({error.strerror or error}); give a flight log (.npz)") from None
+        except (ValueError, EOFError, zipfile.BadZipFile):
+            raise ValueError(f"{path}: is no .npz file of arrays; give a flight log") from None
+        if "omega" not in columns and "gyro" in columns:
+            columns["omega"] = columns["gyro"]
+        columns.pop("gyro", None)
+        return cls(path.name, **_checked(path.name, columns))
+
+    @property
+    def has_rotor_speeds(self) -> bool:
+        """Whether the rotor speeds were measured."""
+        return self.rpm is not None
+
+    @property
+    def has_set_points(self) -> bool:
+        """Whether the flight can be flown again on its set-points."""
+        return self.ref_pos is not None and self.pwm is not None
+
+    @property
+    def orders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What a flight on set-points was given: `ref_pos`, `ref_yaw`, `pwm` and `vbat`.
+
+        Raises:
+            ValueError: the log lacks one of them.
+        """
+        if self.ref_pos is None or self.ref_yaw is None or self.pwm is None or self.vbat is None:
+            raise ValueError(f"{self.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat to fly it again")
+        return self.ref_pos, self.ref_yaw, self.pwm, self.vbat
+
+    @property
+    def in_flight(self) -> np.ndarray:
+        """(T,) whether all motors run; without PWM everywhere."""
+        return np.ones(len(self.t), bool) if self.pwm is None else np.min(self.pwm, axis=1) > _MOST_PERCENT
+
+
+def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns of a log as float64."""
+    if "rpm" in columns:
+        columns.pop("pwm", None)
+    inputs = ("rpm",) if "rpm" in columns else ("pwm", "vbat")
+    for column in ("t", "pos", "quat", "vel", "omega", *inputs):
+        if column not in columns:
+            others = " (or rpm)" if column in ("pwm", "vbat") else " (or gyro)" if column == "omega" else ""
+            raise ValueError(f"{name}: has no column {column!r}{others}: {_COLUMNS[column][1]}; add it to the log")
+    rows = len(np.atleast_1d(columns["t"]))
+    for column, array in columns.items():
+        count, meaning = _COLUMNS[column]
+        shape = (rows,) if count == 1 else (rows, count)
+        if array.shape != shape or array.dtype.kind not in "fiu":
+            raise ValueError(
+                f"{name}: {column} is {array.dtype} of shape {array.shape}; give numbers of shape {shape}: {meaning}"
+            )
+        columns[column] = array.astype(float)
+        if not np.isfinite(columns[column]).all():
+            row = int(np.argmin(np.isfinite(columns[column].reshape(rows, -1)).all(axis=1)))
+            raise ValueError(f"{name}: {column} is not finite in row {row}; leave out or repair such rows")
+    _check_times(name, columns["t"])
+    for column in columns:
+        _check_units(name, column, columns[column])
+    if {"ref_pos"} & columns.keys() and "ref_yaw" not in columns:
+        columns["ref_yaw"] = np.zeros(rows)
+    columns["quat"] /= np.linalg.norm(columns["quat"], axis=1, keepdims=True)
+    return columns
+
+
+def _check_times(name: str, t: np.ndarray) -> None:
+    if len(t) < _FEWEST:
+        raise ValueError(f"{name}: has {len(t)} rows; give at least {_FEWEST}, one second of flight")
+    steps = np.diff(t)
+    if not (steps > 0).all():
+        row = int(np.argmin(steps > 0)) + 1
+        raise ValueError(f"{name}: time goes from {t[row - 1]:g} to {t[row]:g} s in row {row}; sort the rows by time")
+    period = np.median(steps)
+    if abs(period - PERIOD) > _TOLERANCE * PERIOD:
+        raise ValueError(f"{name}: rows are {period:.4g} s apart; resample the log to {PERIOD:g} s")
+    if np.max(steps) > _LONGEST_GAP:
+        row = int(np.argmax(steps))
+        raise ValueError(f"{name}: no rows between {t[row]:g} and {t[row + 1]:g} s; cut the log there")
+
+
+def _check_units(name: str, column: str, x: np.ndarray) -> None:
+    """Raise on numbers that no flight has in the column's unit, and say which unit they may be in."""
+
+    def demand(condition, looks: str, give: str) -> None:
+        if not condition:
+            low, high = np.min(x), np.max(x)
+            raise ValueError(f"{name}: {column} is {low:.4g} to {high:.4g}, which looks like {looks}; give {give}")
+
+    largest = np.max(np.abs(x))
+    if column == "quat":
+        length = np.linalg.norm(x, axis=1)
+        demand(np.all(np.abs(length - 1) < 0.05), f"no unit quaternion (length {shown(length[0])})", "x, y, z, w")
+    elif column == "omega":
+        demand(largest <= _MOST_RATES, "degrees/s", "rad/s")
+    elif column == "ref_yaw":
+        demand(largest <= 4 * np.pi, "degrees", "rad")
+    elif column == "vel":
+        demand(largest <= 100, "mm/s or cm/s", "m/s")
+    elif column in ("pos", "ref_pos"):
+        demand(largest <= 1e4, "mm", "m")
+    elif column == "vbat":
+        demand(largest <= _MOST_VOLTAGE, "millivolts", "V")
+    elif column == "pwm":
+        demand(0 <= np.min(x) and largest <= _FULL_PWM, "no duty cycle of 16 bits", "0 to 65535")
+        demand(largest > _MOST_PERCENT, "percent", "0 to 65535")
+    elif column == "rpm":
+        demand(0 <= np.min(x) and largest <= _MOST_RPM, "no rotor speed", "RPM")
+        demand(np.median(x) >= _LEAST_RPM, "rad/s", "RPM, 60 / (2 pi) times as many")

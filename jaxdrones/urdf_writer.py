@@ -1,0 +1,88 @@
+"""Params -> URDF, the inverse of `jaxdrones.load_params`."""
+
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxdrones.params import Params
+from jaxdrones.urdf import GRAVITY
+
+_PROPERTIES = (
+    "kf",
+    "km",
+    "rotor_spin",
+    "rotor_rise_time",
+    "rotor_fall_time",
+    "rotor_inertia",
+    "drag_coeff",
+    "flapping_coeff",
+    "flapping_climb",
+    "rate_damping",
+    "trim_torque",
+    "ground_effect_coeff",
+    "downwash_coeff",
+    "inflow_loss",
+    "prop_radius",
+)
+
+
+def to_urdf(params: Params, name: str, comment: str = "") -> str:
+    """The text of a URDF of one drone, which `load_params` reads as these params.
+
+    What belongs to the surroundings (gravity, air, wind, forces) and constants in `aux` are not written.
+
+    Args:
+        params: of one drone, with a highest rotor speed.
+        name: of the robot.
+        comment: to stand at the top, without two hyphens in a row.
+    """
+    thrust2weight = 4 * params.kf * params.max_rpm**2 / (params.mass * GRAVITY)
+    properties = {field: getattr(params, field) for field in _PROPERTIES}
+    properties |= {"thrust2weight": thrust2weight, "max_speed_kmh": params.max_speed * 3.6}
+    attributes = "\n".join(f'    {field}="{_numbers(value)}"' for field, value in properties.items())
+    ixx, iyy, izz = (_numbers(x) for x in np.asarray(params.inertia))
+    shape = f'<geometry><cylinder radius="{_numbers(params.collision_radius)}" '
+    shape += f'length="{_numbers(params.collision_height)}"/></geometry>'
+    center = f'<origin xyz="0 0 {_numbers(params.collision_offset)}"/>'
+    rotors = "\n".join(_rotor(i, pos) for i, pos in enumerate(np.asarray(params.rotor_pos)))
+    return f"""<?xml version="1.0"?>
+<!-- {comment}
+-->
+<robot name={quoteattr(name)}>
+  <properties
+{attributes}/>
+
+  <link name="base_link">
+    <inertial>
+      <origin xyz="0 0 0"/>
+      <mass value="{_numbers(params.mass)}"/>
+      <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/>
+    </inertial>
+    <visual>
+      {center}
+      {shape}
+      <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+    </visual>
+    <collision>
+      {center}
+      {shape}
+    </collision>
+  </link>
+
+{rotors}
+</robot>
+"""
+
+
+def _rotor(i: int, pos: np.ndarray) -> str:
+    return f"""  <link name="prop{i}"/>
+  <joint name="rotor{i}" type="fixed">
+    <parent link="base_link"/>
+    <child link="prop{i}"/>
+    <origin xyz="{_numbers(pos)}"/>
+  </joint>"""
+
+
+def _numbers(value: ArrayLike) -> str:
+    return " ".join(f"{x:.9g}" for x in np.atleast_1d(np.asarray(value, float)))

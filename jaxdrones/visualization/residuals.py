@@ -1,0 +1,54 @@
+"""Figures of recorded flights: errors by horizon, and paths with their repetitions."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxdrones.identification import HORIZONS, QUANTITIES, Twin
+from jaxdrones.identification.log import PERIOD
+from jaxdrones.visualization import style
+from jaxdrones.visualization.palette import COLORS, colors
+
+_UNITS = {"pos": "position (m)", "vel": "velocity (m/s)", "rot": "attitude (rad)", "omega": "rates (rad/s)"}
+_COLUMNS = 4
+
+
+def save_errors(errors: dict[str, np.ndarray], path: Path) -> None:
+    """Draw open-loop errors (horizons, 4) of flights over the horizon.
+
+    Args:
+        errors: by flight.
+        path: path of the picture.
+    """
+    t = np.array(HORIZONS) * PERIOD
+    with style.figure(16, 5) as figure:
+        axes = figure.subplots(1, len(QUANTITIES))
+        for i, (axis, quantity) in enumerate(zip(axes, QUANTITIES, strict=True)):
+            for color, (flight, table) in zip(colors(len(errors)), errors.items(), strict=True):
+                axis.plot(t, table[:, i], "o-", color=color, label=flight.removesuffix(".npz"))
+            axis.set(xlabel="after (s)", title=_UNITS[quantity], xticks=t, ylim=(0, None))
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize="small")
+        figure.savefig(path)
+
+
+def save_twins(twins: Sequence[Twin], path: Path) -> None:
+    """Draw the horizontal paths of flights, of their repetitions and of their set-points.
+
+    Args:
+        twins: the flights.
+        path: path of the picture.
+    """
+    columns = min(len(twins), _COLUMNS)
+    rows = -(-len(twins) // columns)
+    with style.figure(5 * columns, 5 * rows + 0.5) as figure:
+        axes = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axis, twin in zip(axes, twins, strict=False):
+            axis.plot(*twin.ref_pos[:, :2].T, color="#b4bac1", label="set-points")
+            axis.plot(*twin.pos[:, :2].T, color=COLORS[0], label="recorded")
+            axis.plot(*twin.twin_pos[:, :2].T, color=COLORS[1], label="simulated")
+            axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=twin.flight.removesuffix(".npz"))
+        for axis in axes[len(twins) :]:
+            axis.set_axis_off()
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        figure.savefig(path)

@@ -1,0 +1,129 @@
+"""Air that moves: wind fields, drag of the body, and the thrust of rotors in it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, assert_finite, flying, make_step
+
+import jaxdrones as jd
+from jaxdrones.dynamics.inflow import flow_through
+
+AREA = {"drag_area": jnp.array([2e-3, 3e-3, 6e-3])}
+CF2X = jd.load_params("cf2x").replace(aux=AREA)
+STATES = flying(jd.repeat(CF2X, 50))
+HOVER = jax.tree.map(lambda x: x[0], jd.State.at_rest([[0.0, 0, 1]])).replace(rpm=jnp.full(4, CF2X.hover_rpm))
+EFFECTS = {"drag": jd.drag, "quadratic drag": jd.quadratic_drag, "inflow": jd.inflow_thrust}
+each_effect = pytest.mark.parametrize("name", EFFECTS)
+
+
+def lift(vel, state=HOVER, params=CF2X):
+    return jd.inflow_thrust(params, state.replace(vel=jnp.array(vel, float))).force[2] / params.weight
+
+
+def test_drag_of_the_body_takes_power_and_grows_with_the_square_of_the_speed():
+    wrench = jax.vmap(jd.quadratic_drag, (None, 0))(CF2X, STATES)
+    force = jax.vmap(jd.rotation.rotate)(STATES.quat, wrench.force)
+    assert np.all(np.sum(force * STATES.vel, axis=1) < 0)
+    twice = jax.vmap(jd.quadratic_drag, (None, 0))(CF2X, STATES.replace(vel=2 * STATES.vel))
+    np.testing.assert_allclose(twice.force, 4 * wrench.force, rtol=1e-12)
+    ahead = jd.quadratic_drag(CF2X, HOVER.replace(vel=jnp.array([3.0, 0, 0]))).force
+    np.testing.assert_allclose(ahead, [-1.225 / 2 * 2e-3 * 9, 0, 0], rtol=1e-12)
+
+
+@each_effect
+def test_only_the_motion_relative_to_the_air_counts(name):
+    wind = jnp.array([1.0, -2, 0.5])
+    still = jax.vmap(EFFECTS[name], (None, 0))(CF2X, STATES)
+    blown = jax.vmap(EFFECTS[name], (None, 0))(CF2X.replace(wind=wind), STATES.replace(vel=STATES.vel + wind[None]))
+    assert_close(blown, still, 1e-12)
+
+
+@each_effect
+def test_a_uniform_field_is_the_wind_of_the_parameters(name):
+    wind = jnp.array([1.0, -2, 0.5])
+    effect = jd.in_wind(lambda pos: wind / 2, EFFECTS[name])
+    half = CF2X.replace(wind=wind / 2)
+    assert_close(
+        jax.vmap(effect, (None, 0))(half, STATES),
+        jax.vmap(EFFECTS[name], (None, 0))(CF2X.replace(wind=wind), STATES),
+        1e-12,
+    )
+
+
+@each_effect
+def test_gradients_at_rest_in_still_air_are_finite(name):
+    for rpm in 0.0, 14e3:
+        state = HOVER.replace(rpm=jnp.full(4, rpm))
+        assert_finite(jax.jacrev(EFFECTS[name], argnums=(0, 1))(CF2X, state))
+
+
+def test_the_mean_wind_is_logarithmic():
+    """At twice the height of 20 ft: ln(40 / 0.15) / ln(20 / 0.15) = 1.1417 times the speed; none at the ground."""
+    field = jd.logarithmic_wind(5.0, height=20 * 0.3048, roughness=0.15 * 0.3048, direction=np.pi / 2)
+    np.testing.assert_allclose(field(jnp.array([7.0, 8.0, 40 * 0.3048])), [0, 5 * 1.141662, 0], rtol=1e-5, atol=1e-12)
+    for height in 0.0, -1.0, 0.0457:
+        np.testing.assert_allclose(field(jnp.array([0.0, 0, height])), 0, atol=1e-12)
+    assert_finite(jax.jacrev(field)(jnp.array([0.0, 0, -1])))
+
+
+def test_a_field_may_change_with_time():
+    """A heavy drone in a wind that swings at 1 Hz: after whole periods the drag has pushed it to and fro."""
+    team = jd.repeat(CF2X.replace(mass=jnp.array(1e3), gravity=jnp.array(0.0)), 1)
+    swinging = jd.in_wind(lambda pos, time: jnp.array([5.0, 0, 0]) * jnp.sin(2 * jnp.pi * time), jd.drag)
+    step = make_step(effects=(swinging,), models=(jd.clock(),), integrator=jd.rk4)
+    state = step.init(team, jd.State.at_rest([[0.0, 0, 1]]))
+    hover = jnp.full((1, 4), CF2X.hover_rpm)
+    end, path = jd.rollout(step, lambda params, memory, s, k: (memory, hover), team, state, None, 240)
+    np.testing.assert_allclose(end.aux["clock"], 1.0, rtol=1e-12)
+    assert path.vel[119, 0, 0] > 1e-7 and abs(end.vel[0, 0]) < 1e-4 * path.vel[119, 0, 0]
+
+
+def test_a_slow_climb_loses_the_share_of_thrust_that_the_vehicle_says():
+    climb = 0.01
+    np.testing.assert_allclose(lift([0, 0, climb]), -CF2X.inflow_loss * climb, rtol=2e-3)
+    np.testing.assert_allclose(lift([0, 0, -climb]), CF2X.inflow_loss * climb, rtol=2e-3)
+    assert abs(lift([0, 0, 0])) < 1e-6
+
+
+def test_forward_flight_lifts_and_its_gain_is_bounded():
+    gains = [float(lift([speed, 0, 0])) for speed in (1, 3, 10, 40)]
+    assert 0 < gains[0] < 0.02 and np.all(np.diff(gains) > 0)
+    induced = np.sqrt(CF2X.weight / 4 / (2 * CF2X.air_density * np.pi * CF2X.prop_radius**2))
+    assert gains[-1] < 2 * CF2X.inflow_loss * induced
+
+
+def test_the_flow_through_a_rotor_is_that_of_glauert_and_of_momentum_theory():
+    climb, edgewise = jnp.meshgrid(jnp.array([-1.0, 0, 2, 8]), jnp.array([0.0, 1, 3, 10]))
+    flow = jax.vmap(flow_through, (0, 0, None))(climb.ravel(), edgewise.ravel() ** 2, 4.0)
+    np.testing.assert_allclose((flow - climb.ravel()) * np.sqrt(edgewise.ravel() ** 2 + flow**2), 16, rtol=1e-6)
+    np.testing.assert_allclose(flow[:4], climb[0] / 2 + np.sqrt(climb[0] ** 2 / 4 + 16), rtol=1e-6)
+
+
+def test_a_rotor_that_moves_down_faster_than_its_neighbors_lifts_more_so_rolling_is_damped():
+    rolling = HOVER.replace(omega=jnp.array([2.0, 0, 0]))
+    assert jd.inflow_thrust(CF2X, rolling).torque[0] < 0
+
+
+@pytest.mark.float32
+def test_in_single_precision_inflow_is_finite_everywhere():
+    params = jd.load_params("cf2x")
+    still = jax.tree.map(lambda x: x[0], jd.State.at_rest([[0.0, 0, 1]]))
+    for vel in [0.0, 0, 0], [30.0, 0, -30], [0, 0, 50.0], [0, 0, -50.0]:
+        for rpm in 0.0, 25e3:
+            assert_finite(jd.inflow_thrust(params, still.replace(vel=jnp.array(vel), rpm=jnp.full(4, rpm))))
+
+
+def test_mistakes_are_named():
+    with pytest.raises(ValueError, match=r"height of the wind's speed is 0.01; give a number above 0.0457"):
+        jd.logarithmic_wind(5.0, height=0.01)
+    with pytest.raises(ValueError, match=r"field: 3 is not a function"):
+        jd.in_wind(3, jd.drag)
+    with pytest.raises(ValueError, match=r"effect: downwash takes .* give a function of \(params, state\)"):
+        jd.in_wind(lambda pos: pos, jd.downwash)
+    with pytest.raises(ValueError, match=r"field: <lambda> takes .* give a function of \(pos, time\)"):
+        jd.in_wind(lambda pos, time, more: pos, jd.drag)
+    with pytest.raises(ValueError, match=r"state.aux lacks 'clock'; give models=\(jaxdrones.clock\(\),\)"):
+        jd.in_wind(lambda pos, time: pos, jd.drag)(CF2X, HOVER)
+    with pytest.raises(ValueError, match=r"params.aux lacks 'drag_area'; found nothing"):
+        jd.quadratic_drag(CF2X.replace(aux={}), HOVER)

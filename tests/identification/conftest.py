@@ -1,0 +1,56 @@
+"""A flight that a known vehicle flew."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdrones
+from jaxdrones import State
+from jaxdrones.control import Setpoint, for_team, geometric
+from jaxdrones.identification import FlightLog
+from jaxdrones.identification.open_loop import EFFECTS
+
+ROWS = 300
+
+
+@pytest.fixture(scope="session")
+def flown():
+    """The parameters of a vehicle, and the log of three seconds that it flew on a wavy path."""
+    cf2x = jaxdrones.load_params("cf2x")
+    params = cf2x.replace(
+        kf=1.2 * cf2x.kf,
+        drag_coeff=2 * cf2x.drag_coeff,
+        flapping_coeff=jnp.array([4e-8, 3e-8]),
+        rate_damping=jnp.array([4e-5, 4e-5, 2e-5]),
+    )
+    return params, simulated("flown.npz", params)
+
+
+def simulated(name, params):
+    """The log of a flight by the geometric controller, with rotor speeds."""
+    team = jaxdrones.repeat(params, 1)
+    step = jaxdrones.make_step(effects=EFFECTS, integrator=jaxdrones.rk4, dt=0.01)
+    gains = geometric.gains()
+
+    def advance(carry, t):
+        memory, state = carry
+        pos = jnp.stack([jnp.sin(3 * t), jnp.cos(2 * t) - 1, 0.5 * jnp.sin(4 * t)])
+        setpoint = jax.tree.map(lambda x: x[None], Setpoint.at(pos))
+        memory, rpm = jax.vmap(lambda *a: geometric.control(gains, *a, dt=0.01))(team, memory, state, setpoint)
+        return (memory, step(team, state, rpm)), (state, rpm)
+
+    memory = for_team(geometric.init(), 1)
+    start = step.init(team, State.at_rest(jnp.zeros((1, 3))))
+    _, (states, rpm) = jax.jit(lambda: jax.lax.scan(advance, (memory, start), jnp.arange(ROWS) * 0.01))()
+    pos, quat, vel, omega = (np.asarray(x[:, 0], float) for x in (states.pos, states.quat, states.vel, states.omega))
+    return FlightLog(name, np.arange(ROWS) * 0.01, pos, quat, vel, omega, rpm=np.asarray(rpm[:, 0], float))
+
+
+@pytest.fixture
+def columns(flown):
+    """The columns of a sound log."""
+    _, log = flown
+    return {k: v for k, v in dataclasses.asdict(log).items() if v is not None and k != "name"}

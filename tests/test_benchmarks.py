@@ -172,3 +172,12 @@ def test_every_benchmark_explains_itself(name):
         [sys.executable, str(BENCHMARKS / name), "--help"], capture_output=True, text=True, check=True
     )
     assert "--quick" in done.stdout and "--json" in done.stdout
+
+
+@pytest.mark.slow
+def test_the_state_estimate_of_a_recorded_flight_has_a_tilt_below_a_degree():
+    """Against Vicon's attitude less the mean, which is how the markers were declared level."""
+    (row,) = quick(
+        "state_estimate.py", str(BENCHMARKS.parent / "tests/golden/nanobench/B10_lissajous_slow_rep1_imu.npz")
+    )["rows"]
+    assert row["tilt"] < 1 and row["as logged"] < 1.5 and row["with attitude"] < 0.5

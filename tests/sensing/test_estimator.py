@@ -11,6 +11,8 @@ from scipy.stats import chi2
 from sensing.estimates import along, errors, few, flights, normalized
 
 import jaxdrones as jd
+from jaxdrones.control import geometric
+from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.sensing import (
     BMI088,
     EUROPE,
@@ -20,6 +22,7 @@ from jaxdrones.sensing import (
     ImuPart,
     MotionCaptureSystem,
     Noise,
+    Scene,
     barometer,
     imu,
     kalman,
@@ -89,6 +92,29 @@ def test_a_reading_is_the_present_state_in_spite_of_the_delay(flown):
     np.testing.assert_allclose(read.omega, states.omega, atol=1e-3)
     np.testing.assert_array_equal(read.rpm, states.rpm)
     assert np.linalg.norm(states.vel, axis=-1).mean() > 0.5
+
+
+@pytest.mark.slow
+def test_a_controller_flies_on_the_estimate():
+    """A hover of 3 s by what the sensor reads: the drone stays within a centimeter, as far as its estimate errs."""
+    params, step = jd.load_params("cf2x"), jd.make_step(effects=(jd.drag,), dt=0.01)
+    sensor, gains, here = state_estimate(), geometric.gains(), jnp.array([0.0, 0, 1])
+    start = jax.tree.map(lambda x: x[0], jd.State.at_rest(here[None]))
+
+    def control(carry, key):
+        state, rate, memory = carry
+        memory, seen = sensor.measure(key, params, state, rate, Scene(), memory)
+        rpm = geometric.control(gains, params, None, seen, Setpoint.at(here), dt=0.01)[1]
+        team = [jax.tree.map(lambda x: x[None], tree) for tree in (params, state, rpm)]
+        after = step(*team)
+        rate = step.rate(team[0], after, team[2])
+        state, rate = (jax.tree.map(lambda x: x[0], tree) for tree in (after, rate))
+        return (state, rate, memory), (state.pos, seen.pos)
+
+    begun = start, jax.tree.map(jnp.zeros_like, start), sensor.init(KEY, params)
+    pos, seen = jax.jit(lambda c: jax.lax.scan(control, c, jax.random.split(KEY, 300))[1])(begun)
+    np.testing.assert_allclose(pos[100:], np.broadcast_to(here, (200, 3)), atol=0.01)
+    assert 0 < np.abs(pos - seen).max() < 0.05
 
 
 def test_the_barometer_and_the_magnetic_field_correct_height_and_heading():

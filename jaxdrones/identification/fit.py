@@ -36,6 +36,7 @@ _STEPS = 4  # of each round
 _DAMPING = 1e-3  # of the first step
 _PRIOR = 1e-2  # inverse variance of x, in pieces: holds what the flights do not tell
 _PRIOR_OF_LOGARITHMS = 1.0
+_LITTLE = 1e-3  # of the prior, which makes the errors of what flights do not tell finite
 _UNTOLD = 0.5  # standard error over value, beyond which flights do not tell a parameter
 
 
@@ -222,7 +223,8 @@ class _Problem:
     def _report(
         self, x: np.ndarray, normal: Normal, history: tuple[float, ...], validate: Sequence[FlightLog], asked: bool
     ) -> Report:
-        vehicle, errors = self.vehicle(x), np.sqrt(np.diag(np.linalg.inv(normal.matrix)))
+        told = normal.matrix - (1 - _LITTLE) * np.diag(self.prior)  # by the flights, not by the prior
+        vehicle, errors = self.vehicle(x), np.sqrt(np.diag(np.linalg.inv(told)))
         common, own = errors[: len(self.common)], errors[len(self.common) :].reshape(len(self.flights), len(self.own))
         by_name = np.concatenate([common, np.sqrt(np.sum(own**2, axis=0)) / len(self.flights)])
         found = {name: _estimate(vehicle, name, error) for name, error in zip(self.names, by_name, strict=True)}

@@ -125,9 +125,9 @@ def _least_squares(residuals: Residuals, count: int, outlier: float) -> tuple[Ar
     def normal(x: Array) -> tuple[Array, Array, Array]:
         r, forward = jax.linearize(residuals, x)
         jacobian = jax.vmap(forward)(jnp.eye(count))
-        weight = 1 / (1 + r * r / outlier)
+        weighted = jacobian / (1 + r * r / outlier)[None]
         loss = jnp.sum(r * r if np.isinf(outlier) else outlier * jnp.log1p(r * r / outlier)) + _PRIOR * x @ x
-        return (jacobian * weight) @ jacobian.T + _PRIOR * jnp.eye(count), (jacobian * weight) @ r + _PRIOR * x, loss
+        return weighted @ jacobian.T + _PRIOR * jnp.eye(count), weighted @ r + _PRIOR * x, loss
 
     x, damping = np.zeros(count), 1e-3
     matrix, gradient, loss = (np.asarray(part, float) for part in normal(jnp.asarray(x, float)))

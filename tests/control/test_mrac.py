@@ -33,7 +33,7 @@ def recorded(request):
 
 
 def recorded_gains(arrays):
-    """Poles are placed by iteration, which another LAPACK ends elsewhere; what follows from gains does not depend on it."""
+    """Poles are placed by iteration, which another LAPACK ends elsewhere; the calls do not depend on that."""
     fields = dict(feedback="Kx0", feedforward="Kr0", model="Am", inputs="Bm", lyapunov="P")
     values = {field: jnp.array(arrays[name]) for field, name in fields.items()}
     return mrac.gains().replace(reference=-jnp.array(arrays["Kr_ref_gain"]), **values)

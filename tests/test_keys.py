@@ -134,7 +134,7 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
         tell("start", key)
         return plain.start(key, params)
 
-    monkeypatch.setattr("jaxdrones.envs.env.draw", draw)
+    monkeypatch.setattr("jaxdrones.envs.randomize.draw", draw)
     env = make(dataclasses.replace(plain, start=start), noise=noise, disturbance=disturbance)
     begin, env.begin = env.begin, lambda key: (tell("reset", key), begin(key))[1]
     _, episode = AutoReset(env).reset(KEY)

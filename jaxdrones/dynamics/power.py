@@ -46,7 +46,7 @@ class Battery(PyTreeNode):
 def lithium_polymer(
     capacity: ArrayLike = 900.0,
     cells: ArrayLike = 1,
-    resistance: ArrayLike = 0.26,
+    resistance: ArrayLike = 0.28,
     slow_resistance: ArrayLike = 0.0,
     slow_time: ArrayLike = 10.0,
     efficiency: ArrayLike = 0.3,
@@ -55,7 +55,7 @@ def lithium_polymer(
     """A battery by its numbers; those of a Crazyflie 2.1 with 250 mAh where left out.
 
     Resistance and efficiency are fitted to flights of NanoBench (Ullah and Baca 2026): at an efficiency of 0.3 the
-    batteries of its flights have 0.20 to 0.49 ohm, and no slow part that could be measured. So give the resistance of
+    batteries of its flights have 0.21 to 0.52 ohm, and no slow part that could be measured. So give the resistance of
     your own. The idle power is an estimate.
 
     Args:

@@ -7,8 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import jaxdrones as jd
 from jaxdrones.visualization.browser import find_browser
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
@@ -46,6 +50,30 @@ def test_swarm_and_scaling_report_every_way_to_fly():
     for row in quick("scaling.py")["rows"]:
         assert {"held", "controlled"} <= set(row["rates"]) and min(row["rates"].values()) > 0
         assert set(row["memory"]) == set(row["compile"]) == set(row["rates"])
+
+
+@pytest.mark.slow
+def test_power_reports_every_case_both_ways():
+    rows = quick("power.py")["rows"]
+    assert len(rows) == 18 and all(row["ratio"] > 0 for row in rows)
+
+
+@pytest.mark.slow
+def test_battery_finds_the_resistance_that_a_flight_was_made_with(tmp_path):
+    """The voltage of a flight by the model itself: 2 s at rest, 3 s with the motors on."""
+    params = jd.load_params("cf2x").replace(
+        aux={"battery": jd.lithium_polymer(resistance=0.37), "motors": jd.crazyflie_motors()}
+    )
+    step = jd.make_step(rotors=jd.pwm_rotors, models=(jd.battery(),), dt=0.005, substeps=2)
+    time = np.arange(500) / 100
+    pwm = jnp.array(np.where(time < 2, 0.0, 50e3)[:, None] * np.ones(4))
+    team = jd.repeat(params, 1)
+    start = jd.State.at_rest(np.zeros((1, 3)))
+    states = jd.rollout(step, lambda p, m, s, k: (m, pwm[k][None]), team, start, None, len(pwm))[1]
+    volts = jax.vmap(jax.vmap(jd.battery_voltage), (None, 0))(team, states)[:, 0]
+    np.savez(tmp_path / "flight.npz", t=time, pwm=pwm, vbat=volts)
+    (row,) = quick("battery.py", str(tmp_path / "flight.npz"), "--seconds", "2")["rows"]
+    assert abs(row["resistance"] - 0.37) < 0.005 and row["rms"] < 0.005
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from jaxdrones.state import State
 from jaxdrones.vector import components, cross
 from jaxdrones.wrench import Wrench
 
-_NEWTON_STEPS = 5
+_NEWTON_STEPS = 3
 _STILL = 1e-6  # (m/s)^2; rounds off the inflow of a rotor that neither turns nor moves
 
 
@@ -53,7 +53,8 @@ def flow_through(
         edgewise_squared: V^2, square of its speed in the plane of the disc, (m/s)^2.
         in_hover: v_h, induced velocity in hover, m/s.
     """
-    flow = jnp.maximum(climb, 0) + in_hover  # the left side is convex, and too large here: Newton's steps only go down
+    # The solution for V = 0 is exact there and too large elsewhere; as the left side is convex, Newton's steps go down.
+    flow = climb / 2 + jnp.sqrt(climb**2 / 4 + in_hover**2 + _STILL)
     for _ in range(_NEWTON_STEPS):
         down = jnp.maximum(flow, 0)
         past = jnp.sqrt(edgewise_squared + down**2 + _STILL)

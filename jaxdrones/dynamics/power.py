@@ -46,7 +46,7 @@ class Battery(PyTreeNode):
 def lithium_polymer(
     capacity: ArrayLike = 900.0,
     cells: ArrayLike = 1,
-    resistance: ArrayLike = 0.26,
+    resistance: ArrayLike = 0.28,
     slow_resistance: ArrayLike = 0.0,
     slow_time: ArrayLike = 10.0,
     efficiency: ArrayLike = 0.3,
@@ -55,7 +55,7 @@ def lithium_polymer(
     """A battery by its numbers; those of a Crazyflie 2.1 with 250 mAh where left out.
 
     Resistance and efficiency are fitted to flights of NanoBench (Ullah and Baca 2026): at an efficiency of 0.3 the
-    batteries of its flights have 0.20 to 0.49 ohm, and no slow part that could be measured. So give the resistance of
+    batteries of its flights have 0.21 to 0.52 ohm, and no slow part that could be measured. So give the resistance of
     your own. The idle power is an estimate.
 
     Args:
@@ -108,26 +108,29 @@ def battery_power(params: Params, state: State) -> Float[Array, ""]:
     return cell.idle_power + per_cube / cell.efficiency * total(jnp.abs(state.rpm) ** 3)
 
 
-def battery_current(params: Params, state: State) -> Float[Array, ""]:
-    """Current I that gives the power, A: I (E - R I) = P, with E the voltage without the resistance R.
-
-    A battery gives E^2 / (4 R) at most; where more is asked for, I is that of the highest power, E / (2 R).
-    """
-    source, power, resistance = _source(params, state), battery_power(params, state), _constants(params).resistance
-    product = 4 * resistance * power
-    enough = product < source**2
-    given = 2 * power / (source + safe_sqrt(source**2 - product))
-    return jnp.where(enough, given, source / jnp.where(enough, 1, 2 * resistance))
-
-
 def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
-    """Voltage at the terminals under the load of the rotors as they turn, V.
+    """Voltage U at the terminals under the load of the rotors as they turn, V: U (E - U) = R P.
+
+    E is the voltage without the resistance R. A battery gives the power E^2 / (4 R) at most, at U = E / 2, and this is
+    what it gives where more is asked for.
 
     Args:
         params: of the drone, with the constants of the battery in `aux["battery"]`.
         state: of the drone, with the state of the model `battery()`.
     """
-    return _source(params, state) - _constants(params).resistance * battery_current(params, state)
+    source = _source(params, state)
+    return (source + safe_sqrt(source**2 - 4 * _constants(params).resistance * battery_power(params, state))) / 2
+
+
+def battery_current(params: Params, state: State) -> Float[Array, ""]:
+    """Current out of the battery, A: the power over the voltage, or U / R where the power is the highest."""
+    power, resistance, voltage = (
+        battery_power(params, state),
+        _constants(params).resistance,
+        battery_voltage(params, state),
+    )
+    enough = 4 * resistance * power <= _source(params, state) ** 2
+    return jnp.where(enough, power, voltage) / jnp.where(enough, voltage, resistance)
 
 
 def open_circuit_voltage(battery: Battery, charge: Float[Array, ""]) -> Float[Array, ""]:

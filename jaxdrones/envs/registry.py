@@ -7,7 +7,7 @@ import inspect
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from jaxdrones.checks import (
     check_choice,
@@ -150,7 +150,8 @@ def make(
     if disturbance is not None:
         effects = [*effects, external_force]
     pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
-    action = _action(task.action if action is None else action, nominal, rotors is lagging_rotors, dt)
+    lagging = inspect.unwrap(cast(Callable, rotors)) is inspect.unwrap(lagging_rotors)  # also inside `failing`
+    action = _action(task.action if action is None else action, nominal, lagging, dt)
     sensors = check_sensors(sensors)
     physics: dict[str, Any] = dict(
         effects=effects,

@@ -10,15 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones import rotation
 from jaxdrones.control import Setpoint, firmware_pid
 from jaxdrones.dynamics import FULL_PWM, Motors, midpoint
 from jaxdrones.identification.log import PERIOD, FlightLog
 from jaxdrones.identification.open_loop import lagging, motion
 from jaxdrones.identification.vehicle import Vehicle
 from jaxdrones.state import State
+from jaxdrones.thrust_curves import thrust_at
 
 _SUBSTEPS = 5  # per row: the loops of attitude and rates run at 500 Hz
-_SETTLING = 500  # rows of hover at the first set-point, in which the integrators come to their values
+_THRUST_PER_OUTPUT = 1000.0  # of the firmware's loop of the vertical velocity
 _BLOCK = 500  # rows, to a multiple of which a course is filled, so that flights share a program
 _NEAR = 0.15  # m, from the height of the set-point: the climb is over
 _LOW = 0.3  # m, below which a flight has not begun or is over
@@ -63,13 +65,18 @@ class Twin:
 
 
 class Course(NamedTuple):
-    """What a repetition takes from a log, K rows in the air: nothing of the flight but where it starts."""
+    """What a repetition takes from a log, K rows from the take-off on: nothing of the flight but where it starts."""
 
     start: State
+    """Upright and at rest on the ground, or in flight where the log begins there."""
+    ground: Float[Array, ""]
+    """Height at which the drone stands, m; minus infinity where the log begins in flight."""
     setpoint: Setpoint
     """(K,) on every array."""
     battery: Float[Array, " K"]
     """V."""
+    sag: Float[Array, ""]
+    """Of the battery at take-off, V."""
 
 
 def rows_in_the_air(log: FlightLog) -> slice:
@@ -87,23 +94,33 @@ def rows_in_the_air(log: FlightLog) -> slice:
 
 
 def course(log: FlightLog) -> Course:
-    """Start, set-points and battery of a log, from `rows_in_the_air` on."""
-    air = rows_in_the_air(log)
+    """Start, set-points and battery of a log, from the row on in which the motors start."""
+    stop = rows_in_the_air(log).stop
+    begin = first_row(log)
     ref_pos, ref_yaw, _, vbat = log.orders
-    pos, quat, vel, omega = (jnp.asarray(x[air.start], float) for x in (log.pos, log.quat, log.vel, log.omega))
-    start = State(pos, quat, vel, omega, jnp.zeros(4))
-    length = -(-(air.stop - air.start) // _BLOCK) * _BLOCK
-    rows = np.minimum(np.arange(air.start, air.start + length), air.stop - 1)
+    pos, quat, vel, omega = (jnp.asarray(x[begin], float) for x in (log.pos, log.quat, log.vel, log.omega))
+    start, ground = State(pos, quat, vel, omega, jnp.zeros(4)), jnp.array(-jnp.inf)
+    if begin > 0:
+        upright = rotation.from_rpy(rotation.to_rpy(quat) * jnp.array([0.0, 0, 1]))
+        start, ground = State(pos, upright, jnp.zeros(3), jnp.zeros(3), jnp.zeros(4)), pos[2]
+    length = -(-(stop - begin) // _BLOCK) * _BLOCK
+    rows = np.minimum(np.arange(begin, begin + length), stop - 1)
     setpoint = Setpoint.at(jnp.asarray(ref_pos[rows], float), yaw=jnp.asarray(ref_yaw[rows], float))
-    return Course(start, setpoint, jnp.asarray(vbat[rows], float))
+    return Course(start, ground, setpoint, jnp.asarray(vbat[rows], float), jnp.asarray(log.sag, float))
+
+
+def first_row(log: FlightLog) -> int:
+    """The first row in which the motors run."""
+    return int(np.argmax(log.in_flight))
 
 
 def fly_again(log: FlightLog, vehicle: Vehicle, motors: Motors, gains: firmware_pid.Gains) -> Twin:
     """Fly a vehicle on the set-points of a log.
 
-    The firmware's PID starts with the integrators of a drone that has hovered at the first set-point, in the state of
-    the log near its height, and is given the logged set-points and the logged voltage of the battery until the landing,
-    and nothing else.
+    The firmware's PID starts on the ground with empty integrators when the motors of the log start, and is given the
+    logged set-points and the logged voltage of the battery until the landing, and nothing else. Where a log begins in
+    flight, it starts in that state, with the integrator that carries the weight in hover. Compared are the rows after
+    the climb.
 
     Args:
         log: with set-points, PWM and battery.
@@ -114,9 +131,10 @@ def fly_again(log: FlightLog, vehicle: Vehicle, motors: Motors, gains: firmware_
     Raises:
         ValueError: see `rows_in_the_air`.
     """
-    rows = rows_in_the_air(log)
+    rows, begin = rows_in_the_air(log), first_row(log)
     ref_pos, _, recorded, _ = log.orders
-    pos, pwm = (np.asarray(x)[: rows.stop - rows.start] for x in _fly(vehicle, motors, gains, course(log)))
+    flown = _fly(vehicle, motors, gains, course(log))
+    pos, pwm = (np.asarray(x)[rows.start - begin : rows.stop - begin] for x in flown)
     return Twin(log.name, log.t[rows], log.pos[rows], pos, ref_pos[rows], recorded[rows], pwm)
 
 
@@ -131,26 +149,36 @@ def fly(
     def substep(carry, setpoint, battery):
         memory, state = carry
         memory, command = firmware_pid.pwm(gains, memory, instruments.estimate(state), setpoint, battery, dt=dt)
-        thrust = motors.thrust(command.pwm / FULL_PWM * instruments.motor_supply(battery))
+        thrust = motors.thrust(command.pwm / FULL_PWM * instruments.motor_supply(battery, given.sag))
         rpm = lagging(params, state.rpm, thrust, dt)
         world = jax.tree.map(lambda x: x[None], state.replace(rpm=rpm))
         after = midpoint(lambda s: derivative(team, s, rpm[None]), world, dt)
-        return (memory, jax.tree.map(lambda x: x[0], after)), command.pwm
+        return (memory, _above_ground(given, jax.tree.map(lambda x: x[0], after))), command.pwm
 
     def row(carry, given):
         after, pwm = jax.lax.scan(lambda carry, _: substep(carry, *given), carry, length=_SUBSTEPS)
         return after, (carry[1].pos, jnp.mean(pwm, axis=0))
 
-    first = jax.tree.map(lambda x: x[0], (given.setpoint, given.battery))
-    hovering = State(
-        first[0].pos, jnp.array([0.0, 0, 0, 1]), jnp.zeros(3), jnp.zeros(3), params.hover_rpm * jnp.ones(4)
-    )
-    (memory, settled), _ = jax.lax.scan(
-        lambda carry, _: row(carry, first), (firmware_pid.init(), hovering), length=_SETTLING
-    )
-    start = given.start.replace(rpm=settled.rpm)
+    flying = jnp.isinf(given.ground)
+    lift = jnp.where(flying, _hovering(vehicle, motors, gains, given), 0)
+    memory = firmware_pid.init().replace(vel_integral=lift * jnp.array([0.0, 0, 1]))
+    start = given.start.replace(rpm=jnp.where(flying, params.hover_rpm, 0) * jnp.ones(4))
     _, (pos, pwm) = jax.lax.scan(row, (memory, start), (given.setpoint, given.battery))
     return pos, pwm
+
+
+def _above_ground(given: Course, state: State) -> State:
+    """The state, or that of the start where the drone would be in the ground."""
+    standing = given.start.replace(rpm=state.rpm)
+    return jax.tree.map(lambda a, b: jnp.where(state.pos[2] < given.ground, a, b), standing, state)
+
+
+def _hovering(vehicle: Vehicle, motors: Motors, gains: firmware_pid.Gains, given: Course) -> Float[Array, ""]:
+    """Integrated error of the upward velocity with which the firmware's command carries the weight, m."""
+    battery = given.battery[0]
+    duty = motors.voltage(vehicle.params.weight / 4) / vehicle.instruments.motor_supply(battery, given.sag)
+    command = thrust_at(gains.motor.thrust, duty * battery) / gains.motor.max_thrust * FULL_PWM
+    return (command - gains.base_thrust) / (_THRUST_PER_OUTPUT * gains.vel_i[2])
 
 
 _fly = jax.jit(fly)

@@ -10,7 +10,7 @@ from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.vector import components
 
-_FULL_VOLTAGE = 3.7  # V, of a cell under little load
+_SOUND_SAG = 0.55  # V, of a Crazyflie's battery at take-off, up to which motors get the voltage that is logged
 
 
 class Instruments(PyTreeNode):
@@ -22,8 +22,8 @@ class Instruments(PyTreeNode):
     """(2,) turn about body x and y from the logged attitude to that of the rotors, rad."""
     position_scale: Array
     """() horizontal distance in logged positions over that which logged velocities cover."""
-    voltage_slope: Array
-    """() change of the voltage that motors get over that of the battery as logged; both are 3.7 V at the same time."""
+    unfelt_sag: Array
+    """() share of a battery's sag at take-off, of what is beyond 0.55 V, that is logged and that motors do not feel."""
     estimate_tilt: Array
     """() tilt that the drone's own filter shows over the true one."""
     estimate_delay: Array
@@ -32,7 +32,7 @@ class Instruments(PyTreeNode):
     @classmethod
     def ideal(cls) -> Instruments:
         """A log that shows what was."""
-        return cls(jnp.zeros(()), jnp.zeros(2), jnp.ones(()), jnp.ones(()), jnp.ones(()), jnp.zeros(()))
+        return cls(jnp.zeros(()), jnp.zeros(2), jnp.ones(()), jnp.zeros(()), jnp.ones(()), jnp.zeros(()))
 
     def true_attitude(self, logged: Float[Array, "4"]) -> Float[Array, "4"]:
         """The attitude of the rotors."""
@@ -47,9 +47,9 @@ class Instruments(PyTreeNode):
         scale = jnp.stack([self.position_scale, self.position_scale, jnp.ones_like(self.position_scale)])
         return start + scale * (true - start)
 
-    def motor_supply(self, logged: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Voltage that motors get at full PWM, V."""
-        return _FULL_VOLTAGE + self.voltage_slope * (logged - _FULL_VOLTAGE)
+    def motor_supply(self, logged: Float[Array, "*n"], sag: Float[Array, "*#n"]) -> Float[Array, "*n"]:
+        """Voltage that motors get at full PWM, V, by that of the battery and its sag at take-off, V."""
+        return logged + self.unfelt_sag * jnp.maximum(sag - _SOUND_SAG, 0)
 
     def estimate(self, state: State) -> State:
         """The state of one drone as its own filter shows it."""

@@ -16,6 +16,7 @@ _TOLERANCE = 0.2  # of the period, by which the median of the time between rows 
 _LONGEST_GAP = 0.05  # s
 _FEWEST = 100  # rows
 _FULL_PWM = 65535
+_TAKE_OFF = slice(150, 350)  # rows after the motors start
 _MOST_RATES = 60.0  # rad/s; gyroscopes of small quadrotors end at 35
 _MOST_VOLTAGE = 60.0  # V
 _MOST_RPM = 1e6
@@ -114,6 +115,17 @@ class FlightLog:
     def in_flight(self) -> np.ndarray:
         """(T,) whether all motors run; without PWM everywhere."""
         return np.ones(len(self.t), bool) if self.pwm is None else np.min(self.pwm, axis=1) > _MOST_PERCENT
+
+    @property
+    def sag(self) -> float:
+        """By how much the voltage of the battery falls from rest to take-off, V; 0 of a log that begins in flight.
+
+        Rest is the highest voltage before the motors run, take-off the mean from 1.5 to 3.5 s after they start.
+        """
+        begin = int(np.argmax(self.in_flight))
+        if self.vbat is None or begin == 0:
+            return 0.0
+        return float(np.max(self.vbat[:begin]) - np.mean(self.vbat[begin:][_TAKE_OFF]))
 
 
 def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

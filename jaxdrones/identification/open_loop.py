@@ -37,9 +37,9 @@ class Windows(NamedTuple):
 
     start: State
     """As logged, of one drone."""
-    command: Float[Array, "n rows 4"] | Float[Array, "n rows 5"]
-    """From some time before the start to some time after the end: measured speeds, RPM; or duty cycles, 0 to 1, and the
-    voltage of the battery."""
+    command: Float[Array, "n rows 4"] | Float[Array, "n rows 6"]
+    """From some time before the start to some time after the end: measured speeds, RPM; or duty cycles, 0 to 1, the
+    voltage of the battery and its sag at take-off, V."""
     truth: State
     """As logged at the horizons, a second axis."""
 
@@ -51,7 +51,7 @@ def windows(log: FlightLog, starts: np.ndarray) -> Windows:
         log: of the flight.
         starts: (n,) rows, from `starts_of`.
     """
-    command = log.rpm if log.rpm is not None else _duty_and_voltage(log)
+    command = log.rpm if log.rpm is not None else _duty_and_voltages(log)
     padded = np.pad(command, ((_BEFORE + _REACH, _REACH + 1), (0, 0)), mode="edge")
     rows = starts[:, None] + np.arange(_BEFORE + _LENGTH + 2 * _REACH + 1)
     at = starts[:, None] + np.array(HORIZONS)
@@ -169,8 +169,8 @@ def _rotor_speed(
         middle, early, late = (_shifted(measured, delay + shift)[:_LENGTH] for shift in (0, _HALF, -_HALF))
         return middle, (late - early) / PERIOD
     given = _shifted(command, delay)
-    duty, battery = given[:, :4], given[:, 4:]
-    thrust = motors.thrust(duty * vehicle.instruments.motor_supply(battery))
+    duty, battery, sag = given[:, :4], given[:, 4:5], given[:, 5:]
+    thrust = motors.thrust(duty * vehicle.instruments.motor_supply(battery, sag))
 
     def follow(speed: Array, thrust: Array) -> tuple[Array, tuple[Array, Array]]:
         after = lagging(vehicle.params, speed, thrust, PERIOD)
@@ -206,6 +206,6 @@ def lagging(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"], d
     return asked + (rpm - asked) * jnp.exp(-dt / time_constant)
 
 
-def _duty_and_voltage(log: FlightLog) -> np.ndarray:
+def _duty_and_voltages(log: FlightLog) -> np.ndarray:
     assert log.pwm is not None and log.vbat is not None  # a log has these or rotor speeds
-    return np.column_stack([log.pwm / FULL_PWM, log.vbat])
+    return np.column_stack([log.pwm / FULL_PWM, log.vbat, np.full(len(log.vbat), log.sag)])

@@ -61,14 +61,14 @@ PARAMETERS = {
         *_axes("tilt", 0.01, of_flight=True, axes="xy"),
         Parameter("delay", "delay", (), 0.01, of_flight=True),
         Parameter("position_scale", "position_scale", (), 0.02),
-        Parameter("voltage_slope", "voltage_slope", (), 0.1),
+        Parameter("unfelt_sag", "unfelt_sag", (), 0.3),
         Parameter("estimate_tilt", "estimate_tilt", (), 0.1),
         Parameter("estimate_delay", "estimate_delay", (), 0.01),
     )
 }
 """Every number that can be fitted, by name."""
 
-_OF_TWIN = ("rotor_lag", "voltage_slope", "estimate_tilt", "estimate_delay")  # beside a delay, pieces do not tell them
+_OF_TWIN = ("rotor_lag", "unfelt_sag", "estimate_tilt", "estimate_delay")  # beside a delay, pieces do not tell them
 # A flight depends on thrust over mass and yaw torque over inertia: one of each is kept. PWM tells thrusts, not speeds.
 _OF_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in ("mass", "inertia_z", *_OF_TWIN))
 _OF_PWM = tuple(name for name in PARAMETERS if name not in ("kf", "inertia_z", "rotor_inertia", *_OF_TWIN))

@@ -95,7 +95,7 @@ def test_a_recorded_flight_is_flown_again(capsys, tmp_path):
 @pytest.mark.slow
 def test_a_fitted_crazyflie_needs_the_thrust_of_the_real_one(capsys, tmp_path):
     assert main(["fit", str(NANOBENCH), "--output", str(tmp_path / "fit")]) == 0
-    assert "voltage_slope" in capsys.readouterr().out
+    assert "unfelt_sag" in capsys.readouterr().out
     assert main(["score", str(NANOBENCH), "--vehicle", str(tmp_path / "fit"), "--json"]) == 0
     results = json.loads(capsys.readouterr().out)
     (twin,), (nominal,) = results["closed_loop"], results["closed_loop_nominal"]

@@ -1,0 +1,96 @@
+"""What do a battery, PWM motors, rotor inertia and moving air cost a step?
+
+A world is one Crazyflie with drag and lagging rotors; commands change at every step. All cases take turns in one run.
+"""
+
+import argparse
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import about, report
+
+import jaxdrones as jd
+
+PLAIN = "lagging rotors"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, default=1024)
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--repeats", type=int, default=25)
+    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    if options.quick:
+        options.worlds, options.steps, options.repeats = 8, 5, 1
+    programs = {
+        (name, how): program(case, how, options)
+        for name, case in cases().items()
+        for how in ("over_worlds", "jax.vmap")
+    }
+    times: dict = {key: [] for key in programs}
+    for _ in range(1 + options.repeats):
+        for key, (fly, rpm) in programs.items():
+            start = time.perf_counter()
+            jax.block_until_ready(fly(rpm))
+            times[key].append(time.perf_counter() - start)
+    rows = []
+    for (name, how), all_times in times.items():
+        median, plain = (np.median(x[1:]) for x in (all_times, times[PLAIN, how]))
+        best = min(all_times[1:]) / min(times[PLAIN, how][1:])
+        ns = 1e9 * median / options.steps / options.worlds
+        rows.append({"case": name, "how": how, "ns": ns, "ratio": median / plain, "ratio of best": best})
+    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines.append(f"{options.worlds} worlds, {options.steps} steps of 1/240 s, semi-implicit Euler, drag, float32")
+    lines.append("case | many worlds | ns of a drone-step, median | over that of lagging rotors: medians, bests")
+    lines += [
+        f"{row['case']:36} | {row['how']:11} | {row['ns']:6.2f} | {row['ratio']:.2f} {row['ratio of best']:.2f}"
+        for row in rows
+    ]
+    report({"about": about(), "rows": rows}, options.json, lines)
+
+
+def cases() -> dict:
+    """Parameters, arguments of `make_step` and the mean command, by name; the first is what the others are over."""
+    plain = jd.load_params("cf2x")
+    inert = plain.replace(rotor_inertia=jnp.array(2e-8))
+    constants = {"battery": jd.lithium_polymer(), "motors": jd.crazyflie_motors(), "drag_area": jnp.full(3, 2e-3)}
+    lagging, pwm = dict(rotors=jd.lagging_rotors), dict(rotors=jd.pwm_rotors)
+    power = dict(models=(jd.battery(),))
+    windy = jd.in_wind(jd.logarithmic_wind(5.0), jd.drag)
+    return {
+        PLAIN: (plain, lagging, 14e3),
+        "rotor inertia": (inert, lagging, 14e3),
+        "battery": (plain.replace(aux=constants), lagging | power, 14e3),
+        "battery, rotor inertia": (inert.replace(aux=constants), lagging | power, 14e3),
+        "PWM motors, fixed voltage": (plain.replace(aux=constants), pwm, 45e3),
+        "PWM motors, battery, rotor inertia": (inert.replace(aux=constants), pwm | power, 45e3),
+        "inflow": (plain, lagging | dict(effects=(jd.drag, jd.inflow_thrust)), 14e3),
+        "quadratic drag": (plain.replace(aux=constants), lagging | dict(effects=(jd.drag, jd.quadratic_drag)), 14e3),
+        "logarithmic wind": (plain, lagging | dict(effects=(windy,)), 14e3),
+    }
+
+
+def program(case, how: str, options):
+    """A function of the commands of many worlds that flies a case, and the commands."""
+    params, arguments, mean = case
+    team = jd.repeat(params, 1)
+    step = jd.make_step(**{"effects": (jd.drag,)} | arguments)
+    start = step.init(team, jd.State.at_rest([[0.0, 0, 1]]).replace(rpm=jnp.full((1, 4), 14e3)))
+
+    def fly(command):
+        # a wave on the command, so that nothing of the motors is the same at every step
+        def control(params, memory, state, k):
+            return memory, command * (1 + 0.02 * jnp.sin(0.1 * k))
+
+        return jd.rollout(step, control, team, start, None, options.steps)[0]
+
+    spread = np.random.default_rng(0).uniform(0.9, 1.1, (options.worlds, 1, 4))
+    return (jd.over_worlds(fly) if how == "over_worlds" else jax.jit(jax.vmap(fly))), jnp.asarray(mean * spread)
+
+
+if __name__ == "__main__":
+    main()

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.engine.legs import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
@@ -109,7 +110,11 @@ def _(flight: EpisodeLog, of_trajectory: dict[str, Any]) -> list[Record]:
 
 
 def fly_episode(
-    env: Env, policy: AnyPolicy, key: jax.Array, on_progress: Callable[[float], Any] = lambda fraction: None
+    env: Env,
+    policy: AnyPolicy,
+    key: jax.Array,
+    on_progress: Callable[[float], Any] = lambda fraction: None,
+    watch: Callable[[EpisodeLog, float], Any] | None = None,
 ) -> EpisodeLog:
     """Fly one episode with a policy.
 
@@ -119,6 +124,8 @@ def fly_episode(
             `learning.recurrence`.
         key: random key of the start and of the noise.
         on_progress: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
+        watch: function that is given each thirtieth of a second of the episode as soon as it is flown, and the time at
+            which the longest possible episode ends, s.
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)
@@ -143,33 +150,50 @@ def fly_episode(
         )
         return (memory, obs, world), (row, terminated | truncated)
 
-    if isinstance(env.physics, HostStep):
-        decide, rows = jax.jit(decide), []
-        for k in range(env.steps):
-            (memory, obs, world), (row, done) = step((memory, obs, world), keys[k])
+    def loop(carry, keys):
+        rows = []
+        for key in keys:
+            carry, row = step(carry, key)
             rows.append(jax.device_get(row))
-            on_progress((k + 1) / env.steps)
-            if done:
+            on_progress((flown + len(rows)) / env.steps)
+            if row[1]:
                 break
-        log = jax.tree.map(lambda *x: np.stack(x), *rows)
+        return carry, jax.tree.map(lambda *x: np.stack(x), *rows)
+
+    def log(rows, first, success=None):
+        drones, target, reward, metrics, ends, images = rows
+        return EpisodeLog(
+            t=env.dt * np.arange(first + 1, first + len(reward) + 1),
+            drones=drones,
+            target=target,
+            reward=reward,
+            metrics=metrics,
+            ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
+            images=images or {},
+            params=params,
+            scene=scene,
+            success=success,
+        )
+
+    if isinstance(env.physics, HostStep):
+        decide, fly = jax.jit(decide), loop
     else:
-        _, (log, done) = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys))(memory, obs, world)
-        length = int(np.argmax(done)) + 1 if np.any(done) else env.steps
-        log = jax.tree.map(lambda x: np.asarray(x)[:length], log)
-    drones, target, reward, metrics, ends, images = log
-    length = len(reward)
-    return EpisodeLog(
-        t=env.dt * np.arange(1, length + 1),
-        drones=drones,
-        target=target,
-        reward=reward,
-        metrics=metrics,
-        ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
-        images=images or {},
-        params=jax.device_get(start.params),
-        scene=jax.device_get(start.scene),
-        success=_success(env, drones, metrics),
-    )
+        fly = jax.jit(lambda carry, keys: jax.lax.scan(step, carry, keys))
+    params, scene = jax.device_get((start.params, start.scene))
+    carry: Any = (memory, obs, world)
+    leg = env.steps if watch is None else leg_length(env.dt)
+    flown, ended, parts = 0, False, []
+    while flown < env.steps and not ended:
+        ahead = np.arange(flown, flown + leg)
+        used = ahead[ahead < env.steps] if fly is loop else np.minimum(ahead, env.steps - 1)  # one length: one program
+        carry, (rows, done) = fly(carry, keys[used])
+        count = min(int(np.argmax(done)) + 1 if np.any(done) else len(done), env.steps - flown)
+        parts.append(jax.tree.map(lambda x, count=count: np.asarray(x)[:count], rows))
+        if watch is not None:
+            watch(log(parts[-1], flown), env.steps * env.dt)
+        flown, ended = flown + count, bool(np.any(done[:count]))
+    rows = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return log(rows, 0, _success(env, rows[0], rows[3]))
 
 
 def _success(env: Env, drones: State, metrics: dict[str, np.ndarray]) -> bool | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ from jaxdrones.engine.legs import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
+from jaxdrones.learning import compilation
 from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -21,6 +23,8 @@ from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.visualization.viewer.show import records_of, refuse
 
+Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
+"""(memory, observations) -> (memory, actions)"""
 _LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
 
 
@@ -133,27 +137,10 @@ def fly_episode(
     world = start
     memory = initial_memory(policy, env.drones)
 
-    def decide(memory, obs):
-        return act(policy, memory, obs)
-
-    def step(carry, key):
-        memory, obs, world = carry
-        memory, action = decide(memory, obs)
-        obs, world, reward, terminated, truncated, info = env.step(key, world, action)
-        row = (
-            world.drones,
-            env.task.target_now(world).pos,
-            reward,
-            info["metrics"],
-            info["terminations"] | info["truncations"],
-            world.images,
-        )
-        return (memory, obs, world), (row, terminated | truncated)
-
     def loop(carry, keys):
         rows = []
         for key in keys:
-            carry, row = step(carry, key)
+            carry, row = _step(env, decide, carry, key)
             rows.append(jax.device_get(row))
             on_progress((flown + len(rows)) / env.steps)
             if row[1]:
@@ -175,10 +162,14 @@ def fly_episode(
             success=success,
         )
 
+    fly: Callable
+    decide: Decide = functools.partial(act, policy)
     if isinstance(env.physics, HostStep):
         decide, fly = jax.jit(decide), loop
+    elif isinstance(policy, PyTreeNode):  # an argument, so that other policies of its shape need no other program
+        fly = functools.partial(_compiled_leg(), compilation.Static(env), policy)
     else:
-        fly = jax.jit(lambda carry, keys: jax.lax.scan(step, carry, keys))
+        fly = jax.jit(functools.partial(_leg, env, policy))
     params, scene = jax.device_get((start.params, start.scene))
     carry: Any = (memory, obs, world)
     leg = env.steps if watch is None else leg_length(env.dt)
@@ -194,6 +185,32 @@ def fly_episode(
         flown, ended = flown + count, bool(np.any(done[:count]))
     rows = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     return log(rows, 0, _success(env, rows[0], rows[3]))
+
+
+def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
+    """One control step of an episode: what the next one needs, and what is logged of this one with whether it ends."""
+    memory, obs, world = carry
+    memory, action = decide(memory, obs)
+    obs, world, reward, terminated, truncated, info = env.step(key, world, action)
+    row = (
+        world.drones,
+        env.task.target_now(world).pos,
+        reward,
+        info["metrics"],
+        info["terminations"] | info["truncations"],
+        world.images,
+    )
+    return (memory, obs, world), (row, terminated | truncated)
+
+
+def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
+    """As many control steps as there are keys, in one program."""
+    return jax.lax.scan(functools.partial(_step, env, functools.partial(act, policy)), carry, keys)
+
+
+@functools.cache
+def _compiled_leg() -> Callable:
+    return jax.jit(lambda env, policy, carry, keys: _leg(env.value, policy, carry, keys), static_argnums=0)
 
 
 def _success(env: Env, drones: State, metrics: dict[str, np.ndarray]) -> bool | None:

@@ -5,6 +5,7 @@ import { Arrows, FORCE, THRUST, TORQUE } from "./arrows.js";
 import { Fleet } from "./fleet.js";
 import { armOf, bounds, scratch, World } from "./flight.js";
 import { CameraImages } from "./camera.js";
+import { drawCurve } from "./curve.js";
 import { Panel } from "./panel.js";
 import { decode } from "./payload.js";
 import { Plot, short } from "./plots.js";
@@ -59,6 +60,7 @@ class Player {
     this.live = Boolean(live);
     this.span = Math.max(this.end, live?.end ?? 0); // s, length of the time line
     this.following = this.running;
+    drawCurve(find("curve"), live?.curve);
     if (live) {
       this.worlds[0].reserve(live.rows);
       this.playing = true;

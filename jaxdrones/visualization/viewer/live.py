@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import http.server
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -90,8 +91,7 @@ class Live:
         if not self._parts or record.t[0] <= self._parts[-1].t[-1]:
             if self._paced is None:
                 self._await_first()
-            dt = float(record.t[-1] - record.t[0]) / max(1, len(record.t) - 1) or end
-            rows = len(record.t) + max(0, round((end - float(record.t[-1])) / dt))
+            rows = max(1, round(len(record.t) * end / float(record.t[-1])))  # row 0 is one step after the start
             self._begin(record, {"rows": rows, "end": end, "running": True})
             self._start = time.monotonic() - float(record.t[0])
         else:
@@ -100,18 +100,20 @@ class Live:
                 self._changed.notify_all()
         self._pace(self._start + float(record.t[-1]))
 
-    def show(self, flight: Any, title: str, curve: Sequence[Sequence[float]] = ()) -> None:
+    def show(self, flight: Any, title: str, curve: Sequence[tuple[float, float]] = (), label: str = "success") -> None:
         """Show a whole flight, again and again until the next one comes; this waits for nobody.
 
         Args:
             flight: anything with one world that `show` takes.
             title: title of the page from now on.
-            curve: points of a learning curve, number of the update and share of success, 0 to 1.
+            curve: points of a learning curve: numbers of updates, and what was evaluated after them.
+            label: name of what was evaluated; `success` is a share, 0 to 1.
         """
         (record,) = records_of(flight, {})
         self._title = title
-        curve = np.asarray(curve, float).reshape(-1, 2).tolist()
-        self._begin(record, {"rows": len(record.t), "end": float(record.t[-1]), "running": False, "curve": curve})
+        points = [[float(x), float(y)] for x, y in curve if math.isfinite(y)]
+        live = {"rows": len(record.t), "end": float(record.t[-1]), "running": False}
+        self._begin(record, live | {"curve": {"label": label, "points": points}})
 
     def close(self) -> None:
         """Let the viewers take what is left, and end. Their pages stay, and play what they have."""

@@ -211,5 +211,3 @@ def _check_numbers(options: argparse.Namespace) -> None:
         raise ValueError("--resume is given with --library rllib, whose trainings are not continued here; leave it out")
     if options.resume and options.overwrite:
         raise ValueError("--resume and --overwrite are given; one continues a run, the other replaces it")
-    if options.live is not None and options.hosts is not None:
-        raise ValueError("--live is given with --hosts, which show nothing in the browser; leave one of them out")

@@ -43,6 +43,7 @@ class Live:
 
     Raises:
         ValueError: the port is taken, or there is no such port.
+        ImportError: the viewer's page is not built; says how to get it.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class Live:
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
         check_at_most("port", port, 65535, 0)
+        self.page = Page("jaxdrones", f"live:{STREAM}").html
         try:
             self._server = _Server((HOST, port), self)
         except OSError as error:
@@ -223,7 +225,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return self.send_error(HTTPStatus.FORBIDDEN, "this page is for this machine alone")
         if self.path == "/":
             self._begin("text/html; charset=utf-8")
-            self.wfile.write(Page("jaxdrones", f"live:{STREAM}").html.encode())
+            self.wfile.write(self.server.live.page.encode())
         elif self.path == STREAM:
             self._begin("text/event-stream")
             self.server.live.stream(self._send)

@@ -74,6 +74,12 @@ FLIGHTS = {
         "circle: 4 x cf2x ... Bullet at 240 Hz ... wrote .*circle.mp4", FLIGHT, FILM
     ),
     "compare circle": Short(r"circle: explicit against bullet ... t \(s\)  position ... 0\.20 ", FLIGHT, BULLET),
+    "compare circle --output runs/compare": Short(
+        r"circle: explicit against bullet ... wrote runs/compare/explicit/log\.npz, .*/compare\.png", FLIGHT, BULLET
+    ),
+    "compare circle --controllers pid,geometric,lqr --output runs/controllers": Short(
+        r"circle: pid, geometric, lqr, largest ... lqr +0\.\d+ ... wrote runs/controllers/pid/log\.npz", FLIGHT
+    ),
     "explain hover": Short(
         "hover: fly to the goal ... x of the target, from the drone +m +world ... speed of rotor 0 +RPM ... position "
         "+-1 ... lost ... semi_implicit_euler ... 0.027 kg"

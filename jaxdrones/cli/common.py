@@ -16,6 +16,7 @@ _MAX_MESSAGE = 1000  # characters
 
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
+    "controller": ("controller", "{}"),
     "rms_error_m": ("rms (m)", "{:.4f}"),
     "peak_error_m": ("peak (m)", "{:.4f}"),
     "steady_error_m": ("steady (m)", "{:.4f}"),

@@ -1,42 +1,133 @@
 """`jaxdrones compare`."""
 
 import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import as_json, table
-from jaxdrones.cli.flight_options import add_conditions, fly_options, warn
-from jaxdrones.flights.conditions import BACKENDS
+from jaxdrones.cli.common import as_json, check_writable, folder, table
+from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
+from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.flights.record import divergence
+from jaxdrones.flights.record import Record, divergence
+from jaxdrones.visualization import comparison, plots
+
+_BACKENDS = "explicit,bullet"
 
 
 def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "compare",
-        help="fly an example on both backends and print how they diverge",
-        description="Fly an example on two backends from the same start and print their divergence over time.",
+        help="fly an example on both backends, or by several controllers, and print how they differ",
+        description="Fly an example on two backends from the same start and print their divergence over time, or fly "
+        "it by several controllers and print the errors of each. With --output draw paths and errors of all, too.",
         allow_abbrev=False,
     )
     parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
     add_conditions(parser)
-    parser.add_argument("--backends", default="explicit,bullet", metavar="A,B", help="two of " + ", ".join(BACKENDS))
+    parser.add_argument("--backends", metavar="A,B", help=f"two of {', '.join(BACKENDS)} ({_BACKENDS})")
+    parser.add_argument(
+        "--controllers", metavar="A,B", help=f"in place of --backends: two or more of {', '.join(CONTROLLERS)}"
+    )
+    parser.add_argument(
+        "--output", type=folder, metavar="DIR", help="write a figure, and the log of each flight in a folder of its own"
+    )
+    parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=_compare)
 
 
 def _compare(options: argparse.Namespace) -> int:
-    names = [name.strip() for name in options.backends.split(",")]
-    if len(set(names)) != 2 or len(names) != 2:
-        raise ValueError(f"--backends is {options.backends!r}; give two different ones, for example explicit,bullet")
-    for name in names:
-        check_choice("backend", name, BACKENDS)
-    first, second = records = [fly_options(options, backend=name) for name in names]
-    rows = divergence(first, second)
-    diverged = {name: record.diverged() for name, record in zip(names, records, strict=True)}
-    if options.json:
-        print(as_json({"flight": options.flight, "backends": names, "divergence": rows, "diverged": diverged}))
+    kind, cases = _cases(options)
+    logs = _logs(options, list(cases))
+    for flown, backend in cases.values():
+        check_conditions(flown, backend=backend)
+    records = {name: fly_options(flown, backend=backend) for name, (flown, backend) in cases.items()}
+    settling_time = FLIGHTS[options.flight].settling_time
+    for name, log in logs.items():
+        records[name].save_npz(log)
+    files = list(logs.values())
+    if logs and not options.no_figure:
+        files.append(options.output / "compare.png")
+        title = (" against " if len(cases) == 2 else ", ").join(cases)
+        comparison.save_comparison(records, files[-1], f"{options.flight}: {title}")
+    diverged = {name: record.diverged() for name, record in records.items()}
+    about: dict[str, Any] = {"flight": options.flight, kind: list(cases)}
+    if kind == "backends":
+        first, second = records.values()
+        found = {"divergence": divergence(first, second)}
+        headline, text = " against ".join(cases) + ", largest difference over the drones", table(found["divergence"])
     else:
-        print(f"{options.flight}: {names[0]} against {names[1]}, largest difference over the drones")
-        print(table(rows))
-    return warn(diverged[names[0]] or diverged[names[1]])
+        found = {"results": _results(records, settling_time)}
+        headline = ", ".join(cases) + ", largest over the drones"
+        text = f"{table(found['results'])}\n{next(iter(records.values())).definitions(settling_time)}"
+    if options.json:
+        print(as_json(about | found | {"diverged": diverged, "files": list(map(str, files))}))
+    else:
+        print(f"{options.flight}: {headline}\n{text}")
+        if files:
+            print("wrote " + ", ".join(map(str, files)))
+    return warn(next(filter(None, diverged.values()), {}))
+
+
+def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.Namespace, str]]]:
+    """What differs, `backends` or `controllers`, and by its name the options and the backend of each flight."""
+    if options.controllers is None:
+        names = _names("backends", options.backends or _BACKENDS)
+        if len(names) != 2:
+            raise ValueError(f"--backends is {options.backends!r}; give two different ones, for example {_BACKENDS}")
+        for name in names:
+            check_choice("backend", name, BACKENDS)
+        return "backends", {name: (options, name) for name in names}
+    for name in ("backends", "controller"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"--{name} {getattr(options, name)} is given beside --controllers; leave one of them out")
+    names = _names("controllers", options.controllers)
+    if len(names) < 2:
+        raise ValueError(f"--controllers is {options.controllers!r}; give two or more, for example pid,lqr")
+    for name in names:
+        check_choice("controller", name, CONTROLLERS)
+    return "controllers", {
+        name: (argparse.Namespace(**vars(options) | {"controller": name}), "explicit") for name in names
+    }
+
+
+def _names(option: str, text: str) -> list[str]:
+    """Names between commas.
+
+    Raises:
+        ValueError: one is given twice.
+    """
+    names = [name.strip() for name in text.split(",")]
+    if len(set(names)) < len(names):
+        raise ValueError(f"--{option} is {text!r}; give two different ones, or more")
+    return names
+
+
+def _logs(options: argparse.Namespace, names: list[str]) -> dict[str, Path]:
+    """Where the log of each flight is to be written, by name; raises before the flights if a file cannot be."""
+    if options.output is None:
+        return {}
+    if not options.no_figure:
+        plots.check_matplotlib()
+        check_writable(options.output / "compare.png")
+    logs = {name: options.output / name / "log.npz" for name in names}
+    for log in logs.values():
+        check_writable(log)
+    return logs
+
+
+def _results(records: Mapping[str, Record], after: float) -> list[dict[str, Any]]:
+    """One row of numbers per controller: the largest over the drones; `None` where one of them has none."""
+    rows = []
+    for name, record in records.items():
+        drones = record.results(after)
+        row: dict[str, Any] = {"controller": name}
+        for column in drones[0]:
+            if "error" in column or column in ("settled_after_s", "rpm_std"):
+                values: list[Any] = [drone[column] for drone in drones]
+                row[column] = None if None in values else max(values)
+        rows.append(row)
+    return rows

@@ -26,8 +26,13 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
 
 
-def fly_options(options: argparse.Namespace, **more) -> Record:
-    """The record of the flight that the options describe; a progress bar shows how far it is."""
+def fly_options(options: argparse.Namespace, **more: Any) -> Record:
+    """The record of the flight that the options describe; a progress bar shows how far it is.
+
+    Args:
+        options: options of the command line.
+        more: further arguments of `fly`.
+    """
     with progress() as report:
         return fly(options.flight, progress=report, **_conditions(options), **more)
 

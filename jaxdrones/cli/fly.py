@@ -10,6 +10,7 @@ from typing import Any
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, check_writable, folder, print_error, run_folder, table
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
+from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.settings import parse_settings
 from jaxdrones.flights.conditions import BACKENDS
@@ -61,6 +62,7 @@ def add(commands) -> None:
     parser.add_argument(
         "--renderer", help=f"of the film: {', '.join(films.RENDERERS)} (page where Chromium is installed, else jax)"
     )
+    add_live(parser, "show the flight in the browser while it is flown, in real time")
     parser.add_argument(
         "--cameras",
         action="store_true",
@@ -116,9 +118,11 @@ def _fly_example(options: argparse.Namespace) -> int:
     output = options.output or Path("runs") / options.flight
     check_conditions(options, backend=options.backend, obstacles=options.obstacles)
     _check_files(options, output)
-    record = fly_options(options, backend=options.backend, obstacles=options.obstacles, gui=options.gui)
     example = FLIGHTS[options.flight]
     title = f"{options.flight}: {example.summary}"
+    with live_server(options) as live:
+        conditions = dict(backend=options.backend, obstacles=options.obstacles, gui=options.gui)
+        record = fly_options(options, **conditions, watch=live.add if live else None)
     files = _write(record, options, output, title, example.panels)
     _report(options, record, example.settling_time, files, record.diverged())
     return warn(record.diverged())
@@ -142,7 +146,10 @@ def _fly_policy(options: argparse.Namespace) -> int:
     with recipe.env(backend=options.backend) as env, progress() as report:
         policy = run.policy(env=env)
         _check_files(options, output)
-        episode = fly_episode(env, policy, jax.random.key(seed), report or (lambda fraction: None))
+        title = f"{recipe.task}: {env.task.summary} ({recipe.trained_by}, {options.backend})"
+        with live_server(options, title) as live:
+            on_progress = report or (lambda fraction: None)
+            episode = fly_episode(env, policy, jax.random.key(seed), on_progress, live.add if live else None)
     conditions = EpisodeConditions(
         str(options.policy),
         recipe.task,
@@ -154,7 +161,6 @@ def _fly_policy(options: argparse.Namespace) -> int:
         recipe.options,
     )
     record = to_record(episode, conditions)
-    title = f"{recipe.task}: {env.task.summary} ({recipe.trained_by}, {options.backend})"
     files = _write(record, options, output, title, plots.POLICY_PANELS)
     end = {
         "success": episode.success,

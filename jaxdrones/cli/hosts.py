@@ -41,6 +41,8 @@ def _on_hosts(train: Callable[[argparse.Namespace], int], options: argparse.Name
         raise ValueError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
     if options.library in ("rllib", "sb3"):
         raise ValueError(f"--library {options.library} trains on one host; leave out --hosts, --host and --coordinator")
+    if options.live is not None:
+        raise ValueError("--live is given with --hosts, whose trainings are not shown; leave one of them out")
     from jaxdrones.training import distributed
 
     with contextlib.ExitStack() as stack:

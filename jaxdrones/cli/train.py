@@ -8,6 +8,7 @@ from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
 from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.evaluate import described
+from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
 from jaxdrones.cli.settings import asked_settings, user_mistakes
 from jaxdrones.cli.train_runs import episodes_of, recipe_of, runs_of
@@ -91,6 +92,7 @@ def add(commands) -> None:
         "--resume", action="store_true", help="continue the run in --output; with --budget train a finished one longer"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
+    add_live(parser, "show an episode in the browser after every evaluation, and the learning curve")
     hosts.add_options(parser)
     parser.add_argument("--no-figure", action="store_true", help="draw no learning curves; needs no matplotlib")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
@@ -144,28 +146,35 @@ def _train(options: argparse.Namespace) -> int:
         for run in (*runs.values(), Run(output)):
             run.clear()
 
-    for seed, run in runs.items():
-        if run.finished and run.sidecar_entry("state", "update") >= total:
-            continue
-        display = ProgressDisplay(total, f"seed {seed}" if len(runs) > 1 else "training", trainer.episodes, print_line)
-        try:
-            with display:
-                loop.train(trainer, run, seed, display.update)
-        except KeyboardInterrupt:
-            if not (run.folder / "last.json").exists():
-                return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
-            draw_curves(options, {seed: run}, run.folder)
-            where = f"interrupted at update {run.sidecar_entry('last', 'update')}; {remaining_best(run)}"
-            if not run.started:
-                return print_error(where, INTERRUPTED)
-            again = f"jaxdrones train {options.task} --output {output} --resume"
-            again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
-            return print_error(f"{where}; continue with: {again}", INTERRUPTED)
-        except Diverged as error:
-            draw_curves(options, {seed: run}, run.folder)
-            return print_error(
-                f"training diverged: {error}, for example --set learning_rate=1e-3; {remaining_best(run)}", 1
+    with live_server(options) as live:
+        for seed, run in runs.items():
+            if run.finished and run.sidecar_entry("state", "update") >= total:
+                continue
+            display = ProgressDisplay(
+                total, f"seed {seed}" if len(runs) > 1 else "training", trainer.episodes, print_line
             )
+            on_progress = display.update
+            if live:
+                what = described(recipe) + f", seed {seed}" * (len(runs) > 1)
+                on_progress = LiveTraining(live, trainer, run, what, on_progress).update
+            try:
+                with display:
+                    loop.train(trainer, run, seed, on_progress)
+            except KeyboardInterrupt:
+                if not (run.folder / "last.json").exists():
+                    return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
+                draw_curves(options, {seed: run}, run.folder)
+                where = f"interrupted at update {run.sidecar_entry('last', 'update')}; {remaining_best(run)}"
+                if not run.started:
+                    return print_error(where, INTERRUPTED)
+                again = f"jaxdrones train {options.task} --output {output} --resume"
+                again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
+                return print_error(f"{where}; continue with: {again}", INTERRUPTED)
+            except Diverged as error:
+                draw_curves(options, {seed: run}, run.folder)
+                return print_error(
+                    f"training diverged: {error}, for example --set learning_rate=1e-3; {remaining_best(run)}", 1
+                )
     return show_results(options, runs, output)
 
 

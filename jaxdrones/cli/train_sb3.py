@@ -85,6 +85,8 @@ def _refuse(options: argparse.Namespace) -> None:
     """Raise for options that Stable-Baselines3 does not support here."""
     if options.resume:
         raise ValueError("--resume is given with --library sb3, whose trainings keep no state; leave it out")
+    if options.live is not None:
+        raise ValueError("--live is given with --library sb3, whose trainings are not shown; leave it out")
     if options.seeds != 1:
         raise ValueError(
             f"--seeds {options.seeds} is given with --library sb3, which trains one; leave it out, choose with --seed"

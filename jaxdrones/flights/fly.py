@@ -1,15 +1,17 @@
 """Flying the control examples on either backend."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdrones.control import Setpoint, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.engine.explicit import make_step
-from jaxdrones.engine.rollout import rollout
+from jaxdrones.engine.legs import leg_length, legs
+from jaxdrones.engine.rollout import Control
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.controllers import controller_of
 from jaxdrones.flights.examples import FLIGHTS, Flight
@@ -22,13 +24,21 @@ from jaxdrones.urdf import load_params
 _START_SPREAD = 0.01  # m; standard deviation of the start when a seed is given
 
 
-def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None = None, **options: Any) -> Record:
+def fly(
+    flight: str,
+    gui: bool = False,
+    progress: Callable[[float], None] | None = None,
+    watch: Callable[[Record, float], None] | None = None,
+    **options: Any,
+) -> Record:
     """Fly one of the examples.
 
     Args:
         flight: `circle`, `velocity`, `ground-effect` or `downwash`.
         gui: show the flight in Bullet's window, in real time.
         progress: function that is called with the share of the flight that is done, at most a hundred times.
+        watch: function that is given each thirtieth of a second of the flight as soon as it is flown, and the time at
+            which the flight ends, s.
         options: the other fields of `Conditions`.
 
     Raises:
@@ -49,24 +59,33 @@ def fly(flight: str, gui: bool = False, progress: Callable[[float], None] | None
         return team, start, controller.init(team, start)
 
     @jax.jit
-    def finish(params: Params, trajectory: State) -> dict[str, jax.Array]:
+    def plan(params: Params) -> dict[str, jax.Array]:
         t = dt * jnp.arange(1, steps + 1)
         target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
         target_pos, target_vel = _targets(target, params)
-        motion = {name: getattr(trajectory, name) for name in ("pos", "quat", "vel", "omega", "rpm")}
-        return dict(motion, t=t, target_pos=target_pos, target_vel=target_vel)
+        return {"t": t, "target_pos": target_pos, "target_vel": target_vel}
 
     params, start, memory = prepare(load_params(conditions.vehicle))
-    trajectory = _rollout(conditions, gui, control, params, start, memory)
-    log = jax.device_get(finish(params, trajectory))
+    planned, team = jax.device_get((plan(params), params))
+
+    def record(trajectory: State, first: int) -> Record:
+        rows = slice(first, first + len(trajectory.pos))
+        return Record(
+            **{name: np.asarray(getattr(trajectory, name)) for name in ("pos", "quat", "vel", "omega", "rpm")},
+            **{name: x[rows] for name, x in planned.items()},
+            labels=example.labels or tuple(f"drone {i}" for i in range(n)),
+            conditions=conditions,
+            params=team,
+            scene=scene_of(conditions),
+        )
+
+    parts: list[State] = []
+    for part in _flown(conditions, gui, control, params, start, memory, whole=watch is None):
+        if watch is not None:
+            watch(record(part, sum(len(x.pos) for x in parts)), steps * dt)
+        parts.append(part)
     jax.effects_barrier()
-    return Record(
-        **log,
-        labels=example.labels or tuple(f"drone {i}" for i in range(n)),
-        conditions=conditions,
-        params=jax.device_get(params),
-        scene=scene_of(conditions),
-    )
+    return record(jax.tree.map(lambda *x: np.concatenate(x), *parts), 0)
 
 
 def scene_of(conditions: Conditions) -> Scene:
@@ -74,8 +93,11 @@ def scene_of(conditions: Conditions) -> Scene:
     return obstacles_2021() if conditions.obstacles else Scene()
 
 
-def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: State, memory) -> State:
-    """The trajectory on the chosen backend."""
+def _flown(
+    conditions: Conditions, gui: bool, control: Control, params: Params, start: State, memory: Any, whole: bool
+) -> Iterator[State]:
+    """The trajectory on the chosen backend, whole or in legs."""
+    length = conditions.steps if whole else leg_length(conditions.dt)
     common: dict[str, Any] = dict(
         effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
         pairs=[PAIRS[effect] for effect in conditions.effects if effect in PAIRS],
@@ -87,14 +109,14 @@ def _rollout(conditions: Conditions, gui: bool, control, params: Params, start: 
         if gui:
             raise ValueError("a window is asked for; only the bullet backend has one")
         step = make_step(**common, integrator=INTEGRATORS[conditions.integrator])
-        fly = jax.jit(lambda params, start, memory: rollout(step, control, params, start, memory, conditions.steps)[1])
-        return fly(params, start, memory)
+        yield from legs(step, control, params, start, memory, conditions.steps, length)
+        return
 
     from jaxdrones.engine import bullet  # optional
 
     with bullet.make_step(**common, scene=scene_of(conditions), gui=gui) as simulated:
         watched = bullet.Window(simulated, params, conditions.dt) if gui else simulated
-        return rollout(watched, control, params, start, memory, conditions.steps)[1]
+        yield from legs(watched, control, params, start, memory, conditions.steps, length)
 
 
 def _start(flight: Flight, n: int, seed: int | None) -> State:

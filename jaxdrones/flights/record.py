@@ -106,7 +106,7 @@ class Record:
         is 1 m or 1 m/s above its error at the start. The four examples with their defaults stay below 0.6 m or m/s
         and within 30 degrees of level; an unstable drone is hundreds of metres off.
         """
-        difference, unit = self._difference()
+        difference, unit = self.difference()
         with np.errstate(over="ignore", invalid="ignore"):
             error = np.linalg.norm(difference.astype(np.float64), axis=-1)
             lost = error[self.last_quarter].max(axis=0) > error[0] + _LOST
@@ -127,7 +127,7 @@ class Record:
         is its mean over the last quarter of the flight. The drone has settled when the error stays within 10 % (or
         5 mm, 5 mm/s) of that; `None` if it does not before the last quarter. Numbers that are not finite are `None`.
         """
-        difference, unit = self._difference()
+        difference, unit = self.difference()
         unit = unit.replace("/", "_")
         counted = self.t >= self._counted_from(after)
         steady = self.last_quarter
@@ -151,7 +151,7 @@ class Record:
 
     def definitions(self, after: float) -> str:
         """What the numbers of `results` are and from which times on they count, in words; three lines."""
-        unit = "mm" if self._difference()[1] == "m" else "mm/s"
+        unit = "mm" if self.difference()[1] == "m" else "mm/s"
         last, begin = self.t[self.last_quarter][0], self._counted_from(after)
         band = f"{100 * _BAND:g} % or {1000 * _MIN_BAND:g} {unit}"
         return (
@@ -164,7 +164,7 @@ class Record:
         """Time from which on results count, s."""
         return after if after < self.t[-1] else float(self.t[-1]) / 2
 
-    def _difference(self) -> tuple[np.ndarray, str]:
+    def difference(self) -> tuple[np.ndarray, str]:
         """(K, n, 3) difference between actual and commanded position or velocity, and its unit."""
         if np.isnan(self.target_pos).any():
             return self.vel - self.target_vel, "m/s"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,9 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.engine.legs import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
+from jaxdrones.learning import compilation
 from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -20,6 +23,8 @@ from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.visualization.viewer.show import records_of, refuse
 
+Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
+"""(memory, observations) -> (memory, actions)"""
 _LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
 
 
@@ -109,7 +114,11 @@ def _(flight: EpisodeLog, of_trajectory: dict[str, Any]) -> list[Record]:
 
 
 def fly_episode(
-    env: Env, policy: AnyPolicy, key: jax.Array, on_progress: Callable[[float], Any] = lambda fraction: None
+    env: Env,
+    policy: AnyPolicy,
+    key: jax.Array,
+    on_progress: Callable[[float], Any] = lambda fraction: None,
+    watch: Callable[[EpisodeLog, float], Any] | None = None,
 ) -> EpisodeLog:
     """Fly one episode with a policy.
 
@@ -119,6 +128,8 @@ def fly_episode(
             `learning.recurrence`.
         key: random key of the start and of the noise.
         on_progress: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
+        watch: function that is given each thirtieth of a second of the episode as soon as it is flown, and the time at
+            which the longest possible episode ends, s.
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)
@@ -126,50 +137,80 @@ def fly_episode(
     world = start
     memory = initial_memory(policy, env.drones)
 
-    def decide(memory, obs):
-        return act(policy, memory, obs)
-
-    def step(carry, key):
-        memory, obs, world = carry
-        memory, action = decide(memory, obs)
-        obs, world, reward, terminated, truncated, info = env.step(key, world, action)
-        row = (
-            world.drones,
-            env.task.target_now(world).pos,
-            reward,
-            info["metrics"],
-            info["terminations"] | info["truncations"],
-            world.images,
-        )
-        return (memory, obs, world), (row, terminated | truncated)
-
-    if isinstance(env.physics, HostStep):
-        decide, rows = jax.jit(decide), []
-        for k in range(env.steps):
-            (memory, obs, world), (row, done) = step((memory, obs, world), keys[k])
+    def loop(carry, keys):
+        rows = []
+        for key in keys:
+            carry, row = _step(env, decide, carry, key)
             rows.append(jax.device_get(row))
-            on_progress((k + 1) / env.steps)
-            if done:
+            on_progress((flown + len(rows)) / env.steps)
+            if row[1]:
                 break
-        log = jax.tree.map(lambda *x: np.stack(x), *rows)
+        return carry, jax.tree.map(lambda *x: np.stack(x), *rows)
+
+    def log(rows, first, success=None):
+        drones, target, reward, metrics, ends, images = rows
+        return EpisodeLog(
+            t=env.dt * np.arange(first + 1, first + len(reward) + 1),
+            drones=drones,
+            target=target,
+            reward=reward,
+            metrics=metrics,
+            ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
+            images=images or {},
+            params=params,
+            scene=scene,
+            success=success,
+        )
+
+    fly: Callable
+    decide: Decide = functools.partial(act, policy)
+    if isinstance(env.physics, HostStep):
+        decide, fly = jax.jit(decide), loop
+    elif isinstance(policy, PyTreeNode):  # an argument, so that other policies of its shape need no other program
+        fly = functools.partial(_compiled_leg(), compilation.Static(env), policy)
     else:
-        _, (log, done) = jax.jit(lambda *carry: jax.lax.scan(step, carry, keys))(memory, obs, world)
-        length = int(np.argmax(done)) + 1 if np.any(done) else env.steps
-        log = jax.tree.map(lambda x: np.asarray(x)[:length], log)
-    drones, target, reward, metrics, ends, images = log
-    length = len(reward)
-    return EpisodeLog(
-        t=env.dt * np.arange(1, length + 1),
-        drones=drones,
-        target=target,
-        reward=reward,
-        metrics=metrics,
-        ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
-        images=images or {},
-        params=jax.device_get(start.params),
-        scene=jax.device_get(start.scene),
-        success=_success(env, drones, metrics),
+        fly = jax.jit(functools.partial(_leg, env, policy))
+    params, scene = jax.device_get((start.params, start.scene))
+    carry: Any = (memory, obs, world)
+    leg = env.steps if watch is None else leg_length(env.dt)
+    flown, ended, parts = 0, False, []
+    while flown < env.steps and not ended:
+        ahead = np.arange(flown, flown + leg)
+        used = ahead[ahead < env.steps] if fly is loop else np.minimum(ahead, env.steps - 1)  # one length: one program
+        carry, (rows, done) = fly(carry, keys[used])
+        count = min(int(np.argmax(done)) + 1 if np.any(done) else len(done), env.steps - flown)
+        parts.append(jax.tree.map(lambda x, count=count: np.asarray(x)[:count], rows))
+        if watch is not None:
+            watch(log(parts[-1], flown), env.steps * env.dt)
+        flown, ended = flown + count, bool(np.any(done[:count]))
+    rows = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return log(rows, 0, _success(env, rows[0], rows[3]))
+
+
+def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
+    """One control step of an episode: what the next one needs, and what is logged of this one with whether it ends."""
+    memory, obs, world = carry
+    memory, action = decide(memory, obs)
+    obs, world, reward, terminated, truncated, info = env.step(key, world, action)
+    row = (
+        world.drones,
+        env.task.target_now(world).pos,
+        reward,
+        info["metrics"],
+        info["terminations"] | info["truncations"],
+        world.images,
     )
+    return (memory, obs, world), (row, terminated | truncated)
+
+
+def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
+    """As many control steps as there are keys, in one program."""
+    return jax.lax.scan(functools.partial(_step, env, functools.partial(act, policy)), carry, keys)
+
+
+@functools.cache
+def _compiled_leg() -> Callable:
+    return jax.jit(lambda env, policy, carry, keys: _leg(env.value, policy, carry, keys), static_argnums=0)
 
 
 def _success(env: Env, drones: State, metrics: dict[str, np.ndarray]) -> bool | None:

@@ -37,18 +37,20 @@ class Tab:
         self._write, self._read = write, read
         self._buffer, self._count = b"", 0
         self._session: str | None = None
+        self._url = ""
         self.problems: list[str] = []
-        """Errors and warnings of the console, exceptions, and requests that left the file."""
+        """Errors and warnings of the console, exceptions, and requests that left the file, or the server."""
 
-    def open(self, file: Path, width: int = 1100, height: int = 720) -> None:
-        """Open a file and wait until the page says that it is ready."""
+    def open(self, page: Path | str, width: int = 1100, height: int = 720) -> None:
+        """Open a file, or the address of a server on this machine, and wait until the page says that it is ready."""
+        self._url = page if isinstance(page, str) else page.absolute().as_uri()
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in "Page", "Runtime", "Log", "Network":
             self.call(f"{domain}.enable")
         size = dict(width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Emulation.setDeviceMetricsOverride", **size)
-        self.call("Page.navigate", url=file.absolute().as_uri())
+        self.call("Page.navigate", url=self._url)
         self.wait("document.documentElement?.dataset.ready === 'true'")
 
     def call(self, method: str, timeout: float = 120, **arguments: Any) -> dict[str, Any]:
@@ -113,7 +115,8 @@ class Tab:
             self.problems.append(params["entry"]["text"])
         elif method == "Network.requestWillBeSent":
             url = params["request"]["url"]
-            if not url.startswith(("file:", "data:", "blob:", "about:")):
+            served = self._url.startswith("http") and url.startswith(self._url)
+            if not served and not url.startswith(("file:", "data:", "blob:", "about:")):
                 self.problems.append(f"a request to {url}")
 
 

@@ -15,8 +15,8 @@ from jaxdrones.visualization import style
 _SMALLEST = 0.2  # m, range of a panel
 _MOST_OBSTACLES = 400
 _CORNERS = 180  # of the outline of an obstacle
-_OUTLINE: dict[str, Any] = {"facecolor": "#c9ced3", "edgecolor": "#9aa1a8", "linewidth": 0.8, "zorder": 0}
-_START: dict[str, Any] = {
+OUTLINE: dict[str, Any] = {"facecolor": "#c9ced3", "edgecolor": "#9aa1a8", "linewidth": 0.8, "zorder": 0}
+START: dict[str, Any] = {
     "marker": "o",
     "markersize": 7,
     "markerfacecolor": "white",
@@ -24,7 +24,9 @@ _START: dict[str, Any] = {
     "linestyle": "none",
 }
 _GOAL: dict[str, Any] = {"marker": "x", "markersize": 9, "markeredgewidth": 2.2, "linestyle": "none"}
-_END: dict[str, Any] = {"marker": "o", "markersize": 7, "linestyle": "none"}
+END: dict[str, Any] = {"marker": "o", "markersize": 7, "linestyle": "none"}
+ENDS = {"start": START, "end": END}
+"""How the first and the last point of a path are drawn."""
 
 
 def widest_plane(pos: np.ndarray) -> tuple[int, int]:
@@ -40,39 +42,49 @@ def draw_plane(axis: Any, record: Record, colors: Sequence[str]) -> None:
     """Draw the paths in the widest plane, at the same scale along both axes, and obstacles as their outlines."""
     plane = list(widest_plane(record.pos))
     names = ["xyz"[k] for k in plane]
-    axis.set_title({"xy": "path from above", "xz": "path from the side", "yz": "path from the side"}["".join(names)])
+    axis.set_title(plane_title(names))
     for outline in outlines(record.scene, *np.eye(3)[plane]):
-        axis.fill(*outline.T, **_OUTLINE)
+        axis.fill(*outline.T, **OUTLINE)
     if record.scene.ground and plane[1] == 2:
         axis.axhline(0, color="#9aa1a8", linewidth=1.2, zorder=0)
     for i, color in enumerate(colors):
         axis.plot(*record.target_pos[:, i, plane].T, color=color, **style.TARGET)
         axis.plot(*record.pos[:, i, plane].T, color=color)
         axis.plot(*record.target_pos[-1, i, plane].T, color=color, **_GOAL)
-        axis.plot(*record.pos[0, i, plane].T, color=color, **_START)
-        axis.plot(*record.pos[-1, i, plane].T, color=color, **_END)
-    (left, right), (low, high) = _ranges(record, plane)
-    wide, tall = max(right - left, (high - low) / 1.5), max(high - low, (right - left) / 1.5)  # neither a strip
+        axis.plot(*record.pos[0, i, plane].T, color=color, **START)
+        axis.plot(*record.pos[-1, i, plane].T, color=color, **END)
+    set_equal(axis, *np.array(ranges(record, plane))[:, None])
+    axis.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
+
+
+def plane_title(names: Sequence[str]) -> str:
+    """The title of a panel in the plane of two axes, `x`, `y` or `z`."""
+    return "path from above" if "z" not in names else "path from the side"
+
+
+def set_equal(axis: Any, x: np.ndarray, y: np.ndarray) -> None:
+    """Let a panel hold ranges (c, 2) along both of its axes, at the same scale, without becoming a strip."""
+    left, right, low, high = x[:, 0].min(), x[:, 1].max(), y[:, 0].min(), y[:, 1].max()
+    wide, tall = max(right - left, (high - low) / 1.5), max(high - low, (right - left) / 1.5)
     middle, height = (left + right) / 2, (low + high) / 2
     axis.set(xlim=(middle - wide / 2, middle + wide / 2), ylim=(height - tall / 2, height + tall / 2))
-    axis.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
     axis.set_aspect("equal")
 
 
 def draw_space(axis: Any, record: Record, colors: Sequence[str]) -> None:
     """Draw the paths in three dimensions, with their shadows on the floor of the panel."""
-    ranges = _ranges(record, [0, 1, 2])
-    floor = ranges[2][0]
+    spaces = ranges(record, [0, 1, 2])
+    floor = spaces[2][0]
     for i, color in enumerate(colors):
-        x, y, z = _inside(record.pos[:, i], ranges).T
+        x, y, z = _inside(record.pos[:, i], spaces).T
         axis.plot(x, y, np.full_like(z, floor), color="#c3c8cd", linewidth=1.2)
-        axis.plot(*_inside(record.target_pos[:, i], ranges).T, color=color, **style.TARGET)
+        axis.plot(*_inside(record.target_pos[:, i], spaces).T, color=color, **style.TARGET)
         axis.plot(x, y, z, color=color)
         axis.plot(*record.target_pos[-1:, i].T, color=color, **_GOAL)
-        axis.plot(*record.pos[:1, i].T, color=color, **_START)
-        axis.plot(*record.pos[-1:, i].T, color=color, **_END)
-    axis.set(xlim=ranges[0], ylim=ranges[1], zlim=ranges[2], xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
-    spans = np.ptp(ranges, axis=1)
+        axis.plot(*record.pos[:1, i].T, color=color, **START)
+        axis.plot(*record.pos[-1:, i].T, color=color, **END)
+    axis.set(xlim=spaces[0], ylim=spaces[1], zlim=spaces[2], xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
+    spans = np.ptp(spaces, axis=1)
     axis.set_box_aspect(np.maximum(spans, 0.5 * spans.max()), zoom=0.95)
     axis.view_init(elev=26, azim=-55)
     axis.locator_params(nbins=4)
@@ -86,7 +98,7 @@ def legend_handles(record: Record) -> list[Any]:
     """Lines for a legend that explain what all drones of a figure have in common."""
     from matplotlib.lines import Line2D
 
-    looks = {"start": _START, "end": _END}
+    looks = dict(ENDS)
     if np.isfinite(record.target_pos).any():
         looks = {"commanded": style.TARGET, "last target": _GOAL} | looks
     elif np.isfinite(record.target_vel).any():
@@ -119,12 +131,13 @@ def outlines(scene: Scene, right: np.ndarray, up: np.ndarray) -> list[np.ndarray
     return found
 
 
-def _ranges(record: Record, axes: Sequence[int]) -> list[tuple[float, float]]:
+def ranges(record: Record, axes: Sequence[int]) -> list[tuple[float, float]]:
+    """Ranges of panels that show paths and what is commanded along some axes, 0 to 2."""
     both = np.concatenate([record.pos, record.target_pos], axis=1)
     return [style.limits(both[..., axis], _SMALLEST) for axis in axes]
 
 
-def _inside(path: np.ndarray, ranges: Sequence[tuple[float, float]]) -> np.ndarray:
+def _inside(path: np.ndarray, spaces: Sequence[tuple[float, float]]) -> np.ndarray:
     """A path (K, 3) without its points outside of the ranges, which axes in three dimensions do not cut off."""
-    low, high = np.transpose(ranges)
+    low, high = np.transpose(spaces)
     return np.where(((path >= low) & (path <= high)).all(axis=1, keepdims=True), path, np.nan)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import threading
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from jaxdrones.visualization.overlay import Lens
 from jaxdrones.visualization.shots import FIELD_OF_VIEW, shoot
 from jaxdrones.visualization.viewer import show
 from jaxdrones.visualization.viewer.film import film
+from jaxdrones.visualization.viewer.live import Live
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")]
 
@@ -143,4 +145,47 @@ def test_worlds_are_ghosts_or_side_by_side(record, tmp_path):
         assert tab.run("jaxdrones.positionsAt(0.5)")[1] == [None] * 4
         tab.press("g")  # ghosts
         assert np.shape(tab.run("jaxdrones.positionsAt(0.5)")[1]) == (4, 3)
+        assert tab.problems == []
+
+
+def test_the_page_follows_a_running_flight_and_holds_what_was_logged():
+    flown = []
+    with browser.open_tab() as tab:
+        with Live() as live:
+            pilot = threading.Thread(
+                target=lambda: flown.append(fly("circle", drones=4, duration=8.0, watch=live.add)), daemon=True
+            )
+            pilot.start()
+            tab.open(live.url)
+            tab.wait("jaxdrones.player.time > 1")
+            assert tab.run("jaxdrones.player.following && !document.getElementById('live').hidden")
+            tab.press("Home")  # a user who looks at the start is left alone
+            tab.wait("jaxdrones.player.end > 3 && jaxdrones.player.playing")
+            assert not tab.run("jaxdrones.player.following")
+            tab.press("End")
+            assert tab.run("jaxdrones.player.following")
+            pilot.join(60)
+        tab.wait("!jaxdrones.player.running")
+        (record,) = flown
+        for row in (0, 1, 400, len(record.t) - 1):
+            positions = tab.run(f"jaxdrones.positionsAt({record.t[row]!s})")
+            np.testing.assert_allclose(positions[0], record.pos[row], rtol=0, atol=1e-4)
+        assert tab.run("document.getElementById('live').hidden")
+        assert tab.run("jaxdrones.player.trails[0].legs") == len(record.t) - 1
+        tab.press(" ")  # what was flown is played again, without the server
+        tab.wait("jaxdrones.player.playing")
+        assert tab.problems == []
+
+
+def test_the_page_shows_every_new_policy_of_a_training(record):
+    later = fly("circle", drones=4, duration=1.0, seed=1)
+    with browser.open_tab() as tab, Live() as live:
+        live.show(record, "update 1", [(1, 0.25)])
+        tab.open(live.url)
+        live.show(later, "update 2", [(1, 0.25), (2, 0.75)])
+        tab.wait("document.title === 'update 2'")
+        positions = tab.run(f"jaxdrones.positionsAt({later.t[60]!s})")
+        np.testing.assert_allclose(positions[0], later.pos[60], rtol=0, atol=1e-4)
+        curve = tab.run("document.querySelector('#curve svg').getAttribute('aria-label')")
+        assert curve == "Learning curve: success 75 % after update 2"
         assert tab.problems == []

@@ -5,6 +5,7 @@ import { extent } from "./solids.js";
 
 const HUGE = 1e6; // m; a drone that is further away, or nowhere, is not shown
 const SAMPLES = 3000; // positions that the camera is fitted to
+const SIZES = { pos: 3, quat: 4, vel: 3, omega: 3, rpm: 4, targets: 3, target_vel: 3 }; // numbers per drone and row
 
 /** Largest horizontal distance of a rotor from the center of mass, m. */
 export const armOf = (vehicle) => Math.max(...vehicle.rotor_pos.map(([x, y]) => Math.hypot(x, y)));
@@ -18,6 +19,38 @@ export class World {
     this.rows = this.t.length;
     this.end = this.t[this.rows - 1];
     this.kinds = this.vehicle.map((k) => vehicles[k]);
+  }
+
+  /** Make room for so many rows in all. */
+  reserve(rows) {
+    const longer = (array, size) => {
+      const room = new Float32Array(size);
+      room.set(array.subarray(0, Math.min(size, array.length)));
+      return room;
+    };
+    if (rows <= this.t.length) return;
+    this.t = longer(this.t, rows);
+    for (const [name, size] of Object.entries(SIZES)) if (this[name]) this[name] = longer(this[name], size * this.n * rows);
+  }
+
+  /** Add rows at the end; what they lack is not a number. */
+  append(more) {
+    const count = more.t.length, first = this.rows;
+    if (first + count > this.t.length) this.reserve(2 * (first + count));
+    this.t.set(more.t, first);
+    for (const [name, size] of Object.entries(SIZES)) {
+      if (!this[name]) continue;
+      const from = size * this.n * first;
+      if (more[name]) this[name].set(more[name], from);
+      else this[name].fill(NaN, from, from + size * this.n * count);
+    }
+    this.rows += count;
+    this.end = this.t[this.rows - 1];
+  }
+
+  /** The rows that there are of `pos` or `targets`. */
+  known(name) {
+    return this[name]?.subarray(0, SIZES[name] * this.n * this.rows) ?? [];
   }
 
   /** The row at or before a time, and how far the time is towards the next one (0 to 1). */
@@ -109,7 +142,7 @@ export function bounds(worlds, scenes) {
     }
   };
   for (const world of worlds)
-    for (const array of [world.pos, world.targets ?? []]) include(array, Math.ceil((array.length * worlds.length) / 3 / SAMPLES));
+    for (const array of [world.known("pos"), world.known("targets")]) include(array, Math.ceil((array.length * worlds.length) / 3 / SAMPLES));
   if (!(low[0] <= high[0])) include([-1, -1, 0, 1, 1, 1], 1);
   const [l, h] = [[...low], [...high]], reach = Math.max(0.5, Math.hypot(...h.map((x, k) => x - l[k])) / 2);
   const near = ({ half, low, high }) => half < reach && [0, 1, 2].every((k) => low[k] < h[k] + reach / 2 && high[k] > l[k] - reach / 2);

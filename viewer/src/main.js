@@ -5,6 +5,7 @@ import { Arrows, FORCE, THRUST, TORQUE } from "./arrows.js";
 import { Fleet } from "./fleet.js";
 import { armOf, bounds, scratch, World } from "./flight.js";
 import { CameraImages } from "./camera.js";
+import { drawCurve } from "./curve.js";
 import { Panel } from "./panel.js";
 import { decode } from "./payload.js";
 import { Plot, short } from "./plots.js";
@@ -15,15 +16,18 @@ import { Trail } from "./trails.js";
 const NAMED = 24; // drones in a world of which all have their names in the view
 const STILL = 200; // ms without a change after which the picture is drawn in full resolution
 const SMALLEST = 0.012; // arm over the radius of the flight from which on a drone is drawn in its true size at first
+const BEHIND = 0.4; // s, how far a flight that is running may be ahead of what is shown
+const ROOM = 0.2; // share of its extent that a flight that is running may grow to every side before the camera moves
+const REPAINT = 200; // ms between two paintings of the plots of a flight that is running
 const find = (id) => document.getElementById(id);
 
 class Player {
   constructor(header) {
     this.worlds = header.worlds.map((entries, w) => new World(entries, header.vehicles, w));
-    this.end = Math.max(...this.worlds.map((world) => world.end));
     this.title = header.title;
     this.time = 0;
     this.playing = false;
+    this.begin(header);
     this.last = null;
     this.colors = (w, i) => header.palette[(this.worlds[w].n > 1 || this.worlds.length === 1 ? i : w) % header.palette.length];
     this.stage = new Stage(find("view"));
@@ -35,8 +39,7 @@ class Player {
     const first = this.worlds[0];
     this.panel.set("trail", first.n > 60 ? "1" : "Infinity");
     this.panel.set("layout", header.layout);
-    const { low, high } = bounds(this.worlds, this.surroundings), seen = armOf(first.kinds[0]) / (low.distanceTo(high) / 2);
-    this.panel.set("size", [1, 3].find((size) => size * seen > SMALLEST) ?? 10);
+    this.sizeDrones();
     this.plots = [...document.querySelectorAll(".plot")].map((box, k) => new Plot(box, header.signals[k], (time) => this.seek(time)));
     this.labels = [];
     this.images = new CameraImages(find("cameras"));
@@ -49,9 +52,80 @@ class Player {
     requestAnimationFrame((now) => this.frame(now));
   }
 
+  /** Learn whether the flight is still running, or is to be shown again and again. */
+  begin({ live }) {
+    this.end = Math.max(...this.worlds.map((world) => world.end));
+    this.running = Boolean(live?.running);
+    this.again = Boolean(live) && !this.running; // and again
+    this.live = Boolean(live);
+    this.span = Math.max(this.end, live?.end ?? 0); // s, length of the time line
+    this.following = this.running;
+    drawCurve(find("curve"), live?.curve);
+    if (live) {
+      this.worlds[0].reserve(live.rows);
+      this.playing = true;
+    }
+  }
+
+  /** Show another flight of the same team. */
+  restart(header) {
+    const [world] = this.worlds;
+    Object.assign(world, new World(header.worlds[0], header.vehicles, 0));
+    for (const scene of this.surroundings) for (const group of scene.groups) this.stage.scene.remove(group);
+    this.surroundings = header.scenes.map((scene) => ({ ...scene, groups: [] }));
+    this.begin(header);
+    this.time = 0;
+    for (const trail of this.trails) trail.restart();
+    this.panel.describe(header.title, this);
+    this.arranged = null;
+    this.changed();
+  }
+
+  /** More of a flight that is running. */
+  append(rows) {
+    const [world] = this.worlds;
+    world.append(rows);
+    this.end = world.end;
+    this.span = Math.max(this.span, this.end);
+    for (const trail of this.trails) trail.extend();
+    if (!this.within(rows.pos)) {
+      this.arranged = null; // the camera has to see more
+      this.sizeDrones();
+    }
+    if (this.arranged === null || performance.now() > (this.painted ?? 0) + REPAINT) {
+      this.painted = performance.now();
+      this.changed();
+    }
+    this.stage.dirty = true;
+  }
+
+  /** Whether positions are in the box that the camera was fitted to. */
+  within(pos) {
+    const { low, high } = this.fitted, inside = (x, k) => !(x < low[k] - 1e-3 || x > high[k] + 1e-3);
+    return pos.every((x, k) => inside(x, k % 3));
+  }
+
+  /** The flight is over, or it cannot be heard of any more. */
+  finish() {
+    if (!this.running) return;
+    this.running = this.following = false;
+    this.span = this.end;
+    this.arranged = null;
+    this.panel.describe(this.title, this);
+    this.changed();
+  }
+
   resize() {
     this.stage.resize();
     for (const plot of this.plots ?? []) plot.stale = true;
+  }
+
+  /** Draw drones in their true size if they can be seen so, unless the user chose. */
+  sizeDrones() {
+    const { low, high } = bounds(this.worlds, this.surroundings), seen = armOf(this.worlds[0].kinds[0]) / (low.distanceTo(high) / 2);
+    if (this.sized && this.panel.size !== this.sized) return;
+    this.sized = [1, 3].find((size) => size * seen > SMALLEST) ?? 10;
+    this.panel.set("size", this.sized);
   }
 
   /** Something was chosen: arrange everything anew. */
@@ -63,7 +137,7 @@ class Player {
       this.arranged = key;
     }
     this.fleet.scale = panel.size;
-    for (const plot of this.plots) plot.look(world, panel.drone, (i) => this.colors(panel.world, i), this.end);
+    for (const plot of this.plots) plot.look(world, panel.drone, (i) => this.colors(panel.world, i), this.span);
     this.pose(scratch.p, scratch.q);
     if (stage.mode !== panel.mode) stage.setMode(panel.mode, scratch.p, panel.size * this.arm);
     find("legend").innerHTML = this.legend();
@@ -93,10 +167,15 @@ class Player {
     });
     const last = this.layout[worlds.length - 1].offset, wide = this.layout[Math.min(columns, worlds.length) - 1].offset;
     const ground = this.surroundings.some((scene) => scene.ground);
+    if (this.running) {
+      const room = span.clone().multiplyScalar(ROOM);
+      corners.push(low.sub(room).clone(), high.add(room).clone());
+    }
+    this.fitted = { low: low.toArray(), high: high.toArray() };
     low.z = ground ? Math.min(low.z, 0) : low.z;
     const points = this.layout.flatMap(({ offset }) => corners.map((point) => point.clone().add(offset)));
     if (mode === "grid") stage.fit(low.clone().setY(low.y + last.y), high.clone().setX(high.x + wide.x), ground, points);
-    else stage.fit(low, high, ground, points);
+    else stage.fit(low, high, ground, points, this.live);
   }
 
   /** Pose of the drone that is looked at. */
@@ -111,6 +190,7 @@ class Player {
 
   seek(time) {
     this.time = Math.max(0, Math.min(this.end, time));
+    this.following = this.running && time >= this.end;
     this.stage.dirty = true;
   }
 
@@ -120,8 +200,15 @@ class Player {
     this.seek(world.t[Math.max(0, Math.min(world.rows - 1, row + rows + (rows < 0 && share > 1e-6 ? 1 : 0)))]);
   }
 
+  /** Keep up with a flight that is running. */
+  follow() {
+    this.seek(Infinity);
+    this.playing = true;
+  }
+
   toggle() {
-    if (!this.playing && this.time >= this.end) this.time = 0;
+    if (this.running && this.playing) this.following = false;
+    if (!this.playing && !this.running && this.time >= this.end) this.time = 0;
     this.playing = !this.playing;
     this.stage.dirty = true;
   }
@@ -137,10 +224,11 @@ class Player {
     this.last = now;
     if (this.playing) {
       this.stage.adapt(passed);
-      this.time += passed * this.panel.speed;
+      this.time += passed * (this.following ? 1 : this.panel.speed);
+      if (this.following && this.end - this.time > BEHIND) this.time = this.end - BEHIND / 2;
       if (this.time >= this.end) {
-        this.time = this.end;
-        this.playing = false;
+        this.time = this.again ? 0 : this.end;
+        this.playing = this.running || this.again;
       }
     }
     if (this.playing || this.stage.dirty) {
@@ -161,7 +249,7 @@ class Player {
     if (!stage.hurried || this.frames % 4 === 0) {
       for (const plot of this.plots) plot.draw(time);
       this.images.show(this.worlds[panel.world], panel.drone, time);
-      panel.showTime(time, this.end, this.playing);
+      panel.showTime(time, this.span, this.playing, this.following);
     }
     this.frames++;
   }
@@ -203,44 +291,80 @@ class Player {
   }
 }
 
+/** What scripts and tests of the page use. */
+function handles(player) {
+  return {
+    player,
+    /** Move to a time, draw, and read the positions back from the scene: [world][drone] = [x, y, z]. */
+    positionsAt(time) {
+      player.playing = false;
+      player.seek(time);
+      player.following = false;
+      player.draw(0);
+      return player.worlds.map((_, w) => player.fleet.positions(w));
+    },
+    /** Show nothing but the flight and a clock, by a camera; drones are `scale` times as large as they are, if given. */
+    async film(mode, scale) {
+      document.body.classList.add("film");
+      await new Promise(requestAnimationFrame);
+      player.resize();
+      if (scale) player.panel.set("size", scale);
+      player.panel.setMode(mode);
+      player.stage.home();
+    },
+    /** Draw one frame, from a point to another if given; it is on the screen when the promise is kept. */
+    async frameAt(time, passed, eye, target) {
+      player.seek(time);
+      if (eye) player.stage.look(eye, target);
+      player.draw(passed);
+      find("filmclock").textContent = `${time.toFixed(2)} s`;
+      await new Promise(requestAnimationFrame);
+    },
+  };
+}
+
+function begin(header) {
+  const player = new Player(header);
+  find("status").textContent = "";
+  window.jaxdrones = handles(player);
+  document.documentElement.dataset.ready = "true";
+  return player;
+}
+
+/** Show what a program on this machine flies, as it tells it. */
+function listen(address) {
+  find("status").textContent = "waiting for the flight …";
+  let player = null, told = Promise.resolve();
+  const source = new EventSource(address);
+  const on = (event, act) => source.addEventListener(event, ({ data }) => (told = told.then(() => act(data)).catch(failed)));
+  on("begin", async (data) => {
+    const header = await decode(data);
+    if (player) player.restart(header);
+    else player = begin(header);
+    document.title = header.title;
+  });
+  on("rows", async (data) => player.append((await decode(data)).rows));
+  const finish = () => {
+    source.close();
+    told = told.then(() => (player ? player.finish() : (find("status").textContent = "There is no flight any more."))).catch(failed);
+  };
+  on("end", finish);
+  source.addEventListener("error", finish); // the program has ended; the page stays
+}
+
+function failed(error) {
+  find("status").textContent = `The flight cannot be shown: ${error.message}`;
+  throw error;
+}
+
 async function start() {
+  const payload = find("payload").textContent;
+  if (payload.startsWith("live:")) return listen(payload.slice(5));
   find("status").textContent = "loading the flight …";
   try {
-    const player = new Player(await decode(find("payload").textContent));
-    find("status").textContent = "";
-    window.jaxdrones = {
-      player,
-      /** Move to a time, draw, and read the positions back from the scene: [world][drone] = [x, y, z]. */
-      positionsAt(time) {
-        player.playing = false;
-        player.seek(time);
-        player.draw(0);
-        return player.worlds.map((_, w) => player.fleet.positions(w));
-      },
-    };
-    Object.assign(window.jaxdrones, {
-      /** Show nothing but the flight and a clock, by a camera; drones are `scale` times as large as they are, if given. */
-      async film(mode, scale) {
-        document.body.classList.add("film");
-        await new Promise(requestAnimationFrame);
-        player.resize();
-        if (scale) player.panel.set("size", scale);
-        player.panel.setMode(mode);
-        player.stage.home();
-      },
-      /** Draw one frame, from a point to another if given; it is on the screen when the promise is kept. */
-      async frameAt(time, passed, eye, target) {
-        player.seek(time);
-        if (eye) player.stage.look(eye, target);
-        player.draw(passed);
-        find("filmclock").textContent = `${time.toFixed(2)} s`;
-        await new Promise(requestAnimationFrame);
-      },
-    });
-    document.documentElement.dataset.ready = "true";
+    begin(await decode(payload));
   } catch (error) {
-    find("status").textContent = `The flight cannot be shown: ${error.message}`;
-    throw error;
+    failed(error);
   }
 }
 

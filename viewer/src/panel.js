@@ -14,11 +14,10 @@ export class Panel {
   /** `player` has `seek`, `toggle`, `step`, `changed`, `home`. */
   constructor(player, flight) {
     this.player = player;
-    const end = flight.end;
-    find("title").textContent = flight.title;
-    find("time").max = end;
+    this.describe(flight.title, flight);
     find("time").addEventListener("input", (event) => player.seek(Number(event.target.value)));
     find("play").addEventListener("click", () => player.toggle());
+    find("live").addEventListener("click", () => player.follow());
     for (const speed of SPEEDS) find("speed").add(new Option(`× ${speed}`, speed));
     find("speed").value = 1;
     flight.worlds.forEach((world, w) => find("world").add(new Option(world.name, w)));
@@ -46,6 +45,13 @@ export class Panel {
   get mode() { return document.querySelector('[data-mode][aria-pressed="true"]').dataset.mode; }
   get shown() {
     return { thrust: find("thrust").checked, wrench: find("wrench").checked, targets: find("targets").checked, names: find("names").checked };
+  }
+
+  /** Show the title, the length of the time line, and whether the flight is running. */
+  describe(title, { span, running }) {
+    find("title").textContent = title;
+    find("time").max = span;
+    find("live").hidden = !running;
   }
 
   set(id, value) { find(id).value = value; }
@@ -95,7 +101,8 @@ export class Panel {
     list.dispatchEvent(new Event("change"));
   }
 
-  showTime(time, end, playing) {
+  showTime(time, end, playing, following) {
+    find("live").setAttribute("aria-pressed", following);
     find("time").value = time;
     find("time").setAttribute("aria-valuetext", `${time.toFixed(2)} of ${end.toFixed(2)} seconds`);
     find("clock").value = `${time.toFixed(2)} / ${end.toFixed(2)} s`;

@@ -67,6 +67,7 @@ export class Stage {
     this.mode = "orbit";
     this.orbit = new OrbitControls(this.camera, canvas);
     this.orbit.maxPolarAngle = 0.98 * Math.PI;
+    this.orbit.addEventListener("start", () => (this.moved = true));
     this.orbit.addEventListener("change", () => (this.dirty = true));
     this.scene.add(new HemisphereLight(0xffffff, 0xb9c0c6, 1.7));
     this.sun = new DirectionalLight(0xffffff, 1.7);
@@ -76,8 +77,8 @@ export class Stage {
     this.scene.add(this.sun, this.sun.target);
   }
 
-  /** Fit ground and light to a box, and the camera to points in it. */
-  fit(low, high, ground, points) {
+  /** Fit ground and light to a box, and the camera to points in it, unless it is to stay where a user has moved it. */
+  fit(low, high, ground, points, stay) {
     this.points = points;
     this.middle = low.clone().add(high).multiplyScalar(0.5);
     this.radius = Math.max(0.25, low.distanceTo(high) / 2);
@@ -90,7 +91,7 @@ export class Stage {
     this.light(middle, radius);
     if (this.ground) this.scene.remove(this.ground);
     if (ground) this.addGround(Math.ceil(30 * radius));
-    this.home();
+    if (!stay || (!this.moved && this.mode === "orbit")) this.home();
   }
 
   /** Let shadows be sharp about a point. */
@@ -130,6 +131,7 @@ export class Stage {
     this.camera.position.copy(this.middle).addScaledVector(VIEW, Math.max(1.25 * away, 0.3 * this.radius));
     this.orbit.target.copy(this.middle);
     this.orbit.update();
+    this.moved = false;
     this.dirty = true;
   }
 

@@ -34,12 +34,14 @@ void main() {
   #include <colorspace_fragment>
 }`;
 
-/** The trails of one world. */
+/** The trails of one world, with room for as many rows as its arrays have. */
 export class Trail {
   constructor(stage, world, color) {
     this.world = world;
-    this.every = Math.max(1, Math.ceil((world.n * world.rows) / MOST));
-    this.legs = Math.floor((world.rows - 1) / this.every);
+    const room = world.t.length;
+    this.every = Math.max(1, Math.ceil((world.n * room) / MOST));
+    this.room = Math.floor((room - 1) / this.every);
+    this.legs = 0;
     this.mesh = new Mesh(
       this.geometry(color),
       new ShaderMaterial({
@@ -53,23 +55,18 @@ export class Trail {
     this.mesh.frustumCulled = false;
     this.mesh.renderOrder = 1;
     stage.scene.add(this.mesh);
+    this.extend();
   }
 
   geometry(color) {
-    const { world, every, legs } = this, n = world.n, count = 4 * legs * n;
+    const { world, room } = this, n = world.n, count = 4 * room * n;
     const start = new Float32Array(3 * count), stop = new Float32Array(3 * count), corner = new Float32Array(2 * count);
-    const times = new Float32Array(2 * count), tint = new Uint8Array(3 * count), index = new Uint32Array(6 * legs * n);
+    const times = new Float32Array(2 * count), tint = new Uint8Array(3 * count), index = new Uint32Array(6 * room * n);
     const tints = world.labels.map((_, i) => new Color(color(i)).toArray().map((x) => Math.round(255 * x)));
-    const { p, v } = scratch;
-    for (let leg = 0, vertex = 0, at = 0; leg < legs; leg++)
+    for (let leg = 0, vertex = 0, at = 0; leg < room; leg++)
       for (let i = 0; i < n; i++) {
-        const row = leg * every;
-        const there = world.position(row, 0, i, p) && world.position(row + every, 0, i, v);
         for (let c = 0; c < 4; c++, vertex++) {
-          start.set(there ? [p.x, p.y, p.z] : [0, 0, 0], 3 * vertex);
-          stop.set(there ? [v.x, v.y, v.z] : [0, 0, 0], 3 * vertex);
           corner.set([c % 2 ? 1 : -1, c > 1 ? 1 : 0], 2 * vertex);
-          times.set(there ? [world.t[row], world.t[row + every]] : [NEVER, 2 * NEVER], 2 * vertex);
           tint.set(tints[i], 3 * vertex);
         }
         index.set([vertex - 4, vertex - 3, vertex - 2, vertex - 2, vertex - 3, vertex - 1], at);
@@ -84,6 +81,32 @@ export class Trail {
     geometry.setAttribute("times", new BufferAttribute(times, 2));
     geometry.setAttribute("tint", new Uint8BufferAttribute(tint, 3, true));
     return geometry;
+  }
+
+  /** Draw the rows that have come since the last time, as far as there is room. */
+  extend() {
+    const { world, every, legs } = this, { start, stop, times } = this.mesh.geometry.attributes, { p, v } = scratch;
+    this.legs = Math.min(this.room, Math.floor((world.rows - 1) / every));
+    for (let leg = legs, vertex = 4 * legs * world.n; leg < this.legs; leg++)
+      for (let i = 0; i < world.n; i++) {
+        const row = leg * every;
+        const there = world.position(row, 0, i, p) && world.position(row + every, 0, i, v);
+        for (let c = 0; c < 4; c++, vertex++) {
+          start.array.set(there ? [p.x, p.y, p.z] : [0, 0, 0], 3 * vertex);
+          stop.array.set(there ? [v.x, v.y, v.z] : [0, 0, 0], 3 * vertex);
+          times.array.set(there ? [world.t[row], world.t[row + every]] : [NEVER, 2 * NEVER], 2 * vertex);
+        }
+      }
+    for (const attribute of [start, stop, times]) {
+      attribute.addUpdateRange(4 * legs * world.n * attribute.itemSize, 4 * (this.legs - legs) * world.n * attribute.itemSize);
+      attribute.needsUpdate = true;
+    }
+  }
+
+  /** Draw the world anew, whose rows are others now. */
+  restart() {
+    this.legs = 0;
+    this.extend();
   }
 
   /** Show the `span` seconds before a time; none if it is 0. */

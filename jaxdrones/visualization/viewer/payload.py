@@ -78,12 +78,7 @@ def encode(records: Sequence[Record], names: Sequence[str], title: str, **looks:
     scenes: list[dict[str, Any]] = []
     worlds = []
     for record, name in zip(records, names, strict=True):
-        world: dict[str, Any] = {"name": name, "labels": list(record.labels), "t": arrays.add(record.t)}
-        for array in ("pos", "quat", "vel", "omega", "rpm"):
-            world[array] = arrays.add(getattr(record, array), _LARGEST_ERROR.get(array, math.inf))
-        for entry, target in (("targets", record.target_pos), ("target_vel", record.target_vel)):
-            known = bool(np.isfinite(target).any())
-            world[entry] = arrays.add(target, _LARGEST_ERROR.get(entry, math.inf)) if known else None
+        world: dict[str, Any] = {"name": name, "labels": list(record.labels)} | _rows(arrays, record)
         world["vehicle"] = [_index(vehicles, vehicle) for vehicle in _vehicles(record.params)]
         world["images"] = [
             {"name": kind, "t": arrays.add(images.t), "frames": arrays.add_bytes(_pixels(kind, images.frames))}
@@ -91,7 +86,28 @@ def encode(records: Sequence[Record], names: Sequence[str], title: str, **looks:
         ]
         world["scene"] = _index(scenes, scene_to_dict(only_shapes(record.scene)))
         worlds.append(world)
-    header = {"title": title, "worlds": worlds, "vehicles": vehicles, "scenes": scenes} | looks
+    return _packed({"title": title, "worlds": worlds, "vehicles": vehicles, "scenes": scenes} | looks, arrays)
+
+
+def encode_rows(record: Record) -> str:
+    """Further rows of the only world of a page, in the same form: a header that is `{"rows": arrays by name}`."""
+    arrays = _Arrays()
+    return _packed({"rows": _rows(arrays, record)}, arrays)
+
+
+def _rows(arrays: _Arrays, record: Record) -> dict[str, Any]:
+    """What a page plays of a flight, by name; targets that are nowhere known are `None`."""
+    rows: dict[str, Any] = {"t": arrays.add(record.t)}
+    for name in ("pos", "quat", "vel", "omega", "rpm"):
+        rows[name] = arrays.add(getattr(record, name), _LARGEST_ERROR.get(name, math.inf))
+    for name, target in (("targets", record.target_pos), ("target_vel", record.target_vel)):
+        known = bool(np.isfinite(target).any())
+        rows[name] = arrays.add(target, _LARGEST_ERROR.get(name, math.inf)) if known else None
+    return rows
+
+
+def _packed(header: dict[str, Any], arrays: _Arrays) -> str:
+    """Header and arrays as text."""
     text = json.dumps(header, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     data = len(text).to_bytes(4, "little") + text + b"".join(arrays.data)

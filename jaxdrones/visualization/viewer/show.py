@@ -74,15 +74,16 @@ def show(
     if scene is not None:
         check_scene(scene, files=True)
         records = [dataclasses.replace(record, scene=scene) for record in records]
-    _check_size(*(record.pos for record in records))
-    has_targets = any(np.isfinite(record.target_pos).any() for record in records)
+    check_size(*(record.pos for record in records))
     title = str(records[0].conditions) if title is None else title
-    looks = {
-        "palette": colors(DISTINCT),
-        "layout": LAYOUTS[others],
-        "signals": ["distance from target" if has_targets else "position z", "rotor speeds"],  # names in plots.js
-    }
-    return Page(title, encode(records, list(worlds), title, **looks), height)
+    return Page(title, encode(records, list(worlds), title, layout=LAYOUTS[others], **looks(records)), height)
+
+
+def looks(records: Sequence[Record]) -> dict[str, Any]:
+    """Colors of drones, and the signals that are plotted at first, as the page reads them."""
+    has_targets = any(np.isfinite(record.target_pos).any() for record in records)
+    signals = ["distance from target" if has_targets else "position z", "rotor speeds"]  # names in plots.js
+    return {"palette": colors(DISTINCT), "signals": signals}
 
 
 def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, Record]:
@@ -162,7 +163,7 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[Record]:
             )
     check_positive("dt", dt, "s")
     check_params(params)
-    _check_size(flight.pos)
+    check_size(flight.pos)
     flight = jax.tree.map(np.asarray, flight.replace(aux={}))
     if flight.pos.ndim not in (3, 4):
         raise ValueError(
@@ -232,7 +233,7 @@ def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str,
     return {name: ImageSequence(t, np.asarray(frames)) for name, frames in images.items()}
 
 
-def _check_size(*positions: ArrayLike) -> None:
+def check_size(*positions: ArrayLike) -> None:
     """Raise if arrays of positions (..., 3) are more than a page plays."""
     samples = sum(math.prod(np.shape(pos)[:-1]) for pos in positions)
     if samples > _MOST:

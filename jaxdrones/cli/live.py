@@ -1,0 +1,75 @@
+"""Option --live of `jaxdrones fly` and `jaxdrones train`: the browser shows what happens while it happens."""
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from jaxdrones.cli.evaluate import percent
+from jaxdrones.visualization.viewer.live import Live
+
+WAIT = 60.0
+"""How long a flight waits for the first viewer, s."""
+
+
+def add_live(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add the option, which gives the port: 0, which is any free one, where it is given alone."""
+    text = f"{what}; prints the address, which only this machine reaches (at a free PORT)"
+    parser.add_argument("--live", type=int, nargs="?", const=0, metavar="PORT", help=text)
+
+
+@contextlib.contextmanager
+def live_server(options: argparse.Namespace, title: str | None = None) -> Iterator[Live | None]:
+    """A context with a server whose address is printed; with `None` unless --live is given.
+
+    Raises:
+        ValueError: the port is taken.
+    """
+    if options.live is None:
+        yield None
+        return
+
+    def say(line: str) -> None:
+        print(line, file=sys.stderr if options.json else sys.stdout, flush=True)
+
+    with Live(options.live, title, WAIT, say) as live:
+        say(f"open {live.url} in a browser on this machine")
+        yield live
+
+
+class LiveTraining:
+    """Shows an episode of the newest policy, and the learning curve, after every evaluation of a training."""
+
+    def __init__(self, live: Live, trainer: Any, run: Any, what: str, then: Callable[[int, dict[str, float]], None]):
+        """Prepare; nothing is flown yet.
+
+        Args:
+            live: where it is shown.
+            trainer: trainer of the run.
+            run: run, which holds the newest policy.
+            what: what is trained, for the title.
+            then: function that is given the progress afterwards.
+        """
+        self._live, self._trainer, self._run, self._what = live, trainer, run, what
+        self._then = then
+        self._name = "success" if trainer.env.task.success is not None else "return"
+        self._curve: list[tuple[float, float]] = []
+
+    def update(self, count: int, now: dict[str, float]) -> None:
+        """Pass the progress on; fly and show an episode, if the newest metrics are those of an evaluation."""
+        if "success" in now:
+            self._show(count, now)
+        self._then(count, now)
+
+    def _show(self, count: int, now: dict[str, float]) -> None:
+        import jax
+
+        from jaxdrones.training.episode import fly_episode
+
+        env, score = self._trainer.env, now["success" if self._name == "success" else "evaluated_return"]
+        self._curve.append((count, score))
+        episode = fly_episode(env, self._run.policy("last", env), jax.random.key(0))
+        result = percent(score, self._trainer.episodes) if self._name == "success" else f"{score:.1f}"
+        title = f"{self._what}, update {count} of {self._trainer.recipe.config.updates}: {self._name} {result}"
+        self._live.show(episode, title, self._curve, self._name)

@@ -1,0 +1,137 @@
+"""A figure of flights of the same example under different conditions: their paths, and their errors over time."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.flights.record import Record
+from jaxdrones.visualization import paths, style
+from jaxdrones.visualization.palette import colors
+
+_COMMANDED: dict[str, Any] = style.TARGET | {"color": "#222222", "zorder": 4}
+_WIDEST, _NARROWEST = 3.6, 1.4  # lines: those that are drawn first are wider, and so are seen where others cover them
+_MOST_BANDED = 3  # flights whose range over the drones is shown
+_SMALLEST = 0.01  # m or m/s: range of an axis
+_CELLS = 100  # along each side of a panel: what is commanded is drawn once in each, so that dashes stay dashes
+
+
+def save_comparison(records: Mapping[str, Record], path: Path, title: str) -> None:
+    """Draw flights of the same example: a color for each, all of its drones, and what is commanded dashed.
+
+    Beside the paths are the errors of each flight over time, mean and range over its drones. Two flights with the same
+    times also have the distance between them, largest over the drones.
+
+    Args:
+        records: by name, what differs between them.
+        path: path of the picture; its suffix chooses the format.
+        title: title of the figure.
+    """
+    tints = colors(len(records))
+    flights = list(records.values())
+    apart = len(flights) == 2 and np.array_equal(flights[0].t, flights[1].t)
+    with style.figure(13, 7.2) as figure:
+        axes = figure.subplot_mosaic([["path", "error"], ["path", "apart" if apart else "error"]])
+        _draw_paths(axes["path"], flights, tints)
+        _draw_errors(axes["error"], flights, tints)
+        if apart:
+            _draw_distance(axes["apart"], *flights)
+            axes["error"].tick_params(labelbottom=False)
+            figure.align_ylabels([axes["error"], axes["apart"]])
+        axes["apart" if apart else "error"].set_xlabel("t (s)")
+        figure.suptitle(title + "\n")
+        handles = _handles(records, tints)
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)))
+        figure.savefig(path, dpi=style.DPI)
+
+
+def _widths(count: int) -> np.ndarray:
+    return np.linspace(_WIDEST, _NARROWEST, count) if count > 1 else np.array([_NARROWEST])
+
+
+def _draw_paths(axis: Any, flights: list[Record], tints: tuple[str, ...]) -> None:
+    """The paths of all drones in the plane in which they are widest, at the same scale along both axes."""
+    plane = list(paths.widest_plane(flights[0].pos))
+    names = ["xyz"[k] for k in plane]
+    for outline in paths.outlines(flights[0].scene, *np.eye(3)[plane]):
+        axis.fill(*outline.T, **paths.OUTLINE)
+    for record, tint, width in zip(flights, tints, _widths(len(flights)), strict=True):
+        for i in range(len(record.labels)):
+            axis.plot(*record.pos[:, i, plane].T, color=tint, linewidth=width)
+        axis.plot(*record.pos[-1][:, plane].T, color=tint, **paths.END)
+    for target in _once(flights[0].target_pos[..., plane].astype(float)):
+        axis.plot(*target.T, **_COMMANDED)
+    axis.plot(*flights[0].pos[0][:, plane].T, color="#222222", **paths.START)
+    ranges = np.array([paths.ranges(record, plane) for record in flights])
+    paths.set_equal(axis, ranges[:, 0], ranges[:, 1])
+    axis.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)", title=paths.plane_title(names))
+
+
+def _once(lines: np.ndarray) -> list[np.ndarray]:
+    """Lines (K, n, 2) of n drones, each without the points where a line before it was near."""
+    points = lines.reshape(-1, 2)
+    if not np.isfinite(points).any():
+        return []
+    low, span = np.nanmin(points, axis=0), max(np.nanmax(np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)), 1e-9)
+    seen = np.zeros((_CELLS + 3, _CELLS + 3), bool)
+    shown = []
+    for line in np.swapaxes(lines, 0, 1):
+        known = np.isfinite(line).all(axis=1)
+        x, y = 1 + (np.where(known[:, None], line - low, 0) / span * _CELLS).astype(int).T
+        shown.append(np.where((known & ~seen[x, y])[:, None], line, np.nan))
+        for dx in (-1, 0, 1):
+            for dy in (-1, 0, 1):
+                seen[x[known] + dx, y[known] + dy] = True
+    return shown
+
+
+def _draw_errors(axis: Any, flights: list[Record], tints: tuple[str, ...]) -> None:
+    """Mean and range over the drones of the distance to the target position, or of the difference in velocity."""
+    ends = []
+    for record, tint, width in zip(flights, tints, _widths(len(flights)), strict=True):
+        difference, unit = record.difference()
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.linalg.norm(difference.astype(float), axis=-1)
+        if len(flights) <= _MOST_BANDED:
+            axis.fill_between(record.t, error.min(axis=1), error.max(axis=1), color=tint, alpha=0.2, linewidth=0)
+        axis.plot(record.t, error.mean(axis=1), color=tint, linewidth=width)
+        ends.append(style.limits(error, _SMALLEST))
+    axis.set_ylim(max(min(low for low, _ in ends), -0.02 * ends[0][1]), max(high for _, high in ends))
+    what = "distance to the target" if unit == "m" else "difference to the commanded velocity"
+    axis.set(title=what, ylabel=f"error ({unit})")
+
+
+def _draw_distance(axis: Any, first: Record, second: Record) -> None:
+    """The distance between the same drones of two flights, largest over the drones, on a logarithmic axis."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.linalg.norm(first.pos.astype(float) - second.pos, axis=-1).max(axis=1)
+    axis.plot(first.t, np.where(apart > 0, apart, np.nan), color="#222222")
+    seen = apart[np.isfinite(apart) & (apart > 0)]
+    if seen.size:
+        axis.set_yscale("log")
+        axis.set_ylim(10 ** np.floor(np.log10(seen.min())), 10 ** np.ceil(np.log10(1.01 * seen.max())))
+        axis.yaxis.set_major_locator(LogLocator(numticks=6))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    axis.set(title="distance between the two flights", ylabel="largest (m)")
+
+
+def _handles(records: Mapping[str, Record], tints: tuple[str, ...]) -> list[Any]:
+    """The lines of the legend: flights, what is dashed, start and end, and the band."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    widths = _widths(len(records))
+    handles: list[Any] = [
+        Line2D([], [], color=tint, linewidth=width, label=name)
+        for name, tint, width in zip(records, tints, widths, strict=True)
+    ]
+    record = next(iter(records.values()))
+    if np.isfinite(record.target_pos).any():
+        handles.append(Line2D([], [], label="commanded", **_COMMANDED))
+    handles += [Line2D([], [], color="#555555", label=label, **look) for label, look in paths.ENDS.items()]
+    if len(records) <= _MOST_BANDED and len(record.labels) > 1:
+        handles.append(Patch(facecolor="#555555", alpha=0.2, label="range of the drones"))
+    return handles

@@ -1,0 +1,249 @@
+"""Flights in the browser while they are flown: a server for this machine alone, which streams them to the page."""
+
+from __future__ import annotations
+
+import dataclasses
+import http.server
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from http import HTTPStatus
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.flights.record import Record
+from jaxdrones.limits import check_at_most
+from jaxdrones.visualization.viewer.page import Page
+from jaxdrones.visualization.viewer.payload import encode, encode_rows
+from jaxdrones.visualization.viewer.show import LAYOUTS, check_size, looks, records_of
+
+HOST = "127.0.0.1"
+"""The only address that is served: that by which a machine reaches itself."""
+STREAM = "/events"
+"""Path of the stream of server-sent events: `begin` (a payload), `rows` (further rows), `end`."""
+_LOCAL_NAMES = ("127.0.0.1", "localhost")  # that a browser may ask for; others may be names of a foreign site
+_RELOADING = 2.0  # s, for which a viewer that left is awaited
+_ALIVE = 0.5  # s between signs of life, by which it is noticed that a viewer left
+_FLUSHING = 5.0  # s, for which viewers may take what is left at the end
+_ROWS = ("t", "pos", "quat", "vel", "omega", "rpm", "target_pos", "target_vel")  # of a record, one per time
+
+
+class Live:
+    """A server that shows flights while they are flown, to any number of viewers; a context, which ends them.
+
+    Only programs on this machine reach it. A viewer that comes late sees the flight from its start.
+
+    Args:
+        port: port of the server; 0 takes a free one.
+        title: title of the page; the conditions of the flight when left out.
+        wait: how long `add` waits for the first viewer, s.
+        say: function that is given a line to print when something happens.
+
+    Raises:
+        ValueError: the port is taken, or there is no such port.
+        ImportError: the viewer's page is not built; says how to get it.
+    """
+
+    def __init__(
+        self,
+        port: int = 0,
+        title: str | None = None,
+        wait: float = 60.0,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        check_at_most("port", port, 65535, 0)
+        self.page = Page("jaxdrones", f"live:{STREAM}").html
+        try:
+            self._server = _Server((HOST, port), self)
+        except OSError as error:
+            raise ValueError(
+                f"port {port} cannot be used: {error.strerror}; give another, or 0 for a free one"
+            ) from None
+        self.url = f"http://{HOST}:{self._server.server_port}/"
+        self._title, self._wait, self._say = title, wait, say
+        self._changed = threading.Condition()
+        self._parts: list[Record] = []  # of the flight that is shown
+        self._flight = 0  # its number; 0 before the first
+        self._header: dict[str, Any] = {}
+        self._viewers = 0
+        self._paced: bool | None = None  # whether real time is kept; None before the first flight
+        self._start = 0.0  # when the flight began, on the clock of `time.monotonic`
+        self._closed = False
+        threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True).start()
+
+    @property
+    def viewers(self) -> int:
+        """How many pages are open now."""
+        return self._viewers
+
+    def add(self, part: Any, end: float) -> None:
+        """Show the next part of a flight, and return when as much real time has passed since its first.
+
+        The first part is held until there is a viewer, for `wait` seconds at most. Without a viewer, or when all have
+        left, nothing is waited for any more.
+
+        Args:
+            part: anything with one world that `show` takes; a part that begins before the last one ended is of a new
+                flight.
+            end: time at which the flight ends at the latest, s.
+        """
+        (record,) = records_of(part, {})
+        if not self._parts or record.t[0] <= self._parts[-1].t[-1]:
+            if self._paced is None:
+                self._await_first()
+            rows = max(1, round(len(record.t) * end / float(record.t[-1])))  # row 0 is one step after the start
+            self._begin(record, {"rows": rows, "end": end, "running": True})
+            self._start = time.monotonic() - float(record.t[0])
+        else:
+            with self._changed:
+                self._parts.append(record)
+                self._changed.notify_all()
+        self._pace(self._start + float(record.t[-1]))
+
+    def show(self, flight: Any, title: str, curve: Sequence[tuple[float, float]] = (), label: str = "success") -> None:
+        """Show a whole flight, again and again until the next one comes; this waits for nobody.
+
+        Args:
+            flight: anything with one world that `show` takes.
+            title: title of the page from now on.
+            curve: points of a learning curve: numbers of updates, and what was evaluated after them.
+            label: name of what was evaluated; `success` is a share, 0 to 1.
+        """
+        (record,) = records_of(flight, {})
+        self._title = title
+        points = [[float(x), float(y)] for x, y in curve if math.isfinite(y)]
+        live = {"rows": len(record.t), "end": float(record.t[-1]), "running": False}
+        self._begin(record, live | {"curve": {"label": label, "points": points}})
+
+    def close(self) -> None:
+        """Let the viewers take what is left, and end. Their pages stay, and play what they have."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._viewers, _FLUSHING)
+        self._server.shutdown()
+        self._server.server_close()
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _begin(self, record: Record, live: dict[str, Any]) -> None:
+        check_size(np.broadcast_to(0.0, (live["rows"], *record.pos.shape[1:])))
+        title = str(record.conditions) if self._title is None else self._title
+        with self._changed:
+            self._parts = [record]
+            self._header = {"title": title, "live": live, "layout": LAYOUTS["hidden"], **looks([record])}
+            self._flight += 1
+            self._changed.notify_all()
+
+    def _await_first(self) -> None:
+        """Wait for the first viewer."""
+        with self._changed:
+            if not self._viewers:
+                self._say(f"waiting for a viewer, {self._wait:g} s at most")
+            self._paced = self._changed.wait_for(lambda: self._viewers > 0, self._wait)
+        if not self._paced:
+            self._say("no viewer came; the flight goes on without one")
+
+    def _pace(self, due: float) -> None:
+        """Wait until a time, unless there is nobody to wait for."""
+        with self._changed:
+            while self._paced and (left := due - time.monotonic()) > 0:
+                if self._viewers:
+                    self._changed.wait(min(left, _ALIVE))
+                elif not self._changed.wait_for(lambda: self._viewers > 0, _RELOADING):
+                    self._paced = False
+                    self._say("the viewer has left; the flight goes on without one")
+
+    @property
+    def _news(self) -> tuple[int, int]:
+        """Number of the flight that is shown, and of the parts that there are of it."""
+        return self._flight, len(self._parts)
+
+    def _await_news(self, had: tuple[int, int]) -> None:
+        """Wait until there is something that a viewer who has this does not have, but not for long."""
+        self._changed.wait_for(lambda: self._closed or self._news != had, _ALIVE)
+
+    def stream(self, send: Callable[[str, str], None]) -> None:
+        """Tell one viewer everything, by a function that sends an event and its data; returns at the end."""
+        with self._changed:
+            self._viewers += 1
+            self._changed.notify_all()
+        had = (0, 0)  # number of the flight that the viewer has, and of its parts
+        try:
+            while True:
+                with self._changed:
+                    self._await_news(had)
+                    news, parts, header, closed = self._news, list(self._parts), self._header, self._closed
+                if news[0] != had[0]:
+                    send("begin", encode([_joined(parts)], ["flight"], **header))
+                elif news != had:
+                    send("rows", encode_rows(_joined(parts[had[1] :])))
+                elif closed:
+                    send("end", "{}")
+                    return
+                else:
+                    send("alive", "{}")
+                had = news
+        except OSError:  # the viewer has left
+            pass
+        finally:
+            with self._changed:
+                self._viewers -= 1
+                self._changed.notify_all()
+
+
+def _joined(parts: Sequence[Record]) -> Record:
+    """Successive parts of a flight as one."""
+    rows: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ROWS}
+    return dataclasses.replace(parts[0], **rows | {"images": {}})
+
+
+class _Server(http.server.ThreadingHTTPServer):
+    """A thread for each viewer; none keeps the program from ending."""
+
+    def __init__(self, address: tuple[str, int], live: Live) -> None:
+        super().__init__(address, _Handler)
+        self.live = live
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    """Answers a viewer's requests: the page, and its stream."""
+
+    server: _Server
+    server_version = "jaxdrones"
+    sys_version = ""
+
+    def do_GET(self) -> None:
+        name = self.headers.get("Host", "").partition(":")[0]
+        if name not in _LOCAL_NAMES:
+            return self.send_error(HTTPStatus.FORBIDDEN, "this page is for this machine alone")
+        if self.path == "/":
+            self._begin("text/html; charset=utf-8")
+            self.wfile.write(self.server.live.page.encode())
+        elif self.path == STREAM:
+            self._begin("text/event-stream")
+            self.server.live.stream(self._send)
+        elif self.path == "/favicon.ico":
+            self.send_response(HTTPStatus.NO_CONTENT)
+            self.end_headers()
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing."""
+
+    def _begin(self, kind: str) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", kind)
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+
+    def _send(self, event: str, data: str) -> None:
+        self.wfile.write(f"event: {event}\ndata: {data}\n\n".encode())
+        self.wfile.flush()

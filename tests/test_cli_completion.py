@@ -40,6 +40,7 @@ def completed(script: str, words: str) -> list[str]:
         ("jaxdrones explain hover-", [name for name in TASKS if name.startswith("hover-")]),
         ("jaxdrones fly circle --backend bul", ["bullet"]),
         ("jaxdrones fly circle --vehicle cf", ["cf21", "cf21_brushless", "cf21_thrust", "cf2p", "cf2x"]),
+        ("jaxdrones train hover --realistic a", ["any"]),
         ("jaxdrones completion f", ["fish"]),
     ],
 )

@@ -99,6 +99,9 @@ TRAININGS = {
     ),
     "train gates --set level=2": Short(f"gates by ppo, level 2: ... {TRAINED}", TRAINING),
     "train tracking --realistic --set period=5 --set worlds=512": Short(TRAINED, TRAINING),
+    "train hover --realistic any --output runs/any": Short(
+        f"hover by bptt, realistic, any vehicle: ... {TRAINED}", TRAINING
+    ),
     "train forest": Short(f"forest by bptt ... {TRAINED}", TRAINING),
     "train recovery --set recurrent_size=32": Short(f"recovery by bptt ... {TRAINED}", TRAINING),
     "train hover --resume": Short(TRAINED),

@@ -1,6 +1,7 @@
 """The command line: `jaxdrones fly`, `train`, `eval` and the others; a file per command."""
 
 import argparse
+import sys
 
 from jaxdrones.checks import UnexpectedKeyword
 from jaxdrones.cli import (
@@ -19,6 +20,7 @@ from jaxdrones.cli import (
     view,
 )
 from jaxdrones.cli.common import INTERRUPTED, Parser, print_error
+from jaxdrones.cli.settings import task_first
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -28,7 +30,7 @@ def main(arguments: list[str] | None = None) -> int:
         The exit code: 0 done, 1 the flight broke or training diverged, 2 a mistake in what was asked, 130 interrupted.
     """
     parser = _parser()
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(task_first(sys.argv[1:] if arguments is None else arguments))
     try:
         return options.run(options)
     except KeyboardInterrupt:

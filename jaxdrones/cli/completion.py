@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.names import known_names
+from jaxdrones.cli.settings import REALISTIC_KINDS
 
 SHELLS = ("bash", "zsh", "fish")
 _KINDS = {  # argument -> kind of the names that it takes
@@ -48,6 +49,8 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
     for action in _actions(root):
         if action.dest == "shell":
             action.choices = SHELLS
+        elif action.dest == "realistic":
+            action.choices = REALISTIC_KINDS
         elif action.dest in _KINDS:
             action.choices = names[_KINDS[action.dest]]
         elif action.metavar in (*_FOLDERS, *_FILES):

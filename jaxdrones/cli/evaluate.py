@@ -6,7 +6,8 @@ from typing import Any
 
 from jaxdrones.cli.common import as_json, folder
 from jaxdrones.cli.policies import is_user_policy, open_policy
-from jaxdrones.cli.settings import asked_settings
+from jaxdrones.cli.settings import add_realistic, asked_settings
+from jaxdrones.training.presets import realism
 
 _FIRST_SEED = 1_000_000  # so that episodes differ from those of the training
 
@@ -27,7 +28,7 @@ def add(commands) -> None:
         help="folder of `jaxdrones train`, for example runs/hover; or file.py:name",
     )
     parser.add_argument("--task", metavar="TASK", help="with file.py:name: the task to fly, as for `jaxdrones train`")
-    parser.add_argument("--realistic", action="store_true", help="with file.py:name: make the task realistic")
+    add_realistic(parser, "with file.py:name: ")
     parser.add_argument("--vehicle", help="with file.py:name: a bundled vehicle or a .urdf file (cf2x)")
     parser.add_argument(
         "--set",
@@ -78,7 +79,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 def described(recipe) -> str:
     """The task, the learner and the options that differ from their defaults, such as `hover by bptt`."""
     options = "".join(f", {name} {x}" for name, x in recipe.options.items())
-    return f"{recipe.task} by {recipe.trained_by}{', realistic' * recipe.realistic}{options}"
+    return f"{recipe.task} by {recipe.trained_by}{realism(recipe.realistic)}{options}"
 
 
 def evaluation_table(report: dict) -> str:

@@ -4,7 +4,7 @@ import argparse
 
 from jaxdrones import assets
 from jaxdrones.cli.common import as_json
-from jaxdrones.cli.settings import asked_settings, user_mistakes
+from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.envs import TASKS, explain, make
 from jaxdrones.flights.conditions import BACKENDS
 
@@ -21,9 +21,7 @@ def add(commands) -> None:
     parser.add_argument("task", metavar="TASK", help=f"{', '.join(TASKS)}, or file.py:function")
     parser.add_argument("--vehicle", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
     parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
-    parser.add_argument(
-        "--realistic", action="store_true", help="with rotor lag, drag, delay, sensor noise and random parameters"
-    )
+    add_realistic(parser)
     parser.add_argument(
         "--set",
         action="append",

@@ -137,7 +137,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
     run, seed = open_policy(options.policy, options.task, False, _options_of_task(options)), options.seed or 0
     recipe = run.recipe()
     check_seed("seed", seed)
-    vehicle = str(recipe.options.get("vehicle", "cf2x"))
+    vehicle = "any vehicle" if recipe.realistic == "any" else str(recipe.options.get("vehicle", "cf2x"))
     if options.pwm:
         check_pwm(vehicle)
     output = options.output or (

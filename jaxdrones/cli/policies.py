@@ -11,13 +11,13 @@ def is_user_policy(policy: Path) -> bool:
     return is_reference(str(policy))
 
 
-def open_policy(policy: Path, task: str | None, realistic: bool, options: dict[str, Any]) -> Any:
+def open_policy(policy: Path, task: str | None, realistic: bool | str, options: dict[str, Any]) -> Any:
     """The run in a folder, or the policy of a user's file, of which the same can be asked.
 
     Args:
         policy: the folder of a run, or `file.py:name`.
         task: the task that a policy of a file flies; `None` for a run, which says it itself.
-        realistic: whether the task is made realistic; false for a run.
+        realistic: that of `jaxdrones.make`; false for a run.
         options: options of `jaxdrones.make`; none for a run.
 
     Raises:

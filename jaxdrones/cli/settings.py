@@ -1,12 +1,49 @@
-"""Settings and options that the command line takes by name: --set NAME=VALUE and --vehicle."""
+"""Settings and options that several commands take: --set NAME=VALUE, --vehicle and --realistic."""
 
 import argparse
 import ast
 import contextlib
+import itertools
 from typing import Any
+
+from jaxdrones.envs import TASKS
+from jaxdrones.user_code import is_reference
 
 # Arguments of `Recipe.of` that are options of the command.
 _NO_SETTINGS = ("cls", "task", "algorithm", "realistic", "library")
+
+
+REALISTIC_KINDS = ("any",)
+"""What may follow --realistic."""
+
+
+def add_realistic(parser: argparse.ArgumentParser, where: str = "") -> None:
+    """Add the option --realistic, or --realistic any; `where` begins its help."""
+    parser.add_argument(
+        "--realistic",
+        nargs="?",
+        const=True,
+        default=False,
+        type=_kind,
+        metavar="any",
+        help=f"{where}simulate rotor lag, drag, delay, sensor noise and random parameters; with `any` another vehicle "
+        "of 20 g to 3 kg in every episode",
+    )
+
+
+def _kind(text: str) -> str:
+    if text not in REALISTIC_KINDS:
+        raise argparse.ArgumentTypeError(f"{text!r} is given; give --realistic alone, or --realistic any")
+    return text
+
+
+def task_first(arguments: list[str]) -> list[str]:
+    """The arguments with `--realistic TASK` as `TASK --realistic`, whose task is not meant to say how."""
+    arguments = list(arguments)
+    for i, (option, word) in enumerate(itertools.pairwise(arguments)):
+        if option == "--realistic" and (word in TASKS or is_reference(word)):
+            arguments[i : i + 2] = word, option
+    return arguments
 
 
 def parse_settings(texts: list[str]) -> dict[str, Any]:

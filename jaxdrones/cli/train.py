@@ -10,7 +10,7 @@ from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
-from jaxdrones.cli.settings import asked_settings, user_mistakes
+from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.cli.train_runs import episodes_of, recipe_of, runs_of
 from jaxdrones.cli.training import (
     ProgressDisplay,
@@ -65,9 +65,7 @@ def add(commands) -> None:
     parser.add_argument("--library", default=LIBRARIES[0], help=f"{', '.join(LIBRARIES)} ({LIBRARIES[0]})")
     algorithms, sb3_algorithms = ", ".join(ALGORITHMS), ", ".join(SB3_ALGORITHMS)
     parser.add_argument("--algo", help=f"{algorithms} (bptt; gates: ppo); with sb3 {sb3_algorithms} (ppo)")
-    parser.add_argument(
-        "--realistic", action="store_true", help="simulate rotor lag, drag, delay, sensor noise, random parameters"
-    )
+    add_realistic(parser)
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds, each in DIR/seed-K (1)")
     parser.add_argument("--seed", type=int, metavar="K", help="the first seed (0)")
     parser.add_argument(
@@ -129,8 +127,9 @@ def _train(options: argparse.Namespace) -> int:
         for run in (*runs.values(), Run(output)):
             trainer.prepare(run)
     print_line = quiet if options.json else print
-    if not options.resume and not settings_known(recipe.task, recipe.algorithm, recipe.library):
-        warn_of_unknown_settings(recipe.task, recipe.trained_by)
+    known = recipe.realistic != "any" and settings_known(recipe.task, recipe.algorithm, recipe.library)
+    if not options.resume and not known:
+        warn_of_unknown_settings(recipe)
     print_line(f"{_headline(recipe)}; compiling")
     trainer.compile()
     made = max((run.sidecar_entry("state", "update") for run in resumed), default=0)

@@ -68,7 +68,7 @@ def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: floa
     user_files.check_unchanged(folder, recipe.files, files | vehicle)
     wanted = {"task": task, **asked}
     wanted |= {} if options.algo is None else {"algo": options.algo}
-    wanted |= {"realistic": True} if options.realistic else {}
+    wanted |= {"realistic": options.realistic} if options.realistic else {}
     wanted |= {} if options.episodes is None else {"episodes": options.episodes}
     if options.seed is not None and options.seeds == 1:
         had, wanted = had | {"seed": next(iter(runs))}, wanted | {"seed": options.seed}

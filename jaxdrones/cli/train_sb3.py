@@ -60,8 +60,8 @@ def train(options: argparse.Namespace) -> int:
     with user_mistakes(asked, options.task):
         trainer = SB3Trainer(recipe, seed, episodes)
     trainer.prepare(run)
-    if recipe.task != PRESET_TASK:
-        warn_of_unknown_settings(recipe.task, recipe.trained_by)
+    if recipe.task != PRESET_TASK or recipe.realistic == "any":
+        warn_of_unknown_settings(recipe)
     run.clear()
     total = recipe.config["steps"] if seconds is None else None
     print_line(f"compiled in {trainer.compile_seconds:.1f} s; control steps: {total or 'as many as the time allows'}")

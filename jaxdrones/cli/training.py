@@ -33,10 +33,11 @@ def parse_budget(text: str | None, unit: str, example: int) -> tuple[int | None,
     )
 
 
-def warn_of_unknown_settings(task: str, learner: str) -> None:
+def warn_of_unknown_settings(recipe) -> None:
     """Say that no settings are known with which a learner masters a task."""
+    task = recipe.task + " on any vehicle" * (recipe.realistic == "any")
     print_warning(
-        f"no settings are known with which {learner} masters {task}; it may fail, then try "
+        f"no settings are known with which {recipe.trained_by} masters {task}; it may fail, then try "
         "another --algo, --set learning_rate=... or horizon=..., or a longer --budget"
     )
 

@@ -5,6 +5,9 @@ of one drone; `velocity.control` takes an action in place of the setpoint. A tea
 memory is `for_team(init(), n)`. The table lists the controllers by the names that the command line uses.
 """
 
+import importlib
+from typing import Any
+
 from jaxdrones.control import (
     firmware_motors,
     firmware_pid,
@@ -18,6 +21,7 @@ from jaxdrones.control import (
 )
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.team import for_team
+from jaxdrones.params import Params
 
 CONTROLLERS = {
     "pid": pid,
@@ -41,5 +45,12 @@ __all__ = [
     "pid",
     "rates",
     "simple_pid",
+    "tune",
     "velocity",
 ]
+
+
+def tune(params: Params, controller: str, **options: Any) -> Any:
+    """Gains of a controller for any vehicle: `jaxdrones.optimal.tune`, which flies the engine to find them."""
+    above = importlib.import_module("jaxdrones.optimal.tuning")  # no import: this room is below the engine
+    return above.tune(params, controller, **options)

@@ -3,11 +3,13 @@
 Each module has `settings(step, ...)`, `init(settings, params, state)` (of `mppi` also with a random key) and
 `control(settings, params, memory, state, setpoints, dt=...) -> (memory, rpm)`, all of one drone; `setpoints` holds the
 target at the present and the next `settings.horizon` control steps. A team, or many worlds, is `jax.vmap`.
+`tune` finds the gains of the controllers of `jaxdrones.control` for a vehicle.
 """
 
 from jaxdrones.optimal import ilqr, lqr, mppi
 from jaxdrones.optimal.coordinates import difference, displaced, linearize, linearize_step, single
 from jaxdrones.optimal.problem import Reference, Weights, reference, weights
+from jaxdrones.optimal.tuning import tune
 
 CONTROLLERS = {"lqr": lqr, "ilqr": ilqr, "mppi": mppi}
 """Controllers by the names that the command line uses."""
@@ -25,5 +27,6 @@ __all__ = [
     "mppi",
     "reference",
     "single",
+    "tune",
     "weights",
 ]

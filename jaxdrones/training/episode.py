@@ -21,6 +21,7 @@ from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
+from jaxdrones.training.presets import realism
 from jaxdrones.visualization.viewer.show import records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
@@ -60,11 +61,11 @@ class EpisodeConditions:
     run: str
     task: str
     algorithm: str
-    realistic: bool
+    realistic: bool | str
     backend: str
     seed: int
     vehicle: str
-    """Name of a bundled vehicle, or path of a URDF."""
+    """Name of a bundled vehicle, path of a URDF, or `any vehicle`."""
     options: dict[str, Any]
     """Options of `jaxdrones.make`."""
 
@@ -76,7 +77,7 @@ class EpisodeConditions:
         options = "".join(f", {name} {x}" for name, x in self.options.items())
         backend = "Bullet" if self.backend == "bullet" else f"the {self.backend} backend"
         return (
-            f"{self.task} by {self.algorithm}{', realistic' * self.realistic}{options}, "
+            f"{self.task} by {self.algorithm}{realism(self.realistic)}{options}, "
             f"policy of {self.run}, on {backend}, seed {self.seed}"
         )
 

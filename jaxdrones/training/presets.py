@@ -100,7 +100,7 @@ def default_algorithm(task: str) -> str:
 def preset(
     task: str | Callable[..., Task],
     algorithm: str,
-    realistic: bool = False,
+    realistic: bool | str = False,
     practice: bool = False,
     **options: Any,
 ) -> tuple[Env, Any]:
@@ -110,8 +110,8 @@ def preset(
         task: a name of `jaxdrones.envs.TASKS`, or a function that returns a task; for such a one no settings are known,
             and the learner has its own.
         algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
-        realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters; the policy then also
-            observes rotor speeds and its last three actions.
+        realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters, or `any` with another
+            vehicle in every episode; the policy then also observes rotor speeds and its last three actions.
         practice: whether to make the environment to train in, which may have easier starts than the one to fly in.
         **options: options of `jaxdrones.make`.
 
@@ -129,6 +129,11 @@ def preset(
     return env, config
 
 
+def realism(realistic: bool | str) -> str:
+    """How realistic a task is, for titles: an addition to its name, which may be empty."""
+    return f", realistic{', any vehicle' if realistic == 'any' else ''}" if realistic else ""
+
+
 def settings_known(task: str, algorithm: str, library: str = "jaxdrones") -> bool:
     """Whether settings are known with which a learner of a library masters a task, that of its default options."""
     if library == "rllib":
@@ -137,7 +142,7 @@ def settings_known(task: str, algorithm: str, library: str = "jaxdrones") -> boo
     return found and (task, algorithm) not in _UNFINISHED
 
 
-def _settings(task: str, algorithm: str, realistic: bool) -> dict[str, Any]:
+def _settings(task: str, algorithm: str, realistic: bool | str) -> dict[str, Any]:
     """The settings of a learner that differ from its defaults."""
     known = _CONFIGS.get((task, algorithm), {})
     return known | (_REALISTIC_CONFIGS.get((task, algorithm), {}) if realistic else {})

@@ -26,7 +26,8 @@ class Recipe:
     task: str
     """A name of `jaxdrones.envs.TASKS`, or `file.py:function` of a file in `files`."""
     algorithm: str
-    realistic: bool
+    realistic: bool | str
+    """Whether, or `any`, as of `jaxdrones.make`."""
     options: dict[str, Any]
     """Options of `jaxdrones.make`."""
     config: Any
@@ -37,7 +38,12 @@ class Recipe:
 
     @classmethod
     def of(
-        cls, task: str, algorithm: str = "bptt", realistic: bool = False, library: str = "jaxdrones", **changes: Any
+        cls,
+        task: str,
+        algorithm: str = "bptt",
+        realistic: bool | str = False,
+        library: str = "jaxdrones",
+        **changes: Any,
     ) -> Recipe:
         """A preset with changes.
 
@@ -116,7 +122,7 @@ def split_changes(
 
 
 def checked_preset(
-    task: str | Callable[..., Task], algorithm: str, realistic: bool, options: dict[str, Any]
+    task: str | Callable[..., Task], algorithm: str, realistic: bool | str, options: dict[str, Any]
 ) -> tuple[Env, Any]:
     """The result of `preset`; options of wrong types raise a `ValueError`."""
     drones = options.get("drones")

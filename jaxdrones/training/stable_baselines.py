@@ -54,7 +54,7 @@ class SB3Recipe:
 
     task: str
     algorithm: str
-    realistic: bool
+    realistic: bool | str
     options: dict[str, Any]
     """Options of `jaxdrones.make`."""
     config: dict[str, Any]
@@ -64,7 +64,7 @@ class SB3Recipe:
     """Texts of the user's files that task and vehicle are in."""
 
     @classmethod
-    def of(cls, task: str, algorithm: str = "ppo", realistic: bool = False, **changes: Any) -> SB3Recipe:
+    def of(cls, task: str, algorithm: str = "ppo", realistic: bool | str = False, **changes: Any) -> SB3Recipe:
         """A preset with changes.
 
         Args:

@@ -18,7 +18,7 @@ class UserPolicy:
     """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a policy with a memory."""
     task: str
     """A name of `jaxdrones.envs.TASKS`, or `file.py:function`."""
-    realistic: bool
+    realistic: bool | str
     options: dict[str, Any]
     """Options of `jaxdrones.make`."""
 

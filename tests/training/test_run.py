@@ -1,6 +1,7 @@
 """A run on disk."""
 
 import errno
+import json
 import struct
 from pathlib import Path
 
@@ -60,10 +61,11 @@ def test_lines_after_the_update_that_training_goes_on_from_are_dropped(tmp_path)
     ]
 
 
-def test_a_recipe_survives_json():
-    recipe = Recipe.of("tracking", "ppo", realistic=True, period=5.0, worlds=64, restart_fraction=1)
+@pytest.mark.parametrize("realistic", [True, "any"])
+def test_a_recipe_survives_json(realistic):
+    recipe = Recipe.of("tracking", "ppo", realistic=realistic, period=5.0, worlds=64, restart_fraction=1)
     assert recipe.config.restart_fraction == 1.0 and recipe.options == {"period": 5.0}
-    assert Recipe.from_dict(recipe.as_dict()) == recipe
+    assert Recipe.from_dict(json.loads(json.dumps(recipe.as_dict()))) == recipe
     assert recipe.env().observation_size > 0
 
 

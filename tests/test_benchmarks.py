@@ -151,6 +151,14 @@ def test_agreement_explains_every_difference_from_recorded_flights():
 
 
 @pytest.mark.slow
+def test_reality_reports_every_horizon_of_our_models():
+    (row,) = quick("reality.py")["rows"]
+    assert row["input"] == "PWM and voltage" and set(row["models"]) == {"hold", "ours cf2x", "ours cf21"}
+    for horizons in row["models"].values():
+        assert set(horizons) == {"10", "25", "50"} and all(min(e.values()) > 0 for e in horizons.values())
+
+
+@pytest.mark.slow
 def test_rivals_races_our_side_where_there_are_no_rivals():
     rows = quick("rivals.py")["rows"]
     assert {row["race"] for row in rows} == {"plant-symplectic_euler", "attitude"}

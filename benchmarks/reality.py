@@ -29,18 +29,20 @@ import numpy as np
 import rivals_venv
 from common import about, report
 
+from jaxdrones import assets
 from jaxdrones.dynamics import crazyflie_motors
 from jaxdrones.identification import FlightLog, held_errors, open_loop_errors
 from jaxdrones.identification.files import errors_as_dict, load_vehicle
 
-FLIGHTS = Path(__file__).parent.parent / "tests" / "golden" / "nanobench" / "B3_figure8_slow_rep2.npz"
 OURS = {True: ("cf2x", "cf21_brushless"), False: ("cf2x", "cf21")}
 """Bundled vehicles, by whether the rotor speeds were measured."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("flights", nargs="*", type=Path, default=[FLIGHTS], help="logs (.npz) or folders of them")
+    parser.add_argument(
+        "flights", nargs="*", type=Path, default=list(assets.flights().values()), help="logs (.npz) or folders of them"
+    )
     parser.add_argument(
         "--vehicle", nargs="+", default=[], metavar="NAME|URDF|FOLDER", help="more of ours, for all of the flights"
     )

@@ -185,7 +185,7 @@ def test_every_benchmark_explains_itself(name):
 @pytest.mark.slow
 def test_the_state_estimate_of_a_recorded_flight_has_a_tilt_below_a_degree():
     """Against Vicon's attitude less the mean, which is how the markers were declared level."""
-    (row,) = quick(
-        "state_estimate.py", str(BENCHMARKS.parent / "tests/golden/nanobench/B10_lissajous_slow_rep1_imu.npz")
-    )["rows"]
+    (row,) = quick("state_estimate.py", str(BENCHMARKS.parent / "assets" / "flights" / "B10_lissajous_slow_rep1.npz"))[
+        "rows"
+    ]
     assert row["tilt"] < 1 and row["as logged"] < 1.5 and row["with attitude"] < 0.5

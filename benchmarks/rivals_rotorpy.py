@@ -13,7 +13,7 @@ import jaxdrones as jd
 
 torch.set_num_threads(1)  # 140,000 steps/s at 1,024 worlds, not 1,000: on a busy machine two wait for each other
 
-_RADIANS_PER_SECOND = 2 * np.pi / 60  # per RPM
+RADIANS_PER_SECOND = 2 * np.pi / 60  # per RPM
 _NAMES = {"pos": "x", "vel": "v", "quat": "q", "omega": "w", "rpm": "rotor_speeds"}
 
 
@@ -24,9 +24,9 @@ def plant(
     worlds, cpu = len(start.pos), torch.device("cpu")
     told = BatchedMultirotorParams([_told(jax.tree.map(lambda x: np.asarray(x[0]), params))] * worlds, worlds, cpu)
     first = {name: torch.from_numpy(np.array(getattr(start, field))[:, 0]) for field, name in _NAMES.items()}
-    first |= {"rotor_speeds": first["rotor_speeds"] * _RADIANS_PER_SECOND, "wind": torch.zeros(worlds, 3).double()}
+    first |= {"rotor_speeds": first["rotor_speeds"] * RADIANS_PER_SECOND, "wind": torch.zeros(worlds, 3).double()}
     vehicles = BatchedMultirotor(told, worlds, first, cpu, aero=False, integrator="rk4")
-    command = {"cmd_motor_speeds": torch.from_numpy(np.array(rpm)[:, 0]) * _RADIANS_PER_SECOND}
+    command = {"cmd_motor_speeds": torch.from_numpy(np.array(rpm)[:, 0]) * RADIANS_PER_SECOND}
     everyone = np.arange(worlds)
 
     def fly() -> jd.State:
@@ -35,7 +35,7 @@ def plant(
             for _ in range(steps):
                 state = vehicles.step(state, command, dt, everyone)
         fields = {field: jnp.asarray(state[name].numpy())[:, None] for field, name in _NAMES.items()}
-        return jd.State(**fields | {"rpm": fields["rpm"] / _RADIANS_PER_SECOND})
+        return jd.State(**fields | {"rpm": fields["rpm"] / RADIANS_PER_SECOND})
 
     return {"rotorpy": fly}
 
@@ -50,8 +50,8 @@ def _told(params: jd.Params) -> dict[str, object]:
             "mass": float(params.mass),
             "rotor_pos": {f"r{i + 1}": pos for i, pos in enumerate(params.rotor_pos)},
             "rotor_directions": params.rotor_spin,
-            "k_eta": float(params.kf) / _RADIANS_PER_SECOND**2,
-            "k_m": float(params.km) / _RADIANS_PER_SECOND**2,
+            "k_eta": float(params.kf) / RADIANS_PER_SECOND**2,
+            "k_m": float(params.km) / RADIANS_PER_SECOND**2,
             "tau_m": float(params.rotor_rise_time),
         }
     )

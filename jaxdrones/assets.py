@@ -14,3 +14,8 @@ def folder() -> Path:
 def vehicles() -> dict[str, Path]:
     """The bundled vehicles: name -> URDF."""
     return {path.stem: path for path in sorted(folder().glob("*.urdf"))}
+
+
+def flights() -> dict[str, Path]:
+    """The bundled logs of flights, of NanoBench (BSD-3): name -> .npz."""
+    return {path.stem: path for path in sorted((folder() / "flights").glob("*.npz"))}

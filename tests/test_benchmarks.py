@@ -179,6 +179,14 @@ def test_agreement_explains_every_difference_from_recorded_flights():
 
 
 @pytest.mark.slow
+def test_reality_reports_every_horizon_of_our_models():
+    (row,) = quick("reality.py")["rows"]
+    assert row["input"] == "PWM and voltage" and set(row["models"]) == {"hold", "ours cf2x", "ours cf21"}
+    for horizons in row["models"].values():
+        assert set(horizons) == {"10", "25", "50"} and all(min(e.values()) > 0 for e in horizons.values())
+
+
+@pytest.mark.slow
 def test_rivals_races_our_side_where_there_are_no_rivals():
     rows = quick("rivals.py")["rows"]
     assert {row["race"] for row in rows} == {"plant-symplectic_euler", "attitude"}
@@ -205,7 +213,7 @@ def test_every_benchmark_explains_itself(name):
 @pytest.mark.slow
 def test_the_state_estimate_of_a_recorded_flight_has_a_tilt_below_a_degree():
     """Against Vicon's attitude less the mean, which is how the markers were declared level."""
-    (row,) = quick(
-        "state_estimate.py", str(BENCHMARKS.parent / "tests/golden/nanobench/B10_lissajous_slow_rep1_imu.npz")
-    )["rows"]
+    (row,) = quick("state_estimate.py", str(BENCHMARKS.parent / "assets" / "flights" / "B10_lissajous_slow_rep1.npz"))[
+        "rows"
+    ]
     assert row["tilt"] < 1 and row["as logged"] < 1.5 and row["with attitude"] < 0.5

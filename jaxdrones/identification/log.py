@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxdrones import assets
 from jaxdrones.checks import shown
 
 PERIOD = 0.01  # s, of the rows of a log
@@ -68,7 +69,7 @@ class FlightLog:
 
     @classmethod
     def load(cls, file: str | os.PathLike) -> FlightLog:
-        """Read a log from an .npz file.
+        """Read a log from an .npz file, or a bundled one by its name (`jaxdrones.assets.flights`).
 
         Columns are `t`, `pos`, `quat`, `vel`, `omega` (or `gyro`), and either `rpm` or `pwm` with `vbat`; a flight on
         set-points has `ref_pos` and `ref_yaw`. Others are ignored.
@@ -77,7 +78,7 @@ class FlightLog:
             ValueError: the file is no log, lacks a column, or holds what no flight does: NaN, times that run
                 backwards, another rate than 100 Hz, other units, too few rows.
         """
-        path = Path(file)
+        path = assets.flights().get(os.fspath(file), Path(file))
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 columns = {name: np.asarray(arrays[name]) for name in arrays.files if name in (*_COLUMNS, "gyro")}

@@ -133,22 +133,21 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.nda
 
 def held_errors(log: FlightLog) -> np.ndarray:
     """`open_loop_errors` of a model that stays in the state of the start."""
-    pieces = windows(log, starts_of(log))
-    return np.asarray(_held_errors(pieces.start, pieces.truth))
+    start, _, truth = windows(log, starts_of(log))
+    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), start, truth)
+    return np.asarray(mean_errors(held, truth))
 
 
 @jax.jit
-def _held_errors(start: State, truth: State) -> Array:
-    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), start, truth)
-    return jnp.mean(jax.vmap(jax.vmap(_error))(held, truth), axis=0)
+def mean_errors(predicted: State, truth: State) -> Float[Array, "horizons 4"]:
+    """Means over n pieces of the norms of `residuals`, the attitude's as an angle; both states (n, horizons, ...)."""
+    return jnp.mean(jax.vmap(jax.vmap(_error))(predicted, truth), axis=0)
 
 
 @jax.jit
 def _errors(vehicle: Vehicle, pieces: Windows, motors: Motors | None) -> Array:
-    def of_piece(piece: Windows) -> Array:
-        return jax.vmap(_error)(predict(vehicle, piece.start, piece.command, motors), piece.truth)
-
-    return jnp.mean(jax.vmap(of_piece)(pieces), axis=0)
+    predicted = jax.vmap(predict, (None, 0, 0, None))(vehicle, pieces.start, pieces.command, motors)
+    return mean_errors(predicted, pieces.truth)
 
 
 def _error(predicted: State, truth: State) -> Float[Array, "4"]:

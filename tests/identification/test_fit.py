@@ -1,7 +1,6 @@
 """A vehicle is found from its flights, and repeats them."""
 
 import json
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +14,7 @@ from jaxdrones.identification.files import load_vehicle, write_vehicle
 from jaxdrones.urdf import parse_params
 from jaxdrones.urdf_writer import to_urdf
 
-NANOBENCH = Path(__file__).parents[1] / "golden" / "nanobench" / "B3_figure8_slow_rep2.npz"
+NANOBENCH = "B3_figure8_slow_rep2"
 TOLD = ("kf", "drag_coeff_x", "drag_coeff_y", "flapping_coeff_x", "flapping_coeff_y")
 
 
@@ -80,7 +79,7 @@ def test_a_written_vehicle_is_read_as_it_was(vehicle):
 def test_a_recorded_flight_is_flown_again(capsys, tmp_path):
     """The nominal Crazyflie stays within 8 cm of the real one in the plane, and needs less thrust than it."""
     figure = tmp_path / "paths.png"
-    assert main(["score", str(NANOBENCH), "--vehicle", "cf2x", "--json", "--figure", str(figure)]) == 0
+    assert main(["score", NANOBENCH, "--vehicle", "cf2x", "--json", "--figure", str(figure)]) == 0
     results = json.loads(capsys.readouterr().out)
     assert set(results["open_loop"]) == {"hold", "nominal", "vehicle"}
     assert set(results["open_loop"]["vehicle"]) == {"10", "25", "50"}
@@ -94,9 +93,9 @@ def test_a_recorded_flight_is_flown_again(capsys, tmp_path):
 
 @pytest.mark.slow
 def test_a_fitted_crazyflie_needs_the_thrust_of_the_real_one(capsys, tmp_path):
-    assert main(["fit", str(NANOBENCH), "--output", str(tmp_path / "fit")]) == 0
+    assert main(["fit", NANOBENCH, "--output", str(tmp_path / "fit")]) == 0
     assert "unfelt_sag" in capsys.readouterr().out
-    assert main(["score", str(NANOBENCH), "--vehicle", str(tmp_path / "fit"), "--json"]) == 0
+    assert main(["score", NANOBENCH, "--vehicle", str(tmp_path / "fit"), "--json"]) == 0
     results = json.loads(capsys.readouterr().out)
     (twin,), (nominal,) = results["closed_loop"], results["closed_loop_nominal"]
     assert abs(twin["pwm_sim"] / twin["pwm_real"] - 1) < 0.015

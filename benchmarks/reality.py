@@ -1,0 +1,98 @@
+"""Which simulator repeats recorded flights, as its Crazyflie comes?
+
+The open loop of `jaxdrones score`: from every state of every log a simulator is given the recorded inputs of the next
+half second, and what is printed is the mean distance from the flight after 0.1, 0.25 and 0.5 s. Ours flies in this
+process, crazyflow 0.4.0 and rotorpy 3.0.0 in an environment of their own (rivals_venv.py, rivals_reality.py).
+
+  vehicles  Each simulator has its own public numbers of the Crazyflie that flew: the brushless one where the log has
+            rotor speeds (`cf21_brushless`, cf21B_500, crazyfliebrushless_params), the 2.1 where it has PWM (`cf21` and
+            cf2x_P250 with the propellers of the 2.1+, crazyflie_params). `cf21` and `cf21_brushless` are crazyflow's
+            numbers in our model; `cf2x` is that of gym-pybullet-drones. `--vehicle` adds others of ours, for example
+            those that `jaxdrones fit` found.
+  start     The logged state. Rotors turn as measured, or have followed the commands of the 0.3 s before.
+  input     Measured rotor speeds, without a lag, each held for 0.01 s. crazyflow, whose rotors have inertia, gets them
+            on straight lines from half a row before to half a row after, whose slope is the rate that ours is given,
+            within its limits (21,661 RPM). PWM and voltage are no input of the rivals: everybody gets the thrust that
+            the firmware's curve of the 2.1+ gives them, the rivals as the speed that has it on their own thrust curve,
+            and has its own lag.
+  steps     Ours: the midpoint rule at 100 Hz. crazyflow: its default, explicit Euler, at 500 Hz. rotorpy: rk4 at
+            100 Hz, of which its default, dopri5, differs by less than a thousandth.
+
+The closed loop is not compared. The flights were flown by the firmware's PID with its battery and its state estimate;
+crazyflow has the firmware's Mellinger controller and rotorpy a geometric one, neither has the other three.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import rivals_venv
+from common import about, report
+
+from jaxdrones import assets
+from jaxdrones.dynamics import crazyflie_motors
+from jaxdrones.identification import FlightLog, held_errors, open_loop_errors
+from jaxdrones.identification.files import errors_as_dict, load_vehicle
+
+OURS = {True: ("cf2x", "cf21_brushless"), False: ("cf2x", "cf21")}
+"""Bundled vehicles, by whether the rotor speeds were measured."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "flights", nargs="*", type=Path, default=list(assets.flights().values()), help="logs (.npz) or folders of them"
+    )
+    parser.add_argument(
+        "--vehicle", nargs="+", default=[], metavar="NAME|URDF|FOLDER", help="more of ours, for all of the flights"
+    )
+    parser.add_argument("--quick", action="store_true", help="our side alone, which needs no environment")
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+    options = parser.parse_args()
+    files = [file for path in options.flights for file in (sorted(path.rglob("*.npz")) if path.is_dir() else [path])]
+    logs = [FlightLog.load(file) for file in files]
+    facts, theirs = about(), {}
+    if not options.quick:
+        result = rivals_venv.run("rivals_reality.py", *(str(file.resolve()) for file in files))
+        facts, theirs = facts | result["versions"], result["errors"]
+    rows, lines = [], [f"{name}: {value}" for name, value in facts.items()]
+    for measured, inputs in (True, "rotor speeds"), (False, "PWM and voltage"):
+        group = [(file, log) for file, log in zip(files, logs, strict=True) if log.has_rotor_speeds == measured]
+        if not group:
+            continue
+        flown = [
+            ours(log, (*OURS[measured], *options.vehicle)) | theirs.get(str(file.resolve()), {}) for file, log in group
+        ]
+        models = {name: mean([errors[name] for errors in flown]) for name in flown[0]}
+        rows.append({"input": inputs, "flights": [log.name for _, log in group], "models": models})
+        lines += [f"{inputs}: {', '.join(log.name for _, log in group)}", *table(models)]
+    report({"about": facts, "rows": rows}, options.json, lines)
+
+
+def ours(log: FlightLog, vehicles: tuple[str, ...]) -> dict[str, dict]:
+    """Errors of a model that stays where it starts and of our vehicles, by name."""
+    motors, errors = crazyflie_motors(), {"hold": held_errors(log)}
+    errors |= {f"ours {name}": open_loop_errors(log, load_vehicle(name), motors) for name in vehicles}
+    return {name: errors_as_dict(e) for name, e in errors.items()}
+
+
+def mean(errors: list[dict]) -> dict:
+    """The mean over flights of errors by horizon and quantity."""
+    return {
+        h: {name: float(np.mean([e[h][name] for e in errors])) for name in quantities}
+        for h, quantities in errors[0].items()
+    }
+
+
+def table(models: dict[str, dict]) -> list[str]:
+    """A line for each model: position, velocity, attitude and rates after each horizon."""
+    head = "".join(f"{f'after {int(h) / 100:g} s: m, m/s, rad, rad/s':>38}" for h in next(iter(models.values())))
+    numbers = {
+        name: "".join(f"{e['pos']:14.4f}{e['vel']:8.3f}{e['rot']:8.4f}{e['omega']:8.3f}" for e in horizons.values())
+        for name, horizons in models.items()
+    }
+    return [f"    {'':32}{head}", *(f"    {name[-32:]:32}{text}" for name, text in numbers.items())]
+
+
+if __name__ == "__main__":
+    main()

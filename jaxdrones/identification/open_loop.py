@@ -30,6 +30,7 @@ _LENGTH = HORIZONS[-1]
 _BEFORE = 30  # rows, in which rotors with a lag come to their speed
 _REACH = 6  # rows, by which inputs can be delayed
 _HALF = 0.5  # rows
+_BLOCK = 1000  # pieces, to a multiple of which those of a flight are filled, so that flights share a program
 
 
 class Windows(NamedTuple):
@@ -128,27 +129,34 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.nda
         Euclidean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular velocity
         (rad/s), by horizon.
     """
-    return np.asarray(_errors(vehicle, windows(log, starts_of(log)), None if log.has_rotor_speeds else motors))
+    return np.asarray(_errors(vehicle, *_all_windows(log), None if log.has_rotor_speeds else motors))
 
 
 def held_errors(log: FlightLog) -> np.ndarray:
     """`open_loop_errors` of a model that stays in the state of the start."""
-    pieces = windows(log, starts_of(log))
-    return np.asarray(_held_errors(pieces.start, pieces.truth))
+    return np.asarray(_held_errors(*_all_windows(log)))
+
+
+def _all_windows(log: FlightLog) -> tuple[Windows, Float[Array, " n"]]:
+    """The pieces from every start of a log, and the weight of each: zero of those that only fill the array."""
+    starts = starts_of(log)
+    places = np.arange(-(-len(starts) // _BLOCK) * _BLOCK)
+    weights = jnp.asarray(places < len(starts), float) / len(starts)
+    return windows(log, starts[np.minimum(places, len(starts) - 1)]), weights
 
 
 @jax.jit
-def _held_errors(start: State, truth: State) -> Array:
-    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), start, truth)
-    return jnp.mean(jax.vmap(jax.vmap(_error))(held, truth), axis=0)
+def _held_errors(pieces: Windows, weights: Array) -> Array:
+    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), pieces.start, pieces.truth)
+    return jnp.tensordot(weights, jax.vmap(jax.vmap(_error))(held, pieces.truth), 1)
 
 
 @jax.jit
-def _errors(vehicle: Vehicle, pieces: Windows, motors: Motors | None) -> Array:
+def _errors(vehicle: Vehicle, pieces: Windows, weights: Array, motors: Motors | None) -> Array:
     def of_piece(piece: Windows) -> Array:
         return jax.vmap(_error)(predict(vehicle, piece.start, piece.command, motors), piece.truth)
 
-    return jnp.mean(jax.vmap(of_piece)(pieces), axis=0)
+    return jnp.tensordot(weights, jax.vmap(of_piece)(pieces), 1)
 
 
 def _error(predicted: State, truth: State) -> Float[Array, "4"]:

@@ -30,6 +30,7 @@ _LENGTH = HORIZONS[-1]
 _BEFORE = 30  # rows, in which rotors with a lag come to their speed
 _REACH = 6  # rows, by which inputs can be delayed
 _HALF = 0.5  # rows
+_BLOCK = 1000  # pieces, to a multiple of which those of a flight are filled, so that flights share a program
 
 
 class Windows(NamedTuple):
@@ -128,26 +129,43 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.nda
         Euclidean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular velocity
         (rad/s), by horizon.
     """
-    return np.asarray(_errors(vehicle, windows(log, starts_of(log)), None if log.has_rotor_speeds else motors))
+    return np.asarray(_errors(vehicle, *_all_windows(log), None if log.has_rotor_speeds else motors))
 
 
 def held_errors(log: FlightLog) -> np.ndarray:
     """`open_loop_errors` of a model that stays in the state of the start."""
-    start, _, truth = windows(log, starts_of(log))
-    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), start, truth)
-    return np.asarray(mean_errors(held, truth))
+    pieces, weights = _all_windows(log)
+    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), pieces.start, pieces.truth)
+    return np.asarray(mean_errors(held, pieces.truth, weights))
+
+
+def _all_windows(log: FlightLog) -> tuple[Windows, Float[Array, " n"]]:
+    """The pieces from every start of a log, and the weight of each: zero of those that only fill the array."""
+    starts = starts_of(log)
+    places = np.arange(-(-len(starts) // _BLOCK) * _BLOCK)
+    weights = jnp.asarray(places < len(starts), float) / len(starts)
+    return windows(log, starts[np.minimum(places, len(starts) - 1)]), weights
 
 
 @jax.jit
-def mean_errors(predicted: State, truth: State) -> Float[Array, "horizons 4"]:
-    """Means over n pieces of the norms of `residuals`, the attitude's as an angle; both states (n, horizons, ...)."""
-    return jnp.mean(jax.vmap(jax.vmap(_error))(predicted, truth), axis=0)
+def mean_errors(
+    predicted: State, truth: State, weights: Float[Array, " n"] | None = None
+) -> Float[Array, "horizons 4"]:
+    """Means over n pieces of the norms of `residuals`, the attitude's as an angle.
+
+    Args:
+        predicted: states (n, horizons, ...).
+        truth: logged states at the same times.
+        weights: of the pieces, which add up to one; equal when left out.
+    """
+    errors = jax.vmap(jax.vmap(_error))(predicted, truth)
+    return jnp.mean(errors, axis=0) if weights is None else jnp.tensordot(weights, errors, 1)
 
 
 @jax.jit
-def _errors(vehicle: Vehicle, pieces: Windows, motors: Motors | None) -> Array:
+def _errors(vehicle: Vehicle, pieces: Windows, weights: Array, motors: Motors | None) -> Array:
     predicted = jax.vmap(predict, (None, 0, 0, None))(vehicle, pieces.start, pieces.command, motors)
-    return mean_errors(predicted, pieces.truth)
+    return mean_errors(predicted, pieces.truth, weights)
 
 
 def _error(predicted: State, truth: State) -> Float[Array, "4"]:

@@ -4,10 +4,13 @@ import dataclasses
 import io
 import threading
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
+import jaxdrones as jd
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.record import ImageSequence
 from jaxdrones.sensing import obstacles_2021
@@ -188,4 +191,27 @@ def test_the_page_shows_every_new_policy_of_a_training(record):
         np.testing.assert_allclose(positions[0], later.pos[60], rtol=0, atol=1e-4)
         curve = tab.run("document.querySelector('#curve svg').getAttribute('aria-label')")
         assert curve == "Learning curve: success 75 % after update 2"
+        assert tab.problems == []
+
+
+def test_drones_of_a_few_pixels_are_where_the_log_says(tmp_path):
+    side = 0.5 * np.stack(np.meshgrid(np.arange(15.0), np.arange(20.0)), axis=-1).reshape(-1, 2)
+    pos = np.broadcast_to(np.concatenate([side, np.ones((300, 1))], axis=1), (30, 300, 3))
+    pos = pos + np.sin(np.arange(30.0))[:, None, None]
+    rest = jax.vmap(jd.State.at_rest)(jnp.asarray(pos, jnp.float32))
+    page = show(rest, jd.repeat(jd.load_params("cf2x"), 300), dt=0.1)
+    vertices = """(() => {
+        const fleet = jaxdrones.player.fleet, slot = fleet.slots[0][7], count = 3 * slot.mesh.vertices;
+        return [...slot.mesh.geometry.attributes.position.array.slice(slot.place * count, (slot.place + 1) * count)];
+    })()"""
+    with browser.open_tab() as tab:
+        tab.open(page.save(tmp_path / "flight.html"))
+        for share in (1.0, 0.25):  # of the resolution: drones with more detail, and with less
+            tab.run(f"jaxdrones.player.stage.setSharp(false); jaxdrones.player.stage.share = {share}")
+            seen = tab.run("jaxdrones.positionsAt(2.0)")[0]
+            np.testing.assert_allclose(seen, pos[19], rtol=0, atol=1e-4)
+        drawn = np.reshape(tab.run(vertices), (-1, 3))
+        reach = tab.run("jaxdrones.player.panel.size * jaxdrones.player.arm")
+        assert np.abs(drawn - pos[19, 7]).max() < 1.5 * reach
+        np.testing.assert_allclose(drawn[:, :2].mean(axis=0), pos[19, 7, :2], atol=1e-3)
         assert tab.problems == []

@@ -1,16 +1,18 @@
-// All drones of all worlds as instances: for every kind of vehicle a mesh for each level of detail, and the same for ghosts.
+// All drones of all worlds: for every kind of vehicle a mesh for each level of detail, and the same for ghosts.
 
 import {
   Color, DoubleSide, DynamicDrawUsage, InstancedBufferAttribute, InstancedMesh, Matrix4, MeshBasicMaterial, MeshLambertMaterial, Vector3,
 } from "three";
+import { Batch, sent } from "./batch.js";
 import { armOf, scratch } from "./flight.js";
-import { coarse, discs, fine, plain } from "./vehicle.js";
+import { coarse, discs, dot, fine, plain } from "./vehicle.js";
 
 const SLOWED = 0.02; // rotors turn so much slower than they do, so that an eye can follow
-const LEVELS = [ // of detail, for drones whose arm is at least so many pixels long
+const LEVELS = [ // of detail, for drones whose arm is at least so many pixels long, as they are drawn
   { pixels: 14, geometry: fine, Material: MeshLambertMaterial },
   { pixels: 9, geometry: plain, Material: MeshLambertMaterial },
-  { pixels: 0, geometry: coarse, Material: MeshBasicMaterial },
+  { pixels: 3.5, geometry: coarse, Material: MeshBasicMaterial },
+  { pixels: 0, geometry: dot, Material: MeshBasicMaterial },
 ];
 const NOWHERE = new Matrix4().makeScale(0, 0, 0);
 const GHOST_OPACITY = 0.28;
@@ -33,6 +35,12 @@ export class Fleet {
 
   mesh({ geometry: shape, Material }, vehicle, count, ghost) {
     const geometry = shape(vehicle), look = ghost ? { transparent: true, opacity: GHOST_OPACITY, depthWrite: false } : {};
+    if (shape === coarse || shape === dot) {
+      const batch = new Batch(geometry, new Material({ vertexColors: true, side: DoubleSide, ...look }), count);
+      batch.castShadow = !ghost;
+      this.stage.scene.add(batch);
+      return batch;
+    }
     geometry.setAttribute("spin", new InstancedBufferAttribute(new Float32Array(4 * count), 4).setUsage(DynamicDrawUsage));
     const mesh = new InstancedMesh(geometry, turning(new Material({ vertexColors: true, side: DoubleSide, ...look })), count);
     mesh.instanceMatrix.setUsage(DynamicDrawUsage);
@@ -53,7 +61,7 @@ export class Fleet {
   /** Place all drones as they are at a time, `passed` seconds after the last; `layout` says where each world is drawn. */
   place(time, passed, layout) {
     const { p, q } = scratch, { camera, canvas } = this.stage, size = new Vector3().setScalar(this.scale), matrix = new Matrix4();
-    const pixels = canvas.clientHeight / 2 / Math.tan((camera.fov * Math.PI) / 360); // of 1 m at 1 m
+    const pixels = (this.stage.detail * canvas.clientHeight) / 2 / Math.tan((camera.fov * Math.PI) / 360); // of 1 m at 1 m
     this.layout = layout;
     for (const mesh of this.meshes) mesh.count = 0;
     this.worlds.forEach((world, w) => {
@@ -66,9 +74,9 @@ export class Fleet {
         const kind = world.vehicle[i], near = (this.scale * this.arms[kind] * pixels) / p.distanceTo(camera.position);
         const mesh = this.shapes[kind][ghost ? 1 : 0][LEVELS.findIndex((level) => !(near < level.pixels))], place = mesh.count++;
         mesh.setMatrixAt(place, there && Number.isFinite(q.w) ? matrix.compose(p, q, size) : NOWHERE);
-        this.colors[w][i].toArray(mesh.instanceColor.array, 3 * place);
-        const spin = world.kinds[i].rotor_spin, turned = mesh.geometry.attributes.spin.array;
-        for (let k = 0; k < 4; k++) {
+        mesh.setColorAt(place, this.colors[w][i]);
+        const spin = world.kinds[i].rotor_spin, turned = mesh.geometry.attributes.spin?.array;
+        for (let k = 0; k < 4 && turned; k++) {
           angles[4 * i + k] -= spin[k] * world.speed(row, i, k) * ((2 * Math.PI) / 60) * passed * SLOWED;
           turned[4 * place + k] = angles[4 * i + k] % (2 * Math.PI);
         }
@@ -76,11 +84,8 @@ export class Fleet {
       }
     });
     for (const mesh of this.meshes) {
-      for (const attribute of [mesh.instanceMatrix, mesh.instanceColor, mesh.geometry.attributes.spin]) {
-        attribute.clearUpdateRanges();
-        attribute.addUpdateRange(0, attribute.itemSize * mesh.count);
-        attribute.needsUpdate = mesh.count > 0;
-      }
+      if (mesh instanceof Batch) mesh.update();
+      else for (const attribute of [mesh.instanceMatrix, mesh.instanceColor, mesh.geometry.attributes.spin]) sent(attribute, mesh.count);
       mesh.visible = mesh.count > 0;
       if (mesh.discs) [mesh.discs.count, mesh.discs.visible] = [mesh.count, mesh.visible];
     }

@@ -187,6 +187,11 @@ export class Stage {
     this.resize();
   }
 
+  /** Pixels that are drawn for one of the screen, along each side. */
+  get detail() {
+    return this.sharp ? 1 : this.share;
+  }
+
   /** Whether everything but the drones may be drawn less often. */
   get hurried() {
     return !this.sharp && this.share < 0.7;

@@ -48,6 +48,12 @@ export function coarse(vehicle) {
   return mergeGeometries(parts);
 }
 
+/** A pixel or two. */
+export function dot(vehicle) {
+  const arm = armOf(vehicle);
+  return part(strip(1.3 * arm, 1.3 * arm).rotateZ(Math.PI / 4).translate(0, 0, 0.1 * arm), BODY, PLAIN);
+}
+
 const beam = (length, width, height) => new BoxGeometry(length, width, height);
 const strip = (length, width) => new PlaneGeometry(length, width);
 

@@ -8,12 +8,13 @@ with a controller compiles.
 
 import argparse
 import functools
+import json
 import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import about, report
+from common import about
 
 import jaxdrones as jd
 from jaxdrones.control import CONTROLLERS, for_team, pid
@@ -37,24 +38,26 @@ def main() -> None:
     controllers, vehicles = options.controllers.split(","), options.vehicles.split(",")
     if options.quick:
         controllers, vehicles = ["geometric"], ["racer"]
+    say = functools.partial(print, flush=True) if not options.json else lambda *_: None
+    say("\n".join(f"{name}: {value}" for name, value in about().items()))
+    say("controller   | vehicle | kg    | curves, cm: before -> after | step, cm: before -> after | s (of CPU)")
     rows = []
     for controller in controllers:
         for vehicle in vehicles:
             params = params_of(vehicle)
             if controller != "pid" or pid.fits(params):
                 rows.append({"controller": controller, "vehicle": vehicle} | row(controller, params, options.quick))
-                if not options.json:
-                    print(line(rows[-1]), flush=True)
-    lines = [f"{name}: {value}" for name, value in about().items()]
-    lines.append("controller   | vehicle | kg    | curves, cm: before -> after | step, cm: before -> after | s")
-    report({"rows": rows, "about": about()}, options.json, lines + [line(x) for x in rows])
+                say(line(rows[-1]))
+    if options.json:
+        print(json.dumps({"rows": rows, "about": about()}))
 
 
 def line(row: dict) -> str:
+    (curves, step), (curves_after, step_after) = (100 * np.array(row[when]) for when in ("before", "after"))
     return (
         f"{row['controller']:12} | {row['vehicle']:7} | {row['mass']:5.3f} | "
-        f"{100 * row['before'][0]:10.2f} -> {100 * row['after'][0]:7.2f}       | "
-        f"{100 * row['before'][1]:8.2f} -> {100 * row['after'][1]:7.2f}      | {row['seconds']:.1f}"
+        f"{curves:10.2f} -> {curves_after:7.2f}       | {step:8.2f} -> {step_after:7.2f}      | "
+        f"{row['seconds']:.0f} ({row['cpu_seconds']:.0f})"
     )
 
 
@@ -66,15 +69,16 @@ def params_of(vehicle: str) -> jd.Params:
 
 def row(controller: str, params: jd.Params, quick: bool) -> dict:
     before = tuning.start(CONTROLLERS[controller], params)
-    begin = time.perf_counter()
-    after = jax.block_until_ready(jd.control.tune(params, controller, iterations=2 if quick else 60))
-    seconds = time.perf_counter() - begin
+    begin = time.perf_counter(), time.process_time()
+    after = jax.block_until_ready(jd.control.tune(params, controller, **(dict(iterations=2) if quick else {})))
+    seconds, cpu_seconds = time.perf_counter() - begin[0], time.process_time() - begin[1]
     errors = functools.partial(flown_errors, CONTROLLERS[controller])
     return {
         "mass": float(params.mass),
         "before": np.asarray(errors(params, before)).tolist(),
         "after": np.asarray(errors(params, after)).tolist(),
         "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
     }
 
 

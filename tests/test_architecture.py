@@ -123,6 +123,11 @@ def test_what_jax_does_not_promise_to_keep_is_touched_in_one_file():
 PHYSICS = [f for f in FILES if top(f) in ("dynamics", "control", "rotation", "vector", "state", "params", "wrench")]
 
 
+def test_only_tune_reaches_up_by_name():
+    files = [str(f.relative_to(PACKAGE)) for f in FILES if 'import_module("jaxdrones' in f.read_text()]
+    assert files == ["control/__init__.py"]
+
+
 @pytest.mark.parametrize("file", PHYSICS, ids=lambda file: str(file.relative_to(PACKAGE)))
 def test_physics_knows_no_compiler(file):
     words = ("XLA", "jaxpr", "fusion", "kernel", "stored", "nanosecond", "optimization_barrier", "compiler")

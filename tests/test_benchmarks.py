@@ -113,6 +113,13 @@ def test_firmware_reports_agreement_and_cost():
 
 
 @pytest.mark.slow
+def test_tuning_reports_errors_before_and_after():
+    (row,) = quick("tuning.py")["rows"]
+    assert row["controller"] == "geometric" and row["seconds"] > 0
+    assert row["after"][0] < row["before"][0] < 0.1
+
+
+@pytest.mark.slow
 def test_envs_reports_a_rate_of_every_environment():
     result = quick("envs.py")
     assert len(result["rates"]) == 8 and min(result["rates"].values()) > 0

@@ -6,6 +6,7 @@ memory is `for_team(init(), n)`. The table lists the controllers by the names th
 """
 
 import importlib
+from types import ModuleType
 from typing import Any
 
 from jaxdrones.control import (
@@ -50,7 +51,21 @@ __all__ = [
 ]
 
 
-def tune(params: Params, controller: str, **options: Any) -> Any:
-    """Gains of a controller for any vehicle: `jaxdrones.optimal.tune`, which flies the engine to find them."""
-    above = importlib.import_module("jaxdrones.optimal.tuning")  # no import: this room is below the engine
-    return above.tune(params, controller, **options)
+def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500, iterations: int = 40) -> Any:
+    """Gains with which a controller flies a vehicle well, by the gradient of the simulation; takes about half a minute.
+
+    Args:
+        params: of one drone.
+        controller: a name of `CONTROLLERS`, or its module; `mrac` has no gains to tune.
+        control_hz: calls of the controller per second, at which the gains will be used, or at a higher rate.
+        iterations: of Adam.
+
+    Returns:
+        Gains of the controller's kind, for its `control`. How they are found is said at `jaxdrones.optimal.tune`.
+
+    Raises:
+        ValueError: an unknown controller, one without gains to tune, one that cannot fly the vehicle, or parameters of
+            a team.
+    """
+    tuning = importlib.import_module("jaxdrones.optimal.tuning")  # at the call and by name: it is above this room
+    return tuning.tune(params, controller, control_hz=control_hz, iterations=iterations)

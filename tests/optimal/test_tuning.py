@@ -46,7 +46,7 @@ def errors(controller, params, gains):
 
 def of_battery(module, params, *gains):
     """The mean errors of the flights by which gains are judged."""
-    flights, flown = tuning._battery(module, params, FEW["control_hz"])
+    flights, flown = tuning._battery(module, params, FEW["control_hz"], tuning._LONG)
     error = jax.jit(lambda each: jnp.mean(flown(each)))
     return [float(error(jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), one))) for one in gains]
 

@@ -77,8 +77,8 @@ print(open_loop_table({name: errors_as_dict(e) for name, e in open_loop(kept).it
 # %% [markdown]
 # ## Identify it from a flight
 # Every piece of half a second is flown from its logged start, and Gauss-Newton steps on 14 parameters make the
-# differences small. The derivative of all pieces in all parameters is that of the simulation. The standard errors are those of
-# residuals that are independent of each other.
+# differences small. The derivative of all pieces in all parameters is that of the simulation. The standard errors are
+# those of residuals that are independent of each other.
 
 # %%
 NAMES = ("mass", "km", "drag_coeff_x", "drag_coeff_y", "flapping_coeff", "inertia_x", "inertia_y", "rate_damping")

@@ -43,7 +43,8 @@ for axis, log, use in (left, told, "to identify"), (middle, kept, "to score"):
     axis.plot(*log.ref_pos[:, :2].T, color="grey", linewidth=1, label="set-points")
     axis.plot(*log.pos[:, :2].T, label="flown")
     axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{use}: {log.name.split('_')[1]}")
-middle.legend(loc="upper right", fontsize="small")
+middle.legend(loc="lower center", bbox_to_anchor=(0.5, 1.25), ncols=2, fontsize="small")
+left.set_xticks([-0.5, 0, 0.5])
 right.plot(kept.t, kept.pwm.mean(axis=1) / 65535, label="mean PWM, share of the time")
 right.plot(kept.t, kept.vbat / 4.2, label="voltage over 4.2 V")
 right.set(xlabel="t (s)", ylim=(0, 1.1), title="motors and battery")
@@ -102,7 +103,7 @@ for i, (axis, title) in enumerate(zip(axes, titles, strict=True)):
     for (name, table), color in zip(errors.items(), ("grey", *COLORS), strict=False):
         axis.plot(np.array(HORIZONS) / 100, table[:, i], "o-", color=color, label=LABELS.get(name, name))
     axis.set(xlabel="after (s)", yscale="log", title=title)
-axes[0].legend(fontsize="small")
+figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize="small")
 print(open_loop_table({"hold": errors_as_dict(errors["hold"]), "pieces": errors_as_dict(errors["pieces"])}))
 assert (errors["pieces"][-1, [0, 1, 3]] < errors["hold"][-1, [0, 1, 3]]).all()
 
@@ -141,8 +142,8 @@ assert twins["path"].as_dict()["xy_rms_m"] < twins["cf2x"].as_dict()["xy_rms_m"]
 # ## What limits the agreement
 # - **No vehicle is best at both.** What was fitted to half a second without a controller has an inertia more than ten
 #   times too large and a damping that goes with it: thrusts that are off by a percent turn a light model away, and a
-#   slow one errs least. Flown by the PID it oscillates and climbs away. What was fitted to the path is off within a
-#   quarter of a second where no controller corrects it.
+#   slow one errs least. Flown by the PID it oscillates and climbs away. What was fitted to the path loses its attitude
+#   within a quarter of a second where no controller corrects it.
 # - **Rotor speeds were not measured.** PWM and voltage tell the thrust within some percent, and it differs from flight
 #   to flight. From measured rotor speeds of faster flights half a second is repeated to 9 cm, where *hold* is 41 cm off
 #   (docs/reality.md).

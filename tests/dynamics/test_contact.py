@@ -110,6 +110,7 @@ def test_friction_takes_energy_and_so_does_what_sinks_in():
     assert np.all(force[:, 2] * sinking.vel[:, 2] <= 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("vehicle", "dt"), [("cf2x", 1 / 240), ("hb", 1 / 240), ("racer", 1 / 240), ("cf2x", 1 / 500)])
 def test_no_landing_gains_energy_or_tunnels_and_every_one_comes_to_rest(vehicle, dt):
     """From any attitude at up to 5 m/s down: kinetic energy and height never exceed what there was at the start."""

@@ -84,9 +84,8 @@ def test_a_start_with_rotor_speeds_out_of_range_flies_as_one_on_the_limit():
     assert_close(*(fly(full_step, mixed, s, tape(mixed, 30)) for s in starts), atol=0)
 
 
-@pytest.mark.parametrize(
-    "step", [single_step, pytest.param(full_step, marks=pytest.mark.slow)], ids=["instant", "lagging"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [single_step, full_step], ids=["instant", "lagging"])
 def test_without_a_limit_motors_follow_and_the_gradient_of_a_flight_is_finite(step):
     """As recordings of versions that did not limit are flown; `rollout` takes an infinite `max_rpm` for a number."""
     team = mixed.replace(max_rpm=jnp.full(len(VEHICLES), jnp.inf))
@@ -223,6 +222,7 @@ def test_a_pair_may_break_down_where_a_drone_meets_itself():
     assert_finite(jax.jit(jax.grad(lambda s: jnp.sum(step(team, s, command).vel)))(start))
 
 
+@pytest.mark.slow
 def test_effects_and_pairs_add_up():
     """Two effects give the sum of their velocity changes; 1e-15 of some m/s."""
     team = jaxdrones.repeat(cf2x, 2)

@@ -90,7 +90,8 @@ def inner(gradient, direction):
     return sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True))
 
 
-@pytest.mark.parametrize("name", mostly_slow(FLIGHTS, ["default"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FLIGHTS)
 def test_gradients_of_a_hundred_steps_agree_with_central_differences(name):
     """In the commands, the start and every array of `Params`.
 
@@ -166,7 +167,8 @@ def test_gradients_are_finite_where_formulas_tend_to_break(effects):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("effects", [SMOOTH, pytest.param(PAPER, marks=pytest.mark.slow)], ids=["smooth", "paper"])
+@pytest.mark.slow
+@pytest.mark.parametrize("effects", [SMOOTH, PAPER], ids=["smooth", "paper"])
 def test_gradients_are_finite_in_float32_too(effects):
     assert_finite_everywhere(jaxdrones.make_step(*effects))
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import VEHICLES, make_step, mostly_slow
+from helpers import VEHICLES, make_step
 
 import jaxdrones
 from jaxdrones import State, assets
@@ -51,7 +51,8 @@ def fly(team, name, act):
 
 
 @pytest.mark.parametrize("controller", TEAMS)
-@pytest.mark.parametrize("name", mostly_slow(ON, ["velocity"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ON)
 def test_every_vehicle_goes_where_an_action_asks_and_stays_where_none_does(name, controller):
     """A nominal 3 % of the top speed, 0.25 m/s of a Crazyflie, covers the 0.47 m in time."""
     axes, act = ON[name]
@@ -71,7 +72,8 @@ def test_the_pid_flies_crazyflies_by_their_numbers_whatever_their_name(tmp_path)
     assert not pid.fits(jaxdrones.stack([CRAZYFLIE, HEAVY]))
 
 
-@pytest.mark.parametrize("vehicle", mostly_slow(["hb", "racer"], ["hb"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("vehicle", ["hb", "racer"])
 def test_hover_with_a_large_vehicle_stays_at_its_start_under_no_action(vehicle):
     """The environment by its name, from any of its starts: it slows down from up to 1 m/s and stays."""
     env = make("hover", vehicle=vehicle, action="position")

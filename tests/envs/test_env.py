@@ -16,8 +16,6 @@ from jaxdrones.tasks.starts import standing_height
 
 KEY = jax.random.key(3)
 OTHER = jax.random.key(4)
-QUICK_TARGETS = tuple(set(TASKS) - {"forest", "room", "follow"})
-QUICK = ("hover", "gates", "hover-2x")
 make_env = lru_cache(make)
 
 
@@ -25,12 +23,12 @@ def zeros(env):
     return jnp.zeros((env.drones, env.action_size))
 
 
-@pytest.mark.parametrize("task", mostly_slow(TASKS, QUICK))
+@pytest.mark.parametrize("task", mostly_slow(TASKS, ("hover",)))
 def test_every_task_keeps_the_contract(task):
     check_env(make_env(task))
 
 
-@pytest.mark.parametrize("action", mostly_slow(ACTIONS, ("rpm", "velocity", "thrust_and_rates")))
+@pytest.mark.parametrize("action", mostly_slow(ACTIONS, ("rpm",)))
 def test_every_action_type_keeps_the_contract(action):
     check_env(make("hover", drones=2, action=action), steps=2)
 
@@ -55,7 +53,7 @@ def test_the_check_sees_a_broken_contract():
         check_env(make(broken))
 
 
-@pytest.mark.parametrize("task", mostly_slow(TASKS, (*QUICK, "recovery", "landing", "meetup")))
+@pytest.mark.parametrize("task", mostly_slow(TASKS, ("recovery", "meetup")))
 def test_starts_are_valid(task):
     """No drone below the ground or in another one."""
     env = make_env(task)
@@ -103,9 +101,7 @@ def with_target_far_up(task):
     return dataclasses.replace(task, target=target)
 
 
-@pytest.mark.parametrize(
-    "name", mostly_slow(["hover", "recovery", "landing", "tracking", "swap-goals"], ["hover", "landing"])
-)
+@pytest.mark.parametrize("name", mostly_slow(["hover", "recovery", "landing", "tracking", "swap-goals"], ["hover"]))
 def test_rewards_terminations_and_the_error_follow_the_target_that_a_task_was_given(name):
     """A team that is moved with its target by 50 m is rewarded as before, and not lost."""
     plain, moved = make_env(name), make(with_target_far_up(TASKS[name]()))
@@ -119,7 +115,7 @@ def test_rewards_terminations_and_the_error_follow_the_target_that_a_task_was_gi
     assert moved.step(KEY, world, zeros(moved))[3], "50 m from its target a drone is lost"
 
 
-@pytest.mark.parametrize("name", mostly_slow(sorted(set(TASKS) - {"takeoff", "meetup"}), QUICK_TARGETS))
+@pytest.mark.parametrize("name", mostly_slow(sorted(set(TASKS) - {"takeoff", "meetup"}), ("hover",)))
 def test_every_reward_that_is_about_the_target_is_about_that_of_the_task(name):
     """That of takeoff is about the height alone, that of meetup about the partner."""
     plain = make_env(name)
@@ -134,7 +130,7 @@ def test_every_reward_that_is_about_the_target_is_about_that_of_the_task(name):
     assert jnp.all(reward(plain.task)[:1] != reward(with_target_far_up(plain.task))[:1])
 
 
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy])
+@pytest.mark.parametrize("copied", [copy.copy, pytest.param(copy.deepcopy, marks=pytest.mark.slow)])
 def test_a_copy_is_an_environment_of_its_own(copied):
     """What is set of it acts, also where the original was compiled before, and only on it."""
     env = make("hover")
@@ -191,7 +187,8 @@ def test_a_state_that_is_not_a_number_ends_the_episode():
     assert env.step(KEY, world, zeros(env))[3]
 
 
-@pytest.mark.parametrize("task", mostly_slow(sorted(set(TASKS) - {"gates"}), ("hover",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("task", sorted(set(TASKS) - {"gates"}))
 def test_gradients_of_the_return_equal_central_differences(task):
     """In the actions, ten steps from a random start, for every task (that of gates below)."""
     env = make_env(task)

@@ -109,6 +109,7 @@ def test_worlds_of_different_ages_see_what_each_sees_alone_and_start_anew(env):
         np.testing.assert_allclose(info["final_obs"]["depth"][i], alone["depth"], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_contract_holds_with_images(env):
     check_env(env, steps=3)
     assert "depth of 8 x 6 pixels every 3 steps, 4 steps late" in repr(env)

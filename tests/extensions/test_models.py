@@ -48,7 +48,8 @@ def flown(step, state, steps, team=TEAM, share=1.05):
     return jd.rollout(step, lambda params, memory, s, k: (memory, command), team, state, None, steps)
 
 
-@pytest.mark.parametrize("name", mostly_slow(EXTENSIONS, ["payload"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXTENSIONS)
 def test_rk4_measures_order_four_in_the_states_of_models(name):
     def end(dt):
         step = make_step(name, jd.rk4, dt)
@@ -168,6 +169,7 @@ def test_a_payload_keeps_the_momentum_of_team_and_load_to_rounding(integrator):
     np.testing.assert_allclose(momentum(end), momentum(start), rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_flapping_follows_the_wind_by_a_first_order_lag():
     """In a wind that blows from the front of a drone that is held where it is."""
     team = TEAM.replace(wind=jnp.tile(jnp.array([[-4.0, 0, 0]]), (2, 1)), mass=TEAM.mass * 1e9, gravity=jnp.zeros(2))

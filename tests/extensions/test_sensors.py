@@ -92,6 +92,7 @@ def test_what_an_imu_feels_integrates_to_the_velocity_that_was_flown():
     assert np.abs(change).max() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.1, -0.05, 0.2)])
 def test_away_from_the_center_an_imu_feels_the_second_derivative_of_its_own_place(offset):
     trajectory, rate = flight(41)

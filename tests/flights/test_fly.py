@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from helpers import mostly_slow
 
 from jaxdrones import optimal
 from jaxdrones.flights.examples import FLIGHTS
@@ -76,7 +75,8 @@ def test_the_jet_model_pushes_less_than_equation_6_but_visibly():
     assert 0.48 < lower["lowest_z_m"] < 0.495
 
 
-@pytest.mark.parametrize("vehicle", mostly_slow(["cf2p", "hb", "racer"], ["hb"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("vehicle", ["cf2p", "hb", "racer"])
 def test_every_vehicle_flies_the_circle(vehicle):
     record = fly("circle", vehicle=vehicle, drones=2, duration=6.0)
     assert all(row["steady_error_m"] < 0.125 for row in results(record))

@@ -18,6 +18,7 @@ NANOBENCH = "B3_figure8_slow_rep2"
 TOLD = ("kf", "drag_coeff_x", "drag_coeff_y", "flapping_coeff_x", "flapping_coeff_y")
 
 
+@pytest.mark.slow
 def test_the_vehicle_that_flew_repeats_its_flight(flown):
     """Up to the order of the integrator: rk4 flew, the midpoint rule repeats. Within 1 % of what others miss."""
     params, log = flown
@@ -27,6 +28,7 @@ def test_the_vehicle_that_flew_repeats_its_flight(flown):
     assert (own[-1] < 0.01 * held_errors(log)[-1]).all()
 
 
+@pytest.mark.slow
 def test_a_fit_finds_the_vehicle_that_flew(flown, tmp_path):
     """Within 1 % of thrust and 5 % of drag and flapping, from a vehicle with half of the drag and no flapping."""
     params, log = flown
@@ -73,6 +75,7 @@ def test_a_written_vehicle_is_read_as_it_was(vehicle):
             np.testing.assert_allclose(getattr(read, name), value, rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_recorded_flight_is_flown_again(capsys, tmp_path):
     """The nominal Crazyflie stays within 8 cm of the real one in the plane, and needs less thrust than it."""
     figure = tmp_path / "paths.png"

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from double_integrator import SMALL, DoubleIntegrator
-from helpers import mostly_slow
 
 from jaxdrones import envs, learning
 from jaxdrones.learning import Diverged, Policy, bptt, evaluate, ppo, shac
@@ -42,7 +41,8 @@ def same(a, b, **tolerance):
         np.testing.assert_allclose(x, y, **tolerance)
 
 
-@pytest.mark.parametrize("name", mostly_slow(LEARNERS, ["bptt"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LEARNERS)
 def test_gradients_that_are_not_finite_are_counted_and_stop_training_when_they_repeat(name):
     learner, env = LEARNERS[name], Steep()
     config = dataclasses.replace(SMALL[learner], updates=PATIENCE)
@@ -111,7 +111,8 @@ def test_train_in_a_program_of_the_user_does_what_it_does_alone():
     same(jax.jit(lambda: bptt.train(KEY, env, SMALL[bptt]))(), alone, rtol=1e-5)
 
 
-@pytest.mark.parametrize("compiled", mostly_slow([True, False], [True]))
+@pytest.mark.slow
+@pytest.mark.parametrize("compiled", [True, False])
 def test_seeds_and_settings_can_be_mapped_inside_and_outside_of_a_program(compiled):
     env, config = DoubleIntegrator(), SMALL[bptt]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from closed_loop import hovering, make_step, one, team_of
-from helpers import VEHICLES, flying, mostly_slow
+from helpers import VEHICLES, flying
 
 import jaxdrones as jd
 from jaxdrones import optimal
@@ -54,7 +54,8 @@ def test_a_short_step_moves_as_the_continuous_linearization_says(rotors):
         np.testing.assert_allclose(b_step / dt, b, rtol=1e-2, atol=1e-2)
 
 
-@pytest.mark.parametrize("vehicle", mostly_slow(VEHICLES, quick=["cf2x"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("vehicle", VEHICLES)
 def test_hover_can_be_controlled_and_the_regulator_makes_it_stable(vehicle):
     params = one(team_of(vehicle))
     step = jd.make_step([jd.drag], rotors=jd.lagging_rotors, dt=DT)

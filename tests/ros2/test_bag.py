@@ -40,6 +40,7 @@ def test_a_bag_holds_every_message_of_a_flight(recorded):
     assert [type(m) for m in read["drone_0/cmd_pose"]] == [msg.PoseStamped]
 
 
+@pytest.mark.slow
 @pytest.mark.needs("mcap_ros2")
 def test_a_bag_opens_in_an_independent_reader(recorded):
     from mcap.reader import make_reader

@@ -37,6 +37,7 @@ def test_a_lost_peer_stops_the_flight_with_exit_code_1(wire, capsys):
     assert "steps 0" in said.out
 
 
+@pytest.mark.slow
 def test_a_landing_is_reported_as_json(wire, capsys):
     short = ["--lockstep", "--wait", "0.01", "--height", "0.03", "--speed", "20"]
     assert main(["ros2", "--failsafe", "land", *short, "--json"]) == 0

@@ -54,6 +54,7 @@ def test_the_imu_reads_gravity_at_rest_in_the_air_and_nothing_in_free_fall():
         np.testing.assert_allclose(convert.numbers(imu.linear_acceleration), (0, 0, reading), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_battery_is_published_where_the_team_has_one():
     def battery(params, state):
         return {"voltage": 3.9 + 0 * params.mass, "current": 2.0 + 0 * params.mass, "charge": 450.0, "capacity": 900.0}

@@ -102,6 +102,7 @@ def test_motors_turn_a_drone_as_those_of_a_crazyflie_do(faster, axis, sign, back
     assert np.abs(np.delete(state.omega, axis)).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_drone_falls_without_an_action_and_rests_on_the_ground(backend):
     made, _ = backend(heights=(0.05, 1.0), dt=0.002)
     for _ in range(500):

@@ -40,6 +40,7 @@ def test_trees_are_as_many_as_the_density_says_but_for_those_left_out():
     assert jnp.all((trees.radius >= 0.1) & (trees.radius <= 0.3))
 
 
+@pytest.mark.slow
 def test_trunks_stand_on_the_ground_and_tilt_as_far_as_they_may():
     trunks = mixed_forests(KEYS)[0].cylinders
     x, y, *_ = jnp.moveaxis(trunks.quat, -1, 0)

@@ -170,6 +170,7 @@ def test_flags_agree_with_bullets_distances_whatever_the_margin():
     assert max(wrong) < 6e-3 and np.sum(np.array(wrong) > 1e-3) < compared / 200
 
 
+@pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_what_bullet_lets_touch_is_flagged():
     """Its balls lie inside the cylinder."""

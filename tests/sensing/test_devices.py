@@ -23,6 +23,7 @@ def each(function, *arrays):
     return jax.vmap(jax.vmap(function))(*arrays)
 
 
+@pytest.mark.slow
 def test_an_imu_feels_thrust_and_drag_and_the_turn_at_its_place(flown):
     params, states, rates = flown
     _, read = along(imu(PERFECT), params, states, rates, KEY)
@@ -59,6 +60,7 @@ def test_poses_are_as_old_as_the_delay(flown, delay, samples):
     np.testing.assert_allclose(np.linalg.norm(read["quat"], axis=-1), 1)
 
 
+@pytest.mark.slow
 def test_poses_are_missing_and_noisy_as_often_as_asked():
     params = jd.repeat(jd.load_params("cf2x"), 50)
     states = jax.tree.map(lambda x: jnp.tile(x[None], (100, 1, 1)), jd.State.at_rest(jnp.ones((50, 3))))

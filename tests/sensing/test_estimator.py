@@ -51,6 +51,7 @@ def assert_chi_square(square, dimensions):
     assert low < mean.mean() < high
 
 
+@pytest.mark.slow
 def test_errors_normalized_by_their_covariance_are_chi_square(flown):
     params, states, rates = flown
     memories, _ = along(state_estimate(), params, states, rates, KEY)
@@ -79,6 +80,7 @@ def test_they_are_with_other_parts_lags_gaps_and_without_attitude(part, system, 
     assert_chi_square(normalized(error, cov), 15)
 
 
+@pytest.mark.slow
 def test_a_reading_is_the_present_state_in_spite_of_the_delay(flown):
     """Without noise to speak of the reading is the truth, also where poses are 50 ms old; the drones fly at 1 m/s."""
     params, states, rates = few(flown, 2)
@@ -117,6 +119,7 @@ def test_a_controller_flies_on_the_estimate():
     assert 0 < np.abs(pos - seen).max() < 0.05
 
 
+@pytest.mark.slow
 def test_the_barometer_and_the_magnetic_field_correct_height_and_heading():
     quat = jd.rotation.from_rpy(jnp.array([0.1, -0.2, 0.3]))
     wrong = jd.rotation.multiply(quat, jd.rotation.exp(jnp.array([0.02, 0.03, -0.05])))
@@ -148,6 +151,7 @@ def test_a_point_away_from_the_imu_is_measured_where_it_is():
     assert np.abs(found.pos).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_prediction_has_the_jacobian_of_its_own_motion():
     """The covariance is moved by the derivative of the motion with respect to the error."""
     rng = np.random.default_rng(0)

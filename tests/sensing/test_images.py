@@ -81,6 +81,7 @@ def test_a_narrow_view_shows_the_middle_of_a_wide_one():
     np.testing.assert_array_equal(some.segmentation, most.segmentation[:, 18:30, 24:40])
 
 
+@pytest.mark.slow
 def test_a_wall_is_at_its_distance_in_every_pixel():
     wall = Box(pos=(4.0, 0.0, 2.0), size=(1.0, 100.0, 100.0))
     images = render(Scene.of(wall, ground=False), *team(([0, 0, 1], [0, 0, 0])), Camera(resolution=(9, 7)))
@@ -88,6 +89,7 @@ def test_a_wall_is_at_its_distance_in_every_pixel():
     np.testing.assert_array_equal(images.segmentation, 2)  # 0 ground, 1 drone, 2 wall
 
 
+@pytest.mark.slow
 def test_labels_are_ground_drones_obstacles_and_nothing():
     scene = Scene.of(Sphere(pos=(0.0, 0.0, 1.0), radius=0.3), Box(pos=(2.0, 3.0, 1.0), size=(1.0, 1.0, 1.0)))
     params, state = team(([-2, 0, 1], [0, 0, 0]), ([-1.5, 0.3, 0.9], [0, 0, 0]))

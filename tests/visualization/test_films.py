@@ -64,6 +64,7 @@ def test_every_drone_has_its_color_where_it_is(record, film, lens):
             assert np.argmax(shares) == i and shares[i] > 0.15
 
 
+@pytest.mark.slow
 def test_a_trail_is_where_the_drone_was_and_a_target_where_it_is(record, film, lens):
     row = row_at(record, 5)
     for i, color in enumerate(colors(4)):

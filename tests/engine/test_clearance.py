@@ -72,7 +72,7 @@ def test_what_stays_in_its_free_ball_has_no_contact():
 
     towards = jnp.array(np.random.default_rng(1).normal(size=(400, 1, 3)) * 0.2)
     inside, touched, radius = jax.jit(jax.vmap(of_world))(states, towards)
-    assert 50 < jnp.sum(inside) < 350 and jnp.sum(touched) > 20
+    assert 50 < jnp.sum(inside) < 350 and jnp.sum(touched) > 10
     assert not np.any(inside & touched)
     size = contact_radius(jd.load_params("cf2x"))
     away = np.linalg.norm(towards[:, 0], axis=1)

@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+_MOST = 4  # if more than one of so many worlds needs a result, all worlds are computed at once
+
 
 def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[..., Any]:
     """`(needed, *args) -> function(*args)`, whose result matters only where `needed` () is true.
 
-    Of many worlds, by `jax.vmap`, only those are computed in which it matters; the others get zeros. If it matters in
-    more than one of `one_in` worlds, all are computed. It is not differentiable.
+    Of many worlds, by `jax.vmap`, only those are computed in which it matters, one of `one_in` at a time; the others
+    get zeros. Derivatives are those of the function where it is needed, else zero; they are computed in every world.
     """
 
     @jax.custom_batching.custom_vmap
@@ -35,19 +37,32 @@ def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[...
             return function(*jax.tree.unflatten(structure, leaves))
 
         every = jax.vmap(of, ([0 if m else None for m in mapped],))
-        few = max(worlds // one_in, 1)
+        needed = jnp.broadcast_to(needed, (worlds,))
+        count, size = jnp.sum(needed), max(worlds // one_in, 1)
 
         def needed_ones() -> Any:
-            index = jnp.nonzero(needed, size=few, fill_value=worlds)[0]
-            place = jnp.minimum(index, worlds - 1)
-            found = every([leaf[place] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)])
-            blank = jax.eval_shape(every, leaves)
-            return jax.tree.map(
-                lambda all, x: jnp.zeros(all.shape, all.dtype).at[index].set(x, mode="drop"), blank, found
-            )
+            index = jnp.nonzero(needed, size=worlds + -worlds % size, fill_value=worlds)[0]
 
-        needed = jnp.broadcast_to(needed, (worlds,))
-        out = jax.lax.cond(jnp.sum(needed) <= few, needed_ones, lambda: every(leaves))
+            def some(i: Array, found: Any) -> Any:
+                to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
+                at = jnp.minimum(to, worlds - 1)
+                new = every([leaf[at] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)])
+                return jax.tree.map(lambda all, x: all.at[to].set(x, mode="drop"), found, new)
+
+            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(every, leaves))
+            return jax.lax.fori_loop(0, -(-count // size), some, zeros)
+
+        out = jax.lax.cond(count <= max(worlds // _MOST, 1), needed_ones, lambda: every(leaves))
         return out, jax.tree.map(lambda _: True, out)
 
-    return lambda needed, *args: one(needed, args)
+    @jax.custom_jvp
+    def result(needed: Array, args: tuple[Any, ...]) -> Any:
+        return one(needed, args)
+
+    @result.defjvp
+    def _(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+        needed, args = primals
+        _, changes = jax.jvp(function, args, tangents[1])
+        return result(needed, args), jax.tree.map(lambda x: jnp.where(needed, x, jnp.zeros_like(x)), changes)
+
+    return lambda needed, *args: result(needed, args)

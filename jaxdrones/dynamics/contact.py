@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.vector import along_z, components, cross, dot, total
+from jaxdrones.vector import along_z, components, cross, dot, safe_sqrt, total
 from jaxdrones.wrench import Wrench
 
 _SPHERES = 8  # as in Bullet
@@ -108,6 +108,12 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     surfaces = scene.touched(state.pos[None] + centers, radius)
     wrench = jax.tree.map(lambda x: jax.vmap(total)(x.T), jax.vmap(at_sphere)(centers, surfaces))
     return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), wrench)
+
+
+def contact_radius(params: Params) -> Float[Array, ""]:
+    """Radius of the ball about the center of mass that holds all of a drone that can touch anything, m."""
+    radius, ring = _rim(params)
+    return safe_sqrt(ring**2 + params.collision_offset**2) + radius
 
 
 def drone_contact(params: Params, state: State, other: Params, other_state: State) -> Wrench:

@@ -14,6 +14,7 @@ from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
 from jaxdrones.dynamics.rotors import limited, with_rotor_speed
+from jaxdrones.engine.clearance import FreeBalls
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Physics, Rotors, check_functions
 from jaxdrones.engine.step import Step, is_traced
@@ -57,12 +58,23 @@ def make_derivative(
     Raises:
         ValueError: an argument that should be a function, a model or a neighbor grid and is not.
     """
-    return _derivative_of(Physics(effects, pairs, team_effects, models, rotors, neighbors))
+    of_team = _derivative_of(Physics(effects, pairs, team_effects, models, rotors, neighbors))
+
+    def derivative(params: Params, state: State, command: Float[Array, "n 4"], scene: Scene = _BARE) -> State:
+        return of_team(params, state, command, scene)
+
+    return derivative
 
 
 def _derivative_of(physics: Physics) -> Derivative:
-    def derivative(params: Params, state: State, command: Float[Array, "n 4"], scene: Scene = _BARE) -> State:
-        loads = physics.loads(params, state, command, scene)
+    def derivative(
+        params: Params,
+        state: State,
+        command: Float[Array, "n 4"],
+        scene: Scene,
+        free: FreeBalls | None = None,
+    ) -> State:
+        loads = physics.loads(params, state, command, scene, free)
         acc, omega_rate = jax.vmap(newton_euler)(params, loads.state, loads.wrench)
         still = jax.tree.map(jnp.zeros_like, state)
         return still.replace(
@@ -136,20 +148,21 @@ class ExplicitStep(Step):
         self._text = f"{self.integrator} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
         derivative = _derivative_of(physics)
 
-        def substep(params: Params, state: State, command: jax.Array, scene: Scene) -> State:
+        def substep(params: Params, state: State, command: jax.Array, scene: Scene, free: FreeBalls | None) -> State:
             speed, _ = physics.rotor_speed(params, state, command)
             if speed is not state.rpm:  # rotors with a lag do not jump
                 state = jax.vmap(with_rotor_speed)(params, state, speed)
-            return integrator(lambda s: derivative(params, s, command, scene), state, dt)
+            return integrator(lambda s: derivative(params, s, command, scene, free), state, dt)
 
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
             command = check_command(params, state, rpm)
             state = state.replace(rpm=jax.vmap(limited)(params, state.rpm))
+            free = FreeBalls.about(state, scene) if physics.touches(scene) else None
 
             # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
             @jax.checkpoint
             def advance(state: State, _: None) -> tuple[State, None]:
-                after = materialize_shared(lambda state, command: substep(params, state, command, scene))
+                after = materialize_shared(lambda state, command: substep(params, state, command, scene, free))
                 return after(state, command), None
 
             return advance(state, None)[0] if substeps == 1 else jax.lax.scan(advance, state, length=substeps)[0]

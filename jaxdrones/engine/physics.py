@@ -11,8 +11,9 @@ import jax
 from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_arguments, check_sequence, takes_scene
-from jaxdrones.dynamics import Model, drone_contact, instant_rotors
+from jaxdrones.dynamics import Model, drone_contact, instant_rotors, obstacle_contact
 from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench
+from jaxdrones.engine.clearance import FreeBalls, contact_of_team
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
 from jaxdrones.params import Params
@@ -90,6 +91,10 @@ class Physics:
         """Whether an effect depends on what stands around."""
         return any(takes_scene(effect) for effect in self.effects)
 
+    def touches(self, scene: Scene | None) -> bool:
+        """Whether drones touch the obstacles of a scene."""
+        return scene is not None and scene.has_obstacles and obstacle_contact in self.effects
+
     def contains(self, function: Callable) -> bool:
         """Whether a function is among the effects or pairs, also with arguments bound by `functools.partial`."""
         return any(_unbound(f) is function for f in (*self.effects, *self.pairs))
@@ -99,8 +104,15 @@ class Physics:
         fresh = {model.name: model.start(params) for model in self.models if model.name not in state.aux}
         return state.replace(aux=state.aux | fresh)
 
-    def loads(self, params: Params, state: State, command: Float[Array, "n 4"], scene: Scene) -> Loads:
-        """Rotor speeds and everything that acts on a team.
+    def loads(
+        self,
+        params: Params,
+        state: State,
+        command: Float[Array, "n 4"],
+        scene: Scene,
+        free: FreeBalls | None = None,
+    ) -> Loads:
+        """Rotor speeds and everything that acts on a team; where a drone is in its free ball it touches no obstacle.
 
         Raises:
             ValueError: the state lacks that of a model, or a function returns something of another type.
@@ -108,7 +120,7 @@ class Physics:
         rpm, rpm_rate = self.rotor_speed(params, state, command)
         state = state.replace(rpm=rpm)
         aux_rate = {model.name: model.team_rate(params, state, command) for model in self.models}
-        wrench = self.wrench(params, state, scene) + jax.vmap(rotor_reaction)(params, state, rpm_rate)
+        wrench = self.wrench(params, state, scene, free) + jax.vmap(rotor_reaction)(params, state, rpm_rate)
         return Loads(state, wrench, rpm_rate, aux_rate)
 
     def rotor_speed(
@@ -126,17 +138,20 @@ class Physics:
                 )
         return jax.vmap(self.rotors)(params, state, command)
 
-    def wrench(self, params: Params, state: State, scene: Scene) -> Wrench:
+    def wrench(self, params: Params, state: State, scene: Scene, free: FreeBalls | None = None) -> Wrench:
         """The sum of the rotors' aerodynamic wrench and of all effects, one row per drone."""
+        effects = [effect for effect in self.effects if effect is not obstacle_contact]
 
         def alone(params: Params, state: State) -> Wrench:
             def acting(effect):
                 return effect(params, state, scene) if takes_scene(effect) else effect(params, state)
 
-            own = (check_wrench("effects", effect, acting(effect)) for effect in self.effects)
+            own = (check_wrench("effects", effect, acting(effect)) for effect in effects)
             return sum(own, rotor_wrench(params, state))
 
         wrench = jax.vmap(alone)(params, state)
+        if self.touches(scene):
+            wrench += contact_of_team(params, state, scene, free)
         of_team = (check_wrench("team_effects", f, f(params, state), len(state.pos)) for f in self.team_effects)
         wrench = sum(of_team, wrench)
         state = side_by_side(state) if self.contains(drone_contact) else state

@@ -65,7 +65,7 @@ class AutoReset:
         """The start of a new episode where one has `ended`, and elsewhere what is given; `key` is that of the step."""
         world, key = episode.world, jax.random.fold_in(key, RESET)
         vector = obs["state"] if isinstance(obs, dict) else obs
-        fresh_obs, fresh = where_needed(self._fresh)(ended, key)
+        fresh_obs, fresh = where_needed(self._fresh, one_in=256)(ended, key)
         fresh = fresh.replace(**{name: getattr(world, name) for name in self._kept})
         fresh = Episode(fresh, jnp.zeros_like(episode.episode_return), jnp.zeros_like(episode.length))
         vector, episode = jax.tree.map(

@@ -23,6 +23,7 @@ from jaxdrones.tasks.task import World
 
 IMAGES = ("rgb", "depth", "segmentation")
 _PIXELS = 16384  # that are computed at a time: so many stay in a cache
+_PIXELS_OF_STARTS = 2048  # the same at starts of episodes, of which there are few in a step
 
 
 class ImageSpace(NamedTuple):
@@ -80,14 +81,14 @@ class Vision:
             images = self._exposed(key, world.params, poses[0], world.scene)
         else:
             due = ((world.step - self.delay) % self.every == 0) & (world.step > self.delay)
-            images = self._where(due, key, world, poses[0])
+            images = self._where(due, _PIXELS, key, world, poses[0])
         return world.replace(images=images, poses=poses[1:])
 
     def renewed(self, ended: Array, key: Any, world: World) -> World:
         """The world with the images of a start where an episode has ended."""
         pose = _pose(world.drones)
         poses = jnp.where(ended, pose[None], world.poses)
-        return world.replace(images=self._where(ended, key, world, pose), poses=poses)
+        return world.replace(images=self._where(ended, _PIXELS_OF_STARTS, key, world, pose), poses=poses)
 
     def spaces(self, drones: int, obstacles: int) -> dict[str, ImageSpace]:
         """The values that the images of one drone can have, by name."""
@@ -104,12 +105,12 @@ class Vision:
         }
         return {name: known[name] for name in self.images}
 
-    def _where(self, due: Any, key: Any, world: World, pose: Array) -> dict[str, Array]:
-        """New images where they are due, elsewhere those that the world has."""
+    def _where(self, due: Any, pixels: int, key: Any, world: World, pose: Array) -> dict[str, Array]:
+        """New images where they are due, so many pixels at a time; elsewhere those that the world has."""
         args = key, world.params, pose, world.scene
         if self.on_host and not is_traced((due, world.images, args)):
             return self._exposed(*args) if due else world.images
-        worlds = 1 if self.on_host else max(1, _PIXELS // (len(pose) * math.prod(self.camera.resolution)))
+        worlds = 1 if self.on_host else max(1, pixels // (len(pose) * math.prod(self.camera.resolution)))
         return where_due(self._exposed, worlds)(due, world.images, *args)
 
     def _exposed(self, key: Any, params: Params, pose: Float[Array, "n 7"], scene: Scene) -> dict[str, Array]:

@@ -58,11 +58,19 @@ def between_planes(origin: Array, direction: Array, half: Array) -> Interval:
 
 def within_radius(origin: Components, direction: Components, radius: Number) -> Interval:
     """Where lines are within `radius` of zero; the empty interval [inf, -inf] where they are never."""
-    square = nonzero(_product(direction, direction))
-    middle = -_product(origin, direction) / square
-    closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
-    slack = radius**2 - _product(closest, closest)
-    reach = jnp.where(slack >= 0, safe_sqrt(slack / square), -jnp.inf)
+    square = _product(direction, direction)
+    divisor = nonzero(square)
+    per_square = 1 / divisor
+    middle = -_product(origin, direction) * per_square
+    if len(origin) == 2:  # the closest distance is a cross product, and that of the origin where nothing moves
+        (x, y), (u, v) = origin, direction
+        slack = divisor * radius**2 - (x * v - y * u) ** 2 - (divisor - square) * (x * x + y * y)
+        half = safe_sqrt(slack) * per_square
+    else:
+        closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
+        slack = radius**2 - _product(closest, closest)
+        half = safe_sqrt(slack * per_square)
+    reach = jnp.where(slack >= 0, half, -jnp.inf)
     return middle - reach, middle + reach
 
 

@@ -14,14 +14,25 @@ def double(x, shared):
     return {"double": 2 * x, "sum": x + shared}
 
 
-@pytest.mark.parametrize("count", [0, 1, 8, 9, 64])
+@pytest.mark.parametrize("count", [0, 1, 8, 9, 16, 17, 64])
 def test_what_is_needed_equals_vmap_and_what_is_not_may_be_zero(count):
     needed = jnp.arange(64) < count
     found = jax.vmap(where_needed(double, one_in=8), (0, 0, None))(needed, X, 3.0)
     expected = jax.vmap(double, (0, None))(X, 3.0)
     for name in expected:
         np.testing.assert_array_equal(found[name][needed], expected[name][needed])
-        assert count > 8 or not jnp.any(found[name][~needed])
+        assert count > 16 or not jnp.any(found[name][~needed])
+
+
+@pytest.mark.parametrize("count", [0, 9, 64])
+def test_derivatives_are_those_of_the_function_where_it_is_needed_and_zero_elsewhere(count):
+    """Forward, backward and twice."""
+    needed = jnp.arange(64) < count
+    cube = where_needed(lambda x: x**3, one_in=8)
+    for derivative in jax.grad, jax.jacfwd:
+        slope = derivative(lambda x, needed: cube(needed, x))
+        for f, expected in (slope, 3 * X**2), (derivative(slope), 6 * X):
+            np.testing.assert_allclose(jax.vmap(f)(X, needed), jnp.where(needed, expected, 0), rtol=1e-12)
 
 
 def test_many_worlds_that_are_given_the_same_key_are_refused():

@@ -1,0 +1,69 @@
+"""Contact with obstacles at the cost of what is near: no drone touches anything in a ball that is free of obstacles.
+
+The distance from the nearest obstacle changes by no more than the way that a drone moves. So one distance for every
+control step tells in all its physics steps which drones cannot touch anything, exactly and at whatever speed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxdrones.accelerate.where_needed import where_needed
+from jaxdrones.dynamics import obstacle_contact
+from jaxdrones.dynamics.contact import contact_radius
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.state import State
+from jaxdrones.vector import dot, safe_sqrt
+from jaxdrones.wrench import Wrench
+
+_ROUNDING = 1e-3  # m: what may be touched reaches a little farther than what is touched
+_ONE_IN = 32  # worlds
+
+
+class FreeBalls(NamedTuple):
+    """A ball about every drone of a team in which there is no obstacle."""
+
+    center: Float[Array, "n 3"]
+    """m, world."""
+    radius: Float[Array, " n"]
+    """m; negative where the center is in an obstacle."""
+
+    @classmethod
+    def about(cls, state: State, scene: Scene) -> FreeBalls:
+        """The largest balls about the drones."""
+        pos, scene = jax.lax.stop_gradient((state.pos, scene.replace(ground=False)))
+        return cls(pos, jax.vmap(scene.distance)(pos))
+
+    def hold(self, params: Params, state: State) -> Bool[Array, " n"]:
+        """Whether all of each drone is in its ball."""
+
+        def is_inside(center: Array, radius: Array, params: Params, state: State) -> Array:
+            moved = state.pos - center
+            return safe_sqrt(dot(moved, moved)) + contact_radius(params) + _ROUNDING < radius
+
+        return jax.vmap(is_inside)(*self, params, state)
+
+
+def contact_of_team(params: Params, state: State, scene: Scene, free: FreeBalls | None) -> Wrench:
+    """`obstacle_contact` on every drone of a team.
+
+    Args:
+        params: of a team of n drones.
+        state: of the team.
+        scene: obstacles.
+        free: balls without obstacles. Of many worlds, only those are computed in which a drone is not in its ball;
+            all, if left out.
+    """
+
+    def contact(params: Params, state: State, scene: Scene) -> Wrench:
+        return jax.vmap(obstacle_contact, (0, 0, None))(params, state, scene)
+
+    if free is None:
+        return contact(params, state, scene)
+    still = jax.lax.stop_gradient((params, state))
+    return where_needed(contact, _ONE_IN)(~jnp.all(free.hold(*still)), params, state, scene)

@@ -1,0 +1,110 @@
+"""Contact that is computed only where an obstacle is near equals contact that is computed everywhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close, make_step
+
+import jaxdrones as jd
+from jaxdrones.dynamics.contact import contact_radius
+from jaxdrones.engine.clearance import FreeBalls
+from jaxdrones.sensing import Box, Scene, Sphere
+
+TEAM = jd.repeat(jd.load_params("cf2x"), 2)
+RPM = jnp.zeros((2, 4))
+SCENE = Scene.of(
+    Box(pos=np.array([(0.4, 0, 0), (-0.4, 0, 0)]), size=(0.2, 1, 1)), Sphere(pos=(0, 0.4, 0), radius=0.2), ground=False
+)
+
+
+def everywhere(params, state, scene):
+    """The same contact as an effect of a user, of which nothing is known."""
+    return jd.obstacle_contact(params, state, scene)
+
+
+def starts(worlds, near, speed):
+    """Teams of two; in the first `near` worlds they fly at the obstacles, in the others far away."""
+    rng = np.random.default_rng(worlds)
+    pos = rng.uniform(-0.6, 0.6, (worlds, 2, 3))
+    pos[near:, :, 2] += 50
+    state = jax.vmap(jd.State.at_rest)(jnp.array(pos))
+    quat = rng.normal(size=(worlds, 2, 4))
+    return state.replace(
+        vel=jnp.array(speed * rng.uniform(-1, 1, (worlds, 2, 3))),
+        omega=jnp.array(rng.uniform(-9, 9, (worlds, 2, 3))),
+        quat=jnp.array(quat / np.linalg.norm(quat, axis=2, keepdims=True)),
+    )
+
+
+def flown(effect, integrator, state, scene=SCENE):
+    """Two long control steps of a world."""
+    step = make_step(effects=(effect,), integrator=integrator, dt=1 / 240, substeps=12)
+    return step(TEAM, step(TEAM, state, RPM, scene), RPM, scene)
+
+
+@pytest.mark.parametrize("integrator", [jd.semi_implicit_euler, pytest.param(jd.rk4, marks=pytest.mark.slow)])
+def test_worlds_that_are_near_and_worlds_that_are_not_fly_as_if_all_were_computed(integrator):
+    """Where few and where most are near; at up to 20 m/s, with 1 m between two control steps."""
+    fly, fly_everywhere = (
+        jax.jit(jax.vmap(lambda s, effect=effect: flown(effect, integrator, s)))
+        for effect in (jd.obstacle_contact, everywhere)
+    )
+    for near in 50, 6:
+        states = starts(64, near, 20.0)
+        found, expected = fly(states), fly_everywhere(states)
+        assert_close(found, expected, 1e-9)
+        pushed = np.any(np.asarray(found.vel != states.vel)[..., :2], axis=(1, 2))  # the rotors stand still
+        assert near / 2 < pushed.sum() <= near
+
+
+def test_what_stays_in_its_free_ball_has_no_contact():
+    """Wherever the drone is in it, and in whatever attitude; and the ball is the largest one."""
+    states = jax.tree.map(lambda x: x[:, :1], starts(400, 400, 0.0))
+    states = states.replace(pos=2 * states.pos)
+    one = jax.tree.map(lambda x: x[:1], TEAM)
+
+    def of_world(state, towards):
+        free = FreeBalls.about(state, SCENE)
+        moved = state.replace(pos=state.pos + towards)
+        wrench = jax.vmap(jd.obstacle_contact, (0, 0, None))(one, moved, SCENE)
+        return free.hold(one, moved)[0], jnp.any(wrench.force != 0), free.radius[0]
+
+    towards = jnp.array(np.random.default_rng(1).normal(size=(400, 1, 3)) * 0.2)
+    inside, touched, radius = jax.jit(jax.vmap(of_world))(states, towards)
+    assert 50 < jnp.sum(inside) < 350 and jnp.sum(touched) > 10
+    assert not np.any(inside & touched)
+    size = contact_radius(jd.load_params("cf2x"))
+    away = np.linalg.norm(towards[:, 0], axis=1)
+    np.testing.assert_array_equal(inside, away + size + 1e-3 < radius)
+
+
+def height(effect, vel, shift, state):
+    """A number that depends on how a world is flown, with the obstacles moved."""
+    scene = SCENE.replace(boxes=SCENE.boxes.replace(pos=SCENE.boxes.pos + shift))
+    return jnp.sum(flown(effect, jd.semi_implicit_euler, state.replace(vel=vel), scene).pos ** 2)
+
+
+def of_each(f):
+    return jax.vmap(jax.grad(f, (0, 1)), (0, None, 0))
+
+
+def of_all(f):
+    return jax.grad(lambda *x: jnp.sum(jax.vmap(f, (0, None, 0))(*x)), (0, 1))
+
+
+def forward(f):
+    return jax.vmap(jax.jacfwd(f, (0, 1)), (0, None, 0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("derivative", [of_each, of_all, forward])
+def test_derivatives_are_those_of_contact_everywhere(derivative):
+    """In the velocities and in the places of the obstacles."""
+    states, shift = starts(16, 8, 3.0), jnp.zeros((1, 3))
+    found, expected = (
+        jax.jit(derivative(lambda *x, effect=effect: height(effect, *x)))(states.vel, shift, states)
+        for effect in (jd.obstacle_contact, everywhere)
+    )
+    assert np.any(found[1] != 0)
+    assert_close(found, expected, 1e-9)

@@ -171,7 +171,7 @@ def _descend(module: ModuleType, hz: int, iterations: int, params: Params, start
 
 def _judged(errors: Float[Array, "gains flights"]) -> Float[Array, " gains"]:
     """Mean error, and by how much it is larger in any one flight than with the first gains; infinite if one breaks."""
-    first = jnp.where(jnp.isfinite(errors[0]), errors[0], jnp.inf)
+    first = jnp.where(jnp.isfinite(errors[:1]), errors[:1], jnp.inf)
     value = jnp.mean(errors, axis=-1) + jnp.max(jnp.maximum(errors - first, 0), axis=-1)
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 

@@ -60,7 +60,7 @@ def of_battery(module, params, *gains):
         ("rates", "hb"),
         ("simple_pid", "racer"),
         ("firmware_pid", "hb"),
-        ("mellinger", "racer"),
+        ("mellinger", "hb"),
         ("pid", "cf2x"),
     ],
 )

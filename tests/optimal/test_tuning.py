@@ -60,7 +60,7 @@ def of_battery(module, params, *gains):
         ("rates", "hb"),
         ("simple_pid", "racer"),
         ("firmware_pid", "hb"),
-        ("mellinger", "racer"),
+        ("mellinger", "hb"),
         ("pid", "cf2x"),
     ],
 )
@@ -92,9 +92,9 @@ def test_no_gradient_of_a_flight_is_longer_than_the_limit_and_broken_ones_do_not
 
 
 def test_gains_with_which_one_flight_becomes_much_worse_are_not_the_best():
-    start, better, lost, broken = [-3.0, -3.0], [-3.5, -2.9], [-9.0, 3.0], [-9.0, jnp.nan]
+    start, better, lost, broken = [-3.0, -3.0], [-3.5, -2.9], [-9.0, 3.5], [-9.0, jnp.nan]
     judged = np.asarray(tuning._judged(jnp.array([start, better, lost, broken])))
-    np.testing.assert_allclose(judged[:3], [-3.0, -3.1, 3.0])
+    np.testing.assert_allclose(judged[:3], [-3.0, -3.2, 3.25])
     assert np.isinf(judged[3]) and np.argmin(judged) == 1
     assert np.argmin(tuning._judged(jnp.array([[-3.0, jnp.inf], [-2.0, 4.0]]))) == 1  # the start itself breaks
 

@@ -156,12 +156,12 @@ def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(arguments, message, cap
     assert message in captured.err and captured.err.count("\n") == 1 and len(captured.err) < 1200
 
 
-def refused_flight(flight, gui=False, progress=None, **options):
+def refused_flight(flight, gui=False, progress=None, watch=None, **options):
     """In place of `fly`, which would take long where a mistake is not seen at once."""
     Conditions(flight, **options)
     if not gui:
         raise AssertionError("flown")
-    return fly(flight, gui, progress, **options)
+    return fly(flight, gui, progress, watch, **options)
 
 
 @pytest.mark.needs("pybullet")

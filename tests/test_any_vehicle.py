@@ -192,6 +192,7 @@ def test_a_law_is_the_regression_over_published_airframes(name):
         np.testing.assert_allclose([law.low, law.high], median * np.exp([residual.min(), residual.max()]), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_angular_acceleration_falls_with_the_mass_as_in_published_airframes(drawn):
     """Froude scaling (Kushleyev et al. 2013) has 1 / length, the power -1/3 of the mass; published airframes -0.28."""
     _, published, _, _ = regression(ARM * T_W * MASS * GRAVITY / 4 / IXX, MASS)
@@ -263,6 +264,7 @@ def test_the_surroundings_and_what_the_core_does_not_know_are_kept():
     np.testing.assert_array_equal(one.wind, params.wind)
 
 
+@pytest.mark.slow
 def test_light_vehicles_can_be_asked_for():
     mass = jax.vmap(lambda key: vehicles.draw(key, CF2X, 0.02, 0.05).mass)(KEYS)
     assert 0.02 <= mass.min() < 0.0205 and 0.0495 < mass.max() <= 0.05
@@ -279,6 +281,7 @@ def test_drawn_vehicles_have_the_precision_of_the_parameters():
     assert_finite(one)
 
 
+@pytest.mark.slow
 def test_an_action_of_zero_hovers_whatever_vehicle_is_drawn():
     env = jd.make("hover", randomize=(AnyVehicle(),), tilt=0.0, speed=0.0, omega=0.0)
     _, world = jax.jit(jax.vmap(env.reset))(KEYS[:20])
@@ -288,6 +291,7 @@ def test_an_action_of_zero_hovers_whatever_vehicle_is_drawn():
     np.testing.assert_allclose(flown.drones.vel, world.drones.vel, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_realistic_any_draws_vehicles_before_what_else_is_drawn():
     env = jd.make("hover", realistic="any", randomize=(scaled("mass", 2.0, 2.0),))
     nominal, drawn = env.params, env.reset(jax.random.key(3))[1].params

@@ -160,6 +160,7 @@ def test_accelerator_names_tests_that_exist():
     assert len(named) > 5 and all((BENCHMARKS.parent / file).is_file() for file in named)
 
 
+@pytest.mark.slow
 def test_accelerator_stops_what_takes_longer_than_its_share(tmp_path):
     file = tmp_path / "result.json"
     command = [sys.executable, str(BENCHMARKS / "accelerator.py"), "--budget", "1", "--sections", "plant", "learning"]

@@ -66,6 +66,7 @@ def test_a_flight_that_breaks_is_logged_and_reported(tmp_path, capsys, monkeypat
 
 
 @pytest.mark.parametrize("flight", mostly_slow(["circle", "velocity"], ["circle"]))
+@pytest.mark.slow
 def test_a_flight_that_diverges_is_logged_and_reported(flight, tmp_path, capsys):
     slow = ["fly", flight, "--drones", "2", "--control-hz", "7", "--duration", "4", "--output", str(tmp_path)]
     assert main([*slow, "--json"]) == 1

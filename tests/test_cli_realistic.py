@@ -32,6 +32,7 @@ def refused(capsys, *command):
     return line
 
 
+@pytest.mark.slow
 def test_a_recipe_of_any_vehicle_draws_another_one_in_every_episode():
     env = Recipe.of("hover", realistic="any").env()
     masses = {float(env.reset(jax.random.key(seed))[1].params.mass[0]) for seed in range(3)}
@@ -59,6 +60,7 @@ def test_a_run_on_any_vehicle_says_so_and_is_evaluated_and_flown_on_any_vehicle(
     assert "is trained to the end" in refused(capsys, *again, "--realistic", "any")
 
 
+@pytest.mark.slow
 def test_a_task_that_comes_after_the_option_is_the_task(capsys):
     before = said(capsys, "explain", "--realistic", "hover")
     assert before == said(capsys, "explain", "hover", "--realistic")
@@ -80,6 +82,7 @@ def test_what_contradicts_any_vehicle_is_refused(capsys):
     assert "--realistic is given beside the run runs/hover, which says what is flown; leave it out" in line
 
 
+@pytest.mark.slow
 def test_a_policy_of_ones_own_flies_any_vehicle(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text("import jax.numpy as jnp\ndef still(obs):\n    return jnp.zeros((1, 4))\n")

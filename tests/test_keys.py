@@ -96,6 +96,7 @@ def keys(monkeypatch):
 
 
 @pytest.mark.parametrize("task", mostly_slow(["hover", "tracking", "swap-goals"], ["hover"]))
+@pytest.mark.slow
 def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
     """Start, parameters, scene, sensors, noise, pushes, and those of the next episode: in one step that ends one."""
     env = make(task, **EVERYTHING)
@@ -193,6 +194,7 @@ class TossWorld(flax.struct.PyTreeNode):
 
 @pytest.mark.float32
 @pytest.mark.parametrize("name", mostly_slow(LEARNERS, ["bptt"]))
+@pytest.mark.slow
 def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(keys, name, monkeypatch):
     learner, config = LEARNERS[name]
     env = Toss()

@@ -52,6 +52,7 @@ def test_the_package_says_that_it_has_types():
 
 
 @pytest.mark.needs("mypy")
+@pytest.mark.slow
 def test_a_type_checker_tells_every_mistake_and_nothing_else():
     """Of a list of mistakes; that it finds nothing in the package and in a user's script is a part of `make lint`."""
     source = HERE / "typing" / "mistakes.py"

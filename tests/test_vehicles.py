@@ -25,6 +25,7 @@ def test_every_vehicle_goes_where_the_geometric_controller_sends_it():
     assert np.all(error[-1] < 1e-3)
 
 
+@pytest.mark.slow
 def test_every_vehicle_hovers_on_rotors_that_lag():
     """With drag, from 0.3 m away and tilted by 20 degrees, and with the reaction of the rotors' inertia."""
     team = team_of(*EVERY)
@@ -32,6 +33,7 @@ def test_every_vehicle_hovers_on_rotors_that_lag():
     assert np.all(distance < 0.01) and np.all(speed < 0.01)
 
 
+@pytest.mark.slow
 def test_the_pid_hovers_the_crazyflies_that_it_suits():
     suited = [vehicle for vehicle in EVERY if pid.fits(jd.load_params(vehicle))]
     assert suited == ["cf2p", "cf2x"]
@@ -114,6 +116,7 @@ def test_coefficients_per_radian_are_those_of_the_source(vehicle, kf, kappa, thr
     np.testing.assert_allclose(params.max_thrust, thrust, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_every_vehicle_stands_on_the_ground():
     """It does not sink, tip or slide; the ground is stiff for all of them."""
     team = team_of(*EVERY)

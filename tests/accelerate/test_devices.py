@@ -12,6 +12,7 @@ EPSILON = {32: 1e-5, 64: 1e-12}  # of the largest number of an array: 20 steps, 
 
 
 @pytest.mark.parametrize("bits", [32, pytest.param(64, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_flights_and_their_gradients_are_those_of_a_cpu_in_either_precision(bits):
     with jax.enable_x64(bits == 64):
         params = jd.repeat(jd.load_params("cf2x"), 1)

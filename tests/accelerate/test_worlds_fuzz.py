@@ -44,6 +44,7 @@ def test_random_programs_give_what_vmap_gives(seed):
     assert_same(function, arguments, dtype, (None, 4)[seed // 2 % 2], inside_jit=seed // 8 % 3 == 0)
 
 
+@pytest.mark.slow
 def test_many_of_the_arithmetic_programs_are_kernels():
     def is_kernel(seed):
         arguments = [x[0] for x in worlds(seed, 1, "float64", arithmetic=True)]

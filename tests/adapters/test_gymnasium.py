@@ -63,6 +63,7 @@ def test_dict_spaces_by_drone_pass_and_show_what_the_boxes_show(env_of):
     assert reward == reward_by_drone
 
 
+@pytest.mark.slow
 def test_a_teams_reward_is_the_sum_over_drones_and_terms(env_of):
     env = GymnasiumEnv(env_of("leader-follower"))
     env.reset(seed=0)
@@ -127,6 +128,7 @@ def test_mistakes_are_named(env_of):
         by_drone.step({"0": np.zeros(1)})
 
 
+@pytest.mark.slow
 def test_world_i_of_many_flies_as_one_that_is_reset_with_the_seed_plus_i(env_of, vector_of):
     envs, alone = vector_of(), GymnasiumEnv(short(env_of))
     obs, _ = envs.reset(seed=7)
@@ -232,6 +234,7 @@ def test_a_list_of_seeds_is_one_for_every_world(vector_of):
         ("DtypeObservation", AutoresetMode.NEXT_STEP),
     ],
 )
+@pytest.mark.slow
 def test_observation_wrappers_of_gymnasium_run(wrapper, mode, vector_of):
     given = {"dtype": np.float64} if wrapper == "DtypeObservation" else {}
     envs = getattr(gymnasium.wrappers.vector, wrapper)(vector_of(mode), **given)

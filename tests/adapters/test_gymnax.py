@@ -45,6 +45,7 @@ def test_it_is_the_environment_with_autoreset(env_of):
     assert discounts == [1, 1, 1]  # truncated, not terminated
 
 
+@pytest.mark.slow
 def test_truncation_may_be_separate_as_in_gymnax_1(env_of):
     env = gymnax.wrap(env_of("hover", drones=2, duration=0.02), separate_truncation=True)
     _, state = env.reset(KEY)
@@ -95,6 +96,7 @@ def test_params_are_those_of_another_environment():
     assert done == [[False, False], [False, False], [False, True]]
 
 
+@pytest.mark.slow
 def test_a_discrete_action_is_a_row_of_the_table(env_of):
     plain, table = env_of("hover", drones=2, duration=0.02), np.linspace(-1, 1, 24).reshape(3, 8)
     env = gymnax.wrap(plain, discrete_actions=table)

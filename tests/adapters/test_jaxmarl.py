@@ -73,6 +73,7 @@ def test_the_next_episode_may_start_at_a_given_state(env_of):
         np.testing.assert_allclose(env.get_obs(state)[agent], obs[agent], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_discrete_action_is_a_row_of_the_table(env_of):
     plain, table = env_of("hover", drones=2, duration=0.02), np.linspace(-1, 1, 12).reshape(3, 4)
     env = jaxmarl.wrap(plain, discrete_actions=table)

@@ -26,6 +26,7 @@ def test_a_library_that_is_not_installed_is_named_with_what_installs_it(adapter,
     assert str(error.value) == named
 
 
+@pytest.mark.slow
 def test_the_other_adapters_need_no_library():
     code = (
         "import sys; sys.modules.update(dict.fromkeys(sys.argv[1:])); "

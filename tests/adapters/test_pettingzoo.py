@@ -17,6 +17,7 @@ def test_pettingzoos_own_tests_pass(task, env_of):
     parallel_seed_test(lambda: parallel_env(env_of(task)), num_cycles=5)
 
 
+@pytest.mark.slow
 def test_agents_are_drones_and_all_end_at_once(env_of):
     env = parallel_env(env_of("hover", drones=2, duration=0.05))
     assert env.possible_agents == ["drone_0", "drone_1"] and env.agents == []

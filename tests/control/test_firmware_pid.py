@@ -130,6 +130,7 @@ def teams():
 
 
 @pytest.mark.parametrize("i", range(len(VEHICLES)), ids=VEHICLES)
+@pytest.mark.slow
 def test_every_vehicle_comes_to_its_place_and_heading(teams, i):
     off = np.linalg.norm(np.asarray(teams.pos[:, i]) - [0.3, -0.2, 1.2], axis=-1)
     yaw = np.asarray(jax.vmap(rotation.to_rpy)(teams.quat[:, i]))[:, 2]
@@ -138,6 +139,7 @@ def test_every_vehicle_comes_to_its_place_and_heading(teams, i):
     assert np.max(np.std(teams.rpm[-500:, i], axis=0)) < 5e-3 * np.mean(teams.rpm[-500:, i])
 
 
+@pytest.mark.slow
 def test_velocities_attitudes_and_rates_are_flown():
     params = jaxdrones.load_params("cf2x")
     team = jaxdrones.repeat(params, 1)

@@ -26,6 +26,7 @@ def test_every_vehicle_reaches_a_place_30_cm_off_in_the_same_way():
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])
 @pytest.mark.parametrize("degrees", [120, 160])
+@pytest.mark.slow
 def test_every_vehicle_recovers_from_upside_down(degrees, axis):
     """With the loss of height that a third of a second without lift costs, more the further it is upside down."""
     team = team_of(*VEHICLES)
@@ -36,6 +37,7 @@ def test_every_vehicle_recovers_from_upside_down(degrees, axis):
     assert np.all(error[-1] < 1e-3)
 
 
+@pytest.mark.slow
 def test_a_circle_is_tracked_as_well_as_it_is_described():
     """Radius 0.5 m in 4 s, 1.2 m/s^2; the worst error of the second turn, the same for every vehicle.
 

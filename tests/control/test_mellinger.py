@@ -48,6 +48,7 @@ def test_every_vehicle_comes_to_its_place_and_heading(placed, i):
     assert np.max(np.std(placed.rpm[-500:, i], axis=0)) < 5e-3 * np.mean(placed.rpm[-500:, i])
 
 
+@pytest.mark.slow
 def test_it_follows_what_the_pid_trails():
     """A circle of 0.5 m in 4 s, 0.8 m/s."""
 

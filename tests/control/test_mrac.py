@@ -39,6 +39,7 @@ def recorded_gains(arrays):
     return mrac.gains().replace(reference=-jnp.array(arrays["Kr_ref_gain"]), **values)
 
 
+@pytest.mark.slow
 def test_the_gains_are_those_of_gym_pybullet_drones(recorded):
     """1e-6 of the largest; measured 0 with SciPy 1.17.1 and 4e-9 with 1.18.1."""
     _, expected, *_ = recorded
@@ -67,6 +68,7 @@ def test_the_model_settles_at_the_target():
     np.testing.assert_allclose(residual, 0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_hovers_as_in_its_example():
     """From 0.1 m to 1 m at 120 Hz, the weight to be learned: measured 5 mm off after 14 s."""
     off = reaches(mrac, ("cf2x",), (0.0, 0.0, 1.0), 15, 120, start=State.at_rest([[0.0, 0.0, 0.1]]))

@@ -30,6 +30,7 @@ def test_recorded_single_calls_agree(name):
 
 @pytest.mark.float32
 @pytest.mark.parametrize("name", golden_data.names("thrust_pwm"))
+@pytest.mark.slow
 def test_recorded_single_calls_agree_in_float32(name):
     case = golden_data.load(name)
     _, rpm, _ = call_fresh(recorded_vehicle(case), *inputs(case))

@@ -42,6 +42,7 @@ def test_recorded_commands_agree_in_float32(name):
 
 
 @pytest.mark.parametrize("omega", [(0.5, -0.3, 0.1), (1.5, 0.0, 0.0), (-0.4, 0.8, -0.1)])
+@pytest.mark.slow
 def test_body_rates_follow_a_step_as_a_first_order_lag(omega):
     """Exactly, as long as all rotors turn: 1 - (1 - 40 dt)^k in roll and pitch, 1 - (1 - 15 dt)^k in yaw."""
     team = team_of(*VEHICLES)
@@ -53,6 +54,7 @@ def test_body_rates_follow_a_step_as_a_first_order_lag(omega):
     np.testing.assert_allclose(flown.omega, np.broadcast_to(expected, flown.omega.shape), rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_collective_is_thrust_per_mass():
     team = team_of(*VEHICLES)
     for params in (one(team, i) for i in range(len(VEHICLES))):
@@ -67,6 +69,7 @@ def test_every_vehicle_reaches_a_place_30_cm_off():
     assert np.all(error[-1] < 1e-4)  # m; measured: 5e-5
 
 
+@pytest.mark.slow
 def test_every_vehicle_recovers_from_straight_upside_down():
     """The quaternion error is largest there, while the geometric controller's would vanish."""
     team = team_of(*VEHICLES)

@@ -21,6 +21,7 @@ def test_recorded_sequences_agree(name):
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (-2, 1, 0), (0.1, 0.2, -0.3)])
 @pytest.mark.parametrize("share", [1.0, -0.4])
+@pytest.mark.slow
 def test_the_speed_becomes_the_asked_share_of_the_limit(direction, share):
     """Crazyflies: 0.25 m/s, 3 % of 30 km/h. Any length of the direction and either sign of the share will do."""
     team = team_of("cf2x", "cf2p")

@@ -146,6 +146,7 @@ def test_ground_effect_fades_out_smoothly_on_the_way_to_upside_down():
     assert gain[2] == 0
 
 
+@pytest.mark.slow
 def test_ground_effect_rights_a_tilted_drone():
     """The lower rotors gain more, so the torque is against the roll."""
     tilts = jnp.array([0.3, -0.3])

@@ -82,6 +82,7 @@ def in_world(states, wrench):
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
+@pytest.mark.slow
 def test_the_ground_pushes_and_rubs_within_the_cone_of_friction(vehicle):
     force, _ = in_world(alone, ground_wrench(alone, VEHICLES[vehicle]))
     assert np.all(force[:, 2] >= 0) and np.mean(force[:, 2] > 0) > 0.3
@@ -89,6 +90,7 @@ def test_the_ground_pushes_and_rubs_within_the_cone_of_friction(vehicle):
     assert np.all(rubbing <= 0.5 * force[:, 2] + 1e-12)
 
 
+@pytest.mark.slow
 def test_there_is_no_contact_in_the_air():
     high = alone.replace(pos=alone.pos.at[:, 2].set(0.0601 + 1e-6))  # the radius and more
     assert all(np.all(x == 0) for x in jax.tree.leaves(ground_wrench(high)))
@@ -151,6 +153,7 @@ def test_a_landing_ends_as_high_as_in_bullet_and_does_not_bounce(vehicle):
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
+@pytest.mark.slow
 def test_a_drone_at_rest_stays_at_rest(vehicle):
     """Turned any way about its axis and left alone for 10 s: less than a nanometre and a nanoradian."""
     yaw = State.at_rest(jnp.array([[0.0, 0, foot(VEHICLES[vehicle])]]), jnp.array([0.3]))
@@ -255,6 +258,7 @@ def crash(params, speed, towards, n=30):
 
 @pytest.mark.parametrize(("speed", "towards"), [(1.0, (1, 0, 0)), (3.0, (1, 0, 0)), (3.0, (0, 0, 1))])
 @pytest.mark.parametrize("vehicle", mostly_slow(VEHICLES, ["cf2x"]))
+@pytest.mark.slow
 def test_drones_that_crash_stop_each_other_and_gain_nothing(vehicle, speed, towards):
     """They rebound by no more than 0.4 of their speed (0.2 typical; Bullet's below 0.05) and stay on their own sides.
 
@@ -298,6 +302,7 @@ def smallest_gap(state):
     "quat", [(0.0, 0, 0, 1), (0.5, 0.5, 0.5, 0.5), (0.0, 0.6, 0, 0.8)], ids=["level", "edge", "tilt"]
 )
 @pytest.mark.parametrize("n", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_drones_in_exactly_the_same_place_come_apart_and_keep_their_momentum(vehicle, n, quat):
     """By the height of the bodies at least, in the order of their indices, the same way every time."""
     params = VEHICLES[vehicle]

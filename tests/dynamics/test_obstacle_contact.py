@@ -57,6 +57,7 @@ def wrenches(scene, states):
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
+@pytest.mark.slow
 def test_a_wall_holds_at_5_meters_per_second_and_gives_no_energy(vehicle):
     """Level and tilted, for half a second without gravity or thrust; the center sinks in by less than 6 cm."""
     params = VEHICLES[vehicle].replace(gravity=jnp.array(0.0))
@@ -113,6 +114,7 @@ def test_what_is_not_active_or_out_of_reach_is_not_touched():
     assert all(np.all(x == 0) for x in jax.tree.leaves(wrenches(SCENE, far)))
 
 
+@pytest.mark.slow
 def test_looking_only_at_what_is_within_reach_changes_nothing():
     """In a heap of overlapping obstacles, every sphere meets the surface that is nearest to it."""
     rng = np.random.default_rng(1)

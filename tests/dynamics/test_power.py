@@ -39,6 +39,7 @@ def flown(team, pwm, length, integrator=jd.semi_implicit_euler, charge=None, mod
 
 
 @pytest.mark.parametrize("integrator", [jd.semi_implicit_euler, jd.rk4], ids=["semi-implicit Euler", "rk4"])
+@pytest.mark.slow
 def test_the_charge_falls_by_the_integral_of_the_current(integrator):
     """1e-9 A s of 4 A s; measured 4e-13."""
     end = flown(TEAM, jnp.array([5e4, 4e4, 6e4, 5e4]), 480, integrator)
@@ -47,6 +48,7 @@ def test_the_charge_falls_by_the_integral_of_the_current(integrator):
     np.testing.assert_allclose(used, end.aux["drawn"], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_voltage_times_current_is_the_power():
     end = flown(TEAM, 5e4, 240)
     voltage, current, power = (jax.vmap(f)(TEAM, end) for f in (jd.battery_voltage, jd.battery_current, battery_power))
@@ -72,6 +74,7 @@ def test_an_empty_battery_stops_the_rotors_and_gives_no_more():
     assert np.all(jax.vmap(jd.battery_current)(TEAM, end) < 0.1)
 
 
+@pytest.mark.slow
 def test_more_power_than_a_battery_has_is_its_highest():
     team = equipped(resistance=2.0)
     params, state = jax.tree.map(lambda x: x[0], (team, flown(team, 0.0, 1)))
@@ -81,6 +84,7 @@ def test_more_power_than_a_battery_has_is_its_highest():
     assert_finite(jax.grad(jd.battery_voltage, argnums=(0, 1))(params, state))
 
 
+@pytest.mark.slow
 def test_a_voltage_at_rest_gives_the_charge():
     cell = jd.lithium_polymer(cells=3)
     charge = jnp.array([10.0, 200, 890])

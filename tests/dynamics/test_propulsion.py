@@ -20,6 +20,7 @@ def with_motors(supply=3.0, **aux):
 
 
 @each_curve
+@pytest.mark.slow
 def test_the_voltage_of_a_thrust_gives_that_thrust(propellers):
     motors = jd.crazyflie_motors(propellers)
     thrust = jnp.linspace(0, 0.2, 9)
@@ -32,6 +33,7 @@ def test_the_voltage_of_a_thrust_gives_that_thrust(propellers):
 
 @pytest.mark.float32
 @each_curve
+@pytest.mark.slow
 def test_the_inverse_holds_in_single_precision(propellers):
     motors = jd.crazyflie_motors(propellers)
     thrust = jnp.linspace(0.001, 0.2, 50)
@@ -84,6 +86,7 @@ def test_sound_rotors_are_as_without_failures_and_a_dead_one_gets_no_command(nam
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_a_drone_with_a_dead_rotor_turns_over_and_its_gradient_in_the_health_is_finite():
     team = jd.repeat(with_motors(rotor_health=jnp.ones(4)), 1)
     step = make_step(rotors=jd.failing(jd.lagging_rotors))

@@ -67,6 +67,7 @@ def test_the_mean_wind_is_logarithmic():
     assert_finite(jax.jacrev(field)(jnp.array([0.0, 0, -1])))
 
 
+@pytest.mark.slow
 def test_a_field_may_change_with_time():
     """A heavy drone in a wind that swings at 1 Hz: after whole periods the drag has pushed it to and fro."""
     team = jd.repeat(CF2X.replace(mass=jnp.array(1e3), gravity=jnp.array(0.0)), 1)
@@ -106,6 +107,7 @@ def test_a_rotor_that_moves_down_faster_than_its_neighbors_lifts_more_so_rolling
 
 
 @pytest.mark.float32
+@pytest.mark.slow
 def test_in_single_precision_inflow_is_finite_everywhere():
     params = jd.load_params("cf2x")
     still = jax.tree.map(lambda x: x[0], jd.State.at_rest([[0.0, 0, 1]]))

@@ -44,6 +44,7 @@ def flown(effect, integrator, state, scene=SCENE):
 
 
 @pytest.mark.parametrize("integrator", [jd.semi_implicit_euler, pytest.param(jd.rk4, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_worlds_that_are_near_and_worlds_that_are_not_fly_as_if_all_were_computed(integrator):
     """Where few and where most are near; at up to 20 m/s, with 1 m between two control steps."""
     fly, fly_everywhere = (
@@ -58,6 +59,7 @@ def test_worlds_that_are_near_and_worlds_that_are_not_fly_as_if_all_were_compute
         assert near / 2 < pushed.sum() <= near
 
 
+@pytest.mark.slow
 def test_what_stays_in_its_free_ball_has_no_contact():
     """Wherever the drone is in it, and in whatever attitude; and the ball is the largest one."""
     states = jax.tree.map(lambda x: x[:, :1], starts(400, 400, 0.0))

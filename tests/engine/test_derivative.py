@@ -55,6 +55,7 @@ class Counted(jd.State):
 
 
 @pytest.mark.parametrize("integrator", mostly_slow(INTEGRATORS, [jd.semi_implicit_euler]), ids=name_of)
+@pytest.mark.slow
 def test_a_further_field_of_a_subclass_stays_as_it_is(integrator):
     mine = Counted(**vars(START) | {"label": jnp.array([[3.0], [7.0]])})
     step = make_step(**PHYSICS, integrator=integrator)

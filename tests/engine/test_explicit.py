@@ -102,6 +102,7 @@ def test_without_a_limit_motors_follow_and_the_gradient_of_a_flight_is_finite(st
     assert_finite(slopes(team, start, rpm))
 
 
+@pytest.mark.slow
 def test_only_with_contact_is_there_a_floor():
     """A drone that falls from 0.1 m with its rotors at rest, after a quarter of a second and more."""
     team, start = jaxdrones.repeat(cf2x, 1), State.at_rest([[0.0, 0, 0.1]])
@@ -127,6 +128,7 @@ def test_substeps_equal_repeated_steps():
     assert_close(once(team, start, command[0]), jax.tree.map(lambda x: x[-1], repeated), ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_compiled_equals_not_compiled():
     team = jaxdrones.repeat(cf2x, 1)
     step = make_step(substeps=2)
@@ -179,6 +181,7 @@ def test_a_distant_drone_changes_nothing(pair, x):
     assert_close(jax.tree.map(lambda x: x[:, :1], together), alone, ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_a_lower_drone_leaves_the_upper_one_alone():
     step = make_step(pairs=(downwash,))
     team = jaxdrones.repeat(cf2x, 2)

@@ -112,6 +112,7 @@ def test_gradients_of_a_hundred_steps_agree_with_central_differences(name):
     assert felt >= {f"[0].{key}" for key in FELT[name]} | {"[1].pos", "[1].quat", "[1].vel", "[1].omega", "[2]"}
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_mode_agree():
     """To round-off through a hundred steps."""
     arguments = flight()

@@ -68,6 +68,7 @@ def test_turning_the_world_about_the_vertical_turns_the_flight(effects, pairs):
     assert_same_motion(flown, turned(q, fly(step, windy, start, command)), ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_moving_the_world_sideways_moves_the_flight():
     step = make_step(*SMOOTH)
     shift = jnp.array([5.0, -7.0, 0.0])
@@ -76,6 +77,7 @@ def test_moving_the_world_sideways_moves_the_flight():
     assert_close(moved, here.replace(pos=here.pos + shift[None, None]), ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_without_gravity_and_ground_there_is_no_up():
     """Drag acts in the body frame and the jet along a thrust axis, so any rotation and shift will do."""
     step = make_step((drag,), (downwash,))
@@ -101,6 +103,7 @@ def test_a_mirrored_team_flies_the_mirrored_flight(effects, pairs):
 
 
 @pytest.mark.parametrize("vehicle", ["cf2x", "racer"])
+@pytest.mark.slow
 def test_a_cross_is_its_own_mirror_image(vehicle):
     """Left and right rotors of an x frame change places; the spins already fit."""
     step = make_step((drag, ground_effect))

@@ -29,6 +29,7 @@ def test_every_task_keeps_the_contract(task):
 
 
 @pytest.mark.parametrize("action", mostly_slow(ACTIONS, ("rpm",)))
+@pytest.mark.slow
 def test_every_action_type_keeps_the_contract(action):
     check_env(make("hover", drones=2, action=action), steps=2)
 
@@ -131,6 +132,7 @@ def test_every_reward_that_is_about_the_target_is_about_that_of_the_task(name):
 
 
 @pytest.mark.parametrize("copied", [copy.copy, pytest.param(copy.deepcopy, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_copy_is_an_environment_of_its_own(copied):
     """What is set of it acts, also where the original was compiled before, and only on it."""
     env = make("hover")

@@ -77,6 +77,7 @@ def held_of_many(function, signal, tape):
     return jnp.sum(jax.lax.scan(control_step, (signal, jax.tree.map(jnp.zeros_like, BEFORE)), tape.T)[1])
 
 
+@pytest.mark.slow
 def test_the_order_of_gradient_map_and_loop_does_not_matter():
     many = jax.vmap(functools.partial(held, due_only))
     gradients = (
@@ -92,6 +93,7 @@ def test_the_order_of_gradient_map_and_loop_does_not_matter():
 
 
 @pytest.mark.parametrize("due", [0, 1, 3, 4, 7])
+@pytest.mark.slow
 def test_no_more_is_drawn_than_the_chunks_that_are_due(due):
     drawn = []
 

@@ -83,6 +83,7 @@ def test_a_delay_takes_an_older_action_or_mixes_two(steps, expected):
     np.testing.assert_allclose(delayed(actions, steps), expected)
 
 
+@pytest.mark.slow
 def test_a_delayed_action_reaches_the_rotors_late():
     env = make("hover", delay=0.02)
     _, world = env.reset(KEY)
@@ -121,6 +122,7 @@ def test_pushes_come_as_often_and_last_as_long_as_asked():
     assert np.abs(push).max() <= 0.5 * float(team.weight[0])
 
 
+@pytest.mark.slow
 def test_a_push_accelerates_as_newton_says():
     env = make("hover", effects=("external_force",), tilt=0.0, speed=0.0, omega=0.0)
     _, world = env.reset(KEY)

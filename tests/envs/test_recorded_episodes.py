@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from golden_data import explicit_params, load, names
+from helpers import mostly_slow
 
 import jaxdrones
 from jaxdrones import State, rotation
@@ -81,7 +82,16 @@ def replayed(name: str):
     return case, answers, np.array(step.commands)
 
 
-EPISODES = names(kind="rl_episode")
+EPISODES = mostly_slow(
+    names(kind="rl_episode"),
+    quick=[
+        "rl_main_HoverAviary_pid_121",
+        "rl_main_MultiHoverAviary_one_d_rpm_21",
+        "rl_paper_HoverAviary_one_d_pid_11",
+        "rl_paper_LeaderFollowerAviary_one_d_rpm_11",
+        "rl_paper_TuneAviary_tun_11",
+    ],
+)
 
 
 def rows_kept(case) -> np.ndarray:

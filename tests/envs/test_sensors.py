@@ -62,6 +62,7 @@ def test_an_environment_with_sensors_and_models_keeps_the_contract(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.slow
 def test_an_accelerometer_in_free_flight_feels_the_thrust(backend):
     """Under gravity and rotors that hover the specific force is the thrust: along body z, as large as gravity."""
     with make("hover", backend=backend, sensors=(IMU,)) as env:
@@ -77,6 +78,7 @@ def test_an_accelerometer_in_free_flight_feels_the_thrust(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.slow
 def test_a_model_starts_anew_in_every_episode_and_is_integrated_in_between(backend):
     with make("hover", backend=backend, models=(battery(),), duration=0.05) as env:
         auto = AutoReset(env)
@@ -107,6 +109,7 @@ def test_a_team_effect_acts_on_the_chosen_drones(backend):
     np.testing.assert_allclose(change, [expected, -expected, np.zeros(3)], rtol=0.02, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_of_a_sensor_has_a_random_stream_of_its_own_in_every_step():
     env = make("hover", sensors=(NOISY,))
     _, world = env.reset(KEY)
@@ -117,6 +120,7 @@ def test_noise_of_a_sensor_has_a_random_stream_of_its_own_in_every_step():
     assert len(set(readings)) == 4
 
 
+@pytest.mark.slow
 def test_readings_after_autoreset_are_those_of_the_new_episode():
     auto = AutoReset(make("hover", sensors=(IMU,), duration=0.01))
     _, episode = auto.reset(KEY)

@@ -49,6 +49,7 @@ CASES = [(7.7, 6.1, 5.0, 0.02), (7.7, 50.0, 20.0, 0.2), (15.4, 100.0, 8.0, 0.25)
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.slow
 def test_intensities_are_those_of_the_specification(case):
     """3 %; 64 gusts of 20,000 steps, of which at least 70 length scales each are independent."""
     speed, altitude, *_ = case
@@ -81,6 +82,7 @@ def test_spectra_are_those_of_the_specification(case):
                 np.testing.assert_allclose(np.mean(power[band, i] / density[band]), 1, atol=0.1, err_msg=axis)
 
 
+@pytest.mark.slow
 def test_an_episode_starts_within_the_turbulence():
     """The first gusts of 4,000 drones have the intensities, too; 3.3 % is three standard deviations."""
     turbulence = jd.dryden(10.0, 30.0)
@@ -102,6 +104,7 @@ def test_a_step_of_any_length_keeps_the_intensity(dt):
 
 
 @pytest.mark.float32
+@pytest.mark.slow
 def test_short_steps_hold_in_single_precision():
     """Gusts of 1 ms at 100 m are 1e-4 of a time constant apart: differences have the variance of a random walk."""
     turbulence = jd.dryden(10.0, 100.0, 5.0)
@@ -116,6 +119,7 @@ def test_short_steps_hold_in_single_precision():
     np.testing.assert_allclose((after.wind - before.wind).std(axis=0), expected, rtol=0.04)
 
 
+@pytest.mark.slow
 def test_an_environment_flies_in_turbulence_that_starts_anew():
     env = make("hover", drones=2, effects=("drag",), disturbance=jd.dryden(7.7))
     _, world = env.reset(KEY)

@@ -219,6 +219,7 @@ def test_gradients_through_a_full_battery_are_finite():
 
 @pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.needs("pybullet"))])
 @pytest.mark.parametrize("name", mostly_slow(EXTENSIONS, ["battery"]))
+@pytest.mark.slow
 def test_a_model_flies_in_an_environment_and_starts_anew_with_the_episode(name, backend):
     with jd.make("hover", drones=2, backend=backend, **EXTENSIONS[name]) as env:
         _, world = env.reset(jax.random.key(0))

@@ -166,6 +166,7 @@ def range_in(key, pos):
     return measured(FINDER, one, state, scene=scene)[0], height
 
 
+@pytest.mark.slow
 def test_ranges_in_drawn_scenes_are_mapped_and_fly_in_one_kernel():
     keys = jax.random.split(KEY, 20)
     pos = jnp.stack([jnp.linspace(-1.5, 1.5, 20), jnp.zeros(20), jnp.full(20, 2.0)], axis=-1)

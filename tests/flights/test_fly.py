@@ -17,6 +17,7 @@ def results(record):
     return record.results(FLIGHTS[record.conditions.flight].settling_time)
 
 
+@pytest.mark.slow
 def test_the_circle_is_flown_with_the_known_steady_lag(circle):
     # gym-pybullet-drones (2021) lags by 0.093 to 0.098 m with its explicit dynamics: its target velocity is zero.
     error = np.linalg.norm(circle.pos - circle.target_pos, axis=-1)
@@ -48,6 +49,7 @@ def test_the_velocity_flight_reaches_its_steps_and_reverses_them():
     np.testing.assert_allclose(before[0], -after[0], atol=0.02)
 
 
+@pytest.mark.slow
 def test_ground_effect_lifts_a_take_off_higher_and_faster():
     # gym-pybullet-drones (2021): 0.1758 against 0.1650 m and 0.4365 against 0.3607 m/s. It starts with an unpowered
     # control period and Bullet's damping, hence 2 mm and 2 mm/s.

@@ -42,6 +42,7 @@ def flown():
     return vehicle, [fly_again(log, vehicle, motors, gains) for log in (log_of(HEIGHT, 0), log_of(0.05, TAKE_OFF))]
 
 
+@pytest.mark.slow
 def test_a_repetition_that_begins_in_flight_hovers_at_once(flown):
     """Within a centimeter, with the PWM that carries the weight."""
     vehicle, (hovering, _) = flown

@@ -30,6 +30,7 @@ def falling(obs):
     return -jnp.ones((1, 4))
 
 
+@pytest.mark.slow
 def test_a_drone_that_stays_succeeds_in_every_episode(env):
     report = evaluate(env, hovering, jax.random.key(0), episodes=20)
     assert report.success == 1 and report.episodes == 20

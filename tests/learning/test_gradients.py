@@ -93,6 +93,7 @@ def test_a_surrogate_points_nearly_where_the_exact_gradient_does(flights):
     assert 0.9 < cosine < 1 - 1e-9
 
 
+@pytest.mark.slow
 def test_a_point_mass_is_pushed_by_thrust_and_by_turning_the_thrust_and_its_attitude_has_no_gradient():
     dt, response = 0.02, 0.1
     params = jd.repeat(jd.load_params("cf2x"), 1)

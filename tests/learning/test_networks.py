@@ -23,6 +23,7 @@ def test_a_new_policy_hovers(team):
     assert jnp.max(jnp.abs(action)) < 0.1
 
 
+@pytest.mark.slow
 def test_actions_are_bounded(team):
     policy = Policy.init(jax.random.key(0), team, (16,))
     wild = policy.replace(params=jax.tree.map(lambda p: 1e3 * jnp.ones_like(p), policy.params))
@@ -30,6 +31,7 @@ def test_actions_are_bounded(team):
 
 
 @pytest.mark.parametrize("per_agent", [False, True])
+@pytest.mark.slow
 def test_drones_share_a_network_or_have_their_own(team, per_agent):
     policy = Policy.init(jax.random.key(0), team, (16,), per_agent)
     action = policy(jnp.ones((2, 12)))

@@ -52,6 +52,7 @@ def test_gradients_that_are_not_finite_are_counted_and_stop_training_when_they_r
     assert np.all(np.isfinite(history["reward"])) and np.all(history["nonfinite_gradients"] >= 1)
 
 
+@pytest.mark.slow
 def test_finite_gradients_are_counted_as_none():
     assert np.all(bptt.train(KEY, DoubleIntegrator(), SMALL[bptt]).history["nonfinite_gradients"] == 0)
 

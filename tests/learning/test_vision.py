@@ -169,6 +169,7 @@ def test_a_policy_that_sees_flies_on_as_it_was_saved(team, tmp_path):
 
 
 @pytest.mark.needs("pybullet")
+@pytest.mark.slow
 def test_a_central_critic_sees_every_vector_and_its_own_pictures(team):
     config = ppo.Config(
         updates=1, worlds=8, horizon=2, per_agent=True, centralized_critic=True, critic_hidden_sizes=(8,)

@@ -22,6 +22,7 @@ def some_state(vehicle="cf2x"):
     return one(team), one(flying(team))
 
 
+@pytest.mark.slow
 def test_the_riccati_solution_is_that_of_scipy():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(6, 6)), rng.normal(size=(6, 2))

@@ -71,6 +71,7 @@ def test_tuned_gains_hover_and_track_better_than_the_controllers_own(controller,
     assert tuned[0] < before[0] and tuned[1] < 0.8 * before[1], (before, tuned)
 
 
+@pytest.mark.slow
 def test_a_few_iterations_lower_the_error_and_a_second_vehicle_compiles_nothing():
     racer, hb = (jaxdrones.load_params(vehicle) for vehicle in ("racer", "hb"))
     tuned = tune(racer, "rates", **FEW)

@@ -75,6 +75,7 @@ def test_a_flight_comes_back_from_its_bag(tmp_path):
     np.testing.assert_allclose(back["vel"], record.vel, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_bag_is_not_written_over(recorded):
     with pytest.raises(ValueError, match="exists already; name a bag that does not"):
         bag.Recorder(recorded[0])

@@ -29,6 +29,7 @@ def test_a_state_comes_back_from_its_messages():
     assert_close(back, jax.device_get(simulation.state), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_whoever_hears_the_odometry_has_the_motors_speeds_of_that_time():
     """They have no stamp, so they are sent first."""
     sent = list(convert.state_messages(measured(1)[1], 0, 0))

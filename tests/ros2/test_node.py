@@ -115,6 +115,7 @@ def test_a_peer_that_comes_back_is_heard():
     assert warnings == ["no command for drone_0 for 0.2 s; it hovers", "commands for drone_0 are back; it flies them"]
 
 
+@pytest.mark.slow
 def test_drones_of_a_lost_peer_land_and_the_flight_ends():
     wire = Wire()
     node, _ = make_node(wire, failsafe=Failsafe("land", wait=0.1))

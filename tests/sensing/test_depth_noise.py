@@ -51,6 +51,7 @@ def test_what_shows_nothing_stays_far_and_nothing_leaves_the_limits():
     np.testing.assert_array_equal(DepthNoise().apply(KEY, flat(3.0), CAMERA), flat(3.0))
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_scatter_and_zero_where_a_pixel_is_missing():
     scatter = DepthNoise(spread=0.01)
     whole = DepthNoise(spread=0.01, disparity_step=1e-3, dropout=0.3)

@@ -38,6 +38,7 @@ def test_an_imu_feels_thrust_and_drag_and_the_turn_at_its_place(flown):
     np.testing.assert_allclose(away["acc"] - read["acc"], expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_means_over_a_step_lead_from_one_state_to_the_next(flown):
     params, states, _ = flown
     one, before, after = (jax.tree.map(lambda x, k=k: x[k, 0], states) for k in (60, 60, 61))
@@ -50,6 +51,7 @@ def test_means_over_a_step_lead_from_one_state_to_the_next(flown):
 
 
 @pytest.mark.parametrize(("delay", "samples"), [(0.0, 0), (0.03, 3), (0.025, 2.5)])
+@pytest.mark.slow
 def test_poses_are_as_old_as_the_delay(flown, delay, samples):
     params, states, rates = flown
     _, read = along(motion_capture(MotionCaptureSystem(delay=delay)), params, states, rates, KEY)
@@ -79,6 +81,7 @@ def test_poses_are_missing_and_noisy_as_often_as_asked():
     np.testing.assert_allclose(np.std(turn[fresh]), 0.02, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_height_and_magnetic_field_are_those_of_the_pose(flown):
     params, states, rates = flown
     np.testing.assert_allclose(along(barometer(Noise()), params, states, rates, KEY)[1], states.pos[..., 2:])

@@ -134,6 +134,7 @@ def test_the_barometer_and_the_magnetic_field_correct_height_and_heading():
     assert np.all(np.linalg.eigvalsh(after.cov) > 0)
 
 
+@pytest.mark.slow
 def test_a_point_away_from_the_imu_is_measured_where_it_is():
     """The estimate is at the truth already, and a measurement of the point leaves it there."""
     quat = jd.rotation.from_rpy(jnp.array([0.4, -0.2, 0.3]))

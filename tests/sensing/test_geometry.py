@@ -159,6 +159,7 @@ def test_a_ray_ends_at_the_first_surface():
         assert np.all(distances(SCENE, POINTS + share * length * DIRECTIONS)[outside] > 0)
 
 
+@pytest.mark.slow
 def test_a_ray_that_starts_inside_ends_at_once_and_one_that_looks_away_never():
     inside = distances(SCENE, POINTS) < 0
     assert inside.sum() > 10

@@ -33,6 +33,7 @@ def readings(noise, dt, length, channels=3):
         (Noise(density=0.02, instability=0.05, correlation=2.0, random_walk=0.01), [1, 10, 100, 400]),
     ],
 )
+@pytest.mark.slow
 def test_the_allan_deviation_is_that_of_the_parameters(noise, samples):
     """64 channels over 200 s."""
     made = readings(noise, 0.01, 20_000, 64)
@@ -49,6 +50,7 @@ def test_each_parameter_is_read_off_its_own_part_of_the_curve():
 
 
 @pytest.mark.parametrize("part", [BMI088, MPU9250], ids=["BMI088", "MPU9250"])
+@pytest.mark.slow
 def test_a_part_has_the_noise_of_its_data_sheet(part):
     for noise in part.acc, part.gyro:
         made = readings(noise, 0.01, 20_000, 64)

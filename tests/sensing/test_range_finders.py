@@ -69,6 +69,7 @@ def test_a_lidar_sees_the_walls_around_it_and_turns_with_the_drone():
     np.testing.assert_allclose(reading(scanner, at(rpy=(0, 0, np.pi / 4))), np.roll(scan, -1))
 
 
+@pytest.mark.slow
 def test_a_grid_looks_up_in_its_first_row_and_left_in_its_first_column():
     grid = reading(time_of_flight(), at(), WALL)
     angle = np.radians(45 / 8 * (3.5 - np.arange(8)))
@@ -140,6 +141,7 @@ def test_a_measurement_is_due_in_the_first_step_that_is_late_enough(rate, expect
     assert [k for k in range(13) if k == 0 or clock.is_due(k, 0.01)] == expected
 
 
+@pytest.mark.slow
 def test_in_an_environment_a_sensor_measures_at_its_rate():
     env = jd.make("hover", sensors=(downward_range(rate=25.0),), observation=("downward_range",), speed=1.0)
     step = jax.jit(env.step)

@@ -37,6 +37,7 @@ def test_a_gate_leaves_its_opening_free_and_closes_the_rest():
     assert not blocked(0.37, 0)
 
 
+@pytest.mark.slow
 def test_inside_is_inside_whatever_way_an_obstacle_is_turned():
     box = Scene.of(Box(pos=(0, 0, 1), quat=QUARTER_TURN, size=(2.0, 0.2, 0.2)))
     assert is_inside(box, (0, 0.9, 1)) and not is_inside(box, (0.9, 0, 1))
@@ -83,6 +84,7 @@ def test_many_obstacles_in_one_share_what_has_no_leading_axis():
     assert not Scene.of(Sphere(pos=jnp.zeros((0, 3)), radius=1)).has_obstacles
 
 
+@pytest.mark.slow
 def test_a_scene_is_drawn_in_a_compiled_program_and_mapped():
     def drawn(key):
         pos = jax.random.uniform(key, (5, 3), minval=1.0, maxval=2.0)

@@ -100,6 +100,7 @@ def test_a_team_has_a_twin_with_the_effects_between_its_drones(pair):
     check(team_of("cf2x", "cf2x"), n=2, effects=[jd.drag], pairs=[pair])
 
 
+@pytest.mark.slow
 def test_a_state_is_a_vector_with_names_and_back():
     model = twin("cf2x")
     assert model.names[:5] == ("pos[0]", "pos[1]", "pos[2]", "quat[0]", "quat[1]") and len(model.names) == 17

@@ -36,6 +36,7 @@ def test_a_drone_is_in_view_where_the_camera_shows_it():
     assert TASK.metrics["in_view"](TASK, world_with((-2, 0, 0), yaw=np.pi))[1] == 1
 
 
+@pytest.mark.slow
 def test_a_follower_should_be_at_its_distance_on_the_level_line_to_the_drone_before_it():
     world = world_with((4.0, 0.0, 1.0))
     np.testing.assert_allclose(TASK.target_now(world).pos[1:], [[3.5, 2, 4], [-0.5, 2, 3]], atol=1e-12)

@@ -31,6 +31,7 @@ def starts(key):
     return jnp.stack([scene.distance(state.pos[0]), scene.distance(variables["goal"][0])])
 
 
+@pytest.mark.slow
 def test_starts_and_goals_are_never_in_an_obstacle():
     assert jnp.min(starts(jax.random.split(jax.random.key(1), 10_000))) > 0.9  # m
 
@@ -69,6 +70,7 @@ def test_the_policy_is_told_the_desired_velocity_in_body_axes_and_nothing_of_its
     assert not {"position", "position_error"} & set(TASK.observation)
 
 
+@pytest.mark.slow
 def test_the_clearance_term_grows_with_the_closing_speed_and_is_free_far_away():
     scene = Scene.of(Cylinder(pos=(10.0, 0.0, 2.5), radius=0.2, height=5.0))
     _, clearance = TASK.rewards["clearance"]
@@ -86,6 +88,7 @@ def test_the_clearance_term_grows_with_the_closing_speed_and_is_free_far_away():
     assert jax.jit(jax.grad(cost))(9.4, 3.0) > 0
 
 
+@pytest.mark.slow
 def test_traversability_is_the_free_way_in_widths_of_the_drone():
     width = 2 * ENV.params.collision_radius[0]
     metric = TASK.metrics["traversability"]

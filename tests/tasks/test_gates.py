@@ -44,6 +44,7 @@ def in_gate(offset, gate=GATES[0]):
         (OPENING / 2 + FRAME + RADIUS + 0.01, 0, False),
     ],
 )
+@pytest.mark.slow
 def test_a_gate_is_passed_by_its_opening_hit_by_its_frame_and_missed_beside_it(aside, passes, hits):
     after = moved(in_gate(aside * LEFT - THROUGH), in_gate(aside * LEFT + 0.05 * THROUGH))
     assert after["index"][0] == passes and bool(after["hit"][0]) == hits

@@ -18,6 +18,7 @@ def test_only_a_soft_touch_is_a_success(touch_speed, landed):
     assert ENV.task.success(metrics, ENV.dt).tolist() == [landed]
 
 
+@pytest.mark.slow
 def test_a_drone_that_falls_touches_at_the_speed_of_its_fall():
     height, step = 0.4, jax.jit(ENV.step)
     world = jax.jit(ENV.reset)(jax.random.key(0))[1]

@@ -50,6 +50,7 @@ def test_touching_is_of_walls_pillars_the_ground_and_each_other():
     np.testing.assert_array_equal(moved_to(a, pillar, c)["touched"], [False, True, False])
 
 
+@pytest.mark.slow
 def test_the_nearest_surface_is_a_vector_to_the_wall():
     world = first_world()
     beside = jnp.array([2.9, -2.0, 1.5])

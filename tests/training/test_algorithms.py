@@ -37,6 +37,7 @@ def test_an_unknown_learner_names_the_closest_one():
         learner("pppo")
 
 
+@pytest.mark.slow
 def test_a_new_learner_is_a_module_and_a_line_in_the_table(tmp_path, monkeypatch, capsys):
     (tmp_path / "own_learner.py").write_text("from jaxdrones.learning.bptt import Config, init, train, update\n")
     monkeypatch.syspath_prepend(str(tmp_path))

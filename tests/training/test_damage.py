@@ -203,6 +203,7 @@ def test_a_number_that_is_edited_in_the_sidecar_is_noticed(runs, tmp_path):
         Run(tmp_path / "run").recipe()
 
 
+@pytest.mark.slow
 def test_a_folder_with_one_checkpoint_of_another_run_is_refused(runs, tmp_path, capsys):
     shutil.copytree(runs[0], tmp_path / "run")
     for ending in ("msgpack", "json"):

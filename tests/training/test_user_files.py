@@ -28,6 +28,7 @@ def files(tmp_path, monkeypatch):
         yield tmp_path
 
 
+@pytest.mark.slow
 def test_a_recipe_keeps_the_texts_and_flies_them_when_the_files_are_gone(files, tmp_path_factory, monkeypatch):
     recipe = Recipe.of(str(files / "my_task.py:moving_box"), vehicle="mine.urdf", period=3.0, worlds=8)
     assert recipe.task == "my_task.py:moving_box" and recipe.options == {"vehicle": "mine.urdf", "period": 3.0}

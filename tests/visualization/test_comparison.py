@@ -39,6 +39,7 @@ def moved(record, by):
     return dataclasses.replace(record, pos=record.pos + np.float32(by))
 
 
+@pytest.mark.slow
 def test_two_flights_are_shown_with_their_errors_and_the_distance_between_them(record, tmp_path, figures):
     other = moved(record, [0.03, 0.0, 0.04])
     comparison.save_comparison({"one": record, "other": other}, tmp_path / "compare.png", "a title")
@@ -106,6 +107,7 @@ def test_flights_that_break_or_have_no_target_are_drawn(record, tmp_path, broken
     comparison.save_comparison({"one": velocity, "same": velocity}, tmp_path / "same.png", "a title")
 
 
+@pytest.mark.slow
 def test_the_command_line_compares_controllers(tmp_path, capsys):
     short = ["--duration", "0.2", "--output", str(tmp_path)]
     assert main(["compare", "circle", "--controllers", "pid,geometric", *short, "--json"]) == 0

@@ -73,6 +73,7 @@ def test_a_trail_is_where_the_drone_was_and_a_target_where_it_is(record, film, l
         assert share_of(color, patch(film[5], lens.project(record.target_pos[row, i])[0], half=12)) > 0.02
 
 
+@pytest.mark.slow
 def test_an_obstacle_hides_the_trail_behind_it(record, lens):
     row = row_at(record, 5)
     bare = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)

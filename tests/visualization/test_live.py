@@ -79,6 +79,7 @@ def same(flight, record):
         np.testing.assert_allclose(flight[name], getattr(record, name), rtol=1e-6, atol=1.01 * half)
 
 
+@pytest.mark.slow
 def test_two_viewers_hear_the_flight_as_it_is_logged(record):
     with Live() as live:
         viewers = [Viewer(live), Viewer(live)]
@@ -202,6 +203,7 @@ def test_more_than_a_browser_plays_is_refused(record):
         live.add(next(parts(record)), 1e5)
 
 
+@pytest.mark.slow
 def test_the_command_line_flies_in_the_browser(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(live_option, "WAIT", 0.0)
     arguments = ["fly", "circle", "--duration", "0.2", "--live", "--no-figure", "--output", str(tmp_path)]

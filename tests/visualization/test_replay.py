@@ -42,6 +42,7 @@ def test_a_film_has_a_frame_for_every_24th_of_a_simulated_second_and_moves(recor
 
 
 @pytest.mark.needs("pybullet")
+@pytest.mark.slow
 def test_a_film_may_be_a_gif(record, tmp_path):
     films.film(record, tmp_path / "flight.gif", "", "bullet", fps=8, size=(320, 180))
     with Image.open(tmp_path / "flight.gif") as picture:

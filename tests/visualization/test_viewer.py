@@ -89,6 +89,7 @@ def test_a_trajectory_of_worlds_is_as_many_worlds(team):
         np.testing.assert_allclose(world["pos"], paths.pos[w], rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_worlds_may_have_vehicles_targets_and_lengths_of_their_own(team, record):
     heavy = jd.stack([jd.load_params("racer"), jd.load_params("cf2x"), jd.load_params("cf2x")])
     goals = np.arange(9.0).reshape(3, 3)

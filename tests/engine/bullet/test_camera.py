@@ -26,6 +26,7 @@ def pictures(step, state, camera=camera_2021, scene=None):
     return images.rgb[0], images.depth[0], images.segmentation[0]
 
 
+@pytest.mark.slow
 def test_a_coloured_box_in_front_is_seen_where_geometry_says():
     box = Box(pos=(2.0, 0.3, 1.0397), size=(0.4, 0.4, 0.4), color=(1.0, 0.0, 0.0, 1.0))
     with bullet.make_step(scene=Scene.of(box)) as step:

@@ -110,6 +110,7 @@ def falling(pos, quat=LEVEL, vel=(0.0, 0.0, 0.0)) -> State:
 
 
 @pytest.mark.parametrize("place", [[0, 0, 1.0], [0, 0, 0.012], [0.05, 0.1, 0.011]])
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_output_whatever_was_called_between(step, place):
     params = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1)
     state, still = falling(place, vel=(0.1, 0.0, -0.2)), np.zeros((1, 4))

@@ -141,7 +141,7 @@ def test_a_user_policy_of_a_wrong_shape_is_refused(here, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "warned"), [("hover", False), ("landing", True)])
+@pytest.mark.parametrize(("task", "warned"), [("hover", False), ("room", True)])
 def test_a_training_without_known_settings_says_so_before_it_starts(task, warned, tmp_path, capsys, monkeypatch):
     def interrupted(self):
         raise KeyboardInterrupt
@@ -156,8 +156,8 @@ def test_a_training_without_known_settings_says_so_before_it_starts(task, warned
 
 def test_settings_are_known_for_what_the_tables_name():
     known = {task for task in TASKS if settings_known(task, default_algorithm(task))}
-    assert {"hover", "tracking", "recovery", "gates", "forest", "follow"} <= known
-    assert not {"landing", "room", "swap-goals", "takeoff"} & known
+    assert {"hover", "landing", "tracking", "recovery", "gates", "forest", "follow", "flock"} <= known
+    assert not {"room", "swap-goals", "takeoff"} & known
     assert settings_known("hover", "ppo") and settings_known("hover", "shac") and not settings_known("landing", "ppo")
 
 

@@ -75,6 +75,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("hover-2021", "ppo"): _ONE_D_PPO,
     ("leader-follower", "bptt"): _ONE_D | dict(per_agent=True),
     ("leader-follower", "ppo"): _ONE_D_PPO | dict(per_agent=True, centralized_critic=True),
+    ("flock", "bptt"): _ONE_D | dict(per_agent=True),
 }
 _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("hover", "bptt"): dict(
@@ -85,11 +86,11 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
 
 _UNFINISHED = {("room", "bptt")}
 """Settings that are the best found, and with which about half of the episodes succeed."""
-_BY_DEFAULT: dict[str, tuple[str, ...]] = {"hover": ("ppo", "shac")}
+_BY_DEFAULT: dict[str, tuple[str, ...]] = {"hover": ("ppo", "shac"), "landing": ("bptt",)}
 """Learners that master a task with their default settings."""
 _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {"gates": dict(random_start=True)}
 """Options of the environment to train in, for tasks that are trained with other options than they are flown with."""
-_DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo"}
+_DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo", "swap-goals": "ppo"}
 
 
 def default_algorithm(task: str) -> str:

@@ -80,8 +80,8 @@ print(open_loop_table({name: errors_as_dict(e) for name, e in open_loop(kept).it
 
 # %% [markdown]
 # After half a second the errors of both are larger than those of *hold*. There is no controller in open loop: errors
-# of a percent in the four thrusts make a drone of 30 g turn at some rad/s within that time. For the real drone it is not
-# known which fraction of the firmware's thrust curve its motors give, nor how much they differ from each other.
+# of a percent in the four thrusts make a drone of 30 g turn at some rad/s within that time. For the real drone it is
+# not known which fraction of the firmware's thrust curve its motors give, nor how much they differ from each other.
 
 # %% [markdown]
 # ## Identify it from a flight

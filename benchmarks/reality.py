@@ -31,7 +31,7 @@ from common import about, report
 
 from jaxdrones import assets
 from jaxdrones.dynamics import crazyflie_motors
-from jaxdrones.identification import FlightLog, held_errors, open_loop_errors
+from jaxdrones.identification import FlightLog, hold_errors, open_loop_errors
 from jaxdrones.identification.files import errors_as_dict, load_vehicle
 
 OURS = {True: ("cf2x", "cf21_brushless"), False: ("cf2x", "cf21")}
@@ -71,7 +71,7 @@ def main() -> None:
 
 def ours(log: FlightLog, vehicles: tuple[str, ...]) -> dict[str, dict]:
     """Errors of a model that stays where it starts and of our vehicles, by name."""
-    motors, errors = crazyflie_motors(), {"hold": held_errors(log)}
+    motors, errors = crazyflie_motors(), {"hold": hold_errors(log)}
     errors |= {f"ours {name}": open_loop_errors(log, load_vehicle(name), motors) for name in vehicles}
     return {name: errors_as_dict(e) for name, e in errors.items()}
 

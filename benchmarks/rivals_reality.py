@@ -27,7 +27,7 @@ from jaxdrones.dynamics import FULL_PWM, crazyflie_motors
 from jaxdrones.identification import HORIZONS, FlightLog
 from jaxdrones.identification.files import errors_as_dict
 from jaxdrones.identification.log import PERIOD
-from jaxdrones.identification.open_loop import mean_errors, starts_of, windows
+from jaxdrones.identification.open_loop import cut_windows, mean_errors, window_starts
 
 BEFORE, LENGTH = 30, HORIZONS[-1]  # rows before a start, in which lagging rotors come to their speed, and after it
 SUBSTEPS = 5  # of crazyflow in a row: its 500 Hz
@@ -45,9 +45,9 @@ def main() -> None:
     errors: dict[str, dict[str, dict]] = {}
     for file in options.logs:
         log = FlightLog.load(file)
-        starts = starts_of(log)
-        truth = windows(log, starts).truth
-        found = {name: mean_errors(fly(log, starts), truth) for name, fly in plants(log).items()}
+        starts = window_starts(log)
+        logged = cut_windows(log, starts).logged
+        found = {name: mean_errors(fly(log, starts), logged) for name, fly in plants(log).items()}
         errors[str(file)] = {name: errors_as_dict(np.asarray(e)) for name, e in found.items()}
     names = ("crazyflow", "rotorpy")
     print(json.dumps({"errors": errors, "versions": {name: importlib.metadata.version(name) for name in names}}))
@@ -86,7 +86,7 @@ def crazyflow(airframe: str) -> Plant:
         fine = subdivided(speeds) if log.has_rotor_speeds else np.repeat(speeds[:, None], SUBSTEPS, axis=1)
         rows = starts[:, None] + np.arange(-BEFORE, LENGTH)
         inputs = jnp.asarray(np.moveaxis(fine[np.maximum(rows, 0)], 1, 0))  # (rows, n, substeps, 4)
-        start = windows(log, starts).start
+        start = cut_windows(log, starts).start
         team = jax.tree.map(lambda x: x[:, None], start.replace(rpm=jnp.asarray(speeds[np.maximum(rows[:, 0], 0)])))
 
         @jax.jit

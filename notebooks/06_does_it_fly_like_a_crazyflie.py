@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Does it fly like a Crazyflie?
-# Two recorded flights of a real Crazyflie 2.1 come with the package, of NanoBench (Ullah and Baca 2026, arXiv
-# 2603.09908, BSD-3). One is used to identify the vehicle, the other one to find out how well the simulation repeats a
-# flight that it has not seen.
+# Two recorded flights of a real Crazyflie 2.1 come with the package; they are from NanoBench (Ullah and Baca 2026,
+# arXiv 2603.09908, BSD-3). One is used to identify the vehicle, the other one to test how well the simulation repeats a
+# flight that was not fitted.
 
 # %%
 # Installs the package where it is missing, as on Colab.
@@ -23,7 +23,15 @@ import jaxdrones as jd
 from jaxdrones.cli.score import closed_loop_table, open_loop_table
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import crazyflie_motors
-from jaxdrones.identification import HORIZONS, FlightLog, Vehicle, fit, fly_again, held_errors, open_loop_errors
+from jaxdrones.identification import (
+    HORIZONS,
+    FlightLog,
+    Vehicle,
+    fit,
+    hold_errors,
+    open_loop_errors,
+    simulate_closed_loop,
+)
 from jaxdrones.identification.files import errors_as_dict
 from jaxdrones.visualization.palette import COLORS
 
@@ -31,8 +39,8 @@ plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True,
 
 # %% [markdown]
 # ## What was recorded
-# Vicon's position, attitude and velocity, the gyroscope, the PWM of the motors, the voltage of the battery, and the
-# set-points, 100 times a second. The firmware's PID flew the drone; rotor speeds were not measured.
+# The log has Vicon's position, attitude and velocity, the gyroscope, the PWM of the motors, the voltage of the battery
+# and the set-points, at 100 Hz. The firmware's PID flew the drone; rotor speeds were not measured.
 
 # %%
 told = FlightLog.load("B10_lissajous_slow_rep1")  # to identify the vehicle
@@ -53,10 +61,9 @@ print(f"{kept.name}: {len(kept.t)} rows, {kept.t[-1] - kept.t[0]:.0f} s, at most
 
 # %% [markdown]
 # ## Vehicles from papers
-# *Open loop*: from every state of the log, the model gets the recorded PWM and voltage of the next half second, and its
-# mean distance from the flight is measured. *Hold* is a model that stays in the state where it starts. `cf2x` has the
-# numbers of Panerati et al. 2021, `cf21` those of a later identification of the same vehicle with these propellers
-# (crazyflow).
+# *Open loop*: from every state of the log, the model gets the recorded PWM and voltage of the next half second. The
+# table has its mean errors. *Hold* is a model that stays in the state where it starts. `cf2x` has the parameters of
+# Panerati et al. 2021, `cf21` those of a later identification of the same vehicle with these propellers (crazyflow).
 
 # %%
 motors, gains = crazyflie_motors("2.1+"), firmware_pid.gains(propellers="2.1+")
@@ -66,21 +73,21 @@ vehicles = {name: Vehicle.of(jd.load_params(name)) for name in ("cf2x", "cf21")}
 
 def open_loop(log):
     """Open-loop errors by model: arrays (horizons, 4)."""
-    return {"hold": held_errors(log)} | {name: open_loop_errors(log, v, motors) for name, v in vehicles.items()}
+    return {"hold": hold_errors(log)} | {name: open_loop_errors(log, v, motors) for name, v in vehicles.items()}
 
 
 print(open_loop_table({name: errors_as_dict(e) for name, e in open_loop(kept).items()}))
 
 # %% [markdown]
-# After half a second both are further off than *hold*. There is no controller in this loop: four thrusts that differ
-# from the real ones by a percent make a drone of 30 g turn by some rad/s within that time. Of the real one nobody knows
-# which share of the firmware's thrust curve its motors give, and how unequal they are.
+# After half a second the errors of both are larger than those of *hold*. There is no controller in open loop: errors
+# of a percent in the four thrusts make a drone of 30 g turn at some rad/s within that time. For the real drone it is
+# not known which fraction of the firmware's thrust curve its motors give, nor how much they differ from each other.
 
 # %% [markdown]
 # ## Identify it from a flight
-# Every piece of half a second is flown from its logged start, and Gauss-Newton steps on 14 parameters make the
-# differences small. The derivative of all pieces in all parameters is that of the simulation. The standard errors are
-# those of residuals that are independent of each other.
+# The vehicle is simulated over windows of half a second (`pieces` below) from their logged starts. Gauss-Newton steps
+# on 14 parameters minimize the differences from the log. The simulation is differentiated with respect to all
+# parameters. The standard errors assume independent residuals.
 
 # %%
 NAMES = ("mass", "km", "drag_coeff_x", "drag_coeff_y", "flapping_coeff", "inertia_x", "inertia_y", "rate_damping")
@@ -89,11 +96,11 @@ began = time.perf_counter()
 report = fit([told], jd.load_params("cf2x"), NAMES)
 print(f"fitted in {time.perf_counter() - began:.0f} s, compilation included")
 for name, estimate in report.parameters.items():
-    print(f"{name:18} {estimate.value:10.3g} +- {estimate.error:.1g}")
+    print(f"{name:18} {estimate.value:10.3g} +- {estimate.std_error:.1g}")
 vehicles["pieces"] = report.vehicle
 
 # %% [markdown]
-# The vehicle is scored on the flight that it has not seen.
+# The vehicle is scored on the other flight, which was not fitted.
 
 # %%
 errors = open_loop(kept)
@@ -110,20 +117,20 @@ assert (errors["pieces"][-1, [0, 1, 3]] < errors["hold"][-1, [0, 1, 3]]).all()
 # %% [markdown]
 # ## The whole flight again
 # *Closed loop*: the firmware's PID gets the logged set-points and the logged voltage, and nothing else of the flight.
-# Now a controller corrects what the model has wrong, so a flight tells other things: thrust over mass comes from the
-# balance of vertical forces, and drag, flapping, lag and the tilt that the drone believes in from the path itself, by
-# the derivative of the whole flight.
+# Now a controller corrects the errors of the model, so the flight identifies other parameters. Thrust over mass comes
+# from the balance of vertical forces. Drag, flapping, rotor lag and the scale of the tilt in the drone's state estimate
+# come from the path itself, with the derivative of the whole flight.
 
 # %%
 began = time.perf_counter()
 report = fit([told], jd.load_params("cf2x"))
 print(f"fitted in {time.perf_counter() - began:.0f} s, compilation included")
 for name, estimate in report.parameters.items():
-    print(f"{name:18} {estimate.value:10.3g} +- {estimate.error:.1g}")
+    print(f"{name:18} {estimate.value:10.3g} +- {estimate.std_error:.1g}")
 vehicles["path"] = report.vehicle
 
 # %%
-twins = {name: fly_again(kept, vehicle, motors, gains) for name, vehicle in vehicles.items()}
+twins = {name: simulate_closed_loop(kept, vehicle, motors, gains) for name, vehicle in vehicles.items()}
 print(closed_loop_table({name: [twin.as_dict()] for name, twin in twins.items()}))
 
 shown = {name: twins[name] for name in ("cf2x", "path")}
@@ -131,8 +138,8 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.8), dpi=80, layout="co
 left.plot(*twins["cf2x"].ref_pos[:, :2].T, "--", color="grey", linewidth=1, label="set-points")
 left.plot(*twins["cf2x"].pos[:, :2].T, color="black", label="flown")
 for color, (name, twin) in zip(COLORS, shown.items(), strict=False):
-    left.plot(*twin.twin_pos[:, :2].T, color=color, label=f"simulated, {LABELS.get(name, name)}")
-    right.plot(twin.t - twin.t[0], 100 * np.linalg.norm(twin.twin_pos - twin.pos, axis=1), color=color)
+    left.plot(*twin.sim_pos[:, :2].T, color=color, label=f"simulated, {LABELS.get(name, name)}")
+    right.plot(twin.t - twin.t[0], 100 * np.linalg.norm(twin.sim_pos - twin.pos, axis=1), color=color)
 left.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title="figure eight, from above")
 figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize="small")
 right.set(xlabel="t (s)", ylabel="distance from the flight (cm)", ylim=(0, None), title="how far apart")
@@ -140,15 +147,15 @@ assert twins["path"].as_dict()["xy_rms_m"] < twins["cf2x"].as_dict()["xy_rms_m"]
 
 # %% [markdown]
 # ## What limits the agreement
-# - **No vehicle is best at both.** What was fitted to half a second without a controller has an inertia more than ten
-#   times too large and a damping that goes with it: thrusts that are off by a percent turn a light model away, and a
-#   slow one errs least. Flown by the PID it oscillates and climbs away. What was fitted to the path loses its attitude
-#   within a quarter of a second where no controller corrects it.
-# - **Rotor speeds were not measured.** PWM and voltage tell the thrust within some percent, and it differs from flight
-#   to flight. From measured rotor speeds of faster flights half a second is repeated to 9 cm, where *hold* is 41 cm off
-#   (docs/reality.md).
-# - **The mass comes out as 44 g**, of a drone of 27 g with its markers: a flight tells thrust over mass, as if the
-#   motors gave less than the firmware's curve says.
-# - **The recording.** The drone's own estimate and Vicon are 2 to 4 cm apart, which no vehicle explains.
+# - **No vehicle is best at both.** The vehicle that was fitted to half a second without a controller has an inertia
+#   more than ten times too large, and a damping that goes with it: thrust errors of a percent turn a light model away,
+#   and a slow model has the smallest errors. With the PID it oscillates and climbs away. The vehicle that was fitted to
+#   the path loses its attitude within a quarter of a second where no controller corrects it.
+# - **Rotor speeds were not measured.** PWM and voltage give the thrust within some percent, and it differs from flight
+#   to flight. With the measured rotor speeds of faster flights, the error after half a second is 9 cm, and that of
+#   *hold* 41 cm (docs/reality.md).
+# - **The mass is estimated as 44 g**, for a drone of 27 g with its markers. A flight identifies only thrust over mass:
+#   it is as if the motors gave less thrust than the firmware's curve.
+# - **The recording.** The drone's own state estimate and Vicon differ by 2 to 4 cm, which no vehicle explains.
 #
 # `jaxdrones score` and `jaxdrones fit` do the same with your flights.

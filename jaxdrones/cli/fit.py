@@ -1,4 +1,4 @@
-"""`jaxdrones fit`."""
+"""The command `jaxdrones fit`."""
 
 import argparse
 import sys
@@ -14,9 +14,9 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "fit",
         help="identify a vehicle from recorded flights",
-        description="Fit the constants of a vehicle to flight logs (.npz with t, pos, quat, vel, omega and rpm, or pwm "
-        "and vbat). Prints each with its standard error, and writes a folder with vehicle.urdf, report.json and a "
-        "figure, which --vehicle of other commands takes.",
+        description="Estimate parameters of a vehicle from flight logs (.npz with t, pos, quat, vel, omega and rpm, or "
+        "pwm and vbat). Prints each with its standard error, and writes a folder with vehicle.urdf, report.json and a "
+        "figure. Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
         allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=Path, metavar="FLIGHT.npz", help="flights to fit")
@@ -24,16 +24,23 @@ def add(commands) -> None:
         "--vehicle",
         default="cf2x",
         metavar="NAME|URDF",
-        help="where the search starts: a bundled vehicle or URDF (cf2x)",
+        help="initial values: a bundled vehicle or URDF (cf2x)",
     )
     parser.add_argument(
-        "--parameters", metavar="NAME,...", help="what to fit, such as kf,inertia,drag_coeff (all that the logs tell)"
+        "--parameters",
+        metavar="NAME,...",
+        help="parameters to fit, such as kf,inertia,drag_coeff (those that such logs identify)",
     )
     parser.add_argument(
-        "--validate", nargs="+", type=Path, default=[], metavar="FLIGHT.npz", help="flights that only stop the fit"
+        "--validate",
+        nargs="+",
+        type=Path,
+        default=[],
+        metavar="FLIGHT.npz",
+        help="flights that are not fitted, on which the best round is chosen",
     )
     parser.add_argument(
-        "--propellers", default="2.1+", metavar="NAME", help="of logs with PWM: thrust curve of the Crazyflie's (2.1+)"
+        "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
     )
     parser.add_argument("--output", type=folder, default=Path("runs/fit"), metavar="FOLDER", help="(runs/fit)")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
@@ -64,10 +71,11 @@ def _fit(options: argparse.Namespace) -> int:
 
 
 def parameter_table(report) -> str:
-    """The parameters with their standard errors, a line each."""
+    """Lines of text with the estimate and standard error of each parameter."""
     width = max(map(len, report.parameters))
     lines = [
-        f"  {name.ljust(width)}  {e.value: .4g} +- {e.error:.2g}{'' if e.told else '  (the flights do not tell it)'}"
+        f"  {name.ljust(width)}  {e.value: .4g} +- {e.std_error:.2g}"
+        f"{'' if e.identifiable else '  (not identifiable from these flights)'}"
         for name, e in report.parameters.items()
     ]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""`jaxdrones score`."""
+"""The command `jaxdrones score`."""
 
 import argparse
 from pathlib import Path
@@ -14,9 +14,9 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "score",
         help="compare a vehicle with recorded flights",
-        description="Fly a vehicle from every state of flight logs on the recorded inputs, and print how far it is "
-        "from the flight after 0.1, 0.25 and 0.5 s, beside a model that stays where it starts and the nominal vehicle. "
-        "A log with set-points is also flown as a whole, by the firmware's PID.",
+        description="Simulate a vehicle from every state of flight logs on the recorded inputs (open loop), and print "
+        "its errors after 0.1, 0.25 and 0.5 s. A model that stays where it starts and the nominal vehicle are printed "
+        "for comparison. A log with set-points is also simulated as a whole, with the firmware's PID (closed loop).",
         allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=Path, metavar="FLIGHT.npz", help="flight logs")
@@ -30,7 +30,7 @@ def add(commands) -> None:
         "--nominal", default=_NOMINAL, metavar="NAME|URDF", help=f"the vehicle to compare with ({_NOMINAL})"
     )
     parser.add_argument(
-        "--propellers", default="2.1+", metavar="NAME", help="of logs with PWM: thrust curve of the Crazyflie's (2.1+)"
+        "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
     )
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw recorded and simulated paths (.png or .pdf)")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
@@ -42,43 +42,46 @@ def _score(options: argparse.Namespace) -> int:
 
     from jaxdrones.control import firmware_pid
     from jaxdrones.dynamics import crazyflie_motors
-    from jaxdrones.identification import FlightLog, fly_again, held_errors, open_loop_errors
+    from jaxdrones.identification import FlightLog, hold_errors, open_loop_errors, simulate_closed_loop
     from jaxdrones.identification.files import errors_as_dict, load_vehicle
-    from jaxdrones.visualization.residuals import save_twins
+    from jaxdrones.visualization.residuals import save_paths
 
     motors = crazyflie_motors(options.propellers)
     vehicles = {"nominal": load_vehicle(options.nominal), "vehicle": load_vehicle(options.vehicle)}
     logs = [FlightLog.load(file) for file in options.logs]
-    errors = {"hold": np.mean([held_errors(log) for log in logs], axis=0)}
+    errors = {"hold": np.mean([hold_errors(log) for log in logs], axis=0)}
     for name, vehicle in vehicles.items():
         errors[name] = np.mean([open_loop_errors(log, vehicle, motors) for log in logs], axis=0)
     gains = firmware_pid.gains(propellers=options.propellers)
-    flown = [log for log in logs if log.has_set_points]
-    flights = {name: [fly_again(log, vehicle, motors, gains) for log in flown] for name, vehicle in vehicles.items()}
-    twins = {name: [twin.as_dict() for twin in flight] for name, flight in flights.items()}
+    with_setpoints = [log for log in logs if log.has_setpoints]
+    simulated = {
+        name: [simulate_closed_loop(log, vehicle, motors, gains) for log in with_setpoints]
+        for name, vehicle in vehicles.items()
+    }
+    closed_loop = {name: [result.as_dict() for result in flights] for name, flights in simulated.items()}
     if options.figure:
-        if not flown:
+        if not with_setpoints:
             raise ValueError("no log has set-points, so there are no paths to draw; leave --figure out")
         check_writable(options.figure)
-        save_twins(flights["vehicle"], options.figure)
+        save_paths(simulated["vehicle"], options.figure)
     results: dict[str, Any] = {
         "vehicle": options.vehicle,
         "flights": [log.name for log in logs],
         "open_loop": {name: errors_as_dict(table) for name, table in errors.items()},
-        "closed_loop": twins["vehicle"],
-        "closed_loop_nominal": twins["nominal"],
+        "closed_loop": closed_loop["vehicle"],
+        "closed_loop_nominal": closed_loop["nominal"],
     }
     if options.json:
         print(as_json(results))
     else:
         print(open_loop_table(results["open_loop"]))
-        if flown:
-            print(closed_loop_table(twins))
+        if with_setpoints:
+            print(closed_loop_table(closed_loop))
     return 0
 
 
 def open_loop_table(models: dict[str, Any]) -> str:
-    """Errors by model and horizon as lines of text."""
+    """Lines of text with the open-loop errors of each model after each horizon."""
     lines = ["model     after (s)  position (m)  velocity (m/s)  attitude (rad)  rates (rad/s)"]
     for model, horizons in models.items():
         for rows, e in horizons.items():
@@ -87,10 +90,10 @@ def open_loop_table(models: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def closed_loop_table(twins: dict[str, list[dict[str, Any]]]) -> str:
-    """Distances of the paths, tracking errors and mean PWM, a line for each flight and vehicle."""
+def closed_loop_table(models: dict[str, list[dict[str, Any]]]) -> str:
+    """Lines of text with path distances, tracking errors and mean PWM of each vehicle in each flight."""
     lines = ["model     flight                            xy (m)  xyz (m)  tracking real, sim (m)  PWM real, sim"]
-    for model, flights in twins.items():
+    for model, flights in models.items():
         for e in flights:
             tracking = f"{e['tracking_real_m']:14.3f}, {e['tracking_sim_m']:6.3f}"
             pwm = f"{e['pwm_real']:7.0f}, {e['pwm_sim']:5.0f}{' (at its limit)' * e['saturated']}"

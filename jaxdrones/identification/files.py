@@ -1,4 +1,4 @@
-"""The folder of an identified vehicle: `vehicle.urdf`, `report.json` and a figure of the residuals."""
+"""The folder of an identified vehicle: reads and writes `vehicle.urdf` and `report.json`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _INSTRUMENTS = tuple(field.name for field in dataclasses.fields(Instruments))
 
 
 def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
-    """Write `vehicle.urdf` and `report.json`; the folder is made, files of an earlier fit are replaced."""
+    """Write `vehicle.urdf` and `report.json`; create the folder, and replace the files of an earlier fit."""
     folder.mkdir(parents=True, exist_ok=True)
-    flights = ", ".join(report.of_flights) or "flights"
+    flights = ", ".join(report.per_flight) or "flights"
     comment = (
         f"Identified by `jaxdrones fit` from {started_from} and {flights}.\n     {REPORT} has the standard errors."
     )
@@ -35,29 +35,29 @@ def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
 
 
 def report_as_dict(report: Report) -> dict[str, Any]:
-    """What a fit found, for JSON; SI units."""
+    """The result of a fit for JSON, in SI units."""
     instruments = report.vehicle.instruments
     return {
         "parameters": {name: dataclasses.asdict(estimate) for name, estimate in report.parameters.items()},
         "instruments": {name: np.asarray(getattr(instruments, name), float).tolist() for name in _INSTRUMENTS},
-        "of_flights": report.of_flights,
+        "per_flight": report.per_flight,
         "losses": list(report.losses),
         "errors": {flight: errors_as_dict(errors) for flight, errors in report.errors.items()},
     }
 
 
 def errors_as_dict(errors: np.ndarray) -> dict[str, dict[str, float]]:
-    """Open-loop errors (horizons, 4) by horizon in rows of 0.01 s and by quantity."""
+    """Open-loop errors (horizons, 4) as a dictionary by horizon, in rows of 0.01 s, and by quantity."""
     return {
         str(h): dict(zip(QUANTITIES, map(float, row), strict=True)) for h, row in zip(HORIZONS, errors, strict=True)
     }
 
 
 def load_vehicle(vehicle: str | os.PathLike) -> Vehicle:
-    """A bundled vehicle, that of a URDF, or that of a folder of `jaxdrones fit`, with its instruments.
+    """Load a bundled vehicle or a URDF, with ideal instruments, or a folder of `jaxdrones fit` with fitted ones.
 
     Raises:
-        ValueError: there is none, or it holds nonsense.
+        ValueError: there is no such vehicle, or its files are invalid.
     """
     folder = Path(vehicle)
     if not folder.is_dir():

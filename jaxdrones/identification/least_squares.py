@@ -1,4 +1,4 @@
-"""Gauss-Newton steps of Levenberg and Marquardt on a robust sum of squares over many pieces of many flights."""
+"""Normal equations of a robust sum of squares over the windows of a flight."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from jaxdrones.identification.open_loop import HORIZONS, Windows, predict, resid
 from jaxdrones.identification.parameters import with_parameters
 from jaxdrones.identification.vehicle import Vehicle
 
-_OUTLIER = 1.0  # mean square of the weighted residuals of a piece, beyond which it counts ever less (Cauchy)
-_MEDIAN_SQUARE = 0.455  # of a standard normal number
+_CAUCHY_SCALE_SQUARED = 1.0  # c^2 of the Cauchy loss c^2 log(1 + s / c^2); s is a window's mean squared residual
+_MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 
 
 class Normal(NamedTuple):
-    """Normal equations of one flight, or of all."""
+    """Normal equations of one flight, or of all flights."""
 
     matrix: np.ndarray
     """(n, n) Gauss-Newton matrix J'WJ."""
     gradient: np.ndarray
     """(n,) J'Wr."""
     loss: float
-    spread: np.ndarray
+    scale: np.ndarray
     """(horizons, 4) robust standard deviation of the unweighted residuals, by horizon and quantity."""
 
 
@@ -36,52 +36,52 @@ def _normal(
     vehicle: Vehicle,
     names: tuple[str, ...],
     x: Array,
-    spread: Array,
-    pieces: Windows,
-    counts: Array,
+    scale: Array,
+    windows: Windows,
+    mask: Array,
     motors: Motors | None,
 ):
-    def weighted(x: Array, piece: Windows) -> Float[Array, "horizons 4 3"]:
-        flown = predict(with_parameters(vehicle, names, list(x)), piece.start, piece.command, motors)
-        return jax.vmap(residuals)(flown, piece.truth) / spread[:, :, None]
+    def scaled(x: Array, window: Windows) -> Float[Array, "horizons 4 3"]:
+        predicted = predict(with_parameters(vehicle, names, list(x)), window.start, window.command, motors)
+        return jax.vmap(residuals)(predicted, window.logged) / scale[:, :, None]
 
-    def of_piece(piece: Windows, counts: Array):
-        r = weighted(x, piece)
-        jacobian = jax.vmap(lambda e: jax.jvp(lambda x: weighted(x, piece), (x,), (e,))[1])(jnp.eye(len(x)))
+    def of_window(window: Windows, mask: Array):
+        r = scaled(x, window)
+        jacobian = jax.vmap(lambda e: jax.jvp(lambda x: scaled(x, window), (x,), (e,))[1])(jnp.eye(len(x)))
         square = jnp.mean(r * r)
-        weight = counts / (1 + square / _OUTLIER)
+        weight = mask / (1 + square / _CAUCHY_SCALE_SQUARED)
         flat, r = jacobian.reshape(len(x), -1), r.reshape(-1)
-        return flat, weight, r, counts * _OUTLIER * jnp.log1p(square / _OUTLIER)
+        return flat, weight, r, mask * _CAUCHY_SCALE_SQUARED * jnp.log1p(square / _CAUCHY_SCALE_SQUARED)
 
-    jacobian, weight, r, loss = jax.vmap(of_piece)(pieces, counts)
+    jacobian, weight, r, loss = jax.vmap(of_window)(windows, mask)
     matrix = jnp.einsum("pik,pjk,p->ij", jacobian, jacobian, weight)
     gradient = jnp.einsum("pik,pk,p->i", jacobian, r, weight)
-    squares = jnp.where(counts[:, None] > 0, r * r, jnp.nan)
+    squares = jnp.where(mask[:, None] > 0, r * r, jnp.nan)
     median = jnp.nanmedian(squares, axis=0).reshape(len(HORIZONS), 4, 3)
-    return matrix, gradient, jnp.sum(loss), spread * jnp.sqrt(jnp.mean(median, axis=-1) / _MEDIAN_SQUARE)
+    return matrix, gradient, jnp.sum(loss), scale * jnp.sqrt(jnp.mean(median, axis=-1) / _MEDIAN_SQUARE)
 
 
 def normal_equations(
     vehicle: Vehicle,
     names: tuple[str, ...],
     x: np.ndarray,
-    spread: np.ndarray,
-    pieces: Windows,
-    counts: Array,
+    scale: np.ndarray,
+    windows: Windows,
+    mask: Array,
     motors: Motors | None,
 ) -> Normal:
-    """Normal equations of one flight.
+    """Normal equations of one flight at the coordinates x.
 
     Args:
-        vehicle: at x = 0.
-        names: n parameters.
-        x: (n,) where they are.
-        spread: (horizons, 4) by which residuals are divided.
-        pieces: of the flight.
-        counts: (pieces,) 1 for a piece, 0 for one that only fills the array.
+        vehicle: the vehicle at x = 0.
+        names: names of the n parameters.
+        x: (n,) coordinates of the parameters.
+        scale: (horizons, 4) by which residuals are divided.
+        windows: windows of the flight.
+        mask: (windows,) 1 for a window, 0 for padding.
         motors: see `predict`.
     """
-    matrix, gradient, loss, found = _normal(
-        vehicle, names, jnp.asarray(x, float), jnp.asarray(spread, float), pieces, counts, motors
+    matrix, gradient, loss, robust = _normal(
+        vehicle, names, jnp.asarray(x, float), jnp.asarray(scale, float), windows, mask, motors
     )
-    return Normal(np.asarray(matrix, float), np.asarray(gradient, float), float(loss), np.asarray(found, float))
+    return Normal(np.asarray(matrix, float), np.asarray(gradient, float), float(loss), np.asarray(robust, float))

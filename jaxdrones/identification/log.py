@@ -1,4 +1,4 @@
-"""Recorded flights as arrays, and what is wrong with those that are none."""
+"""Flight logs: recorded flights as arrays, checked when they are loaded."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ import numpy as np
 from jaxdrones import assets
 from jaxdrones.checks import shown
 
-PERIOD = 0.01  # s, of the rows of a log
-_TOLERANCE = 0.2  # of the period, by which the median of the time between rows may differ
-_LONGEST_GAP = 0.05  # s
-_FEWEST = 100  # rows
+PERIOD = 0.01  # s, time between the rows of a log
+_PERIOD_TOLERANCE = 0.2  # largest relative error of the median time between rows
+_MAX_GAP = 0.05  # s
+_MIN_ROWS = 100
 _FULL_PWM = 65535
-_TAKE_OFF = slice(150, 350)  # rows after the motors start
-_MOST_RATES = 60.0  # rad/s; gyroscopes of small quadrotors end at 35
-_MOST_VOLTAGE = 60.0  # V
-_MOST_RPM = 1e6
-_LEAST_RPM = 2700.0  # median; rotors of small quadrotors that turn slower do not lift, and 16,000 RPM are 1,700 rad/s
-_MOST_PERCENT = 100.0
+_TAKE_OFF = slice(150, 350)  # rows after the motors start, over which the voltage at take-off is averaged
+_MAX_RATE = 60.0  # rad/s; gyroscopes of small quadrotors saturate at 35
+_MAX_VOLTAGE = 60.0  # V
+_MAX_RPM = 1e6
+_MIN_MEDIAN_RPM = 2700.0  # small quadrotors do not fly at a lower median speed; 16,000 RPM are 1,700 rad/s
+_MAX_PERCENT = 100.0  # PWM that never exceeds this is a percentage; a motor with more than this runs
 
-_COLUMNS = {  # name: (numbers per row, meaning)
+_COLUMNS = {  # name: (numbers per row, meaning and unit)
     "t": (1, "time, s"),
     "pos": (3, "position, m, world"),
     "quat": (4, "attitude, quaternion x, y, z, w, body to world"),
@@ -42,41 +42,41 @@ _COLUMNS = {  # name: (numbers per row, meaning)
 class FlightLog:
     """A recorded flight of one drone: T rows at 100 Hz.
 
-    Either the rotor speeds are known, or the PWM of the motors and the voltage of the battery.
+    A log has either the rotor speeds, or the PWM of the motors and the voltage of the battery.
     """
 
     name: str
     t: np.ndarray
-    """(T,) s."""
+    """(T,) time, s."""
     pos: np.ndarray
-    """(T, 3) m, world."""
+    """(T, 3) position, m, world."""
     quat: np.ndarray
-    """(T, 4) unit quaternions (x, y, z, w), body to world."""
+    """(T, 4) attitude, unit quaternions (x, y, z, w), body to world."""
     vel: np.ndarray
-    """(T, 3) m/s, world."""
+    """(T, 3) velocity, m/s, world."""
     omega: np.ndarray
-    """(T, 3) rad/s, body."""
+    """(T, 3) angular velocity, rad/s, body."""
     rpm: np.ndarray | None = None
-    """(T, 4) RPM; motors front right, back right, back left, front left."""
+    """(T, 4) rotor speeds, RPM; motors front right, back right, back left, front left."""
     pwm: np.ndarray | None = None
-    """(T, 4) 0 to 65535."""
+    """(T, 4) duty cycles of the motors, 0 to 65535."""
     vbat: np.ndarray | None = None
-    """(T,) V."""
+    """(T,) voltage of the battery, V."""
     ref_pos: np.ndarray | None = None
-    """(T, 3) set-points that the drone flew to, m, world."""
+    """(T, 3) set-points of the position, m, world."""
     ref_yaw: np.ndarray | None = None
-    """(T,) rad."""
+    """(T,) set-points of the heading, rad."""
 
     @classmethod
     def load(cls, file: str | os.PathLike) -> FlightLog:
         """Read a log from an .npz file, or a bundled one by its name (`jaxdrones.assets.flights`).
 
         Columns are `t`, `pos`, `quat`, `vel`, `omega` (or `gyro`), and either `rpm` or `pwm` with `vbat`; a flight on
-        set-points has `ref_pos` and `ref_yaw`. Others are ignored.
+        set-points has `ref_pos` and `ref_yaw`. Other columns are ignored.
 
         Raises:
-            ValueError: the file is no log, lacks a column, or holds what no flight does: NaN, times that run
-                backwards, another rate than 100 Hz, other units, too few rows.
+            ValueError: the file is not a log, lacks a column, or has invalid data: NaN, times that run backwards, a
+                rate other than 100 Hz, other units, too few rows.
         """
         path = assets.flights().get(os.fspath(file), Path(file))
         try:
@@ -85,7 +85,7 @@ class FlightLog:
         except OSError as error:
             raise ValueError(f"{path}: cannot be read ({error.strerror or error}); give a flight log (.npz)") from None
         except (ValueError, EOFError, zipfile.BadZipFile):
-            raise ValueError(f"{path}: is no .npz file of arrays; give a flight log") from None
+            raise ValueError(f"{path}: is not an .npz file of arrays; give a flight log") from None
         if "omega" not in columns and "gyro" in columns:
             columns["omega"] = columns["gyro"]
         columns.pop("gyro", None)
@@ -97,31 +97,32 @@ class FlightLog:
         return self.rpm is not None
 
     @property
-    def has_set_points(self) -> bool:
-        """Whether the flight can be flown again on its set-points."""
+    def has_setpoints(self) -> bool:
+        """Whether the flight can be simulated in closed loop: the log has set-points and PWM."""
         return self.ref_pos is not None and self.pwm is not None
 
     @property
-    def orders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What a flight on set-points was given: `ref_pos`, `ref_yaw`, `pwm` and `vbat`.
+    def closed_loop_columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The columns `ref_pos`, `ref_yaw`, `pwm` and `vbat`, which closed-loop simulation needs.
 
         Raises:
             ValueError: the log lacks one of them.
         """
         if self.ref_pos is None or self.ref_yaw is None or self.pwm is None or self.vbat is None:
-            raise ValueError(f"{self.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat to fly it again")
+            raise ValueError(f"{self.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop")
         return self.ref_pos, self.ref_yaw, self.pwm, self.vbat
 
     @property
     def in_flight(self) -> np.ndarray:
-        """(T,) whether all motors run; without PWM everywhere."""
-        return np.ones(len(self.t), bool) if self.pwm is None else np.min(self.pwm, axis=1) > _MOST_PERCENT
+        """(T,) whether all motors run; true in all rows of a log without PWM."""
+        return np.ones(len(self.t), bool) if self.pwm is None else np.min(self.pwm, axis=1) > _MAX_PERCENT
 
     @property
     def sag(self) -> float:
-        """By how much the voltage of the battery falls from rest to take-off, V; 0 of a log that begins in flight.
+        """Drop of the battery voltage from rest to take-off, V; 0 for a log that begins in flight.
 
-        Rest is the highest voltage before the motors run, take-off the mean from 1.5 to 3.5 s after they start.
+        The voltage at rest is the highest one before the motors start, that at take-off the mean from 1.5 to 3.5 s
+        after they start.
         """
         begin = int(np.argmax(self.in_flight))
         if self.vbat is None or begin == 0:
@@ -130,7 +131,7 @@ class FlightLog:
 
 
 def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns of a log as float64."""
+    """The columns of a log as float64, with unit quaternions; raises `ValueError` on invalid ones."""
     if "rpm" in columns:
         columns.pop("pwm", None)
     inputs = ("rpm",) if "rpm" in columns else ("pwm", "vbat")
@@ -149,7 +150,7 @@ def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]
         columns[column] = array.astype(float)
         if not np.isfinite(columns[column]).all():
             row = int(np.argmin(np.isfinite(columns[column].reshape(rows, -1)).all(axis=1)))
-            raise ValueError(f"{name}: {column} is not finite in row {row}; leave out or repair such rows")
+            raise ValueError(f"{name}: {column} is not finite in row {row}; remove or repair such rows")
     _check_times(name, columns["t"])
     for column in columns:
         _check_units(name, column, columns[column])
@@ -160,24 +161,24 @@ def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 
 def _check_times(name: str, t: np.ndarray) -> None:
-    if len(t) < _FEWEST:
-        raise ValueError(f"{name}: has {len(t)} rows; give at least {_FEWEST}, one second of flight")
+    if len(t) < _MIN_ROWS:
+        raise ValueError(f"{name}: has {len(t)} rows; give at least {_MIN_ROWS}, one second of flight")
     steps = np.diff(t)
     if not (steps > 0).all():
         row = int(np.argmin(steps > 0)) + 1
         raise ValueError(f"{name}: time goes from {t[row - 1]:g} to {t[row]:g} s in row {row}; sort the rows by time")
     period = np.median(steps)
-    if abs(period - PERIOD) > _TOLERANCE * PERIOD:
+    if abs(period - PERIOD) > _PERIOD_TOLERANCE * PERIOD:
         raise ValueError(f"{name}: rows are {period:.4g} s apart; resample the log to {PERIOD:g} s")
-    if np.max(steps) > _LONGEST_GAP:
+    if np.max(steps) > _MAX_GAP:
         row = int(np.argmax(steps))
         raise ValueError(f"{name}: no rows between {t[row]:g} and {t[row + 1]:g} s; cut the log there")
 
 
 def _check_units(name: str, column: str, x: np.ndarray) -> None:
-    """Raise on numbers that no flight has in the column's unit, and say which unit they may be in."""
+    """Raise on values that are implausible in the column's unit; the message names the likely unit."""
 
-    def demand(condition, looks: str, give: str) -> None:
+    def require(condition, looks: str, give: str) -> None:
         if not condition:
             low, high = np.min(x), np.max(x)
             raise ValueError(f"{name}: {column} is {low:.4g} to {high:.4g}, which looks like {looks}; give {give}")
@@ -185,20 +186,20 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
     largest = np.max(np.abs(x))
     if column == "quat":
         length = np.linalg.norm(x, axis=1)
-        demand(np.all(np.abs(length - 1) < 0.05), f"no unit quaternion (length {shown(length[0])})", "x, y, z, w")
+        require(np.all(np.abs(length - 1) < 0.05), f"no unit quaternion (length {shown(length[0])})", "x, y, z, w")
     elif column == "omega":
-        demand(largest <= _MOST_RATES, "degrees/s", "rad/s")
+        require(largest <= _MAX_RATE, "degrees/s", "rad/s")
     elif column == "ref_yaw":
-        demand(largest <= 4 * np.pi, "degrees", "rad")
+        require(largest <= 4 * np.pi, "degrees", "rad")
     elif column == "vel":
-        demand(largest <= 100, "mm/s or cm/s", "m/s")
+        require(largest <= 100, "mm/s or cm/s", "m/s")
     elif column in ("pos", "ref_pos"):
-        demand(largest <= 1e4, "mm", "m")
+        require(largest <= 1e4, "mm", "m")
     elif column == "vbat":
-        demand(largest <= _MOST_VOLTAGE, "millivolts", "V")
+        require(largest <= _MAX_VOLTAGE, "millivolts", "V")
     elif column == "pwm":
-        demand(0 <= np.min(x) and largest <= _FULL_PWM, "no duty cycle of 16 bits", "0 to 65535")
-        demand(largest > _MOST_PERCENT, "percent", "0 to 65535")
+        require(0 <= np.min(x) and largest <= _FULL_PWM, "no duty cycle of 16 bits", "0 to 65535")
+        require(largest > _MAX_PERCENT, "percent", "0 to 65535")
     elif column == "rpm":
-        demand(0 <= np.min(x) and largest <= _MOST_RPM, "no rotor speed", "RPM")
-        demand(np.median(x) >= _LEAST_RPM, "rad/s", "RPM, 60 / (2 pi) times as many")
+        require(0 <= np.min(x) and largest <= _MAX_RPM, "no rotor speed", "RPM")
+        require(np.median(x) >= _MIN_MEDIAN_RPM, "rad/s", "RPM, 60 / (2 pi) times as many")

@@ -1,4 +1,4 @@
-"""Open loop: from a state of a log, how far a model is from the flight after it was given the same rotor speeds."""
+"""Open-loop prediction: a model starts in a logged state and gets the recorded inputs; its errors against the log."""
 
 from __future__ import annotations
 
@@ -20,55 +20,54 @@ from jaxdrones.state import State
 from jaxdrones.vector import atan2, dot, safe_sqrt
 
 HORIZONS = (10, 25, 50)
-"""Rows after the start at which a prediction is compared, 0.01 s each."""
+"""Prediction horizons, in rows of 0.01 s after the start."""
 QUANTITIES = ("pos", "vel", "rot", "omega")
-"""Whose errors are in m, m/s, rad and rad/s."""
+"""Names of the errors: position (m), velocity (m/s), attitude (rad) and angular velocity (rad/s)."""
 EFFECTS = (drag, flapping_moment, rate_damping, trim_torque)
-"""What acts on a vehicle beside its rotors and its weight."""
+"""Effects that act on a vehicle in addition to its rotors and its weight."""
 
 _LENGTH = HORIZONS[-1]
-_BEFORE = 30  # rows, in which rotors with a lag come to their speed
-_REACH = 6  # rows, by which inputs can be delayed
-_HALF = 0.5  # rows
-_BLOCK = 1000  # pieces, to a multiple of which those of a flight are filled, so that flights share a program
+_WARM_UP = 30  # rows before the start, in which lagging rotors reach their speed
+_MAX_DELAY = 6  # rows, largest delay of the inputs
+_HALF_ROW = 0.5
+_BLOCK = 1000  # windows; those of a flight are padded to a multiple of it, so that flights share a compiled program
 
 
 class Windows(NamedTuple):
-    """Pieces of a flight, each from its start to the last horizon; a leading axis over n pieces on every array."""
+    """Windows of a flight, each from its start to the last horizon; every array has a leading axis over n windows."""
 
     start: State
-    """As logged, of one drone."""
+    """(n,) logged states of one drone at the start."""
     command: Float[Array, "n rows 4"] | Float[Array, "n rows 6"]
-    """From some time before the start to some time after the end: measured speeds, RPM; or duty cycles, 0 to 1, the
-    voltage of the battery and its sag at take-off, V."""
-    truth: State
-    """As logged at the horizons, a second axis."""
+    """Recorded inputs, from `_WARM_UP + _MAX_DELAY` rows before the start to `_MAX_DELAY` rows after the end: rotor
+    speeds, RPM; or duty cycles, 0 to 1, the voltage of the battery and its sag at take-off, V."""
+    logged: State
+    """(n, horizons) logged states at the horizons."""
 
 
-def windows(log: FlightLog, starts: np.ndarray) -> Windows:
-    """The pieces of a log that begin in some rows.
+def cut_windows(log: FlightLog, starts: np.ndarray) -> Windows:
+    """Cut the windows of a log that begin in the given rows.
 
     Args:
-        log: of the flight.
-        starts: (n,) rows, from `starts_of`.
+        log: log of the flight.
+        starts: (n,) rows, from `window_starts`.
     """
     command = log.rpm if log.rpm is not None else _duty_and_voltages(log)
-    padded = np.pad(command, ((_BEFORE + _REACH, _REACH + 1), (0, 0)), mode="edge")
-    rows = starts[:, None] + np.arange(_BEFORE + _LENGTH + 2 * _REACH + 1)
-    at = starts[:, None] + np.array(HORIZONS)
+    padded = np.pad(command, ((_WARM_UP + _MAX_DELAY, _MAX_DELAY + 1), (0, 0)), mode="edge")
+    rows = starts[:, None] + np.arange(_WARM_UP + _LENGTH + 2 * _MAX_DELAY + 1)
 
     def state(rows: np.ndarray) -> State:
         pos, quat, vel, omega = (jnp.asarray(x[rows], float) for x in (log.pos, log.quat, log.vel, log.omega))
         return State(pos, quat, vel, omega, jnp.zeros((*rows.shape, 4)))
 
-    return Windows(state(starts), jnp.asarray(padded[rows], float), state(at))
+    return Windows(state(starts), jnp.asarray(padded[rows], float), state(starts[:, None] + np.array(HORIZONS)))
 
 
-def starts_of(log: FlightLog, stride: int = 1) -> np.ndarray:
-    """The rows from which the whole horizon is in flight, every `stride`-th one.
+def window_starts(log: FlightLog, stride: int = 1) -> np.ndarray:
+    """Every `stride`-th row from which the drone is in flight up to the last horizon.
 
     Raises:
-        ValueError: there are none.
+        ValueError: there is no such row.
     """
     flying = np.convolve(~log.in_flight, np.ones(_LENGTH + 1), mode="valid") == 0
     starts = np.flatnonzero(flying)[::stride]
@@ -78,151 +77,154 @@ def starts_of(log: FlightLog, stride: int = 1) -> np.ndarray:
 
 
 def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows columns"], motors: Motors | None) -> State:
-    """The states of one drone at the horizons, as they would be logged.
+    """Predicted states of one drone at the horizons, as its instruments would log them.
 
     Args:
-        vehicle: with its instruments.
-        start: as logged.
-        command: a row of `Windows.command`.
-        motors: that turn duty cycles into thrust, which rotors come to with the lag of the vehicle; `None` where the
-            command is their speed.
+        vehicle: parameters of the drone and of its instruments.
+        start: logged state at the start.
+        command: recorded inputs of one window, see `Windows.command`.
+        motors: the map from duty cycle to thrust, which the rotors follow with the vehicle's lag; `None` where the
+            command is the measured rotor speeds.
     """
     params, instruments = vehicle.params, vehicle.instruments
     speed, rate = _rotor_speed(vehicle, command, motors)
     team = jax.tree.map(lambda x: x[None], params)
     state = start.replace(quat=instruments.true_attitude(start.quat), rpm=speed[0])
 
-    def advance(state: State, given: tuple[Array, Array]) -> tuple[State, State]:
-        speed, rate = given
-        derivative = motion(rate)
+    def advance(state: State, rotors: tuple[Array, Array]) -> tuple[State, State]:
+        speed, rate = rotors
+        derivative = equations_of_motion(rate)
         world = jax.tree.map(lambda x: x[None], state)
         after = midpoint(lambda s: derivative(team, s, speed[None]), world, PERIOD)
         after = jax.tree.map(lambda x: x[0], after)
         return after, after
 
     _, states = jax.lax.scan(advance, state, (speed, rate))
-    at = jax.tree.map(lambda x: x[np.array(HORIZONS) - 1], states)
-    return at.replace(
-        pos=jax.vmap(instruments.logged_position, (0, None))(at.pos, start.pos),
-        quat=jax.vmap(instruments.logged_attitude)(at.quat),
+    predicted = jax.tree.map(lambda x: x[np.array(HORIZONS) - 1], states)
+    return predicted.replace(
+        pos=jax.vmap(instruments.logged_position, (0, None))(predicted.pos, start.pos),
+        quat=jax.vmap(instruments.logged_attitude)(predicted.quat),
     )
 
 
-def residuals(predicted: State, truth: State) -> Float[Array, "4 3"]:
-    """Errors of one state: position, velocity, rotation vector (body), angular velocity."""
-    between = rotation.multiply(rotation.conjugate(truth.quat), predicted.quat)
-    turn = 2 * jnp.where(between[3] < 0, -1, 1) * between[:3]  # twice the sine of half the angle
+def residuals(predicted: State, logged: State) -> Float[Array, "4 3"]:
+    """Errors of one state: position (m) and velocity (m/s), world; rotation (rad) and angular velocity (rad/s), body.
+
+    The rotation error is a vector along the axis, whose length is twice the sine of half the angle.
+    """
+    error = rotation.multiply(rotation.conjugate(logged.quat), predicted.quat)
+    rotation_error = 2 * jnp.where(error[3] < 0, -1, 1) * error[:3]
     return jnp.stack(
-        [predicted.pos - truth.pos, predicted.vel - truth.vel, turn, predicted.omega - truth.omega],
+        [predicted.pos - logged.pos, predicted.vel - logged.vel, rotation_error, predicted.omega - logged.omega],
     )
 
 
 def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.ndarray:
-    """Mean errors of a vehicle over all starts of a log.
+    """Mean prediction errors of a vehicle over all windows of a log.
 
     Args:
-        log: of the flight.
-        vehicle: that is flown.
-        motors: of a log of PWM.
+        log: log of the flight.
+        vehicle: the vehicle to simulate.
+        motors: motors of the vehicle, for a log of PWM.
 
     Returns:
-        Euclidean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular velocity
-        (rad/s), by horizon.
+        (horizons, 4) mean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular
+        velocity (rad/s).
     """
     return np.asarray(_errors(vehicle, *_all_windows(log), None if log.has_rotor_speeds else motors))
 
 
-def held_errors(log: FlightLog) -> np.ndarray:
-    """`open_loop_errors` of a model that stays in the state of the start."""
-    pieces, weights = _all_windows(log)
-    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), pieces.start, pieces.truth)
-    return np.asarray(mean_errors(held, pieces.truth, weights))
+def hold_errors(log: FlightLog) -> np.ndarray:
+    """`open_loop_errors` of *hold*, the persistence model: it stays in the state of the start."""
+    windows, weights = _all_windows(log)
+    held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), windows.start, windows.logged)
+    return np.asarray(mean_errors(held, windows.logged, weights))
 
 
 def _all_windows(log: FlightLog) -> tuple[Windows, Float[Array, " n"]]:
-    """The pieces from every start of a log, and the weight of each: zero of those that only fill the array."""
-    starts = starts_of(log)
-    places = np.arange(-(-len(starts) // _BLOCK) * _BLOCK)
-    weights = jnp.asarray(places < len(starts), float) / len(starts)
-    return windows(log, starts[np.minimum(places, len(starts) - 1)]), weights
+    """The windows from every start of a log, with padding, and their weights, which are zero for the padding."""
+    starts = window_starts(log)
+    indices = np.arange(-(-len(starts) // _BLOCK) * _BLOCK)
+    weights = jnp.asarray(indices < len(starts), float) / len(starts)
+    return cut_windows(log, starts[np.minimum(indices, len(starts) - 1)]), weights
 
 
 @jax.jit
 def mean_errors(
-    predicted: State, truth: State, weights: Float[Array, " n"] | None = None
+    predicted: State, logged: State, weights: Float[Array, " n"] | None = None
 ) -> Float[Array, "horizons 4"]:
-    """Means over n pieces of the norms of `residuals`, the attitude's as an angle.
+    """Mean norms of the errors over n windows: position (m), velocity (m/s), angle (rad), angular velocity (rad/s).
 
     Args:
-        predicted: states (n, horizons, ...).
-        truth: logged states at the same times.
-        weights: of the pieces, which add up to one; equal when left out.
+        predicted: predicted states (n, horizons, ...).
+        logged: logged states at the same times.
+        weights: weights of the windows, which add up to one; equal when left out.
     """
-    errors = jax.vmap(jax.vmap(_error))(predicted, truth)
+    errors = jax.vmap(jax.vmap(_error))(predicted, logged)
     return jnp.mean(errors, axis=0) if weights is None else jnp.tensordot(weights, errors, 1)
 
 
 @jax.jit
-def _errors(vehicle: Vehicle, pieces: Windows, weights: Array, motors: Motors | None) -> Array:
-    predicted = jax.vmap(predict, (None, 0, 0, None))(vehicle, pieces.start, pieces.command, motors)
-    return mean_errors(predicted, pieces.truth, weights)
+def _errors(vehicle: Vehicle, windows: Windows, weights: Array, motors: Motors | None) -> Array:
+    predicted = jax.vmap(predict, (None, 0, 0, None))(vehicle, windows.start, windows.command, motors)
+    return mean_errors(predicted, windows.logged, weights)
 
 
-def _error(predicted: State, truth: State) -> Float[Array, "4"]:
-    between = rotation.multiply(rotation.conjugate(truth.quat), predicted.quat)
-    x, y, z, w = between
+def _error(predicted: State, logged: State) -> Float[Array, "4"]:
+    x, y, z, w = rotation.multiply(rotation.conjugate(logged.quat), predicted.quat)
     angle = 2 * atan2(safe_sqrt(x * x + y * y + z * z), jnp.abs(w))
-    pos, vel, _, omega = residuals(predicted, truth)
+    pos, vel, _, omega = residuals(predicted, logged)
     return jnp.stack([safe_sqrt(dot(pos, pos)), safe_sqrt(dot(vel, vel)), angle, safe_sqrt(dot(omega, omega))])
 
 
 def _rotor_speed(
     vehicle: Vehicle, command: Array, motors: Motors | None
 ) -> tuple[Float[Array, "rows 4"], Float[Array, "rows 4"]]:
-    """Speed of the rotors in each row of a piece and its rate, RPM and RPM/s."""
+    """Rotor speeds (RPM) and their rates (RPM/s) in each row of a window, from its start to its end."""
     delay = vehicle.instruments.delay / PERIOD
     if motors is None:
-        measured = command[_BEFORE:]
-        middle, early, late = (_shifted(measured, delay + shift)[:_LENGTH] for shift in (0, _HALF, -_HALF))
+        measured = command[_WARM_UP:]
+        middle, early, late = (_shifted(measured, delay + shift)[:_LENGTH] for shift in (0, _HALF_ROW, -_HALF_ROW))
         return middle, (late - early) / PERIOD
-    given = _shifted(command, delay)
-    duty, battery, sag = given[:, :4], given[:, 4:5], given[:, 5:]
+    delayed = _shifted(command, delay)
+    duty, battery, sag = delayed[:, :4], delayed[:, 4:5], delayed[:, 5:]
     thrust = motors.thrust(duty * vehicle.instruments.motor_supply(battery, sag))
 
     def follow(speed: Array, thrust: Array) -> tuple[Array, tuple[Array, Array]]:
-        after = lagging(vehicle.params, speed, thrust, PERIOD)
+        after = lagged_rpm(vehicle.params, speed, thrust, PERIOD)
         return after, ((speed + after) / 2, (after - speed) / PERIOD)
 
-    _, flown = jax.lax.scan(follow, safe_sqrt(thrust[0] / vehicle.params.kf), thrust)
-    speed, rate = (x[_BEFORE : _BEFORE + _LENGTH] for x in flown)
+    _, followed = jax.lax.scan(follow, safe_sqrt(thrust[0] / vehicle.params.kf), thrust)
+    speed, rate = (x[_WARM_UP : _WARM_UP + _LENGTH] for x in followed)
     return speed, rate
 
 
 def _shifted(x: Float[Array, "rows n"], delay: Array) -> Float[Array, "inner n"]:
-    """The rows between the first and last few of x, some rows later; linear in between."""
-    n = len(x) - 2 * _REACH
-    shifts = range(-_REACH, _REACH + 1)
+    """Rows of x with a delay in rows, linearly interpolated, without its first and last `_MAX_DELAY` rows."""
+    n = len(x) - 2 * _MAX_DELAY
+    shifts = range(-_MAX_DELAY, _MAX_DELAY + 1)
     weights = [jnp.maximum(1 - jnp.abs(delay - shift), 0) for shift in shifts]
-    moved = [weight * x[_REACH - shift :][:n] for weight, shift in zip(weights, shifts, strict=True)]
-    return jnp.sum(jnp.stack(moved), axis=0)
+    terms = [weight * x[_MAX_DELAY - shift :][:n] for weight, shift in zip(weights, shifts, strict=True)]
+    return jnp.sum(jnp.stack(terms), axis=0)
 
 
-def motion(rpm_rate: Float[Array, "4"]) -> Derivative:
-    """The law of motion of a team of one whose rotors have the commanded speed, which changes at a rate (RPM/s)."""
+def equations_of_motion(rpm_rate: Float[Array, "4"]) -> Derivative:
+    """The equations of motion of a team of one drone whose rotors have the commanded speed and this rate, RPM/s."""
 
-    def given(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Array, Array]:
+    def prescribed(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Array, Array]:
         return command, rpm_rate
 
-    return make_derivative(effects=EFFECTS, rotors=given)
+    return make_derivative(effects=EFFECTS, rotors=prescribed)
 
 
-def lagging(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"], dt: float) -> Float[Array, "4"]:
-    """Rotor speeds a time later, on the way to those that give a thrust (N)."""
-    asked = safe_sqrt(thrust / params.kf)
-    time_constant = jnp.where(asked > rpm, params.rotor_rise_time, params.rotor_fall_time)
-    return asked + (rpm - asked) * jnp.exp(-dt / time_constant)
+def lagged_rpm(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"], dt: float) -> Float[Array, "4"]:
+    """Rotor speeds (RPM) after a time dt (s) of a first-order lag toward those of the commanded thrusts (N)."""
+    commanded = safe_sqrt(thrust / params.kf)
+    time_constant = jnp.where(commanded > rpm, params.rotor_rise_time, params.rotor_fall_time)
+    return commanded + (rpm - commanded) * jnp.exp(-dt / time_constant)
 
 
 def _duty_and_voltages(log: FlightLog) -> np.ndarray:
-    assert log.pwm is not None and log.vbat is not None  # a log has these or rotor speeds
+    """(T, 6) duty cycles, 0 to 1, voltage of the battery and its sag at take-off, V."""
+    assert log.pwm is not None and log.vbat is not None  # a log without rotor speeds has both
     return np.column_stack([log.pwm / FULL_PWM, log.vbat, np.full(len(log.vbat), log.sag)])

@@ -1,4 +1,4 @@
-"""The numbers of a vehicle that flights can tell, by name, and the vehicle that has them."""
+"""Parameters of a vehicle that can be identified from flights, by name, and vehicles with other values of them."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from jaxdrones.identification.vehicle import Vehicle
 from jaxdrones.limits import check_at_most
 from jaxdrones.params import Params
 
-_MOST = 60
-_SUMMED_SPEED = 6900.0  # rad/s, about that of a hovering Crazyflie
+_MAX_PARAMETERS = 60
+_HOVER_SUMMED_SPEED = 6900.0  # rad/s, sum of the four rotor speeds, about that of a hovering Crazyflie
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """One number of a vehicle, as the coordinate that is searched: x is 0 where the search starts.
+    """A scalar parameter of a vehicle and the coordinate x in which it is searched; x is 0 at the initial value.
 
-    The number is exp(x) times its start where it must be positive, and `unit` x more than its start elsewhere.
+    A positive parameter is its initial value times exp(x), any other its initial value plus `scale` times x.
     """
 
     name: str
-    """For example `inertia_x`."""
+    """Name of the parameter, for example `inertia_x`."""
     field: str
-    """Of `Params`, of `Instruments`, `center_of_mass`, or `rotor_lag`, the time constant up and down."""
-    entries: int | slice | tuple[()]
-    """Those of the field's array that are this number."""
-    unit: float | None = None
-    """What a step of 1 changes; `None` for a positive number, of which it is the logarithm."""
-    of_flight: bool = False
-    """Whether it differs from flight to flight: the vehicle has the median."""
+    """Field of `Params` or `Instruments`; or `center_of_mass`; or `rotor_lag`, both time constants of the rotors."""
+    index: int | slice | tuple[()]
+    """Entries of the field's array that have this value."""
+    scale: float | None = None
+    """Change of the parameter for a step of 1 in x, SI units; `None` for a positive parameter with logarithmic x."""
+    per_flight: bool = False
+    """Whether every flight has its own value; the fitted vehicle then has the median."""
 
 
-def _axes(field: str, unit: float | None = None, of_flight: bool = False, axes: str = "xyz") -> list[Parameter]:
-    return [Parameter(f"{field}_{axis}", field, i, unit, of_flight) for i, axis in enumerate(axes)]
+def _axes(field: str, scale: float | None = None, per_flight: bool = False, axes: str = "xyz") -> list[Parameter]:
+    return [Parameter(f"{field}_{axis}", field, i, scale, per_flight) for i, axis in enumerate(axes)]
 
 
 PARAMETERS = {
@@ -50,92 +50,94 @@ PARAMETERS = {
         Parameter("rotor_inertia", "rotor_inertia", (), 1e-8),
         Parameter("rotor_lag", "rotor_lag", ()),
         *_axes("drag_coeff", 1e-7),
-        *_axes("flapping_coeff", 1e-4 / _SUMMED_SPEED, axes="xy"),
+        *_axes("flapping_coeff", 1e-4 / _HOVER_SUMMED_SPEED, axes="xy"),
         Parameter("flapping_climb_x", "flapping_climb", 0, 0.1),
         Parameter("flapping_climb_y", "flapping_climb", 1, 0.1),
         Parameter("flapping_climb_squared", "flapping_climb", 2, 0.1),
         Parameter("rate_damping_xy", "rate_damping", slice(0, 2), 1e-4),
         Parameter("rate_damping_z", "rate_damping", 2, 1e-4),
         *_axes("center_of_mass", 1e-3, axes="xy"),
-        *_axes("trim_torque", 1e-4, of_flight=True),
-        *_axes("tilt", 0.01, of_flight=True, axes="xy"),
-        Parameter("delay", "delay", (), 0.01, of_flight=True),
+        *_axes("trim_torque", 1e-4, per_flight=True),
+        *_axes("tilt", 0.01, per_flight=True, axes="xy"),
+        Parameter("delay", "delay", (), 0.01, per_flight=True),
         Parameter("position_scale", "position_scale", (), 0.02),
         Parameter("unfelt_sag", "unfelt_sag", (), 0.3),
         Parameter("estimate_tilt", "estimate_tilt", (), 0.1),
         Parameter("estimate_delay", "estimate_delay", (), 0.01),
     )
 }
-"""Every number that can be fitted, by name."""
+"""All parameters that can be fitted, by name."""
 
-_OF_TWIN = ("rotor_lag", "unfelt_sag", "estimate_tilt", "estimate_delay")  # beside a delay, pieces do not tell them
-# A flight depends on thrust over mass and yaw torque over inertia: one of each is kept. PWM tells thrusts, not speeds.
-_OF_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in ("mass", "inertia_z", *_OF_TWIN))
-_OF_PWM = tuple(name for name in PARAMETERS if name not in ("kf", "inertia_z", "rotor_inertia", *_OF_TWIN))
+# Open-loop windows do not identify these beside a delay.
+_CLOSED_LOOP_ONLY = ("rotor_lag", "unfelt_sag", "estimate_tilt", "estimate_delay")
+# A flight identifies only the ratios of thrust to mass and of yaw torque to inertia: one parameter of each is fixed.
+# PWM identifies thrusts, not rotor speeds.
+_FROM_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in ("mass", "inertia_z", *_CLOSED_LOOP_ONLY))
+_FROM_PWM = tuple(name for name in PARAMETERS if name not in ("kf", "inertia_z", "rotor_inertia", *_CLOSED_LOOP_ONLY))
 
 
 def default_parameters(has_rotor_speeds: bool) -> tuple[str, ...]:
-    """Names of what is fitted if nothing is asked for."""
-    return _OF_ROTOR_SPEEDS if has_rotor_speeds else _OF_PWM
+    """Names of the parameters that are fitted when none are named."""
+    return _FROM_ROTOR_SPEEDS if has_rotor_speeds else _FROM_PWM
 
 
-def asked_parameters(names: Sequence[str]) -> tuple[str, ...]:
-    """The parameters of names and of fields: `inertia` stands for all three.
+def select_parameters(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of the parameters that names of parameters or fields stand for: `inertia` stands for all three axes.
 
     Raises:
-        ValueError: an unknown name, or more parameters than flights can tell.
+        ValueError: a name is unknown, or there are too many parameters.
     """
     fields = {parameter.field for parameter in PARAMETERS.values()}
-    found: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for name in names:
         check_choice("parameter", name, sorted(fields | PARAMETERS.keys()))
-        found |= dict.fromkeys(p.name for p in PARAMETERS.values() if name in (p.name, p.field))
-    check_at_most("parameters", len(found), _MOST)
-    return tuple(found)
+        selected |= dict.fromkeys(p.name for p in PARAMETERS.values() if name in (p.name, p.field))
+    check_at_most("parameters", len(selected), _MAX_PARAMETERS)
+    return tuple(selected)
 
 
 def with_parameters(vehicle: Vehicle, names: Sequence[str], x: Sequence[ArrayLike]) -> Vehicle:
-    """The vehicle whose parameters are x from those that it is given with."""
+    """The vehicle whose named parameters have the coordinates x, where `vehicle` has x = 0."""
     for name, value in zip(names, x, strict=True):
         vehicle = _with(vehicle, PARAMETERS[name], value)
     return vehicle
 
 
 def value_of(vehicle: Vehicle, name: str) -> float:
-    """The number itself, in SI units; of the center of mass, its place among the rotors."""
+    """The value of a parameter, SI units; the center of mass is relative to the mean position of the rotors."""
     parameter = PARAMETERS[name]
     if parameter.field == "center_of_mass":
-        return float(-jnp.mean(vehicle.params.rotor_pos[:, parameter.entries]))
+        return float(-jnp.mean(vehicle.params.rotor_pos[:, parameter.index]))
     if parameter.field == "rotor_lag":
         return float(vehicle.params.rotor_rise_time)
-    array = getattr(getattr(vehicle, _part(parameter)), parameter.field)
-    return float(jnp.mean(array[parameter.entries]))
+    array = getattr(getattr(vehicle, _owner(parameter)), parameter.field)
+    return float(jnp.mean(array[parameter.index]))
 
 
-def step_of(vehicle: Vehicle, name: str) -> float:
-    """How much the number changes with x, in SI units."""
-    unit = PARAMETERS[name].unit
-    return abs(value_of(vehicle, name)) if unit is None else unit
+def scale_of(vehicle: Vehicle, name: str) -> float:
+    """The magnitude of the derivative of a parameter with respect to its coordinate x, SI units."""
+    scale = PARAMETERS[name].scale
+    return abs(value_of(vehicle, name)) if scale is None else scale
 
 
 _PARAMS = frozenset(field.name for field in dataclasses.fields(Params))
 
 
-def _part(parameter: Parameter) -> str:
-    """Of the vehicle, to which the parameter's field belongs."""
+def _owner(parameter: Parameter) -> str:
+    """The attribute of `Vehicle` that has the parameter's field."""
     return "params" if parameter.field in _PARAMS else "instruments"
 
 
 def _with(vehicle: Vehicle, parameter: Parameter, x: ArrayLike) -> Vehicle:
     if parameter.field == "center_of_mass":
-        moved = -(parameter.unit or 0.0) * x
-        rotor_pos = vehicle.params.rotor_pos.at[:, parameter.entries].add(moved)
+        shift = -(parameter.scale or 0.0) * x
+        rotor_pos = vehicle.params.rotor_pos.at[:, parameter.index].add(shift)
         return vehicle.replace(params=vehicle.params.replace(rotor_pos=rotor_pos))
     if parameter.field == "rotor_lag":
         lag = vehicle.params.rotor_rise_time * jnp.exp(x)
         return vehicle.replace(params=vehicle.params.replace(rotor_rise_time=lag, rotor_fall_time=lag))
-    part = _part(parameter)
-    owner = getattr(vehicle, part)
-    place = getattr(owner, parameter.field).at[parameter.entries]
-    changed = place.multiply(jnp.exp(x)) if parameter.unit is None else place.add(parameter.unit * x)
-    return vehicle.replace(**{part: owner.replace(**{parameter.field: changed})})
+    attribute = _owner(parameter)
+    owner = getattr(vehicle, attribute)
+    entries = getattr(owner, parameter.field).at[parameter.index]
+    changed = entries.multiply(jnp.exp(x)) if parameter.scale is None else entries.add(parameter.scale * x)
+    return vehicle.replace(**{attribute: owner.replace(**{parameter.field: changed})})

@@ -1,4 +1,4 @@
-"""The vehicle whose repetitions of flights on set-points follow the recorded paths best."""
+"""Closed-loop identification: estimates parameters of a vehicle from the paths of flights on set-points."""
 
 from __future__ import annotations
 
@@ -13,24 +13,30 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import FULL_PWM, Motors
-from jaxdrones.identification.closed_loop import Course, course, first_row, fly, rows_in_the_air
+from jaxdrones.identification.closed_loop import (
+    ClosedLoopInputs,
+    closed_loop_inputs,
+    motor_start_row,
+    rows_after_climb,
+    simulate,
+)
 from jaxdrones.identification.log import PERIOD, FlightLog
 from jaxdrones.identification.parameters import with_parameters
 from jaxdrones.identification.vehicle import Vehicle
 
-BALANCE = ("mass", "unfelt_sag")
-"""What the balance of vertical forces tells."""
-PATH = ("drag_coeff_x", "drag_coeff_y", "flapping_coeff_x", "flapping_coeff_y", "rotor_lag", "estimate_tilt")
-"""What the path in the plane tells."""
+BALANCE_PARAMETERS = ("mass", "unfelt_sag")
+"""Parameters that are estimated from the balance of vertical forces."""
+PATH_PARAMETERS = ("drag_coeff_x", "drag_coeff_y", "flapping_coeff_x", "flapping_coeff_y", "rotor_lag", "estimate_tilt")
+"""Parameters that are estimated from the horizontal path."""
 
-_SECOND = 100  # rows
-_FORCE = 0.02  # standard deviation of the vertical balance of a second, share of the weight
-_DISTANCE = 0.05  # m, of a path
-_STRIDE = 20  # rows between the points of a path that are compared, which lie on each other
-_OUTLIER = 9.0  # square of a residual beyond which it counts ever less (Cauchy)
-_PRIOR = 1.0  # inverse variance of x
-_STEPS = 8
-_LITTLE = 1e-3  # share of the loss; a step that gains less is the last one
+_BALANCE_ROWS = 100  # rows over which the balance of vertical forces is averaged: one second
+_FORCE_STD = 0.02  # standard deviation of the averaged vertical balance, fraction of the weight
+_PATH_STD = 0.05  # m, standard deviation of the horizontal position along an axis
+_STRIDE = 20  # rows between the compared points of a path
+_CAUCHY_SCALE_SQUARED = 9.0  # c^2 of the Cauchy loss c^2 log(1 + r^2 / c^2)
+_PRIOR_PRECISION = 1.0  # inverse variance of x
+_MAX_STEPS = 8
+_MIN_DECREASE = 1e-3  # relative; a step that decreases the loss by less is the last one
 
 Residuals = Callable[[Array], Float[Array, " n"]]
 
@@ -38,112 +44,129 @@ Residuals = Callable[[Array], Float[Array, " n"]]
 def fit_path(
     logs: Sequence[FlightLog], start: Vehicle, motors: Motors, progress: Callable[[str], None]
 ) -> tuple[Vehicle, dict[str, float]]:
-    """Fit a vehicle to flights on set-points.
+    """Estimate parameters of a vehicle from flights on set-points.
 
-    First the mass and what the motors get of the battery's sag, by the balance of the vertical forces in every
-    second of the flights; then what moves a drone sideways, by the horizontal path of its repetition.
+    `mass` and `unfelt_sag` come first, from the balance of vertical forces in every second of the flights. The
+    parameters of the horizontal motion come second: the path of the closed-loop simulation is fitted to the recorded
+    one.
 
     Args:
-        logs: with set-points, PWM and battery.
-        start: where the search starts.
-        motors: of the vehicle.
-        progress: called with a line after each part.
+        logs: flights with set-points, PWM and battery voltage.
+        start: the vehicle with the initial values.
+        motors: motors of the vehicle.
+        progress: called with a line after each of the two fits.
 
     Returns:
-        The vehicle, and the standard error of each parameter's coordinate.
+        The fitted vehicle, and the standard error of each parameter's coordinate x.
     """
-    seconds = zip(*(_seconds(log) for log in logs), strict=True)
-    duty, battery, sag, up, acc = (jnp.asarray(np.concatenate(parts), float) for parts in seconds)
-    balance = functools.partial(_balance, start, motors, duty, battery, sag, up, acc)
-    x, balance_errors = _least_squares(balance, len(BALANCE), np.inf)
-    progress(f"balance of forces: {_rms(balance(x)) * _FORCE:.1%} of the weight")
-    vehicle = with_parameters(start, BALANCE, list(x))
+    data = zip(*(_balance_data(log) for log in logs), strict=True)
+    duty, battery, sag, up, acc = (jnp.asarray(np.concatenate(parts), float) for parts in data)
+    balance = functools.partial(_balance_residuals, start, motors, duty, battery, sag, up, acc)
+    x, balance_errors = _least_squares(balance, len(BALANCE_PARAMETERS), np.inf)
+    progress(f"balance of forces: {_rms(balance(x)) * _FORCE_STD:.1%} of the weight")
+    vehicle = with_parameters(start, BALANCE_PARAMETERS, list(x))
 
-    courses, truth, counts = _paths(logs)
-    path = functools.partial(_path, vehicle, motors, firmware_pid.gains(), courses, truth, counts)
-    x, path_errors = _least_squares(path, len(PATH), _OUTLIER)
-    progress(
-        f"paths: {_rms(path(x)[np.repeat(np.asarray(counts).reshape(-1), 2) > 0]) * _DISTANCE:.3f} m rms along an axis"
-    )
-    errors = dict(zip((*BALANCE, *PATH), np.concatenate([balance_errors, path_errors]), strict=True))
-    return with_parameters(vehicle, PATH, list(x)), errors
+    inputs, recorded, mask = _path_data(logs)
+    path = functools.partial(_path_residuals, vehicle, motors, firmware_pid.gains(), inputs, recorded, mask)
+    x, path_errors = _least_squares(path, len(PATH_PARAMETERS), _CAUCHY_SCALE_SQUARED)
+    compared = np.repeat(np.asarray(mask).reshape(-1), 2) > 0
+    progress(f"paths: {_rms(path(x)[compared]) * _PATH_STD:.3f} m rms along an axis")
+    names = (*BALANCE_PARAMETERS, *PATH_PARAMETERS)
+    errors = dict(zip(names, np.concatenate([balance_errors, path_errors]), strict=True))
+    return with_parameters(vehicle, PATH_PARAMETERS, list(x)), errors
 
 
-def _seconds(log: FlightLog) -> tuple[np.ndarray, ...]:
-    """Duty cycles (n, rows, 4), voltage (n, rows), sag (n, 1), upward share of thrust (n, rows), acceleration (n,)."""
-    air = rows_in_the_air(log)
-    starts = np.arange(air.start, air.stop - _SECOND, _SECOND)
-    rows = starts[:, None] + np.arange(_SECOND)
+def _balance_data(log: FlightLog) -> tuple[np.ndarray, ...]:
+    """Data of the n seconds of a flight.
+
+    Duty cycles (n, rows, 4), 0 to 1; voltage (n, rows), V; sag at take-off (n, 1), V; vertical component of the thrust
+    direction (n, rows); mean vertical acceleration (n,), m/s^2.
+    """
+    air = rows_after_climb(log)
+    starts = np.arange(air.start, air.stop - _BALANCE_ROWS, _BALANCE_ROWS)
+    rows = starts[:, None] + np.arange(_BALANCE_ROWS)
     up = np.asarray(jax.vmap(rotation.z_axis)(jnp.asarray(log.quat, float)))[:, 2]
-    acc = (log.vel[starts + _SECOND, 2] - log.vel[starts, 2]) / (_SECOND * PERIOD)
-    _, _, pwm, vbat = log.orders
+    acc = (log.vel[starts + _BALANCE_ROWS, 2] - log.vel[starts, 2]) / (_BALANCE_ROWS * PERIOD)
+    _, _, pwm, vbat = log.closed_loop_columns
     return pwm[rows] / FULL_PWM, vbat[rows], np.full((len(starts), 1), log.sag), up[rows], acc
 
 
-def _balance(
+def _balance_residuals(
     start: Vehicle, motors: Motors, duty: Array, battery: Array, sag: Array, up: Array, acc: Array, x: Array
 ) -> Array:
-    vehicle = with_parameters(start, BALANCE, list(x))
+    vehicle = with_parameters(start, BALANCE_PARAMETERS, list(x))
     thrust = jnp.sum(motors.thrust(duty * vehicle.instruments.motor_supply(battery, sag)[..., None]), axis=-1)
     lift = jnp.mean(thrust * up, axis=1)
-    return (lift / (vehicle.params.mass * (vehicle.params.gravity + acc)) - 1) / _FORCE
+    return (lift / (vehicle.params.mass * (vehicle.params.gravity + acc)) - 1) / _FORCE_STD
 
 
-def _paths(logs: Sequence[FlightLog]) -> tuple[Course, Array, Array]:
-    """Courses of equal length, the horizontal paths (flights, rows, 2), and which rows count."""
-    courses = [course(log) for log in logs]
-    rows = max(len(each.battery) for each in courses)
-    truth, counts = np.zeros((len(logs), rows, 2)), np.zeros((len(logs), rows))
+def _path_data(logs: Sequence[FlightLog]) -> tuple[ClosedLoopInputs, Array, Array]:
+    """Inputs of equal length, the recorded horizontal paths (flights, points, 2), m, and a mask (flights, points).
+
+    The mask is 1 at the points that are compared, 0 elsewhere.
+    """
+    inputs = [closed_loop_inputs(log) for log in logs]
+    rows = max(len(each.battery) for each in inputs)
+    recorded, mask = np.zeros((len(logs), rows, 2)), np.zeros((len(logs), rows))
     for i, log in enumerate(logs):
-        air, begin = rows_in_the_air(log), first_row(log)
-        truth[i, air.start - begin : air.stop - begin] = log.pos[air, :2]
-        counts[i, air.start - begin : air.stop - begin] = 1
+        air, begin = rows_after_climb(log), motor_start_row(log)
+        recorded[i, air.start - begin : air.stop - begin] = log.pos[air, :2]
+        mask[i, air.start - begin : air.stop - begin] = 1
 
-    def filled(x: Array) -> Array:
+    def padded(x: Array) -> Array:
         return jnp.pad(x, [(0, rows - len(x))] + [(0, 0)] * (x.ndim - 1), mode="edge")
 
     equal = [
-        each._replace(setpoint=jax.tree.map(filled, each.setpoint), battery=filled(each.battery)) for each in courses
+        each._replace(setpoint=jax.tree.map(padded, each.setpoint), battery=padded(each.battery)) for each in inputs
     ]
-    at = slice(None, None, _STRIDE)
+    points = slice(None, None, _STRIDE)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *equal)
-    return stacked, jnp.asarray(truth[:, at], float), jnp.asarray(counts[:, at], float)
+    return stacked, jnp.asarray(recorded[:, points], float), jnp.asarray(mask[:, points], float)
 
 
-def _path(
-    start: Vehicle, motors: Motors, gains: firmware_pid.Gains, courses: Course, truth: Array, counts: Array, x: Array
+def _path_residuals(
+    start: Vehicle,
+    motors: Motors,
+    gains: firmware_pid.Gains,
+    inputs: ClosedLoopInputs,
+    recorded: Array,
+    mask: Array,
+    x: Array,
 ) -> Array:
-    vehicle = with_parameters(start, PATH, list(x))
-    pos, _ = jax.vmap(lambda each: fly(vehicle, motors, gains, each))(courses)
-    return ((pos[:, ::_STRIDE, :2] - truth) / _DISTANCE * counts[..., None]).reshape(-1)
+    vehicle = with_parameters(start, PATH_PARAMETERS, list(x))
+    pos, _ = jax.vmap(lambda each: simulate(vehicle, motors, gains, each))(inputs)
+    return ((pos[:, ::_STRIDE, :2] - recorded) / _PATH_STD * mask[..., None]).reshape(-1)
 
 
-def _least_squares(residuals: Residuals, count: int, outlier: float) -> tuple[Array, np.ndarray]:
-    """The coordinates of the least sum of squares by Levenberg and Marquardt, and their standard errors.
+def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float) -> tuple[Array, np.ndarray]:
+    """Levenberg-Marquardt from x = 0; returns the coordinates of the least loss and their standard errors.
 
-    Squares beyond `outlier` count ever less.
+    The loss is the Cauchy loss; with an infinite scale it is the sum of squares.
     """
 
     @jax.jit
     def normal(x: Array) -> tuple[Array, Array, Array]:
         along = jax.vmap(lambda e: jax.jvp(residuals, (x,), (e,)), out_axes=(None, 0))
         r, jacobian = along(jnp.eye(count))
-        weighted = jacobian / (1 + r * r / outlier)[None]
-        loss = jnp.sum(r * r if np.isinf(outlier) else outlier * jnp.log1p(r * r / outlier)) + _PRIOR * x @ x
-        return weighted @ jacobian.T + _PRIOR * jnp.eye(count), weighted @ r + _PRIOR * x, loss
+        relative = r * r / cauchy_scale_squared
+        weighted = jacobian / (1 + relative)[None]
+        robust = r * r if np.isinf(cauchy_scale_squared) else cauchy_scale_squared * jnp.log1p(relative)
+        loss = jnp.sum(robust) + _PRIOR_PRECISION * x @ x
+        matrix = weighted @ jacobian.T + _PRIOR_PRECISION * jnp.eye(count)
+        return matrix, weighted @ r + _PRIOR_PRECISION * x, loss
 
     x, damping = np.zeros(count), 1e-3
     matrix, gradient, loss = (np.asarray(part, float) for part in normal(jnp.asarray(x, float)))
-    for _ in range(_STEPS):
-        after = x - np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
-        found = [np.asarray(part, float) for part in normal(jnp.asarray(after, float))]
-        gained = loss - found[2]
-        if gained > 0:
-            x, damping = after, damping / 10
-            matrix, gradient, loss = found
+    for _ in range(_MAX_STEPS):
+        candidate = x - np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+        at_candidate = [np.asarray(part, float) for part in normal(jnp.asarray(candidate, float))]
+        decrease = loss - at_candidate[2]
+        if decrease > 0:
+            x, damping = candidate, damping / 10
+            matrix, gradient, loss = at_candidate
         else:
             damping *= 10
-        if 0 < gained < _LITTLE * loss:
+        if 0 < decrease < _MIN_DECREASE * loss:
             break
     return jnp.asarray(x, float), np.sqrt(np.diag(np.linalg.inv(matrix)))
 

@@ -1,4 +1,4 @@
-"""A vehicle as a log shows it."""
+"""A vehicle together with the measurement model of its logs."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from jaxdrones.pytree import PyTreeNode
 
 
 class Vehicle(PyTreeNode):
-    """The constants of one drone and of the instruments that log its flights."""
+    """Parameters of one drone, and of the instruments that log its flights."""
 
     params: Params
     instruments: Instruments
 
     @classmethod
     def of(cls, params: Params) -> Vehicle:
-        """A vehicle whose instruments show what is."""
+        """A vehicle with ideal instruments."""
         return cls(params, Instruments.ideal())

@@ -1,11 +1,11 @@
-"""Figures of recorded flights: errors by horizon, and paths with their repetitions."""
+"""Figures of recorded flights: open-loop errors by horizon, and recorded beside simulated paths."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from jaxdrones.identification import HORIZONS, QUANTITIES, Twin
+from jaxdrones.identification import HORIZONS, QUANTITIES, ClosedLoopResult
 from jaxdrones.identification.log import PERIOD
 from jaxdrones.visualization import style
 from jaxdrones.visualization.palette import COLORS, colors
@@ -15,10 +15,10 @@ _COLUMNS = 4
 
 
 def save_errors(errors: dict[str, np.ndarray], path: Path) -> None:
-    """Draw open-loop errors (horizons, 4) of flights over the horizon.
+    """Draw the open-loop errors of flights over the horizon.
 
     Args:
-        errors: by flight.
+        errors: open-loop errors (horizons, 4) by flight.
         path: path of the picture.
     """
     t = np.array(HORIZONS) * PERIOD
@@ -32,23 +32,23 @@ def save_errors(errors: dict[str, np.ndarray], path: Path) -> None:
         figure.savefig(path)
 
 
-def save_twins(twins: Sequence[Twin], path: Path) -> None:
-    """Draw the horizontal paths of flights, of their repetitions and of their set-points.
+def save_paths(results: Sequence[ClosedLoopResult], path: Path) -> None:
+    """Draw the recorded and simulated horizontal paths of flights and their set-points.
 
     Args:
-        twins: the flights.
+        results: closed-loop simulations of the flights.
         path: path of the picture.
     """
-    columns = min(len(twins), _COLUMNS)
-    rows = -(-len(twins) // columns)
+    columns = min(len(results), _COLUMNS)
+    rows = -(-len(results) // columns)
     with style.figure(5 * columns, 5 * rows + 0.5) as figure:
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axis, twin in zip(axes, twins, strict=False):
-            axis.plot(*twin.ref_pos[:, :2].T, color="#b4bac1", label="set-points")
-            axis.plot(*twin.pos[:, :2].T, color=COLORS[0], label="recorded")
-            axis.plot(*twin.twin_pos[:, :2].T, color=COLORS[1], label="simulated")
-            axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=twin.flight.removesuffix(".npz"))
-        for axis in axes[len(twins) :]:
+        for axis, result in zip(axes, results, strict=False):
+            axis.plot(*result.ref_pos[:, :2].T, color="#b4bac1", label="set-points")
+            axis.plot(*result.pos[:, :2].T, color=COLORS[0], label="recorded")
+            axis.plot(*result.sim_pos[:, :2].T, color=COLORS[1], label="simulated")
+            axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=result.flight.removesuffix(".npz"))
+        for axis in axes[len(results) :]:
             axis.set_axis_off()
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
         figure.savefig(path)

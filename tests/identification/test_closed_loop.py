@@ -1,4 +1,4 @@
-"""A flight on set-points is flown again from its take-off on."""
+"""Closed-loop simulations of flights on set-points start at take-off or in flight."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 import jaxdrones
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import FULL_PWM, crazyflie_motors
-from jaxdrones.identification import FlightLog, Vehicle, fly_again
+from jaxdrones.identification import FlightLog, Vehicle, simulate_closed_loop
 
 ROWS, REST, LOADED = 700, 4.1, 3.3
 HEIGHT = 0.5  # m, of the set-point
@@ -15,7 +15,7 @@ TAKE_OFF = 100  # row
 
 
 def log_of(height, begin):
-    """A log whose motors start in a row, with a drone at this height, which is told to be at `HEIGHT`."""
+    """A log whose motors start in the row `begin`, with a drone at this height and a set-point at `HEIGHT`."""
     zero, up = np.zeros((ROWS, 3)), np.array([0.0, 0, 1])
     runs = np.arange(ROWS) >= begin
     pos = np.where((np.arange(ROWS) < 2 * begin)[:, None], height * up, HEIGHT * up)
@@ -35,31 +35,32 @@ def log_of(height, begin):
 
 @pytest.fixture(scope="module")
 def flown():
-    """A vehicle that does not feel half of the sag, and its repetitions: begun in flight, begun on the ground."""
+    """A vehicle with an unfelt sag of 0.5, and its simulations from a start in flight and from one on the ground."""
     vehicle = Vehicle.of(jaxdrones.load_params("cf21"))
     vehicle = vehicle.replace(instruments=vehicle.instruments.replace(unfelt_sag=jnp.array(0.5)))
     motors, gains = crazyflie_motors(), firmware_pid.gains()
-    return vehicle, [fly_again(log, vehicle, motors, gains) for log in (log_of(HEIGHT, 0), log_of(0.05, TAKE_OFF))]
+    logs = log_of(HEIGHT, 0), log_of(0.05, TAKE_OFF)
+    return vehicle, [simulate_closed_loop(log, vehicle, motors, gains) for log in logs]
 
 
 @pytest.mark.slow
-def test_a_repetition_that_begins_in_flight_hovers_at_once(flown):
-    """Within a centimeter, with the PWM that carries the weight."""
+def test_a_simulation_that_begins_in_flight_hovers_at_once(flown):
+    """The drone stays within a centimeter, with the PWM that carries the weight."""
     vehicle, (hovering, _) = flown
-    np.testing.assert_allclose(hovering.twin_pos, hovering.ref_pos, atol=0.01)
+    np.testing.assert_allclose(hovering.sim_pos, hovering.ref_pos, atol=0.01)
     duty = crazyflie_motors().voltage(vehicle.params.weight / 4) / LOADED
-    np.testing.assert_allclose(hovering.twin_pwm[-1], duty * FULL_PWM, rtol=1e-3)
+    np.testing.assert_allclose(hovering.sim_pwm[-1], duty * FULL_PWM, rtol=1e-3)
 
 
-def test_a_repetition_from_the_ground_climbs_with_the_integrators_of_the_climb(flown):
-    """Overshoots as the real one does, by an integrator that was filled on the ground, and comes to its set-point."""
+def test_a_simulation_from_the_ground_overshoots_by_the_integrators_of_the_climb(flown):
+    """The drone overshoots as the real one does, by an integrator that wound up on the ground, and then settles."""
     _, (_, climbing) = flown
-    assert climbing.twin_pos[:, 2].max() > HEIGHT + 0.05
-    assert np.abs(climbing.twin_pos[:, :2]).max() < 1e-6
-    assert abs(climbing.twin_pos[-1, 2] - HEIGHT) < 0.05
+    assert climbing.sim_pos[:, 2].max() > HEIGHT + 0.05
+    assert np.abs(climbing.sim_pos[:, :2]).max() < 1e-6
+    assert abs(climbing.sim_pos[-1, 2] - HEIGHT) < 0.05
 
 
-def test_motors_do_not_feel_all_of_a_large_sag(flown):
+def test_a_part_of_a_large_sag_does_not_reach_the_motors(flown):
     """A drone whose battery sags by 0.8 V needs the PWM of one with half of 0.25 V more."""
     vehicle, (hovering, climbing) = flown
     log = log_of(0.05, TAKE_OFF)
@@ -67,4 +68,4 @@ def test_motors_do_not_feel_all_of_a_large_sag(flown):
     assert log_of(HEIGHT, 0).sag == 0
     np.testing.assert_allclose(vehicle.instruments.motor_supply(jnp.array(LOADED), jnp.array(0.4)), LOADED)
     supply = LOADED + 0.5 * (log.sag - 0.55)
-    np.testing.assert_allclose(climbing.twin_pwm[-1].mean() * supply, hovering.twin_pwm[-1].mean() * LOADED, rtol=0.01)
+    np.testing.assert_allclose(climbing.sim_pwm[-1].mean() * supply, hovering.sim_pwm[-1].mean() * LOADED, rtol=0.01)

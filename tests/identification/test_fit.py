@@ -1,4 +1,4 @@
-"""A vehicle is found from its flights, and repeats them."""
+"""A vehicle is identified from its flights, and repeats them."""
 
 import json
 
@@ -9,38 +9,38 @@ import pytest
 import jaxdrones
 from jaxdrones.cli import main
 from jaxdrones.dynamics import crazyflie_motors
-from jaxdrones.identification import FlightLog, Vehicle, fit, held_errors, open_loop_errors
+from jaxdrones.identification import FlightLog, Vehicle, fit, hold_errors, open_loop_errors
 from jaxdrones.identification.files import load_vehicle, write_vehicle
 from jaxdrones.urdf import parse_params
 from jaxdrones.urdf_writer import to_urdf
 
 NANOBENCH = "B3_figure8_slow_rep2"
-TOLD = ("kf", "drag_coeff_x", "drag_coeff_y", "flapping_coeff_x", "flapping_coeff_y")
+IDENTIFIABLE = ("kf", "drag_coeff_x", "drag_coeff_y", "flapping_coeff_x", "flapping_coeff_y")
 
 
 @pytest.mark.slow
 def test_the_vehicle_that_flew_repeats_its_flight(flown):
-    """Up to the order of the integrator: rk4 flew, the midpoint rule repeats. Within 1 % of what others miss."""
+    """Its errors are below 1 % of those of others; rk4 flew, and the midpoint rule repeats."""
     params, log = flown
     own = open_loop_errors(log, Vehicle.of(params), crazyflie_motors())
     other = open_loop_errors(log, Vehicle.of(jaxdrones.load_params("cf2x")), crazyflie_motors())
     assert (own[-1] < 0.01 * other[-1]).all()
-    assert (own[-1] < 0.01 * held_errors(log)[-1]).all()
+    assert (own[-1] < 0.01 * hold_errors(log)[-1]).all()
 
 
 @pytest.mark.slow
 def test_a_fit_finds_the_vehicle_that_flew(flown, tmp_path):
-    """Within 1 % of thrust and 5 % of drag and flapping, from a vehicle with half of the drag and no flapping."""
+    """From half of the drag and no flapping, thrust is found within 1 %, drag and flapping within 5 %."""
     params, log = flown
     start = params.replace(
         kf=params.kf / 1.2, drag_coeff=params.drag_coeff * jnp.array([0.5, 0.5, 1]), flapping_coeff=jnp.zeros(2)
     )
-    report = fit([log], start, TOLD)
+    report = fit([log], start, IDENTIFIABLE)
     found = report.vehicle.params
     np.testing.assert_allclose(found.kf, params.kf, rtol=0.01)
     np.testing.assert_allclose(found.drag_coeff, params.drag_coeff, rtol=0.05)
     np.testing.assert_allclose(found.flapping_coeff, params.flapping_coeff, rtol=0.05)
-    assert all(estimate.told for estimate in report.parameters.values())
+    assert all(estimate.identifiable for estimate in report.parameters.values())
 
     write_vehicle(tmp_path / "fit", report, "test")
     read = load_vehicle(tmp_path / "fit")
@@ -49,10 +49,10 @@ def test_a_fit_finds_the_vehicle_that_flew(flown, tmp_path):
 
 
 @pytest.mark.slow
-def test_parameters_that_flights_do_not_tell_are_named(flown):
-    """Where the speeds of rotors were measured, no flight tells how they follow a command."""
+def test_unidentifiable_parameters_are_named(flown):
+    """With measured rotor speeds, no flight identifies how the rotors follow a command."""
     params, log = flown
-    with pytest.raises(ValueError, match=r"do not tell rotor_lag \(\S+ \+- \S+\); leave out of --parameters"):
+    with pytest.raises(ValueError, match=r"do not identify rotor_lag \(\S+ \+- \S+\); leave .* out of --parameters"):
         fit([log], params, ("kf", "rotor_lag"))
 
 
@@ -76,7 +76,7 @@ def test_a_written_vehicle_is_read_as_it_was(vehicle):
 
 
 @pytest.mark.slow
-def test_a_recorded_flight_is_flown_again(capsys, tmp_path):
+def test_a_recorded_flight_is_simulated_in_closed_loop(capsys, tmp_path):
     """The nominal Crazyflie stays within 8 cm of the real one in the plane, and needs less thrust than it."""
     figure = tmp_path / "paths.png"
     assert main(["score", NANOBENCH, "--vehicle", "cf2x", "--json", "--figure", str(figure)]) == 0
@@ -84,10 +84,10 @@ def test_a_recorded_flight_is_flown_again(capsys, tmp_path):
     assert set(results["open_loop"]) == {"hold", "nominal", "vehicle"}
     assert set(results["open_loop"]["vehicle"]) == {"10", "25", "50"}
     assert results["open_loop"]["vehicle"] == results["open_loop"]["nominal"]
-    (twin,) = results["closed_loop"]
-    assert twin["xy_rms_m"] < 0.08
-    assert twin["pwm_sim"] < 0.9 * twin["pwm_real"]
-    assert abs(twin["tracking_sim_m"] / twin["tracking_real_m"] - 1) < 0.12
+    (flight,) = results["closed_loop"]
+    assert flight["xy_rms_m"] < 0.08
+    assert flight["pwm_sim"] < 0.9 * flight["pwm_real"]
+    assert abs(flight["tracking_sim_m"] / flight["tracking_real_m"] - 1) < 0.12
     assert figure.stat().st_size > 1e4
 
 
@@ -97,6 +97,6 @@ def test_a_fitted_crazyflie_needs_the_thrust_of_the_real_one(capsys, tmp_path):
     assert "unfelt_sag" in capsys.readouterr().out
     assert main(["score", NANOBENCH, "--vehicle", str(tmp_path / "fit"), "--json"]) == 0
     results = json.loads(capsys.readouterr().out)
-    (twin,), (nominal,) = results["closed_loop"], results["closed_loop_nominal"]
-    assert abs(twin["pwm_sim"] / twin["pwm_real"] - 1) < 0.015
-    assert twin["xy_rms_m"] < nominal["xy_rms_m"]
+    (flight,), (nominal,) = results["closed_loop"], results["closed_loop_nominal"]
+    assert abs(flight["pwm_sim"] / flight["pwm_real"] - 1) < 0.015
+    assert flight["xy_rms_m"] < nominal["xy_rms_m"]

@@ -1,4 +1,4 @@
-"""What is a log of a flight, and what is none."""
+"""Logs of flights are loaded, and invalid ones are refused."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ def written(folder, columns):
 def test_a_log_is_read_as_it_was_written(columns, tmp_path):
     log = written(tmp_path, columns)
     np.testing.assert_array_equal(log.rpm, columns["rpm"])
-    assert log.name == "flight.npz" and log.has_rotor_speeds and not log.has_set_points
+    assert log.name == "flight.npz" and log.has_rotor_speeds and not log.has_setpoints
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_what_no_flight_has_is_named(columns, tmp_path, change, says):
 
 def test_what_is_no_file_of_arrays_is_named(tmp_path):
     (tmp_path / "text.npz").write_text("t, pos")
-    with pytest.raises(ValueError, match=r"is no \.npz file"):
+    with pytest.raises(ValueError, match=r"is not an \.npz file"):
         FlightLog.load(tmp_path / "text.npz")
     with pytest.raises(ValueError, match="cannot be read"):
         FlightLog.load(tmp_path / "missing.npz")

@@ -115,8 +115,8 @@ def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
     what it gives where more is asked for.
 
     Args:
-        params: of the drone, with the constants of the battery in `aux["battery"]`.
-        state: of the drone, with the state of the model `battery()`.
+        params: parameters of the drone, with the constants of the battery in `aux["battery"]`.
+        state: state of the drone, with the state of the model `battery()`.
     """
     source = _source(params, state)
     return (source + safe_sqrt(source**2 - 4 * _constants(params).resistance * battery_power(params, state))) / 2

@@ -85,8 +85,8 @@ def pwm_rotors(params: Params, state: State, command: Float[Array, "4"]) -> tupl
     where this model is not among the step's. Thrust follows by the motors' cubic, and speed from thrust by `kf`.
 
     Args:
-        params: of the drone, with `Motors` in `aux["motors"]`.
-        state: of the drone.
+        params: parameters of the drone, with `Motors` in `aux["motors"]`.
+        state: state of the drone.
         command: (4,) PWM, limited to 0 .. 65535.
 
     Returns:

@@ -69,7 +69,7 @@ def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500,
     best, no flight much worse than at the start, which it may be. A second vehicle needs no second compilation.
 
     Args:
-        params: of one drone.
+        params: parameters of one drone.
         controller: a name of `jaxdrones.control.CONTROLLERS`, or its module; but for `mrac`, which adapts by itself.
         control_hz: calls of the controller per second, at which the gains will be used, or at a higher rate.
         iterations: of Adam.

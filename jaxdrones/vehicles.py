@@ -1,20 +1,20 @@
-"""Quadrotors of 20 g to 3 kg that could be built: a size is drawn, and the rest follows by laws of scale.
+"""Random realistic quadrotors of 20 g to 3 kg: a size is drawn, and scaling laws give the other parameters.
 
-A law gives the median for a vehicle of this size. A drawn number differs from it by a log-normal factor that is cut off
-where published vehicles end. Medians, spreads and limits are those of a regression over 13 published airframes of 31 g
-to 3.35 kg; tests/test_any_vehicle.py has the table with its sources and repeats the regression. Where the form of a law
-comes from:
+A scaling law gives the median for a vehicle of this size. A drawn parameter is the median times a log-normal factor,
+truncated to the range of published vehicles. Medians, spreads and limits are those of a regression over 13 published
+airframes of 31 g to 3.35 kg; tests/test_any_vehicle.py has the table with its sources and repeats the regression. The
+laws have these forms:
 
 - mass: its cube root, the size, is uniform, as in RAPTOR (rl-tools, l2f, `sample_initial_parameters`), whose ranges of
-  thrust to weight and of lag are kept as well.
-- arm: a power of the mass, by regression; it would be the cube root if all were of one shape.
-- inertia: m l^2 times a number; I_zz is nearly I_xx + I_yy, which it is of a flat body (perpendicular axis theorem).
-- thrust: C_T rho n^2 D^4 of a propeller that the arms leave room for.
+  thrust-to-weight ratio and of lag are used as well.
+- arm: a power of the mass, by regression; it would be the cube root for geometrically similar vehicles.
+- inertia: m l^2 times a number; I_zz is nearly I_xx + I_yy, the value of a flat body (perpendicular axis theorem).
+- thrust: C_T rho n^2 D^4 of a propeller that fits between the arms.
 - torque: momentum theory of hover, power T sqrt(T / (2 rho A)) over a figure of merit.
 - drag: proportional to thrust and to air speed over tip speed, the form of blade flapping and induced drag (Mahony,
   Kumar and Corke 2012), so that drag per rotor speed is c k_F / R.
-- lag: the shorter the more thrust to weight, by regression.
-- highest speed: sqrt(g l), Froude scaling (Kushleyev, Mellinger, Powers and Kumar 2013).
+- lag: it falls with the thrust-to-weight ratio, by regression.
+- maximum speed: sqrt(g l), Froude scaling (Kushleyev, Mellinger, Powers and Kumar 2013).
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from jaxdrones.urdf import AIR_DENSITY, GRAVITY
 
 LIGHTEST, HEAVIEST = 0.02, 3.0  # kg
 _RADIANS_PER_SECOND = 2 * np.pi / 60  # per RPM
-_CORNERS = np.array([[1.0, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])  # of rotors 0 to 3, as the Crazyflie's
+_CORNERS = np.array([[1.0, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])  # signs of rotors 0 to 3, as on the Crazyflie
 _SPINS = np.array([-1.0, 1, -1, 1])
 
 
 class Law(NamedTuple):
-    """How a number is distributed about the median that its law gives."""
+    """Truncated log-normal distribution of a parameter about the median of its scaling law."""
 
     median: float
     spread: float
@@ -66,26 +66,26 @@ LAWS = {
 }
 ARM_POWER, THRUST_POWER, LAG_POWER = 0.423, 0.143, -1.07
 _SHORTEST_LAG = 0.03  # s
-_FROUDE = 12.0  # highest speed over sqrt(g l): 8 to 17 for the bundled vehicles
+_FROUDE = 12.0  # maximum speed over sqrt(g l): 8 to 17 for the bundled vehicles
 _COLLISION_HEIGHT = 0.5  # over the collision radius, about that of the bundled vehicles
-_DOWNWASH_LOSS = 0.07 * 35.0  # of the Crazyflie per m/s, times the speed of its blade tips, m/s
+_DOWNWASH_LOSS = 0.07 * 35.0  # `inflow_loss` of the Crazyflie times the speed of its blade tips
 
 Vary = Callable[..., Array]
 
 
 def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST) -> Params:
-    """A quadrotor, drawn anew: everything but what surrounds it (gravity, air, wind, external force) and `aux`.
+    """A random quadrotor; its environment (gravity, air, wind, external force) and `aux` do not change.
 
-    Ground effect is that of Cheeseman and Bennett; equation 6 for the downwash is off.
+    The ground effect is that of Cheeseman and Bennett; the downwash of equation 6 is off.
 
     Args:
         key: random key.
-        params: parameters of one drone, whose surroundings are kept.
-        lightest: kg.
-        heaviest: kg.
+        params: parameters of one drone, whose environment and `aux` are kept.
+        lightest: smallest mass, kg.
+        heaviest: largest mass, kg.
 
     Raises:
-        ValueError: no masses of 20 g to 3 kg with the lightest first.
+        ValueError: masses outside 20 g to 3 kg, or the lightest is not first.
     """
     check_masses(lightest, heaviest)
     dtype = params.mass.dtype
@@ -102,14 +102,14 @@ def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: f
 
 
 def median(params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST) -> Params:
-    """The quadrotor of middle size whose numbers are the medians of their laws; arguments and errors as for `draw`."""
+    """The quadrotor of middle size with the medians of the scaling laws; arguments and errors are those of `draw`."""
     check_masses(lightest, heaviest)
     size = jnp.asarray((np.cbrt(lightest) + np.cbrt(heaviest)) / 2, params.mass.dtype)
     return _vehicle(params, size**3, lambda name, median, low, high: jnp.clip(median, low, high))
 
 
 def check_masses(lightest: float, heaviest: float) -> None:
-    """Raise unless these are masses for which the laws hold, the lightest first."""
+    """Raise unless the scaling laws hold for these masses and the lightest is first."""
     for name, mass in ("lightest", lightest), ("heaviest", heaviest):
         check_number(f"mass of the {name} vehicle", mass, "kg", at_least=LIGHTEST, at_most=HEAVIEST)
     if not lightest <= heaviest:
@@ -117,7 +117,7 @@ def check_masses(lightest: float, heaviest: float) -> None:
 
 
 def _vehicle(params: Params, mass: Array, vary: Vary) -> Params:
-    """The quadrotor of a mass; `vary(name, median, low, high)` is a number near its median."""
+    """The quadrotor of a mass; `vary(name, median, low, high)` returns a parameter near its median."""
 
     def by_law(name: str, scale: Array | float = 1.0) -> Array:
         law = LAWS[name]
@@ -142,7 +142,7 @@ def _vehicle(params: Params, mass: Array, vary: Vary) -> Params:
     thrust_to_weight = within("thrust_to_weight", mass**THRUST_POWER, low, high)
     coefficient = by_law("thrust_coefficient")
     kf = coefficient * AIR_DENSITY * (2 * radius) ** 4 / 3600  # N/RPM^2
-    weight = mass * GRAVITY / 4  # of one rotor
+    weight = mass * GRAVITY / 4  # on one rotor
     hover_rpm = jnp.sqrt(weight / kf)
     induced = jnp.sqrt(weight / (2 * AIR_DENSITY * jnp.pi * radius**2))  # m/s, through the rotors in hover
     tip_speed = _RADIANS_PER_SECOND * hover_rpm * radius

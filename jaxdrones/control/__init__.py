@@ -1,8 +1,8 @@
 """Controllers of one drone.
 
 Each module has `gains()`, `init()` and `control(gains, params, memory, state, setpoint, dt=...) -> (memory, rpm)`, all
-of one drone; `velocity.control` takes an action in place of the setpoint. A team is `jax.vmap` of `control`, and its
-memory is `for_team(init(), n)`. The table lists the controllers by the names that the command line uses.
+for one drone; `velocity.control` takes an action instead of the setpoint. For a team use `jax.vmap` of `control`, with
+the memory `for_team(init(), n)`. `CONTROLLERS` lists the controllers by the names that the command line uses.
 """
 
 import importlib
@@ -52,20 +52,20 @@ __all__ = [
 
 
 def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500, iterations: int = 40) -> Any:
-    """Gains with which a controller flies a vehicle well, by the gradient of the simulation; takes about half a minute.
+    """Tuned gains of a controller for a vehicle, by the gradient of the simulation; this takes about half a minute.
 
     Args:
-        params: of one drone.
+        params: parameters of one drone.
         controller: a name of `CONTROLLERS`, or its module; `mrac` has no gains to tune.
-        control_hz: calls of the controller per second, at which the gains will be used, or at a higher rate.
-        iterations: of Adam.
+        control_hz: calls of the controller per second; use the gains at this rate or a higher one.
+        iterations: number of iterations of Adam.
 
     Returns:
-        Gains of the controller's kind, for its `control`. How they are found is said at `jaxdrones.optimal.tune`.
+        Gains for the `control` of the controller. `jaxdrones.optimal.tune` documents the method.
 
     Raises:
         ValueError: an unknown controller, one without gains to tune, one that cannot fly the vehicle, or parameters of
             a team.
     """
-    tuning = importlib.import_module("jaxdrones.optimal.tuning")  # at the call and by name: it is above this room
+    tuning = importlib.import_module("jaxdrones.optimal.tuning")  # by name, as it is in a higher layer
     return tuning.tune(params, controller, control_hz=control_hz, iterations=iterations)

@@ -1,4 +1,4 @@
-"""Thrust and torque -> rotor speeds, from the geometry of the rotors."""
+"""Control allocation: rotor speeds from thrust and torque, by the geometry of the rotors."""
 
 import jax
 import jax.numpy as jnp
@@ -9,26 +9,26 @@ from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.vector import safe_sqrt
 
-_LEAST_SHARE = 0.01  # of thrust or yaw that a rotor must make to be relieved by less of it; usually all make 0.25
-_ACTIVE_SETS = np.array([[i >> k & 1 for k in range(4)] for i in range(16)], bool)  # which rotors turn
+_MIN_SHARE = 0.01  # smallest share of a rotor in thrust or yaw that counts; usually each rotor has 0.25
+_ACTIVE_SETS = np.array([[i >> k & 1 for k in range(4)] for i in range(16)], bool)  # rotors whose speed is not zero
 
 
 def mixer(params: Params) -> Float[Array, "4 3"]:
-    """Normalised share of each rotor in roll, pitch and yaw: 2y/sum|y|, -2x/sum|x|, spin."""
+    """Normalized share of each rotor in roll, pitch and yaw: 2y/sum|y|, -2x/sum|x|, spin."""
     x, y, _ = params.rotor_pos.T
     return jnp.stack([2 * y / jnp.sum(jnp.abs(y)), -2 * x / jnp.sum(jnp.abs(x)), params.rotor_spin], axis=-1)
 
 
 def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Rotor speeds in [0, `max_rpm`] that produce a thrust (N, body z) and a torque (N m, body) as nearly as they can.
+    """Rotor speeds in [0, `max_rpm`] that produce a thrust (N, body z) and a torque (N m, body) as closely as possible.
 
-    A demand that the rotors can produce is produced exactly. Otherwise yaw torque is given up first, as much as it
-    takes for no rotor to turn backwards or faster than `max_rpm`. Then thrust is given up where it is too high, and
-    roll and pitch torque keep their direction (the priorities of Faessler, Falanga and Scaramuzza 2017). Where thrust
-    is too low for roll and pitch, the squared speeds are the non-negative least-squares solution of A P^2 = b, with
-    rows 1, y/L, -x/L, spin and b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` they
-    are that solution for every demand, as in gym-pybullet-drones, whose allocation has no upper limit. The allocation
-    is differentiable; where a rotor is held at a limit, its derivative is zero.
+    A feasible demand is produced exactly. Otherwise yaw torque is reduced first, until no rotor would turn backwards or
+    faster than `max_rpm`. Then thrust is reduced if it is too high, and roll and pitch torque keep their direction (the
+    priorities of Faessler, Falanga and Scaramuzza 2017). If thrust is too low for roll and pitch, the squared speeds
+    are the non-negative least-squares solution of A P^2 = b, with the rows 1, y/L, -x/L, spin of A and
+    b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` they are this solution for every
+    demand, as in gym-pybullet-drones, whose allocation has no upper limit. The allocation is differentiable; the
+    derivative of a rotor at a limit is zero.
 
     Raises:
         ValueError: arrays of a team (use `jax.vmap`).
@@ -49,18 +49,18 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
 
 
 def _square_of_limit(params: Params) -> Float[Array, ""]:
-    """The square of `max_rpm`, RPM^2; infinite, with a zero gradient, where that is."""
+    """The square of `max_rpm`, RPM^2; it is infinite, with a zero gradient, if `max_rpm` is infinite."""
     unlimited = jnp.isinf(params.max_rpm)
     return jnp.where(unlimited, jnp.inf, jnp.where(unlimited, 0, params.max_rpm) ** 2)
 
 
-@jax.checkpoint  # cheaper to compute again in a backward pass than to keep
+@jax.checkpoint  # recomputing is cheaper in a backward pass than storing
 def _within_authority(
     inverse: Float[Array, "4 4"], target: Float[Array, "4"], limit: Float[Array, ""]
 ) -> Float[Array, "4"]:
-    """The demand with roll and pitch scaled down to what the rotors can produce, and then yaw to what is left.
+    """The demand with roll and pitch scaled down to what the rotors can produce, and then yaw to the remaining range.
 
-    Otherwise least squares would trade thrust for torques that are out of reach. Without a limit nothing changes.
+    Otherwise least squares would trade thrust for infeasible torques. Without a limit the demand does not change.
     """
     turning = inverse[:, 1:3] @ target[1:3]
     exact = inverse @ target
@@ -79,16 +79,16 @@ def _within_authority(
 def _excess(
     squares: Float[Array, "4"], limit: Float[Array, ""] | float, direction: Float[Array, "4"]
 ) -> Float[Array, ""]:
-    """How far to go back along a direction until none of the rotors that it raises is above the limit, RPM^2."""
-    raises = direction > _LEAST_SHARE
+    """The step back along a direction after which no rotor that this direction accelerates exceeds the limit, RPM^2."""
+    raises = direction > _MIN_SHARE
     beyond = jnp.maximum(squares - limit, 0) / jnp.where(raises, direction, 1)
     return jnp.max(jnp.where(raises, beyond, 0))
 
 
 def _inverses(matrix: Float[Array, "4 4"]) -> Float[Array, "16 4 4"]:
-    """Least-squares inverses of A for all sixteen sets of unknowns that are not zero; the last one is the inverse.
+    """Least-squares inverses of A for all sixteen sets of nonzero unknowns; the last one is the inverse of A.
 
-    They depend on the vehicle alone.
+    They depend only on the vehicle.
     """
 
     def solve_on(active):

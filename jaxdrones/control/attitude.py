@@ -1,4 +1,4 @@
-"""The attitude that points the thrust along a force, and the error of an attitude. Tracking controllers share them."""
+"""The attitude that points the thrust along a force, and the attitude error; tracking controllers share them."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,7 +11,7 @@ Axes = list[Float[Array, "3"]]
 
 
 def from_thrust(force: Float[Array, "3"], yaw: Float[Array, ""]) -> Axes:
-    """The attitude with body z along `force` (N, world) and body x as near to the heading `yaw` (rad) as it can be."""
+    """The attitude with body z along `force` (N, world) and body x as close to the heading `yaw` (rad) as possible."""
     sin, cos = sin_cos(yaw)
     heading = jnp.stack([cos, sin, jnp.zeros_like(yaw)])
     z = vector.unit(force)
@@ -20,7 +20,7 @@ def from_thrust(force: Float[Array, "3"], yaw: Float[Array, ""]) -> Axes:
 
 
 def error(axes: Axes, target: Axes) -> Float[Array, "3"]:
-    """Vector of (R_d^T R - R^T R_d) / 2, body: the sine of the angle times the axis (Lee et al. 2010)."""
+    """Attitude error, body: the vector of (R_d^T R - R^T R_d) / 2, sine of the angle times axis (Lee et al. 2010)."""
     x, y, z = axes
     tx, ty, tz = target
     return jnp.stack([dot(tz, y) - dot(ty, z), dot(tx, z) - dot(tz, x), dot(ty, x) - dot(tx, y)]) / 2

@@ -1,8 +1,8 @@
-"""The four loops of the Crazyflie's cascaded PID, each from its set-point to that of the next one.
+"""The four loops of the Crazyflie's cascaded PID; each computes the set-point of the next one from its own.
 
-Gains and limits are those of Bitcraze's firmware, release 2025.12; the code is written anew from its description.
-Angles are degrees and rates degrees per second; pitch is positive nose up, as in the firmware. The heading
-frame is the world's turned by yaw. Thrust and torque are in units of the firmware's 16-bit commands.
+Gains and limits are those of Bitcraze's firmware, release 2025.12; the code is an independent implementation of its
+description. Angles are in degrees and rates in degrees per second; pitch is positive nose up, as in the firmware. The
+heading frame is the world frame, rotated by yaw. Thrust and torque are in units of the firmware's 16-bit commands.
 """
 
 from __future__ import annotations
@@ -15,39 +15,39 @@ from jaxdrones.control.firmware_motors import FULL, Motor
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 
-_MAX_INTEGRAL = 5000.0  # m s and m; the limit of an integrator that has none of its own
-_OVERHEAD = 1.1  # of what a loop may ask for over the limit of what is flown
+_MAX_INTEGRAL = 5000.0  # m s and m; limit of an integrator that has no limit of its own
+_OVERHEAD = 1.1  # commanded velocity limit over `max_vel`
 _THRUST_PER_OUTPUT = 1000.0
-_MAX_TORQUE = 32767.0  # 16 bit with a sign
-_MAX_CUTOFF = 0.4  # of the rate of the calls, beyond which a low-pass is of no use
-_FIRMWARE_SIGN = (1.0, -1.0, 1.0)  # of roll, pitch, yaw: pitch and its rate count the other way
+_MAX_TORQUE = 32767.0  # signed 16 bit
+_MAX_CUTOFF = 0.4  # largest cutoff frequency of a low-pass over the sampling rate
+_FIRMWARE_SIGN = (1.0, -1.0, 1.0)  # of roll, pitch, yaw: the firmware has the opposite sign of pitch and of its rate
 
 
 class Gains(PyTreeNode):
-    """Gains and limits of the four loops, and the motor that the firmware believes it has."""
+    """Gains and limits of the four loops, and the firmware's model of the motor."""
 
     pos_p: Array
     """(3,) 1/s, heading frame."""
     pos_i: Array
     """(3,) 1/s^2."""
     max_vel: Array
-    """(3,) m/s; a position is flown to at 1.1 times this."""
+    """(3,) m/s; the position loop commands at most 1.1 times this."""
     vel_p: Array
     """(3,) degrees per m/s forward and left, 1000 units of thrust per m/s up."""
     vel_i: Array
-    """(3,) the same per m."""
+    """(3,) degrees per m forward and left, 1000 units of thrust per m up."""
     max_tilt: Array
-    """() roll and pitch, degrees."""
+    """() limit of roll and pitch, degrees."""
     base_thrust: Array
-    """() 16 bit, about that of hover."""
+    """() thrust command near hover, 16 bit."""
     min_thrust: Array
-    """() 16 bit, in the air."""
+    """() smallest thrust command in the air, 16 bit."""
     attitude_p: Array
     """(3,) roll, pitch, yaw, 1/s."""
     attitude_i: Array
     """(3,) 1/s^2."""
     attitude_d: Array
-    """(3,) of the measured angle, no unit."""
+    """(3,) gain of the derivative of the measured angle, dimensionless."""
     max_attitude_integral: Array
     """(3,) degrees s."""
     rate_p: Array
@@ -55,17 +55,17 @@ class Gains(PyTreeNode):
     rate_i: Array
     """(3,) 16 bit per degree."""
     rate_d: Array
-    """(3,) 16 bit per degree/s^2, of the measured rate."""
+    """(3,) gain of the derivative of the measured rate, 16 bit per degree/s^2."""
     max_rate_integral: Array
     """(3,) degrees."""
     gyro_cutoff: Array
-    """() of the low-pass (Butterworth, second order) through which the rates are measured, Hz."""
+    """() cutoff frequency of the low-pass filter of the gyroscope (Butterworth, second order), Hz."""
     motor: Motor
-    """Of which a command is a share of the thrust."""
+    """Motor whose maximum thrust is the full command."""
 
 
 class Memory(PyTreeNode):
-    """What the controller of one drone keeps between calls."""
+    """State of the controller of one drone between calls."""
 
     pos_integral: Array
     """(3,) integrated position error, m s, heading frame."""
@@ -78,31 +78,31 @@ class Memory(PyTreeNode):
     rpy: Array
     """(3,) roll, pitch, yaw at the last call, degrees."""
     rates: Array
-    """(3,) rates about the body axes at the last call, behind their low-pass, degrees/s."""
+    """(3,) low-pass filtered rates about the body axes at the last call, degrees/s."""
     gyro: Array
-    """(2, 3) state of that low-pass, degrees/s."""
+    """(2, 3) state of this low-pass filter, degrees/s."""
     tilt: Array
-    """(2,) roll and pitch that the slow loops asked for, degrees."""
+    """(2,) roll and pitch commanded by the loops of position and velocity, degrees."""
     thrust: Array
-    """() thrust that they asked for, 16 bit."""
+    """() thrust commanded by these loops, 16 bit."""
     battery: Array
-    """() voltage of the battery behind its filter, V."""
+    """() filtered voltage of the battery, V."""
     age: Array
-    """() time since the slow loops ran, s; infinite before the first call."""
+    """() time since the loops of position and velocity ran, s; infinite before the first call."""
 
 
 def degrees(angles: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Roll, pitch and yaw, or the rates about the body axes, from rad to degrees and to the firmware's sign."""
+    """Roll, pitch and yaw, or the rates about the body axes, in degrees and with the firmware's signs."""
     return jnp.rad2deg(angles) * jnp.array(_FIRMWARE_SIGN)
 
 
 def rpy(quat: Float[Array, "4"]) -> Float[Array, "3"]:
-    """Roll, pitch and yaw of an attitude, degrees."""
+    """Roll, pitch and yaw of an attitude, degrees, with the firmware's signs."""
     return degrees(rotation.to_rpy(quat))
 
 
 def in_heading_frame(quat: Float[Array, "4"], v: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Forward, left and up components of a vector of the world, for an attitude; none forward of a vertical nose."""
+    """Forward, left and up components of a world vector; with a vertical nose the horizontal ones are zero."""
     nose_x, nose_y, _ = vector.components(rotation.axes(quat)[0])
     x, y, z = vector.components(v)
     cos, sin, _ = vector.components(vector.unit(jnp.stack([nose_x, nose_y, jnp.zeros_like(nose_x)])))
@@ -163,14 +163,14 @@ def rate_loop(
 def low_pass(
     memory: Float[Array, "2 3"], x: Float[Array, "3"], cutoff: Float[Array, ""], dt: Array | float
 ) -> tuple[Float[Array, "2 3"], Float[Array, "3"]]:
-    """The filtered x: Butterworth, second order, bilinear transform, with a cutoff (Hz) of at most 0.4/dt."""
+    """Filter state and filtered x: Butterworth, second order, bilinear transform, cutoff (Hz) of at most 0.4/dt."""
     b, a1, a2 = _butterworth(cutoff, dt)
     y = b * x + memory[0]
     return jnp.stack([2 * b * x - a1 * y + memory[1], b * x - a2 * y]), y
 
 
 def settled(x: Float[Array, "3"], cutoff: Float[Array, ""], dt: Array | float) -> Float[Array, "2 3"]:
-    """The state of a low-pass that has seen nothing but x."""
+    """The steady state of the low-pass filter for a constant input x."""
     b, _, a2 = _butterworth(cutoff, dt)
     return jnp.stack([(1 - b) * x, (b - a2) * x])
 
@@ -182,6 +182,6 @@ def _butterworth(cutoff: Array, dt: Array | float) -> tuple[Array, Array, Array]
 
 
 def _wrap_yaw(angles: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Angles (degrees) with the third between -180 and 180."""
+    """Angles (degrees) with yaw wrapped to -180 to 180."""
     turns = jnp.round(angles / 360) * jnp.array([0.0, 0.0, 1.0])
     return angles - 360 * turns

@@ -1,7 +1,7 @@
-"""From the 16-bit commands of the Crazyflie's firmware to thrust and to the duty cycle of its brushed motors.
+"""Thrust and duty cycle of the Crazyflie's brushed motors from the 16-bit commands of its firmware.
 
 The constants are those of the firmware (Bitcraze, 2025.12): the thrust of one motor is a cubic of the mean voltage
-across it, and a command is a share of the largest thrust, whatever the battery has left.
+across it, and a command is a fraction of the maximum thrust, at any voltage of the battery.
 """
 
 from __future__ import annotations
@@ -19,42 +19,42 @@ from jaxdrones.thrust_curves import THRUST_CURVES, voltage_for
 from jaxdrones.vector import safe_sqrt
 
 FULL = 65535.0
-"""The largest command and the duty cycle of a motor that is always on."""
+"""The largest command, and the duty cycle of a motor that is always on."""
 
 _MIXER = ((-0.5, -0.5, -1.0), (-0.5, 0.5, 1.0), (0.5, 0.5, -1.0), (0.5, -0.5, 1.0))
-_BATTERY_FILTER = 0.99  # share of the last voltage that the filter of the battery keeps in 1 ms
-_WEIGHT = 0.029 * 9.81  # N, of a Crazyflie 2.1 with 2.1+ propellers by its firmware
-_LEVERS = (0.0325, 0.0325, 0.00699)  # m, to its motors along y and x; of torque over thrust by its firmware
+_BATTERY_FILTER = 0.99  # weight of the last filtered voltage after 1 ms
+_WEIGHT = 0.029 * 9.81  # N, weight of a Crazyflie 2.1 with 2.1+ propellers according to its firmware
+_LEVERS = (0.0325, 0.0325, 0.00699)  # m, lever arms along y and x; torque over thrust according to its firmware
 _INERTIA = (16.6e-6, 16.7e-6, 29.3e-6)  # kg m^2; Foerster 2015
 _ACCELERATION = tuple(
     _WEIGHT * lever * share / inertia for lever, share, inertia in zip(_LEVERS, (0.5, 0.5, 1), _INERTIA, strict=True)
-)  # 1/s^2, as below
-_LEAST_VOLTAGE = 2.0  # V; below it a reading of the battery is not believed, and the motors stop
+)  # 1/s^2, as `_acceleration` computes it
+_LEAST_VOLTAGE = 2.0  # V; the firmware considers a lower reading of the battery invalid and stops the motors
 _COMMANDS = {"2.1": (0.12, 0.012817578), "2.1+": (0.12, 0.012817578), "thrust upgrade": (0.18, 0.019226368)}
-"""N at full command, N below which a motor stands still."""
+"""Thrust at full command, N; thrust below which a motor stands still, N."""
 PROPELLERS = tuple(_COMMANDS)
 
 
 class Motor(PyTreeNode):
-    """Thrust of one motor with its propeller, as the firmware believes it to be."""
+    """The firmware's model of the thrust of one motor with its propeller."""
 
     thrust: Array
-    """(4,) polynomial of the voltage, N, N/V, N/V^2, N/V^3; it must rise with the voltage."""
+    """(4,) coefficients of the thrust in the voltage, N, N/V, N/V^2, N/V^3; thrust must rise with the voltage."""
     max_thrust: Array
-    """() N at full command."""
+    """() thrust at full command, N."""
     min_thrust: Array
-    """() N; a motor that is told to push less stands still."""
+    """() thrust below which the motor stands still, N."""
 
 
 class Command(PyTreeNode):
-    """What the firmware commands, and logs."""
+    """The commands of the firmware, which it also logs."""
 
     attitude: Array
-    """(3,) desired roll, pitch, yaw, degrees; pitch is positive nose up. Of set-points of rates the present ones."""
+    """(3,) desired roll, pitch, yaw, degrees; pitch is positive nose up. For `Rates` the present attitude."""
     thrust: Array
-    """() of each motor, 16 bit."""
+    """() thrust of each motor, 16 bit."""
     torque: Array
-    """(3,) roll, pitch, yaw, 16 bit, right-handed body axes."""
+    """(3,) torque in roll, pitch, yaw, 16 bit, right-handed body axes."""
     pwm: Array
     """(4,) duty cycles of the motors, 0 to 65535: front right, back right, back left, front left."""
 
@@ -70,7 +70,7 @@ def motor(propellers: str = "2.1+") -> Motor:
 
 
 def duty_cycle(motor: Motor, command: Float[Array, "4"], battery: Float[Array, ""]) -> Float[Array, "4"]:
-    """Duty cycle (0 to 65535 and above) that makes of a battery's voltage (V) the thrust of a 16-bit command."""
+    """Duty cycle (0 to 65535, not limited) that gives the thrust of a 16-bit command at a battery voltage (V)."""
     thrust = command * (motor.max_thrust / FULL)
     turning = (thrust >= motor.min_thrust) & (battery >= _LEAST_VOLTAGE)
     return jnp.where(turning, voltage_for(motor.thrust, thrust) * (FULL / jnp.maximum(battery, _LEAST_VOLTAGE)), 0)
@@ -79,19 +79,19 @@ def duty_cycle(motor: Motor, command: Float[Array, "4"], battery: Float[Array, "
 def mix(
     thrust: Float[Array, ""], torque: Float[Array, "3"], mixer: Float[Array, "4 3"] | None = None
 ) -> Float[Array, "4"]:
-    """Commands of the motors, of any size.
+    """Commands of the motors, not limited.
 
     Args:
-        thrust: 16 bit, of each motor.
+        thrust: thrust of each motor, 16 bit.
         torque: roll, pitch, yaw, 16 bit, right-handed body axes.
-        mixer: share of each motor in the torques; the firmware's for a Crazyflie, a cross, when left out.
+        mixer: share of each motor in the torques; by default the firmware's for a Crazyflie in X configuration.
     """
     shares = jnp.array(_MIXER) if mixer is None else mixer
     return thrust + jax.vmap(vector.dot, (0, None))(shares, torque)
 
 
 def within_range(commands: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Commands from 0 to 65535: where one is too high all are lowered, so that thrust is lost and not attitude."""
+    """Commands limited to 0 .. 65535: if one is too high, all are lowered, which reduces thrust, not torque."""
     return jnp.maximum(commands - jnp.maximum(jnp.max(commands) - FULL, 0), 0)
 
 
@@ -103,15 +103,15 @@ def duty_cycles(
     voltage: Float[Array, ""],
     dt: float,
 ) -> tuple[Float[Array, ""], Float[Array, "4"]]:
-    """The voltage behind the filter of the battery, V, and duty cycles from 0 to 65535.
+    """The filtered voltage of the battery, V, and duty cycles from 0 to 65535.
 
     Args:
-        motor: of the vehicle.
-        thrust: 16 bit, of each motor.
+        motor: model of the motors.
+        thrust: thrust of each motor, 16 bit.
         torque: roll, pitch, yaw, 16 bit, right-handed body axes.
-        battery: voltage, V; without it, and with the compensation switched off, a duty cycle is the command itself.
-        voltage: behind the filter at the last call, V; zero at the first.
-        dt: time since then, s.
+        battery: voltage, V; None switches battery compensation off, so that a duty cycle is the command itself.
+        voltage: filtered voltage at the last call, V; zero at the first call.
+        dt: time since the last call, s.
 
     Raises:
         ValueError: the voltages of a team (use `jax.vmap`).
@@ -128,21 +128,21 @@ def duty_cycles(
 def rotor_speeds(
     motor: Motor, params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]
 ) -> Float[Array, "4"]:
-    """Speeds (RPM, up to `max_rpm`) at which rotors make the thrusts of 16-bit commands, mixed by their geometry."""
+    """Rotor speeds (RPM, up to `max_rpm`) for the thrusts of 16-bit commands, mixed by the geometry of the rotors."""
     commands = within_range(mix(thrust, torque, mixer(params)))
     return jnp.minimum(safe_sqrt(commands * (motor.max_thrust / FULL) / params.kf), params.max_rpm)
 
 
 def scale(params: Params) -> tuple[Float[Array, ""], Float[Array, "3"]]:
-    """What the firmware's numbers are to be multiplied by so that a vehicle answers as a Crazyflie does.
+    """Factors that scale the firmware's gains, so that a vehicle responds as a Crazyflie does.
 
-    The thrust of a command by the first, its weight over that of a Crazyflie; then torque commands by the second.
+    The first scales the thrust of a command: the weight over that of a Crazyflie. The second scales torque commands.
     """
     return params.weight / _WEIGHT, jnp.array(_ACCELERATION) / _acceleration(params)
 
 
 def _acceleration(params: Params) -> Float[Array, "3"]:
-    """Angular acceleration by a torque command as large as the thrust command that carries the weight, 1/s^2."""
+    """Angular acceleration for a torque command as large as the thrust command of hover, 1/s^2."""
     x, y, _ = params.rotor_pos.T
     levers = jnp.stack([y, -x, params.rotor_spin * params.km / params.kf])
     return params.weight * jnp.sum(levers * mixer(params).T, axis=1) / params.inertia / 4

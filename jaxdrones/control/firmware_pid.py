@@ -1,8 +1,9 @@
-"""The cascaded PID that flies a Crazyflie, as its firmware does (Bitcraze, release 2025.12).
+"""The cascaded PID of the Crazyflie's firmware (Bitcraze, release 2025.12).
 
 The loops of position and velocity run at 100 Hz, those of attitude and rates at every call, which is 500 Hz on the
-vehicle. A position is flown to at `pos_p` times its distance, without the velocity of the set-point: the vehicle trails
-a moving one by 0.5 s. 16-bit numbers are limited as in the firmware, but not rounded, so that there is a derivative.
+vehicle. The position loop commands `pos_p` times the distance, without the velocity of the set-point, so the vehicle
+lags a moving set-point by 0.5 s. 16-bit numbers are limited as in the firmware, but not rounded, so that they have a
+derivative.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Attitude(PyTreeNode):
     rpy: Array
     """(3,) roll, pitch, yaw about fixed axes, rad, right-handed."""
     thrust: Array
-    """() of each motor, 16 bit; at 0 the motors stop and the loops forget."""
+    """() thrust of each motor, 16 bit; at 0 the motors stop and the integrators are reset."""
 
 
 class Rates(PyTreeNode):
@@ -58,7 +59,7 @@ class Rates(PyTreeNode):
     omega: Array
     """(3,) rad/s, body, right-handed."""
     thrust: Array
-    """() of each motor, 16 bit; at 0 the motors stop and the loops forget."""
+    """() thrust of each motor, 16 bit; at 0 the motors stop and the integrators are reset."""
 
 
 AnySetpoint = Setpoint | Velocity | Attitude | Rates
@@ -67,12 +68,12 @@ AnySetpoint = Setpoint | Velocity | Attitude | Rates
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
     """The gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
 
-    Scaled ones give every command the share of weight and the angular acceleration that it gives to a Crazyflie. What
-    the firmware believes of the voltage of its motors is not scaled.
+    With scaled gains, a command has the thrust over weight and the angular acceleration that it has on a Crazyflie. The
+    firmware's thrust curve of the motor voltage is not scaled.
 
     Args:
-        params: of the drone to scale to; a Crazyflie when left out.
-        propellers: of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
+        params: parameters of the drone to scale to; a Crazyflie when left out.
+        propellers: propellers of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
 
     Raises:
         ValueError: unknown propellers.
@@ -122,9 +123,10 @@ def init() -> Memory:
 
 
 def reset(memory: Memory) -> Memory:
-    """The memory with empty integrators.
+    """The memory with the integrators at zero.
 
-    The firmware resets where the kind of the set-point changes, as at the start of a landing, and while motors rest.
+    The firmware resets them when the kind of the set-point changes, as at the start of a landing, and while the motors
+    are off.
     """
     names = ("pos_integral", "vel_integral", "attitude_integral", "rate_integral")
     return memory.replace(**{name: jnp.zeros_like(getattr(memory, name)) for name in names})
@@ -133,17 +135,17 @@ def reset(memory: Memory) -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: AnySetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`: those that make the thrusts that the firmware commands.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`, that produce the thrusts that the firmware commands.
 
-    A command is a share of `gains.motor.max_thrust`, which battery compensation makes true, and the rotor turns as fast
-    as it must for that by the vehicle's `kf`. The mixing follows from the geometry of the rotors.
+    A command is a fraction of `gains.motor.max_thrust` at any battery voltage, thanks to battery compensation, and the
+    vehicle's `kf` gives the rotor speed for this thrust. The mixing follows from the geometry of the rotors.
 
     Args:
-        gains: of the four loops.
-        params: of the drone.
-        memory: of the last call.
-        state: of the drone, as it is estimated.
-        setpoint: of position (pos and yaw of a `Setpoint`; the rest is not used), `Velocity`, `Attitude` or `Rates`.
+        gains: gains of the four loops.
+        params: parameters of the drone.
+        memory: memory after the last call.
+        state: estimated state of the drone.
+        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude` or `Rates`.
         dt: time between calls, s; 0.002 on the vehicle.
 
     Raises:
@@ -163,15 +165,15 @@ def pwm(
     *,
     dt: float = 0.002,
 ) -> tuple[Memory, motors.Command]:
-    """What the firmware of one Crazyflie commands: desired attitude, thrust, and the duty cycles of its motors.
+    """The commands of the firmware of one Crazyflie: desired attitude, thrust, and the duty cycles of its motors.
 
     Args:
-        gains: of the four loops.
-        memory: of the last call.
-        state: of the drone, as it is estimated.
-        setpoint: of position (pos and yaw of a `Setpoint`; the rest is not used), `Velocity`, `Attitude` or `Rates`.
-        battery: voltage, V, for which duty cycles are compensated, behind a filter of 0.1 s; without it, and with the
-            compensation switched off, a duty cycle is the command itself.
+        gains: gains of the four loops.
+        memory: memory after the last call.
+        state: estimated state of the drone.
+        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude` or `Rates`.
+        battery: voltage for the battery compensation, V, which is filtered over 0.1 s; None switches the compensation
+            off, so that a duty cycle is the command itself.
         dt: time between calls, s.
 
     Raises:
@@ -194,7 +196,7 @@ def _fly(
         memory = _slow_loops(gains, memory, state, setpoint, dt)
         attitude, thrust = jnp.append(memory.tilt, jnp.rad2deg(setpoint.yaw)), memory.thrust
     elif isinstance(setpoint, Attitude | Rates):
-        memory = memory.replace(age=jnp.minimum(memory.age, _SLOW))  # after them the slow loops run at once
+        memory = memory.replace(age=jnp.minimum(memory.age, _SLOW))  # the slow loops run at once afterwards
         attitude, thrust = rpy(state.quat), jnp.clip(setpoint.thrust, 0, motors.FULL)
     else:
         raise ValueError(f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude or Rates")
@@ -212,7 +214,7 @@ def _fly(
 
 
 def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Memory:
-    """The memory, which at the first call is that of a drone whose attitude and rates have always been the present."""
+    """The memory; at the first call its past attitude and rates are the present ones, so that derivatives are zero."""
     measured = degrees(state.omega)
     start = dict(rpy=rpy(state.quat), rates=measured, gyro=settled(measured, gains.gyro_cutoff, dt))
     first = jnp.isinf(memory.age)
@@ -220,7 +222,7 @@ def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Me
 
 
 def _slow_loops(gains: Gains, memory: Memory, state: State, setpoint: Setpoint | Velocity, dt: float) -> Memory:
-    """The memory with the tilt and the thrust of the loops of position and velocity, if it is their turn."""
+    """The memory; if the loops of position and velocity are due, with their new tilt and thrust."""
     check_shape("setpoint.yaw", setpoint.yaw, (), "one target for one drone")
     check_shape("setpoint.vel", setpoint.vel, (3,), "one target for one drone")
     period = jnp.maximum(_SLOW, dt)

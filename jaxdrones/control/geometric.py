@@ -32,7 +32,7 @@ class Gains(PyTreeNode):
 
 
 def gains() -> Gains:
-    """Gains for rotors that do not lag: position at 2.5 rad/s, tilt at 20, yaw at 10, damping 0.7 to 0.8."""
+    """Gains for instant rotors: bandwidth 2.5 rad/s in position, 20 in tilt, 10 in yaw, damping ratio 0.7 to 0.8."""
     return Gains(
         pos=jnp.array([6.25, 6.25, 6.25]),
         vel=jnp.array([4.0, 4.0, 4.0]),
@@ -42,7 +42,7 @@ def gains() -> Gains:
 
 
 def init() -> None:
-    """The memory of a drone: this controller keeps none."""
+    """The memory of a drone: this controller has none."""
 
 
 def control(
@@ -54,11 +54,11 @@ def control(
     tau = -J (k_R e_R + k_w e_w) + w x J w - J (w x R^T R_d w_d), with e_w = w - R^T R_d w_d.
 
     Args:
-        gains: of position and attitude.
-        params: of the drone.
-        memory: handed through; this controller keeps none.
-        state: of the drone.
-        setpoint: pos, vel, acc, yaw and omega.
+        gains: gains of position and attitude.
+        params: parameters of the drone.
+        memory: returned unchanged; this controller has none.
+        state: state of the drone.
+        setpoint: target; all of pos, vel, acc, yaw and omega are used.
         dt: time between calls, s; only checked.
 
     Raises:

@@ -1,9 +1,9 @@
 """The tracking controller of Mellinger and Kumar (2011), as the Crazyflie's firmware flies it.
 
-The law is that of Hoenig and Preiss in Bitcraze's firmware: position with an integral, the error of the attitude on
-SO(3), and a derivative of the rates of roll and pitch. It runs at 500 Hz and follows velocity, acceleration and rates
-of the set-point, too. Thrust and torque are 16-bit numbers, limited as in the firmware but not rounded. It needs rotors
-that lag by less than 0.1 s: with the 0.25 s in which those of `cf2x` fall, it swings.
+The control law is that of Hoenig and Preiss in Bitcraze's firmware: position control with an integral, the attitude
+error on SO(3), and a derivative of the roll and pitch rates. It runs at 500 Hz and also follows velocity, acceleration
+and rates of the set-point. Thrust and torque are 16-bit numbers, limited as in the firmware but not rounded. It needs
+rotors that lag by less than 0.1 s: with the fall time of 0.25 s of `cf2x` it oscillates.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from jaxdrones.state import State
 
 _GRAVITY = 9.81  # m/s^2
 _MAX_TORQUE = 32000.0  # 16 bit
-_MASSES = {"2.1": 0.029, "2.1+": 0.029, "thrust upgrade kit": 0.0325}  # kg, that the firmware believes
+_MASSES = {"2.1": 0.029, "2.1+": 0.029, "thrust upgrade kit": 0.0325}  # kg, according to the firmware
 
 
 class Gains(PyTreeNode):
-    """Gains and limits of position and attitude, and what the firmware believes of the vehicle."""
+    """Gains and limits of position and attitude, and the vehicle parameters in the firmware."""
 
     pos_p: Array
     """(3,) N/m, world."""
@@ -49,19 +49,19 @@ class Gains(PyTreeNode):
     rate_d: Array
     """(3,) 16 bit per rad/s^2."""
     weight: Array
-    """() N."""
+    """() weight of the vehicle, N."""
     mass: Array
-    """() kg."""
+    """() mass of the vehicle, kg."""
     thrust: Array
-    """() 16 bit of each motor per N of all."""
+    """() thrust command of each motor per total thrust, 16 bit per N."""
     gyro_cutoff: Array
-    """() of the low-pass (Butterworth, second order) through which the rates are measured, Hz."""
+    """() cutoff frequency of the low-pass filter of the gyroscope (Butterworth, second order), Hz."""
     motor: motors.Motor
-    """Of which a command is a share of the thrust."""
+    """Motor whose maximum thrust is the full command."""
 
 
 class Memory(PyTreeNode):
-    """What the controller of one drone keeps between calls; zero before the first."""
+    """State of the controller of one drone between calls; zero before the first call."""
 
     pos_integral: Array
     """(3,) integrated position error, m s."""
@@ -70,9 +70,9 @@ class Memory(PyTreeNode):
     rate_error: Array
     """(3,) error of the body rates at the last call, rad/s."""
     gyro: Array
-    """(2, 3) state of the low-pass of the body rates, rad/s."""
+    """(2, 3) state of the low-pass filter of the body rates, rad/s."""
     battery: Array
-    """() voltage of the battery behind its filter, V."""
+    """() filtered voltage of the battery, V."""
     running: Array
     """() 1 after the first call."""
 
@@ -80,11 +80,11 @@ class Memory(PyTreeNode):
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
     """The gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
 
-    Scaled ones give every error the acceleration, linear and angular, that it gives to a Crazyflie.
+    With scaled gains, an error causes the linear and angular acceleration that it causes on a Crazyflie.
 
     Args:
-        params: of the drone to scale to; a Crazyflie when left out.
-        propellers: of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
+        params: parameters of the drone to scale to; a Crazyflie when left out.
+        propellers: propellers of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
 
     Raises:
         ValueError: unknown propellers.
@@ -124,14 +124,14 @@ def init() -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`: those that make the thrusts that the firmware commands.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`, that produce the thrusts that the firmware commands.
 
     Args:
-        gains: of position and attitude.
-        params: of the drone.
-        memory: of the last call.
-        state: of the drone, as it is estimated.
-        setpoint: pos, vel, acc, yaw and omega.
+        gains: gains of position and attitude.
+        params: parameters of the drone.
+        memory: memory after the last call.
+        state: estimated state of the drone.
+        setpoint: target; all of pos, vel, acc, yaw and omega are used.
         dt: time between calls, s; 0.002 on the vehicle.
 
     Raises:
@@ -151,14 +151,14 @@ def pwm(
     *,
     dt: float = 0.002,
 ) -> tuple[Memory, motors.Command]:
-    """What the firmware of one Crazyflie commands: desired attitude, thrust, and the duty cycles of its motors.
+    """The commands of the firmware of one Crazyflie: desired attitude, thrust, and the duty cycles of its motors.
 
     Args:
-        gains: of position and attitude.
-        memory: of the last call.
-        state: of the drone, as it is estimated.
-        setpoint: pos, vel, acc, yaw and omega.
-        battery: voltage, V, for which duty cycles are compensated; without it a duty cycle is the command itself.
+        gains: gains of position and attitude.
+        memory: memory after the last call.
+        state: estimated state of the drone.
+        setpoint: target; all of pos, vel, acc, yaw and omega are used.
+        battery: voltage for the battery compensation, V; without it a duty cycle is the command itself.
         dt: time between calls, s.
 
     Raises:
@@ -195,7 +195,7 @@ def _fly(
     change = (rate_error - jnp.where(first, rate_error, memory.rate_error)) / dt
     torque = -gains.attitude_p * error + gains.attitude_i * integral
     torque = torque + gains.rate_p * rate_error + gains.rate_d * change
-    flying = thrust > 0  # else the motors stand still and the integrators are emptied
+    flying = thrust > 0  # otherwise the motors stop and the integrators are reset
     memory = Memory(
         pos_integral=jnp.where(flying, pos_integral, 0),
         attitude_integral=jnp.where(flying, integral, 0),

@@ -1,9 +1,9 @@
-"""Model-reference adaptive control of gym-pybullet-drones (2.x): state feedback whose gains learn in flight.
+"""Model-reference adaptive control of gym-pybullet-drones (2.x): state feedback with gains that adapt in flight.
 
 The state x is position, roll, pitch and yaw, velocity and body rates. In hover its linear model is x' = A x + B u, with
-u thrust (N) and torque (N m), without the weight: that, too, is left to the adaptation. The feedback puts the poles of
-the model at -1 to -12 1/s; the adaptation makes the drone follow the model that this would give (Narendra and
-Annaswamy, Stable Adaptive Systems, chapter 3).
+u thrust (N) and torque (N m). The weight is not part of the model; the adaptation compensates it. The feedback places
+the poles of the model at -1 to -12 1/s. This closed loop is the reference model that the adaptation makes the drone
+follow (Narendra and Annaswamy, Stable Adaptive Systems, chapter 3).
 """
 
 from __future__ import annotations
@@ -25,47 +25,47 @@ from jaxdrones.urdf import load_params
 from jaxdrones.vector import safe_sqrt
 
 _POLES = -np.linspace(1, 12, 12)  # 1/s
-_WEIGHT = 600.0  # Q of the Lyapunov equation over the unit matrix
+_WEIGHT = 600.0  # Q of the Lyapunov equation is this times the unit matrix
 _LEARNING_RATE = 5e-3
 _MAX_TORQUE = 3200.0
 
 
 class Gains(PyTreeNode):
-    """The gains before the first call, the model to follow, and how fast gains change."""
+    """The initial gains, the reference model, and the adaptation rates."""
 
     feedback: Array
-    """(12, 4) K_x: u = K_x^T x + K_r^T r."""
+    """(12, 4) K_x of u = K_x^T x + K_r^T r."""
     feedforward: Array
     """(4, 4) K_r."""
     reference: Array
-    """(4, 12) from the target's state to r."""
+    """(4, 12) matrix from the state of the target to r."""
     model: Array
-    """(12, 12) A_m of the model to follow, x_m' = A_m x_m + B r."""
+    """(12, 12) A_m of the reference model, x_m' = A_m x_m + B r."""
     inputs: Array
     """(12, 4) B."""
     lyapunov: Array
-    """(12, 12) P, of which A_m^T P + P A_m = -600."""
+    """(12, 12) P, the solution of A_m^T P + P A_m = -600 I."""
     feedback_rate: Array
-    """(12, 12) of K_x' = -rate x e^T P B, with e = x - x_m."""
+    """(12, 12) adaptation rate of K_x' = -rate x e^T P B, with e = x - x_m."""
     feedforward_rate: Array
-    """(4, 4) of K_r' = -rate r e^T P B."""
+    """(4, 4) adaptation rate of K_r' = -rate r e^T P B."""
 
 
 class Memory(PyTreeNode):
-    """What the controller of one drone keeps between calls; zero before the first."""
+    """State of the controller of one drone between calls; zero before the first call."""
 
     feedback: Array
-    """(12, 4) what is learned of K_x."""
+    """(12, 4) adaptation of K_x."""
     feedforward: Array
-    """(4, 4) what is learned of K_r."""
+    """(4, 4) adaptation of K_r."""
     model: Array
-    """(12,) state of the model."""
+    """(12,) state of the reference model."""
     running: Array
-    """() 1 after the first call, at which the model is where the drone is."""
+    """() 1 after the first call, which sets the state of the reference model to that of the drone."""
 
 
 def gains(params: Params | None = None) -> Gains:
-    """The gains of gym-pybullet-drones for `cf2x`, or by its method for another vehicle.
+    """The gains of gym-pybullet-drones for `cf2x`, or those of its method for another vehicle.
 
     Poles are placed by the method of Tits and Yang, in float64 on the host.
 
@@ -75,7 +75,7 @@ def gains(params: Params | None = None) -> Gains:
     from scipy import linalg, signal  # comes with JAX; loading it takes half a second
 
     if params is None:
-        with jax.ensure_compile_time_eval():  # so that it may be called while something else is traced
+        with jax.ensure_compile_time_eval():  # so that `gains()` may be called during tracing
             params = load_params("cf2x")
     if not all(is_known(leaf) for leaf in (params.mass, params.inertia, params.gravity)):
         raise ValueError(
@@ -119,11 +119,11 @@ def control(
     As in gym-pybullet-drones, thrust becomes PWM as in `pid`, and the torque, in N m, is mixed as if it were in PWM.
 
     Args:
-        gains: of the first call.
-        params: of the drone.
-        memory: of the last call.
-        state: of the drone.
-        setpoint: pos, vel, yaw, and omega, which is taken for body rates; acc is not used.
+        gains: initial gains.
+        params: parameters of the drone.
+        memory: memory after the last call.
+        state: state of the drone.
+        setpoint: target; pos, vel, yaw and omega (as body rates) are used, acc is not.
         dt: time between calls, s.
 
     Raises:
@@ -151,8 +151,8 @@ def control(
 def _state(state: State) -> Float[Array, "12"]:
     """Position, roll, pitch and yaw, velocity, body rates.
 
-    The rates are turned to the body by roll, pitch and yaw about moving axes in that order, which is not the attitude;
-    in gym-pybullet-drones they are.
+    As in gym-pybullet-drones, the rates are rotated to the body by roll, pitch and yaw about moving axes in that order,
+    which is not the attitude.
     """
     roll, pitch, yaw = rpy = rotation.to_rpy(state.quat)
     omega = rotation.rotate(state.quat, state.omega)

@@ -1,7 +1,7 @@
 """The PID of gym-pybullet-drones for Crazyflies: position loop, attitude loop, PWM mixer.
 
-It goes back to the Dynamic Systems Lab of the University of Toronto. Torques and thrust are in units of the
-Crazyflie's 16-bit PWM, whatever the vehicle.
+It originates from the Dynamic Systems Lab of the University of Toronto. For every vehicle, torques and thrust are in
+units of the Crazyflie's 16-bit PWM.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jaxdrones.vector import safe_sqrt
 
 VEHICLES = ("cf2x", "cf2p")
 
-_LIKENESS = np.log(1.25)  # between the constants of a vehicle that the gains suit and those of cf2x or cf2p
+_TOLERANCE = np.log(1.25)  # largest logarithmic difference from the parameters of cf2x or cf2p
 _PWM_TO_RPM = 0.2685  # RPM per unit of the 16-bit PWM
 _PWM_OFFSET = 4070.3  # RPM
 _PWM_RANGE = (20000.0, 65535.0)
@@ -54,7 +54,7 @@ class Gains(PyTreeNode):
 
 
 class Memory(PyTreeNode):
-    """What the controller of one drone keeps between calls; zero before the first."""
+    """State of the controller of one drone between calls; zero before the first call."""
 
     pos_integral: Array
     """(3,) integrated position error, m s."""
@@ -90,9 +90,9 @@ def gains(vehicle: str = "cf2x") -> Gains:
 
 
 def fits(params: Params) -> bool:
-    """Whether the gains suit a drone, or every drone of a team: a Crazyflie by its numbers, whatever its name.
+    """Whether the gains suit a drone, or every drone of a team, by its parameters.
 
-    That is, mass, inertia, arm, thrust and torque coefficient are within a quarter of those of `cf2x` or of `cf2p`.
+    They do if mass, inertia, arm, thrust and torque coefficient are within a quarter of those of `cf2x` or of `cf2p`.
 
     Raises:
         ValueError: the parameters are being traced.
@@ -103,11 +103,11 @@ def fits(params: Params) -> bool:
         )
     numbers = _numbers(params)
     unlike = [np.max(np.abs(np.log(numbers / _numbers(load_params(vehicle)))), axis=-1) for vehicle in VEHICLES]
-    return bool(np.all(np.min(unlike, axis=0) <= _LIKENESS))
+    return bool(np.all(np.min(unlike, axis=0) <= _TOLERANCE))
 
 
 def _numbers(params: Params) -> np.ndarray:
-    """The constants that the gains depend on: (7,) of one drone, (n, 7) of a team."""
+    """The parameters on which the gains depend: (7,) for one drone, (n, 7) for a team."""
     scalars = np.stack([params.mass, params.arm, params.kf, params.km], axis=-1)
     return np.concatenate([scalars, params.inertia], axis=-1)
 
@@ -123,11 +123,11 @@ def control(
     """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 
     Args:
-        gains: of the two loops.
-        params: of the drone.
-        memory: of the last call.
-        state: of the drone.
-        setpoint: pos, vel, yaw, and omega, which is taken for Euler rates; acc is not used.
+        gains: gains of the two loops.
+        params: parameters of the drone.
+        memory: memory after the last call.
+        state: state of the drone.
+        setpoint: target; pos, vel, yaw and omega (as Euler rates) are used, acc is not.
         dt: time between calls, s.
 
     Raises:
@@ -140,11 +140,11 @@ def control(
     return memory, rotor_speeds(params, thrust, torque)
 
 
-@jax.checkpoint  # both loops are cheaper to compute again in a backward pass than to keep
+@jax.checkpoint  # recomputing both loops is cheaper in a backward pass than storing
 def position_loop(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, dt: float
 ) -> tuple[Memory, Float[Array, ""], attitude.Axes]:
-    """Thrust per rotor (PWM, not clipped) and the attitude that points it where the position error asks."""
+    """Thrust per rotor (PWM, not clipped) and the attitude that points it along the desired force."""
     error = setpoint.pos - state.pos
     limit = jnp.array(_MAX_POS_INTEGRAL)
     integral = jnp.clip(memory.pos_integral + error * dt, -limit, limit)
@@ -175,6 +175,6 @@ def attitude_loop(
 
 
 def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Rotor speeds (RPM) of a thrust per rotor and a torque (PWM), limited to the Crazyflie's PWM and to `max_rpm`."""
+    """Rotor speeds (RPM) for a thrust per rotor and a torque (PWM), limited to the Crazyflie's PWM and to `max_rpm`."""
     pwm = jnp.clip(thrust + jax.vmap(vector.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
     return jnp.minimum(_PWM_TO_RPM * pwm + _PWM_OFFSET, params.max_rpm)

@@ -32,7 +32,7 @@ class Gains(PyTreeNode):
 
 
 def gains() -> Gains:
-    """Gains with the outer loop of gym-pybullet-drones, and an inner one of 40 rad/s in roll and pitch, 15 in yaw."""
+    """Gains of gym-pybullet-drones for the outer loop; the inner loop has 40 rad/s in roll and pitch, 15 in yaw."""
     return Gains(
         pos=jnp.array([3.0, 3.0, 8.0]),
         vel=jnp.array([2.5, 2.5, 5.0]),
@@ -42,7 +42,7 @@ def gains() -> Gains:
 
 
 def init() -> None:
-    """The memory of a drone: this controller keeps none."""
+    """The memory of a drone: this controller has none."""
 
 
 def control(
@@ -51,11 +51,11 @@ def control(
     """Rotor speeds of one drone by both loops, RPM, up to `max_rpm`.
 
     Args:
-        gains: of both loops.
-        params: of the drone.
-        memory: handed through; this controller keeps none.
-        state: of the drone.
-        setpoint: pos, vel, acc and yaw; omega is not used.
+        gains: gains of both loops.
+        params: parameters of the drone.
+        memory: returned unchanged; this controller has none.
+        state: state of the drone.
+        setpoint: target; pos, vel, acc and yaw are used, omega is not.
         dt: time between calls, s; only checked.
 
     Raises:
@@ -82,7 +82,7 @@ def command(
     target = rotation.from_matrix(jnp.stack([x, vector.cross(z, x), z], axis=-1))
     error = rotation.multiply(rotation.conjugate(state.quat), target)
     shorter_way = jnp.where(error[3] < 0, -1, 1)
-    turn = jnp.where(jnp.any(acc != 0), shorter_way, 0)  # no force, no attitude to turn to
+    turn = jnp.where(jnp.any(acc != 0), shorter_way, 0)  # without a force there is no desired attitude
     return collective, 2 * gains.attitude * error[:3] * turn
 
 

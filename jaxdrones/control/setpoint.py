@@ -10,7 +10,7 @@ from jaxdrones.pytree import PyTreeNode
 
 
 class Setpoint(PyTreeNode):
-    """Target of one drone, or of a team with a leading drone axis on every array."""
+    """Target of one drone, or of a team, with a leading drone axis on every array."""
 
     pos: Array
     """(3,) m, world."""
@@ -32,7 +32,7 @@ class Setpoint(PyTreeNode):
         yaw: ArrayLike | None = None,
         omega: ArrayLike | None = None,
     ) -> Setpoint:
-        """The target of a position, (*n, 3), and of everything else that is given; the rest is zero."""
+        """A target with the position (*n, 3) and the other given quantities; the rest is zero."""
         pos = jnp.asarray(pos)
         zero = jnp.zeros_like(pos)
         return cls(

@@ -1,6 +1,6 @@
 """The simple PID of gym-pybullet-drones for the Hummingbird.
 
-Angles follow from a desired force; rotor speeds follow from thrust and torque by least squares.
+The desired force gives the angles; thrust and torque give the rotor speeds by least squares.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Gains(PyTreeNode):
 
 
 class Memory(PyTreeNode):
-    """What the controller of one drone keeps between calls; zero before the first."""
+    """State of the controller of one drone between calls; zero before the first call."""
 
     pos_integral: Array
     """(3,) integrated position error, m s; not limited."""
@@ -73,16 +73,16 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm`; those of gym-pybullet-drones are not limited.
 
-    The drone keeps yaw zero: of the setpoint only `pos` is used. Derivatives are differences of errors, so the first
-    call jumps. With the inertia of the Hummingbird it needs 60 calls per second; the paper flies it at 48 with a
-    fivefold one.
+    The controller keeps yaw at zero: it uses only `pos` of the setpoint. Derivatives are differences of errors, so the
+    first call has a spike. With the inertia of the Hummingbird it needs 60 calls per second; the paper uses 48 calls
+    with five times this inertia.
 
     Args:
-        gains: of the two loops.
-        params: of the drone.
-        memory: of the last call.
-        state: of the drone.
-        setpoint: where to be.
+        gains: gains of the two loops.
+        params: parameters of the drone.
+        memory: memory after the last call.
+        state: state of the drone.
+        setpoint: target; only pos is used.
         dt: time between calls, s.
 
     Raises:
@@ -107,7 +107,7 @@ def control(
 
 
 def _angles_of(force: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Roll and pitch that point body z (or -z) along the force, limited, and yaw zero; rad."""
+    """Limited roll and pitch that point body z (or -z) along the force, and a yaw of zero; rad."""
     x, y, z = jnp.where(force[2] < 0, -force, force)
     roll = atan2(-y, safe_sqrt(x**2 + z**2))
     pitch = atan2(x, z)

@@ -1,4 +1,4 @@
-"""A check that every controller makes: its arguments are those of one drone."""
+"""Checks of every controller that its arguments are those of one drone."""
 
 from typing import Any
 
@@ -38,6 +38,6 @@ def check_setpoint(setpoint: Setpoint) -> None:
 
 
 def check_memory(memory: Any, like: Any) -> None:
-    """Raise `ValueError` unless a memory has the shapes of another, that of one drone."""
+    """Raise `ValueError` unless a memory has the shapes of `like`, the memory of one drone."""
     for name, value in vars(memory).items():
         check_shape(f"memory.{name}", value, np.shape(getattr(like, name)), _HINT)

@@ -1,4 +1,4 @@
-"""What a team needs of a controller of one drone."""
+"""The memory of a team of drones that have the same controller."""
 
 from typing import Any
 

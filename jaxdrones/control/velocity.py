@@ -1,4 +1,4 @@
-"""The velocity input of the paper (equation 8): a direction and a share of a speed limit, flown by the PID."""
+"""The velocity input of the paper (equation 8): a direction and a fraction of a speed limit, followed by the PID."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,7 +11,7 @@ from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
-SPEED_SHARE = 0.03  # of the vehicle's highest speed, at magnitude 1
+SPEED_SHARE = 0.03  # speed at magnitude 1 over the vehicle's highest speed
 
 
 def control(
@@ -20,11 +20,11 @@ def control(
     """Rotor speeds of one drone, RPM.
 
     Args:
-        gains: of the PID.
-        params: of the drone.
-        memory: of the PID.
-        state: of the drone.
-        action: (4,) direction x, y, z of any length, and magnitude: the share of the speed limit, sign ignored.
+        gains: gains of the PID.
+        params: parameters of the drone.
+        memory: memory of the PID.
+        state: state of the drone.
+        action: (4,) direction x, y, z of any length, and magnitude: the fraction of the speed limit, sign ignored.
         dt: time between calls, s.
 
     The position target is the position of the drone and the yaw target its heading, so only the velocity error acts.
@@ -43,5 +43,5 @@ def setpoint(params: Params, state: State, action: Float[Array, "4"]) -> Setpoin
 
 
 def commanded(params: Params, action: Float[Array, "4"]) -> Float[Array, "3"]:
-    """The velocity that an action asks for, m/s, world."""
+    """The velocity that an action commands, m/s, world."""
     return SPEED_SHARE * params.max_speed * jnp.abs(action[3]) * vector.unit(action[:3])

@@ -1,4 +1,4 @@
-"""Torques that recorded flights show and a rigid body with four thrusts has not: flapping, rate damping, trim."""
+"""Torques that recorded flights show beyond a rigid body with four thrusts: flapping, rate damping, trim."""
 
 import jax.numpy as jnp
 
@@ -9,15 +9,15 @@ from jaxdrones.state import State
 from jaxdrones.vector import components, safe_sqrt
 from jaxdrones.wrench import Wrench
 
-_MOST_CLIMB = 3.0  # m/s, beyond which the loss does not follow; the flights it was found in climb at up to 2 m/s
+_MOST_CLIMB = 3.0  # m/s, limit of the climb speed in the loss; the identified flights climb at up to 2 m/s
 
 
 def flapping_moment(params: Params, state: State) -> Wrench:
-    """Moment of rotors that move through the air: their discs tilt back, and their drag acts above the center of mass.
+    """Moment of rotors in horizontal flight: their discs tilt back, and their drag acts above the center of mass.
 
-    M = sum(rotor speed) (c_y v g_y, -c_x u g_x, 0) with u, v, w the velocity relative to the air along the body axes: a
-    drone that flies forward is pitched nose up. It changes with the climb by g = 1 - l w + k w^2, as flights of the
-    Crazyflie 2.1 brushless show (docs/reality.md).
+    M = sum(rotor speed) (c_y v g_y, -c_x u g_x, 0) with u, v, w the velocity relative to the air along the body axes.
+    It pitches a drone that flies forward nose up. The factor g = 1 - l w + k w^2 depends on the climb speed, as flights
+    of the Crazyflie 2.1 brushless show (docs/reality.md).
     """
     u, v, w = components(rotation.rotate_inverse(state.quat, state.vel - params.wind))
     climb = w / safe_sqrt(1 + (w / _MOST_CLIMB) ** 2)
@@ -29,7 +29,7 @@ def flapping_moment(params: Params, state: State) -> Wrench:
 
 
 def rate_damping(params: Params, state: State) -> Wrench:
-    """Torque against the angular velocity: a rotor that goes down gains thrust, one that rises loses it."""
+    """Torque against the angular velocity: a descending rotor gains thrust, a rising one loses thrust."""
     return Wrench.of_torque(-params.rate_damping * state.omega)
 
 

@@ -11,22 +11,22 @@ from jaxdrones.vector import components, cross
 from jaxdrones.wrench import Wrench
 
 _NEWTON_STEPS = 3
-_STILL = 1e-6  # (m/s)^2; rounds off the inflow of a rotor that neither turns nor moves
+_STILL = 1e-6  # (m/s)^2; makes the inflow of a rotor that neither turns nor moves differentiable
 
 
 def inflow_thrust(params: Params, state: State) -> Wrench:
-    """Thrust that rotors lose when they climb, and gain when they sink or fly forward, at the same speed.
+    """Change of thrust at constant rotor speed: a loss in a climb, a gain in descent or forward flight.
 
-    With U the flow through a rotor that moves through the air and v_h that in hover,
+    With U the air speed through a moving rotor, and v_h that in hover,
 
         dF = -2 b F (U - v_h),  b = inflow_loss hover_rpm / P.
 
-    A blade element loses lift in proportion to the flow through the disc. Half of a slow climb is taken up by the
-    smaller induced velocity, hence the 2: in a climb at w the loss is the share b w. Forward flight lowers the induced
-    velocity, which is translational lift. Sources: Leishman, Principles of Helicopter Aerodynamics, 2006, chapters 2
-    and 3; Glauert 1926. What the blades gain by advancing is left out.
+    A blade element loses lift in proportion to the flow through the disc. In a slow climb the induced velocity falls by
+    half the climb speed, hence the factor 2: in a climb at w the fraction b w is lost. Forward flight lowers the
+    induced velocity, which is translational lift. The lift that advancing blades gain is not modeled. Sources:
+    Leishman, Principles of Helicopter Aerodynamics, 2006, chapters 2 and 3; Glauert 1926.
 
-    The part along z of `drag_coeff` is the same loss as it was measured on the Crazyflie: with `drag` set it to zero.
+    The z component of `drag_coeff` is the same loss, measured on the Crazyflie: set it to zero if you also use `drag`.
     """
     air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
     area = jnp.pi * params.prop_radius**2
@@ -45,8 +45,8 @@ def flow_through(
 ) -> Float[Array, ""]:
     """Speed U of the air through a rotor of constant thrust, m/s: (U - w) sqrt(V^2 + U^2) = v_h^2, after Glauert.
 
-    Where the air comes from below, U < 0, its part of the flow past the disc is left out: momentum theory has several
-    solutions there, or none (vortex ring), and this one is smooth.
+    If air flows from below, U < 0, the square root has V alone: momentum theory has several solutions there, or none
+    (vortex ring state), and this solution is smooth.
 
     Args:
         climb: w, speed of the rotor through the air along its axis, m/s; negative when it sinks.

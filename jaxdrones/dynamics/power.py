@@ -21,24 +21,24 @@ from jaxdrones.vector import safe_sqrt, total
 _KNEE, _KNEE_RATE = 1.031, 35.0  # V, 1
 _CUBIC = (3.685, 0.3126, -0.1178, 0.3201)  # V
 _BISECTIONS = 30
-_SMALLEST_VOLTAGE = 1e-6  # V; of a battery that is empty, so that nothing is divided by zero
+_SMALLEST_VOLTAGE = 1e-6  # V; voltage of an empty battery, which avoids a division by zero
 
 
 class Battery(PyTreeNode):
-    """Constants of a battery and of what it feeds, `Params.aux["battery"]`; `lithium_polymer` makes them."""
+    """Constants of a battery and its load, `Params.aux["battery"]`; `lithium_polymer` makes them."""
 
     capacity: Array
     """() charge when full, A s."""
     cells: Array
     """() number of cells in series."""
     resistance: Array
-    """() of battery, plug and wires: the part of the voltage drop that comes at once, ohm."""
+    """() resistance of battery, plug and wires, whose voltage drop is immediate, ohm."""
     slow_resistance: Array
-    """() the part that comes and goes with the time constant, ohm."""
+    """() resistance whose voltage drop lags with the time constant `slow_time`, ohm."""
     slow_time: Array
-    """() time constant, s."""
+    """() time constant of the slow voltage drop, s."""
     efficiency: Array
-    """() power that the rotors' thrust takes in an ideal hover over the electrical power of the motors."""
+    """() power of ideal rotors with the same thrust in hover over the electrical power of the motors."""
     idle_power: Array
     """() power of the electronics, W."""
 
@@ -52,17 +52,17 @@ def lithium_polymer(
     efficiency: ArrayLike = 0.3,
     idle_power: ArrayLike = 0.5,
 ) -> Battery:
-    """A battery by its numbers; those of a Crazyflie 2.1 with 250 mAh where left out.
+    """Constants of a battery; the defaults are those of a Crazyflie 2.1 with 250 mAh.
 
     Resistance and efficiency are fitted to flights of NanoBench (Ullah and Baca 2026): at an efficiency of 0.3 the
-    batteries of its flights have 0.21 to 0.52 ohm, and no slow part that could be measured. So give the resistance of
-    your own. The idle power is an estimate.
+    batteries of its flights have 0.21 to 0.52 ohm, and no measurable slow resistance. So give the resistance of your
+    battery. The idle power is an estimate.
 
     Args:
         capacity: charge when full, A s; 3.6 times the mAh on the label.
-        cells: in series.
-        resistance: of battery, plug and wires, all cells together, ohm.
-        slow_resistance: the part of the resistance whose drop lags behind the current, ohm.
+        cells: number of cells in series.
+        resistance: resistance of battery, plug and wires, all cells together, ohm.
+        slow_resistance: resistance whose voltage drop lags behind the current, ohm.
         slow_time: time constant of this lag, s.
         efficiency: power of an ideal rotor with the same thrust over the electrical power of a motor.
         idle_power: power of the electronics, W.
@@ -91,16 +91,16 @@ def battery() -> Model:
     """The model of a battery that is full at the start; its constants are `Params.aux["battery"]`.
 
     `state.aux["battery"]` holds `charge` () in A s and `slow_drop` (), the part of the voltage drop that follows the
-    current with a lag, V. The charge falls by the integral of `battery_current`, and by nothing else.
+    current with a lag, V. The charge falls by exactly the integral of `battery_current`.
     """
     return Model("battery", _full, _rate)
 
 
 def battery_power(params: Params, state: State) -> Float[Array, ""]:
-    """Electrical power that motors and electronics ask for, W.
+    """Electrical power that motors and electronics demand, W.
 
-    By momentum theory a rotor needs F sqrt(F / (2 rho A)) for its thrust F = k_F P^2 in hover; `efficiency` is the
-    share of the electrical power that this is. It holds the losses of rotor, motor and driver.
+    By momentum theory a rotor needs the power F sqrt(F / (2 rho A)) for its thrust F = k_F P^2 in hover. `efficiency`
+    is this power over the electrical power; it includes the losses of rotor, motor and driver.
     """
     cell = _constants(params)
     area = jnp.pi * params.prop_radius**2
@@ -109,21 +109,21 @@ def battery_power(params: Params, state: State) -> Float[Array, ""]:
 
 
 def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
-    """Voltage U at the terminals under the load of the rotors as they turn, V: U (E - U) = R P.
+    """Terminal voltage U under the load of the turning rotors, V, from U (E - U) = R P.
 
-    E is the voltage without the resistance R. A battery gives the power E^2 / (4 R) at most, at U = E / 2, and this is
-    what it gives where more is asked for.
+    E is the voltage before the resistance R. The maximum power of a battery is E^2 / (4 R), at U = E / 2; it delivers
+    this power if the demand is higher.
 
     Args:
-        params: of the drone, with the constants of the battery in `aux["battery"]`.
-        state: of the drone, with the state of the model `battery()`.
+        params: parameters of the drone, with the constants of the battery in `aux["battery"]`.
+        state: state of the drone, with the state of the model `battery()`.
     """
     source = _source(params, state)
     return (source + safe_sqrt(source**2 - 4 * _constants(params).resistance * battery_power(params, state))) / 2
 
 
 def battery_current(params: Params, state: State) -> Float[Array, ""]:
-    """Current out of the battery, A: the power over the voltage, or U / R where the power is the highest."""
+    """Current out of the battery, A: power over voltage, or U / R at the maximum power."""
     power, resistance, voltage = (
         battery_power(params, state),
         _constants(params).resistance,
@@ -136,7 +136,7 @@ def battery_current(params: Params, state: State) -> Float[Array, ""]:
 def open_circuit_voltage(battery: Battery, charge: Float[Array, ""]) -> Float[Array, ""]:
     """Voltage of a battery at rest, V, at a charge in A s (Chen and Rincon-Mora 2006).
 
-    It falls to zero just below no charge, where also the current ends.
+    It falls to zero just below a charge of zero, and there the current also becomes zero.
     """
     share = charge / battery.capacity
     a, b, c, d = _CUBIC
@@ -146,7 +146,8 @@ def open_circuit_voltage(battery: Battery, charge: Float[Array, ""]) -> Float[Ar
 def charge_at(battery: Battery, voltage: Float[ArrayLike, ""]) -> Float[Array, ""]:
     """Charge of a battery at rest with this voltage, A s: for a flight that starts with a measured voltage.
 
-    Voltages beyond those of a full and of an empty battery give the charge of these. The derivative is exact between.
+    Voltages above that of a full and below that of an empty battery give the charges of these. In between, the
+    derivative is exact.
     """
     voltage = jnp.asarray(voltage, battery.capacity.dtype)
 
@@ -176,7 +177,7 @@ def _rate(params: Params, state: State, command: Float[Array, "4"]) -> dict[str,
 
 
 def _source(params: Params, state: State) -> Float[Array, ""]:
-    """Voltage behind the resistance, V."""
+    """Voltage before the resistance, V."""
     memory = state.aux["battery"]
     voltage = open_circuit_voltage(_constants(params), memory["charge"]) - memory["slow_drop"]
     return jnp.maximum(voltage, _SMALLEST_VOLTAGE)

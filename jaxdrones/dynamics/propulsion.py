@@ -1,4 +1,4 @@
-"""Motors that are commanded by PWM, and motors that fail."""
+"""Rotors with PWM commands, and rotors that fail."""
 
 import functools
 from collections.abc import Callable
@@ -21,19 +21,19 @@ from jaxdrones.vector import safe_sqrt
 Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
 
 FULL_PWM = 65535
-"""The command of a motor that is always on."""
+"""The PWM command of a motor that is always on."""
 
 
 class Motors(PyTreeNode):
-    """What turns PWM into thrust, `Params.aux["motors"]`; `crazyflie_motors` and `cubic_motors` make it."""
+    """Thrust curve of the motors, `Params.aux["motors"]`; `crazyflie_motors` and `cubic_motors` make it."""
 
     coefficients: Array
-    """(4,) of the thrust of one motor as a cubic of its voltage, N/V^0 to N/V^3."""
+    """(4,) coefficients of the thrust of one motor as a cubic of its voltage, N/V^0 to N/V^3."""
     supply: Array
-    """() V, where no battery is simulated."""
+    """() supply voltage if no battery is simulated, V."""
 
     def thrust(self, voltage: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Thrust of one motor at a mean voltage (V), N; none where the cubic is negative, at low voltage."""
+        """Thrust of one motor at a mean voltage (V), N; zero at low voltage, where the cubic is negative."""
         return jnp.maximum(thrust_at(self.coefficients, voltage), 0)
 
     def voltage(self, thrust: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -42,10 +42,10 @@ class Motors(PyTreeNode):
 
 
 def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
-    """Motors by the coefficients of their thrust curve.
+    """Motors with a cubic thrust curve.
 
     Args:
-        coefficients: (4,) of the powers 0 to 3 of the voltage, N/V^0 to N/V^3.
+        coefficients: (4,) coefficients of the powers 0 to 3 of the voltage, N/V^0 to N/V^3.
         supply: voltage where no battery is simulated, V.
 
     Raises:
@@ -81,12 +81,13 @@ def crazyflie_motors(propellers: str = "2.1+", supply: ArrayLike = 3.7) -> Motor
 def pwm_rotors(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
     """Rotors with a first-order lag whose command is the PWM of each motor, 0 to 65535.
 
-    The mean voltage of a motor is that share of the supply: of `battery()` under its load, or of the motors' `supply`
-    where this model is not among the step's. Thrust follows by the motors' cubic, and speed from thrust by `kf`.
+    The mean voltage of a motor is the fraction PWM / 65535 of the supply voltage, which is that of `battery()` under
+    load, or the motors' `supply` if the step does not have this model. The motors' cubic gives the thrust, and `kf` the
+    speed for this thrust.
 
     Args:
-        params: of the drone, with `Motors` in `aux["motors"]`.
-        state: of the drone.
+        params: parameters of the drone, with `Motors` in `aux["motors"]`.
+        state: state of the drone.
         command: (4,) PWM, limited to 0 .. 65535.
 
     Returns:
@@ -97,20 +98,20 @@ def pwm_rotors(params: Params, state: State, command: Float[Array, "4"]) -> tupl
 
 
 def pwm_of_thrust(params: Params, state: State, thrust: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The PWM with which `pwm_rotors` come to a thrust (4,) in N, limited to 0 .. 65535: battery compensation."""
+    """The PWM for which `pwm_rotors` reach a thrust (4,) in N, limited to 0 .. 65535: battery compensation."""
     return FULL_PWM * _duty(FULL_PWM * _motors(params).voltage(thrust) / supply_voltage(params, state))
 
 
 def supply_voltage(params: Params, state: State) -> Float[Array, ""]:
-    """Voltage that the motors get at full PWM, V."""
+    """Voltage of the motors at full PWM, V."""
     return battery_voltage(params, state) if "battery" in state.aux else _motors(params).supply
 
 
 def failing(rotors: Rotors) -> Rotors:
-    """Rotors that may fail: each takes the share `params.aux["rotor_health"]` (4,) of its command.
+    """Rotors that may fail: each gets the fraction `params.aux["rotor_health"]` (4,) of its command.
 
-    1 is sound, and a rotor of health 0 runs down and stays still. As any constant the health may be drawn for an
-    episode, change in flight, and have a gradient.
+    A rotor of health 1 is intact, and a rotor of health 0 slows down and stops. Like every parameter, the health may be
+    drawn for an episode, change in flight, and have a gradient.
 
     Args:
         rotors: `lagging_rotors`, `pwm_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
@@ -125,7 +126,7 @@ def failing(rotors: Rotors) -> Rotors:
 
 
 def _duty(pwm: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The share of the time in which a motor is on, with the derivative of a limit that a gradient finds back from."""
+    """Duty cycle, 0 to 1; at the limits themselves the derivative is not zero, so that a gradient can leave them."""
     return jnp.where(pwm < 0, 0, jnp.where(pwm > FULL_PWM, 1, pwm / FULL_PWM))
 
 

@@ -1,4 +1,4 @@
-"""Wind that depends on place and time."""
+"""Wind that depends on position and time."""
 
 import functools
 import inspect
@@ -14,7 +14,7 @@ from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
 WindField = Callable[..., Float[Array, "3"]]
-"""`(pos)` or `(pos, time)`, m and s -> velocity of the air there, m/s, world."""
+"""`(pos)` or `(pos, time)`, m and s -> wind velocity, m/s, world."""
 Effect = Callable[[Params, State], Wrench]
 
 
@@ -26,11 +26,11 @@ def clock() -> Model:
 
 
 def in_wind(field: WindField, effect: Effect) -> Effect:
-    """An effect in a wind field, which adds to `params.wind` where the drone is.
+    """An effect in a wind field, which is added to `params.wind` at the position of the drone.
 
     Args:
-        field: `(pos) -> wind` or `(pos, time) -> wind`, of one drone, (3,) m/s, world; the latter needs the model
-            `clock()` among the step's.
+        field: `(pos) -> wind` or `(pos, time) -> wind` for one drone, (3,) m/s, world; the latter needs the model
+            `clock()` in the step.
         effect: `(params, state) -> Wrench` that depends on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`.
 
     Raises:
@@ -59,13 +59,14 @@ def logarithmic_wind(
 ) -> Callable[[Float[Array, "3"]], Float[Array, "3"]]:
     """The mean wind over flat ground, which grows with the logarithm of the height (MIL-F-8785C, 3.7.3.1).
 
-    It is u ln(z / z_0) / ln(h / z_0) at the height z, and none below z_0.
+    It is u ln(z / z_0) / ln(h / z_0) at the height z, and zero below z_0.
 
     Args:
-        speed: u, m/s, at `height`.
-        height: h, m; 20 ft where left out.
-        roughness: z_0, m; 0.15 ft, which the specification has for take-off and landing, where left out (else 2 ft).
-        direction: that it blows to, rad from the x axis towards the y axis.
+        speed: wind speed u at `height`, m/s.
+        height: h, m; the default is 20 ft.
+        roughness: roughness length z_0, m; the default is 0.15 ft, which the specification has for take-off and landing
+            (2 ft otherwise).
+        direction: direction towards which the wind blows, rad from the x axis towards the y axis.
 
     Raises:
         ValueError: a height that is not above the roughness, or numbers that are not positive.
@@ -83,7 +84,7 @@ def logarithmic_wind(
 
 
 def _arguments(function: Callable) -> int:
-    """How many positional arguments a function has without defaults; one without a signature has one."""
+    """The number of positional arguments without defaults; 1 for a function without a signature."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Turbulence of the air near the ground, after Dryden (MIL-F-8785C, 3.7.2 and 3.7.3)."""
+"""Dryden turbulence near the ground (MIL-F-8785C, 3.7.2 and 3.7.3)."""
 
 import math
 
@@ -11,34 +11,34 @@ from jaxdrones.envs.randomize import DisturbanceWithMemory
 from jaxdrones.params import Params
 
 _FOOT = 0.3048  # m
-_LOWEST, _HIGHEST = 10 * _FOOT, 1000 * _FOOT  # m, of the specification's model at low altitude
-_ROUGHNESS, _REFERENCE = 0.15 * _FOOT, 20 * _FOOT  # m, of the specification's mean wind
+_LOWEST, _HIGHEST = 10 * _FOOT, 1000 * _FOOT  # m, range of the specification's low-altitude model
+_ROUGHNESS, _REFERENCE = 0.15 * _FOOT, 20 * _FOOT  # m, roughness length and reference height of the mean wind
 _SQRT3 = math.sqrt(3.0)
-_TERMS = 40  # of a series that is used up to 1
+_TERMS = 40  # terms of a series for arguments up to 1
 
 
 def dryden(speed: float, altitude: float = 6.096, airspeed: float | None = None) -> DisturbanceWithMemory:
     """Dryden turbulence at low altitude: gusts that are added to the wind with which an episode starts.
 
-    Along the mean wind (along x where there is none), across it and upwards the gusts of each drone, independent of
-    those of the others, have the spectra of MIL-F-8785C,
+    The gusts of each drone are independent of those of the others. Along the mean wind (along x without mean wind),
+    across it and upwards they have the spectra of MIL-F-8785C,
 
         u: s_u^2 (2 L_u / pi) / (1 + (L_u W)^2),  v, w: s^2 (L / pi) (1 + 3 (L W)^2) / (1 + (L W)^2)^2,
 
     over the spatial frequency W >= 0, rad/m, with L_w = h, L_u = L_v = h / (0.177 + 0.000823 h)^1.2 (h in feet),
     s_w = 0.1 W_20 and s_u = s_v = s_w / (0.177 + 0.000823 h)^0.4. The filters are discretized exactly, so that
-    intensities and spectra do not depend on the control rate, and an episode starts within the turbulence. Gusts of
-    rotation are left out: they matter for wings that are long beside L.
+    intensities and spectra do not depend on the control rate, and an episode starts with stationary turbulence.
+    Rotational gusts are not modeled: they matter for wings that are long compared with L.
 
-    It acts through the effects that depend on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`. The state of
-    the filters and the mean wind are in `params.aux["dryden"]`.
+    The turbulence acts through the effects that depend on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`. The
+    state of the filters and the mean wind are in `params.aux["dryden"]`.
 
     Args:
-        speed: W_20, that of the mean wind 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe. It sets
-            the intensity alone; the mean wind itself is `params.wind`.
+        speed: W_20, the mean wind speed 20 ft above the ground, m/s: 7.7 is light, 15.4 moderate, 23.1 severe. It only
+            sets the intensity; the mean wind itself is `params.wind`.
         altitude: h, m, 3.048 to 304.8.
-        airspeed: speed at which a drone meets the gusts, m/s. When left out, that of the specification's mean wind at
-            the altitude, as for a drone that hovers.
+        airspeed: speed at which a drone flies through the gusts, m/s. The default is the specification's mean wind
+            speed at the altitude, as for a drone that hovers.
 
     Raises:
         ValueError: a speed that is not positive, or an altitude out of range.
@@ -72,8 +72,8 @@ def scales(speed: float, altitude: float) -> dict[str, tuple[float, float]]:
     """Length scale (m) and intensity (m/s) of the gusts by axis, u along the mean wind, v across, w upwards.
 
     Args:
-        speed: of the mean wind at 20 ft, m/s.
-        altitude: m.
+        speed: mean wind speed at 20 ft, m/s.
+        altitude: altitude, m.
     """
     feet = altitude / _FOOT
     ratio = 0.177 + 0.000823 * feet
@@ -82,10 +82,13 @@ def scales(speed: float, altitude: float) -> dict[str, tuple[float, float]]:
 
 
 def _next(along: float, up: float, memory: dict[str, Array], noise: Float[Array, "5"]) -> dict[str, Array]:
-    """The filters' states after a step of that many time constants.
+    """The states of the filters after a step.
 
-    Of u the filter is 1 / (1 + s), of v and w a chain z1 = n / (1 + s), z2 = z1 / (1 + s); s in units of the time
-    constant. In a stationary wind u has the variance 1, z1 and z2 have 1/2 and 1/4, and their covariance is 1/4.
+    `along` and `up` are the step over the time constants of u and v, and of w.
+
+    The filter of u is 1 / (1 + s). The filters of v and w are a chain z1 = n / (1 + s), z2 = z1 / (1 + s). The unit of
+    1 / s is the time constant. In stationary turbulence u has the variance 1, z1 and z2 have 1/2 and 1/4, and their
+    covariance is 1/4.
     """
     n0, n1, n2, n3, n4 = noise
     kept = math.exp(-along)
@@ -99,15 +102,15 @@ def _next(along: float, up: float, memory: dict[str, Array], noise: Float[Array,
 
 
 def _decayed(z: Float[Array, "2"], step: float) -> Float[Array, "2"]:
-    """What is left of the states of a chain."""
+    """The decayed states of a chain after a step, without noise."""
     return math.exp(-step) * jnp.stack([z[0], z[1] + step * z[0]])
 
 
 def _correlated(n1: Float[Array, ""], n2: Float[Array, ""], step: float) -> Float[Array, "2"]:
-    """What white noise adds to the states of a chain in a step: two normal numbers by the root of its covariance.
+    """White noise of a step in the states of a chain: two normal numbers times the root of the covariance.
 
-    The covariance is the integral of exp(-2 s) (1, s; s, s^2) from 0 to the step; that of an infinite step is the
-    stationary one.
+    The covariance is the integral of exp(-2 s) (1, s; s, s^2) from 0 to the step; for an infinite step it is the
+    stationary covariance.
     """
     a, b, c = (_tail(k, 2 * step) * weight for k, weight in ((1, 1 / 2), (2, 1 / 4), (3, 1 / 4)))
     first = math.sqrt(a)
@@ -115,7 +118,7 @@ def _correlated(n1: Float[Array, ""], n2: Float[Array, ""], step: float) -> Floa
 
 
 def _shaped(z: Float[Array, "2"]) -> Float[Array, ""]:
-    """The output of (1 + sqrt(3) s) / (1 + s)^2, of variance 1."""
+    """The output of the filter (1 + sqrt(3) s) / (1 + s)^2, with variance 1."""
     return _SQRT3 * z[0] + (1 - _SQRT3) * z[1]
 
 

@@ -1,4 +1,4 @@
-"""Gains for a vehicle, by the gradient of the simulation on a battery of steps and curves."""
+"""Gains of a controller for a vehicle, by the gradient of the simulation through test flights."""
 
 from __future__ import annotations
 
@@ -35,53 +35,54 @@ _TUNED: dict[ModuleType, dict[str, int]] = {
     | {"rate_p": 1, "rate_i": 2, "rate_d": 0},
     mellinger: {"pos_p": 2, "pos_i": 3, "pos_d": 1, "attitude_p": 2, "attitude_i": 3, "rate_p": 1, "rate_d": 0},
 }
-"""Gains that are tuned, each with the power k of 1/s in its unit: a loop s times as fast has gains s^k times as large.
+"""Tuned gains, each with the power k of 1/s in its unit: a loop that is s times faster has gains s^k times as large.
 
-Limits, and what a controller believes of the vehicle, stay.
+Limits and the nominal vehicle parameters of a controller are not tuned.
 """
-_OUTER = ("pos", "vel")  # how the names of the gains of the outer loop begin; the others are of the inner one
-_OUTER_SPEEDS = (1.0, 0.6, 0.3)  # of the loops, times those of the start, from which the best is taken
+_OUTER = ("pos", "vel")  # prefixes of the gains of the outer loop; the other gains are of the inner loop
+_OUTER_SPEEDS = (1.0, 0.6, 0.3)  # tested loop speeds, times those of the start
 _INNER_SPEEDS = (2.0, 1.0, 0.5, 0.25)
 
-_SECONDS = 3.0  # of a flight whose gradient is followed
-_LONG = 8.0  # s, of a flight by which gains are judged in the end: what swings up slowly shows
-_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the way from the start to what was found, in logarithms
-_SMALL = 2e-3  # m; smaller distances count by their squares
-_CURVES = (("circle", 5.0), ("figure-eight", 4.0), ("lissajous", 7.0))  # s, period
-_SLUGGISH = 1.5  # times the lag of the rotors, of the other vehicle that flies the battery
-_HEAVY = 1.2  # times mass and inertia
-_LEARNING_RATE = 0.1  # of the logarithm of a gain, at the first iteration; zero after the last
-_WORSE = 0.5  # by which the error of a flight may be larger than at the start, if the mean is smaller
-_LEFT = 0.5  # weight of what is left of the distance in the last second
-_YAW = 0.2  # m per rad of heading, in the error of a flight
-_RATES = 2e-3  # m per (rad/s)^2
-_STEEPEST = 3.0  # length of the gradient of a flight
-_EFFORT = 1e-5  # m s^2, of the square of the rate of the rotor speeds over that of hover
+_SECONDS = 3.0  # s, duration of the flights for the gradient
+_EVALUATION_SECONDS = 8.0  # s, duration of the final evaluation, in which slow instabilities show
+_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the step from the start to the optimized gains, in logarithms
+_SMOOTHING = 2e-3  # m; below it the penalty on the distance is quadratic
+_CURVES = (("circle", 5.0), ("figure-eight", 4.0), ("lissajous", 7.0))  # period, s
+_LAG_FACTOR = 1.5  # rotor lag of the heavy vehicle over that of the vehicle
+_MASS_FACTOR = 1.2  # its mass and inertia over those of the vehicle
+_LEARNING_RATE = 0.1  # for the logarithm of a gain, at the first iteration; it decays to zero
+_MAX_DETERIORATION = 0.5  # tolerated increase of the error of a single flight
+_FINAL_WEIGHT = 0.5  # weight of the distance in the last second
+_HEADING_WEIGHT = 0.2  # m; of the heading error, in the error of a flight
+_RATE_WEIGHT = 2e-3  # m per (rad/s)^2
+_MAX_GRAD_NORM = 3.0  # largest norm of the gradient of a flight
+_EFFORT_WEIGHT = 1e-5  # m s^2; of the squared rate of the rotor speeds over hover speed
 
 
 def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500, iterations: int = 40) -> Any:
-    """Gains with which a controller flies a vehicle well: steps, a turn, a tilted start and three curves.
+    """Tuned gains of a controller for a vehicle, in steps, a turn, a tilted start and three curves.
 
-    It starts twice, from the controller's own gains, scaled to the vehicle, and from those with faster or slower loops
-    that fly best, and follows the gradient of the mean error through flights of 3 s with drag: of the vehicle, of one
-    with rotors that follow at once, and of one that is a fifth heavier and whose rotors lag by half more. The
-    gains found, and those a quarter, half and three quarters of the way to them, then fly 8 s. What comes back flew
-    best, no flight much worse than at the start, which it may be. A second vehicle needs no second compilation.
+    The optimization starts from two sets of gains: the controller's own, scaled to the vehicle, and the best of several
+    sets with faster or slower loops. It follows the gradient of the mean error of flights of 3 s with drag, which three
+    vehicles fly: the vehicle itself, one with instant rotors, and one with a fifth more mass and inertia and with
+    rotors that lag by half more. The optimized gains, and those a quarter, half and three quarters of the way from the
+    start to them, are then evaluated in flights of 8 s. The result is the best set with no flight much worse than at
+    the start; it may be the start itself. A second vehicle needs no second compilation.
 
     Args:
-        params: of one drone.
-        controller: a name of `jaxdrones.control.CONTROLLERS`, or its module; but for `mrac`, which adapts by itself.
-        control_hz: calls of the controller per second, at which the gains will be used, or at a higher rate.
-        iterations: of Adam.
+        params: parameters of one drone.
+        controller: a name of `jaxdrones.control.CONTROLLERS`, or its module; not `mrac`, which adapts its own gains.
+        control_hz: calls of the controller per second; use the gains at this rate or a higher one.
+        iterations: number of iterations of Adam.
 
     Returns:
-        Gains of the controller's kind.
+        Gains for the `control` of the controller.
 
     Raises:
         ValueError: an unknown controller, one without gains to tune, one that cannot fly the vehicle, or parameters of
             a team.
     """
-    module = _with_gains(controller)
+    module = _tunable(controller)
     check_params(params)
     check_shape("params.mass", params.mass, (), "tune takes the parameters of a single drone")
     check_whole("control_hz", control_hz, 100)
@@ -93,7 +94,7 @@ def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500,
 
 
 def start(module: ModuleType, params: Params) -> Any:
-    """The gains of a controller, in units of the vehicle, from which `tune` starts."""
+    """The gains from which `tune` starts: those of the controller, scaled to the vehicle."""
     if module in (firmware_pid, mellinger):
         return module.gains(params)
     if module is pid and not pid.fits(params):
@@ -107,7 +108,7 @@ def start(module: ModuleType, params: Params) -> Any:
     return gains.replace(**{name: getattr(gains, name) * scale for name, scale in scales.items()})
 
 
-def _with_gains(controller: str | ModuleType) -> ModuleType:
+def _tunable(controller: str | ModuleType) -> ModuleType:
     """The module of a controller that can be tuned."""
     if isinstance(controller, str):
         check_choice("controller", controller, control.CONTROLLERS)
@@ -124,7 +125,7 @@ def _name(module: Any) -> str:
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _descend(module: ModuleType, hz: int, iterations: int, params: Params, start: Any) -> tuple[Any, Float[Array, ""]]:
-    """The best gains on two ways down, from the start and from its best speeds of the loops, and their long error."""
+    """The best gains of two descents, from the start and from its best loop speeds, and their evaluated error."""
 
     def gains_of(logarithms: dict[str, Array]) -> Any:
         return start.replace(**{name: getattr(start, name) * jnp.exp(x) for name, x in logarithms.items()})
@@ -148,7 +149,7 @@ def _descend(module: ModuleType, hz: int, iterations: int, params: Params, start
         at, memory, best, lowest = carry
         (_, value), gradients = jax.value_and_grad(errors, has_aux=True)(each_flight(at))
         best = jax.tree.map(lambda x, y: jnp.where(value < lowest, x, y), at, best)
-        gradient = jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.vmap(_limited)(gradients))
+        gradient = jax.tree.map(lambda x: jnp.mean(x, axis=0), jax.vmap(_clipped)(gradients))
         change, memory = optimizer.update(gradient, memory)
         return (optax.apply_updates(at, change), memory, best, jnp.minimum(value, lowest)), None
 
@@ -156,44 +157,47 @@ def _descend(module: ModuleType, hz: int, iterations: int, params: Params, start
         carry = (at, optimizer.init(at), at, jnp.full((), jnp.inf, params.mass.dtype))
         return jax.lax.scan(advance, carry, length=iterations)[0][2:]
 
-    flights, flown = _battery(module, params, hz, _SECONDS)
+    flights, flown = _test_flights(module, params, hz, _SECONDS)
     optimizer = optax.adam(optax.cosine_decay_schedule(_LEARNING_RATE, iterations))
     speeds = jnp.meshgrid(jnp.asarray(_OUTER_SPEEDS, float), jnp.asarray(_INNER_SPEEDS, float))
     starts = jax.vmap(with_speeds)(*(x.ravel() for x in speeds))
-    tried = jax.vmap(lambda at: errors(each_flight(at))[1])(starts)
-    two = jax.tree.map(lambda x: jnp.stack([jnp.zeros_like(x[0]), x[jnp.argmin(tried)]]), starts)
+    errors_of_starts = jax.vmap(lambda at: errors(each_flight(at))[1])(starts)
+    two = jax.tree.map(lambda x: jnp.stack([jnp.zeros_like(x[0]), x[jnp.argmin(errors_of_starts)]]), starts)
     found, _ = jax.vmap(descend)(two)
-    shares = jnp.asarray(_SHARES, float)
-    ways = jax.tree.map(lambda x: jnp.concatenate([share * x for share in shares]), found)
-    _, flown_long = _battery(module, params, hz, _LONG)
-    judged = _judged(jax.vmap(lambda at: flown_long(jax.vmap(gains_of)(each_flight(at))))(ways))
-    return gains_of(jax.tree.map(lambda x: x[jnp.argmin(judged)], ways)), jnp.min(judged)
+    shares = jnp.asarray(_FRACTIONS, float)
+    candidates = jax.tree.map(lambda x: jnp.concatenate([share * x for share in shares]), found)
+    _, evaluate = _test_flights(module, params, hz, _EVALUATION_SECONDS)
+    costs = _costs(jax.vmap(lambda at: evaluate(jax.vmap(gains_of)(each_flight(at))))(candidates))
+    return gains_of(jax.tree.map(lambda x: x[jnp.argmin(costs)], candidates)), jnp.min(costs)
 
 
-def _judged(errors: Float[Array, "gains flights"]) -> Float[Array, " gains"]:
-    """Mean error, and by how much one is larger than with the first gains and `_WORSE`; infinite where one breaks."""
+def _costs(errors: Float[Array, "gains flights"]) -> Float[Array, " gains"]:
+    """Mean error plus the largest deterioration beyond `_MAX_DETERIORATION`; infinite if a flight diverges.
+
+    The deterioration of a flight is measured against the first gains.
+    """
     first = jnp.where(jnp.isfinite(errors[:1]), errors[:1], jnp.inf)
-    value = jnp.mean(errors, axis=-1) + jnp.max(jnp.maximum(errors - first - _WORSE, 0), axis=-1)
+    value = jnp.mean(errors, axis=-1) + jnp.max(jnp.maximum(errors - first - _MAX_DETERIORATION, 0), axis=-1)
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
 
-def _limited(gradient: dict[str, Array]) -> dict[str, Array]:
-    """The gradient of a flight, not longer than `_STEEPEST`; zero where it is not finite, as of one that tumbles."""
+def _clipped(gradient: dict[str, Array]) -> dict[str, Array]:
+    """The gradient of a flight, clipped to `_MAX_GRAD_NORM`; zero if it is not finite, as in a tumbling flight."""
     length = optax.tree.norm(gradient)
-    share = jnp.minimum(1, _STEEPEST / jnp.maximum(length, _STEEPEST))
+    share = jnp.minimum(1, _MAX_GRAD_NORM / jnp.maximum(length, _MAX_GRAD_NORM))
     return jax.tree.map(lambda x: jnp.where(jnp.isfinite(length), share * x, 0), gradient)
 
 
-def _battery(
+def _test_flights(
     module: ModuleType, params: Params, hz: int, seconds: float
 ) -> tuple[int, Callable[[Any], Float[Array, " flights"]]]:
-    """How many flights there are, and the function from gains, those of each flight, to the errors of the flights."""
+    """The number of flights, and the function from the gains of each flight to the errors of the flights."""
 
     def lagging(times: float) -> Params:
         names = ("rotor_rise_time", "rotor_fall_time")
         return params.replace(**{name: jnp.maximum(times * getattr(params, name), 1 / hz) for name in names})
 
-    slow = lagging(_SLUGGISH).replace(mass=_HEAVY * params.mass, inertia=_HEAVY * params.inertia)
+    slow = lagging(_LAG_FACTOR).replace(mass=_MASS_FACTOR * params.mass, inertia=_MASS_FACTOR * params.inertia)
     vehicles = (lagging(0), lagging(1), slow)
     start, targets = _starts_and_targets(params, hz, seconds)
     each = len(start.pos)
@@ -215,15 +219,15 @@ def _battery(
 
 
 def _error(params: Params, hz: int, flown: State, targets: Setpoint) -> Float[Array, " flights"]:
-    """The logarithms of the errors, m: distance, heading, body rates, and how fast the rotors change; and the end."""
-    distance = safe_sqrt(jnp.sum((flown.pos - targets.pos) ** 2, axis=-1) + _SMALL**2)
+    """Logarithm of the error of each flight: distance, heading, body rates, rotor accelerations, final distance."""
+    distance = safe_sqrt(jnp.sum((flown.pos - targets.pos) ** 2, axis=-1) + _SMOOTHING**2)
     x = jax.vmap(jax.vmap(lambda quat: rotation.axes(quat)[0]))(flown.quat)
     heading = 1 - (x[..., 0] * jnp.cos(targets.yaw) + x[..., 1] * jnp.sin(targets.yaw))
     effort = jnp.diff(flown.rpm, axis=0) * (hz / params.hover_rpm)
-    error = jnp.mean(distance, axis=0) + _YAW * jnp.mean(heading, axis=0)
-    error = error + _RATES * jnp.mean(jnp.sum(flown.omega**2, axis=-1), axis=0)
-    error = error + _EFFORT * jnp.mean(jnp.mean(effort**2, axis=-1), axis=0)
-    return jnp.log(error) + _LEFT * jnp.log(jnp.mean(distance[-hz:], axis=0))
+    error = jnp.mean(distance, axis=0) + _HEADING_WEIGHT * jnp.mean(heading, axis=0)
+    error = error + _RATE_WEIGHT * jnp.mean(jnp.sum(flown.omega**2, axis=-1), axis=0)
+    error = error + _EFFORT_WEIGHT * jnp.mean(jnp.mean(effort**2, axis=-1), axis=0)
+    return jnp.log(error) + _FINAL_WEIGHT * jnp.log(jnp.mean(distance[-hz:], axis=0))
 
 
 def _starts_and_targets(params: Params, hz: int, seconds: float) -> tuple[State, Setpoint]:
@@ -239,7 +243,8 @@ def _starts_and_targets(params: Params, hz: int, seconds: float) -> tuple[State,
 
     targets = jax.vmap(all_at)(jnp.arange(1, round(seconds * hz) + 1) / hz)
     first = all_at(jnp.zeros(()))
-    steps = jnp.array([[0.5, 0.2, 0.0], [-1.0, 0.6, 0.5], [0.0, 0.0, 0.5]])  # m; not along arms, which couples the axes
+    # The steps, m, are not along the arms, so that the axes are coupled.
+    steps = jnp.array([[0.5, 0.2, 0.0], [-1.0, 0.6, 0.5], [0.0, 0.0, 0.5]])
     aside = jnp.concatenate([steps, jnp.zeros((2, 3)), first.pos[5:]])
     turned = jnp.zeros((8, 3)).at[3, 2].set(1.0).at[4, 0].set(0.6).at[4, 1].set(0.4)  # rad
     start = State(

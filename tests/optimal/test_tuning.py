@@ -44,9 +44,9 @@ def errors(controller, params, gains):
     return off(lambda t: jnp.zeros(3) * t, jnp.array([0.4, -0.3, 0.3])), off(curve, jnp.zeros(3))
 
 
-def of_battery(module, params, *gains):
-    """The mean errors of the flights by which gains are judged."""
-    flights, flown = tuning._battery(module, params, FEW["control_hz"], tuning._LONG)
+def of_test_flights(module, params, *gains):
+    """The mean errors of the flights by which gains are costs."""
+    flights, flown = tuning._test_flights(module, params, FEW["control_hz"], tuning._EVALUATION_SECONDS)
     error = jax.jit(lambda each: jnp.mean(flown(each)))
     return [float(error(jax.tree.map(lambda x: jnp.broadcast_to(x, (flights, *x.shape)), one))) for one in gains]
 
@@ -76,7 +76,7 @@ def test_a_few_iterations_lower_the_error_and_a_second_vehicle_compiles_nothing(
     racer, hb = (jaxdrones.load_params(vehicle) for vehicle in ("racer", "hb"))
     tuned = tune(racer, "rates", **FEW)
     compiled = tuning._descend._cache_size()
-    before, after = of_battery(rates, racer, rates.gains(), tuned)
+    before, after = of_test_flights(rates, racer, rates.gains(), tuned)
     assert after < before - 0.1
     for_hb = tune(hb, rates, **FEW)  # by its module
     assert tuning._descend._cache_size() == compiled
@@ -84,20 +84,20 @@ def test_a_few_iterations_lower_the_error_and_a_second_vehicle_compiles_nothing(
 
 
 def test_no_gradient_of_a_flight_is_longer_than_the_limit_and_broken_ones_do_not_count():
-    steep = tuning._limited({"pos": jnp.array([3e5, 4e5]), "vel": jnp.zeros(2)})
-    np.testing.assert_allclose(steep["pos"], [0.6 * tuning._STEEPEST, 0.8 * tuning._STEEPEST], rtol=1e-6)
+    steep = tuning._clipped({"pos": jnp.array([3e5, 4e5]), "vel": jnp.zeros(2)})
+    np.testing.assert_allclose(steep["pos"], [0.6 * tuning._MAX_GRAD_NORM, 0.8 * tuning._MAX_GRAD_NORM], rtol=1e-6)
     gentle = {"pos": jnp.array([0.3, 0.4])}
-    np.testing.assert_array_equal(tuning._limited(gentle)["pos"], gentle["pos"])
+    np.testing.assert_array_equal(tuning._clipped(gentle)["pos"], gentle["pos"])
     for broken in jnp.nan, jnp.inf:
-        assert not np.any(tuning._limited({"pos": jnp.array([broken, 1.0]), "vel": jnp.ones(2)})["vel"])
+        assert not np.any(tuning._clipped({"pos": jnp.array([broken, 1.0]), "vel": jnp.ones(2)})["vel"])
 
 
 def test_gains_with_which_one_flight_becomes_much_worse_are_not_the_best():
     start, better, lost, broken = [-3.0, -3.0], [-3.5, -2.9], [-9.0, 3.5], [-9.0, jnp.nan]
-    judged = np.asarray(tuning._judged(jnp.array([start, better, lost, broken])))
-    np.testing.assert_allclose(judged[:3], [-3.0, -3.2, 3.25])
-    assert np.isinf(judged[3]) and np.argmin(judged) == 1
-    assert np.argmin(tuning._judged(jnp.array([[-3.0, jnp.inf], [-2.0, 4.0]]))) == 1  # the start itself breaks
+    costs = np.asarray(tuning._costs(jnp.array([start, better, lost, broken])))
+    np.testing.assert_allclose(costs[:3], [-3.0, -3.2, 3.25])
+    assert np.isinf(costs[3]) and np.argmin(costs) == 1
+    assert np.argmin(tuning._costs(jnp.array([[-3.0, jnp.inf], [-2.0, 4.0]]))) == 1  # the start itself breaks
 
 
 def test_what_cannot_be_tuned_is_refused():

@@ -24,7 +24,7 @@ from jaxdrones.state import State
 
 _GRAVITY = 9.81  # m/s^2
 _MAX_TORQUE = 32000.0  # 16 bit
-_MASSES = {"2.1": 0.029, "2.1+": 0.029, "thrust upgrade kit": 0.0325}  # kg, according to the firmware
+_MASSES = {"2.1": 0.029, "2.1+": 0.029, "thrust upgrade": 0.0325}  # kg, according to the firmware
 
 
 class Gains(PyTreeNode):

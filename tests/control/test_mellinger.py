@@ -11,7 +11,7 @@ from helpers import VEHICLES
 
 import jaxdrones
 from jaxdrones import State, rotation
-from jaxdrones.control import Setpoint, firmware_pid, for_team, mellinger
+from jaxdrones.control import Setpoint, firmware_motors, firmware_pid, for_team, mellinger
 from jaxdrones.tasks.curves import setpoint_on
 
 DT = 0.002
@@ -46,6 +46,13 @@ def test_every_vehicle_comes_to_its_place_and_heading(placed, i):
     assert np.max(off[-500:]) < 0.03  # m; the integrator of the weight is slow
     assert np.max(np.abs(yaw[-500:] - 0.4)) < 0.01
     assert np.max(np.std(placed.rpm[-500:, i], axis=0)) < 5e-3 * np.mean(placed.rpm[-500:, i])
+
+
+@pytest.mark.parametrize("propellers", firmware_motors.PROPELLERS)
+def test_it_knows_the_mass_of_the_vehicle_with_each_kind_of_propellers(propellers):
+    gains = mellinger.gains(propellers=propellers)
+    assert 0.025 < gains.mass < 0.035  # kg
+    np.testing.assert_allclose(gains.weight, 9.81 * gains.mass)
 
 
 @pytest.mark.slow

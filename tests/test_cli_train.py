@@ -300,6 +300,7 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
         (["eval", "file"], "file/best.json cannot be read: Not a directory"),
         (["eval", "nowhere", "--seed", "-1"], "seed is -1"),
         (["eval", "nowhere", "--episodes", "1000000000000"], "episodes is 1000000000000"),
+        (["eval", "nowhere", "--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["train", "hover", "--output", "file"], "choose another --output"),
         (["eval", "nowhere"], "no checkpoint at nowhere/best"),
         (["fly", "--policy", "nowhere"], "no checkpoint at nowhere/best"),
@@ -355,8 +356,24 @@ def test_eval_prints_one_object(trained, capsys):
     assert main(["eval", str(folder), "--episodes", "8", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["evaluation"]["episodes"] == 8 and printed["recipe"]["task"] == "hover"
+    assert printed["backend"] == "explicit"
     assert printed["evaluation"]["successes"] == 0
     assert set(printed["evaluation"]["final_error_percentiles"]) == {"50", "95", "99"}
+
+
+@pytest.mark.slow
+@pytest.mark.needs("pybullet")
+def test_a_policy_is_evaluated_from_the_same_starts_on_either_backend(trained, capsys):
+    folder, _ = trained
+    reports = []
+    for backend in ("explicit", "bullet"):
+        assert main(["eval", str(folder), "--episodes", "2", "--backend", backend, "--json"]) == 0
+        printed = json.loads(capsys.readouterr().out)
+        assert printed["backend"] == backend
+        reports.append(printed["evaluation"])
+    assert reports[0]["mean_return"] == pytest.approx(reports[1]["mean_return"], rel=1e-2)  # in free flight
+    assert main(["eval", str(folder), "--episodes", "1", "--backend", "bullet"]) == 0
+    assert "on the bullet backend" in capsys.readouterr().out
 
 
 @pytest.mark.slow

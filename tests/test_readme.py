@@ -108,6 +108,9 @@ TRAININGS = {
     "train hover --resume --budget 100": Short("updates: 102, 2 of them made ... " + TRAINED.split(" ... ", 1)[1]),
     "train hover --overwrite": Short(TRAINED, TRAINING),
     "eval runs/hover --episodes 10000 --json": Short('"run": "runs/hover" ... "episodes": 8', "--episodes 8"),
+    "eval runs/hover --episodes 100 --backend bullet": Short(
+        "hover by bptt: policy of update .* on the bullet backend ... success", "--episodes 2", BULLET
+    ),
     "fly --policy runs/hover": Short(f"hover by bptt, policy of runs/hover ... {LOGGED}"),
     "fly --policy runs/hover --backend bullet --video hover.mp4": Short(
         "hover by bptt, policy of runs/hover, on Bullet ... wrote .*hover.mp4", needs=FILM

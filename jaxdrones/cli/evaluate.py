@@ -1,12 +1,15 @@
 """`jaxdrones eval`."""
 
 import argparse
+import functools
 import math
 from typing import Any
 
+from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, folder
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.settings import add_realistic, asked_settings
+from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.training.presets import realism
 
 _FIRST_SEED = 1_000_000  # so that episodes differ from those of the training
@@ -37,6 +40,7 @@ def add(commands) -> None:
         metavar="NAME=VALUE",
         help="with file.py:name: option of the environment (action, observation, drones, ...)",
     )
+    parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
     parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
     parser.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
     parser.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
@@ -53,21 +57,22 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     check_at_most("episodes", options.episodes, LARGEST_COUNT)
     check_seed("seed", options.seed)
+    check_choice("backend", options.backend, BACKENDS)
     run = open_policy(options.policy, options.task, options.realistic, asked_settings(options))
-    about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed}
+    about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed, "backend": options.backend}
     if is_user_policy(options.policy):
-        recipe = run.recipe()
-        env = recipe.env()
-        policy = run.policy(env)
+        recipe, make_policy = run.recipe(), run.policy
         title = described(recipe)
     else:
         name = "last" if options.last else "best"
         recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
-        env = recipe.env()
-        policy = run.policy(name, env)
+        make_policy = functools.partial(run.policy, name)
         title = f"{described(recipe)}: policy of update {update}"
         about |= {"policy": name, "update": update}
-    report = report_as_dict(evaluate(env, policy, jax.random.key(_FIRST_SEED + options.seed), options.episodes))
+    title += f", on the {options.backend} backend" * (options.backend != "explicit")
+    key = jax.random.key(_FIRST_SEED + options.seed)
+    with recipe.env(backend=options.backend) as env:
+        report = report_as_dict(evaluate(env, make_policy(env), key, options.episodes))
     if options.json:
         print(as_json(about | {"recipe": recipe.as_dict(), "evaluation": report}))
     else:

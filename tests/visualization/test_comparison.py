@@ -1,6 +1,5 @@
 """A comparison shows every flight, and says what every line is."""
 
-import contextlib
 import dataclasses
 import json
 
@@ -8,31 +7,9 @@ import numpy as np
 import pytest
 
 from jaxdrones.cli import main
-from jaxdrones.flights.fly import fly
 from jaxdrones.flights.record import Record
 from jaxdrones.visualization import comparison, style
 from jaxdrones.visualization.palette import colors
-
-
-@pytest.fixture(scope="module")
-def record():
-    return fly("circle", drones=2, duration=0.5)
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """The figures that are drawn in a test."""
-    drawn = []
-    original = style.figure
-
-    @contextlib.contextmanager
-    def kept(width, height):
-        with original(width, height) as figure:
-            drawn.append(figure)
-            yield figure
-
-    monkeypatch.setattr(style, "figure", kept)
-    return drawn
 
 
 def moved(record, by):

@@ -1,35 +1,12 @@
-import contextlib
 import dataclasses
 
 import numpy as np
 import pytest
 from helpers import mostly_slow
 
-from jaxdrones.flights.fly import fly
 from jaxdrones.sensing import Box, Cylinder, Scene, Sphere
 from jaxdrones.visualization import paths, plots, style
 from jaxdrones.visualization.palette import colors
-
-
-@pytest.fixture(scope="module")
-def record():
-    return fly("circle", drones=2, duration=0.5)
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """The figures that are drawn in a test."""
-    drawn = []
-    original = style.figure
-
-    @contextlib.contextmanager
-    def kept(width, height):
-        with original(width, height) as figure:
-            drawn.append(figure)
-            yield figure
-
-    monkeypatch.setattr(style, "figure", kept)
-    return drawn
 
 
 def test_every_quantity_of_the_state_has_a_panel(record):

@@ -50,5 +50,6 @@ def save_paths(results: Sequence[ClosedLoopResult], path: Path) -> None:
             axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=result.flight.removesuffix(".npz"))
         for axis in axes[len(results) :]:
             axis.set_axis_off()
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        entries_in_a_row = 1 if columns == 1 else 3  # all three are wider than one panel
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=entries_in_a_row)
         figure.savefig(path)

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.errors import UserError
+
 _SMALLEST = np.finfo(np.float64).tiny
 _LONGEST = 120  # characters of a value in an error
 _UNIT_LENGTH = 1e-3  # by which the length of a unit quaternion may be off; float32 and integrators stay far below
@@ -53,7 +55,7 @@ def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: st
     )
     if not fits:
         wanted = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
-        raise ValueError(f"{name} has shape {given}; expected {wanted}: {meaning}")
+        raise UserError(f"{name} has shape {given}; expected {wanted}: {meaning}")
 
 
 def check_finite(name: str, tree: Any) -> None:
@@ -61,7 +63,7 @@ def check_finite(name: str, tree: Any) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if is_known(leaf) and not np.all(np.isfinite(leaf)):
             where = name + jax.tree_util.keystr(path)
-            raise ValueError(f"{where} is not finite: {shown(leaf)}; give finite numbers")
+            raise UserError(f"{where} is not finite: {shown(leaf)}; give finite numbers")
 
 
 def check_number(
@@ -95,7 +97,7 @@ def check_number(
         words = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items())
         wanted = {"": "a finite number", "above 0": "a positive number"}.get(words, f"a number of {words}")
         wanted = wanted.replace("number of above", "number above").replace("number of below", "number below")
-        raise ValueError(f"{name} is {shown(value)}; give {wanted}" + (f" ({unit})" if unit else ""))
+        raise UserError(f"{name} is {shown(value)}; give {wanted}" + (f" ({unit})" if unit else ""))
 
 
 def _is_number(value: Any) -> bool:
@@ -127,20 +129,20 @@ def check_whole(name: str, value: int, minimum: int = 1) -> None:
     except TypeError:
         whole = False
     if not whole:
-        raise ValueError(f"{name} is {shown(value)}; give a whole number of at least {minimum}")
+        raise UserError(f"{name} is {shown(value)}; give a whole number of at least {minimum}")
 
 
 def check_switch(name: str, value: bool | str, others: tuple[str, ...] = ()) -> None:
     """Raise unless `value` is true or false, or one of the `others`."""
     if not isinstance(value, bool | np.bool_) and not (isinstance(value, str) and value in others):
-        raise ValueError(f"{name} is {shown(value)}; give {' or '.join(['True', 'False', *map(repr, others)])}")
+        raise UserError(f"{name} is {shown(value)}; give {' or '.join(['True', 'False', *map(repr, others)])}")
 
 
 def check_choice(kind: str, name: str, known: Iterable[str]) -> None:
     """Raise unless `name` is one of the `known` names."""
     known = sorted(known)
     if name not in known:
-        raise ValueError(f"unknown {kind} {name!r}{hint(name, known)} (known: {', '.join(known)})")
+        raise UserError(f"unknown {kind} {name!r}{hint(name, known)} (known: {', '.join(known)})")
 
 
 def check_keyword(function: str, keyword: str, known: Iterable[str]) -> None:
@@ -160,14 +162,14 @@ def hint(name: str, known: Iterable[str]) -> str:
 def check_sequence(name: str, value: Any, example: str) -> tuple:
     """The entries of a sequence, or an error if something single stands in its place."""
     if isinstance(value, str) or callable(value) or not isinstance(value, Iterable):
-        raise ValueError(f"{name} is {shown(value)}; give a sequence, for example ({example},)")
+        raise UserError(f"{name} is {shown(value)}; give a sequence, for example ({example},)")
     return tuple(value)
 
 
 def check_callable(name: str, value: Any, example: str) -> None:
     """Raise unless `value` is a function."""
     if not callable(value):
-        raise ValueError(f"{name}: {shown(value)} is not a function; give for example {example}")
+        raise UserError(f"{name}: {shown(value)} is not a function; give for example {example}")
 
 
 def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], hint: str = "") -> None:
@@ -181,7 +183,7 @@ def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], h
     except TypeError:
         called = getattr(function, "__name__", repr(function))
         wanted = f"give a function of ({', '.join(arguments)})"
-        raise ValueError(f"{name}: {called} takes {signature}; {wanted}{hint}") from None
+        raise UserError(f"{name}: {called} takes {signature}; {wanted}{hint}") from None
 
 
 def takes_scene(function: Callable) -> bool:
@@ -218,7 +220,7 @@ def check_arrays(name: str, tree: Any) -> None:
     """
     for field, leaf in vars(tree).items():
         if field != "aux" and isinstance(leaf, _NO_ARRAYS):
-            raise ValueError(f"{name}.{field} is {shown(leaf)}; give an array, for example with jax.numpy.array(...)")
+            raise UserError(f"{name}.{field} is {shown(leaf)}; give an array, for example with jax.numpy.array(...)")
 
 
 def check_params(params: Any, finite: bool = True) -> None:
@@ -238,7 +240,7 @@ def check_params(params: Any, finite: bool = True) -> None:
         for name in names:
             leaf = constants[name]
             if is_known(leaf) and not (np.asarray(leaf) > bound).all():
-                raise ValueError(f"params.{name} is {shown(leaf)}; give {words}")
+                raise UserError(f"params.{name} is {shown(leaf)}; give {words}")
 
 
 def _without_infinity(leaf: Any) -> Any:
@@ -254,20 +256,20 @@ def check_quaternion(name: str, quat: Any) -> None:
     off = ~(np.abs(length - 1) <= _UNIT_LENGTH)
     if off.any():
         given, length = quat[off][0].tolist(), np.atleast_1d(length[off])[0]
-        raise ValueError(f"{name} has length {length:g}: {given}; give a unit quaternion (x, y, z, w)")
+        raise UserError(f"{name} has length {length:g}: {given}; give a unit quaternion (x, y, z, w)")
 
 
 def check_key(name: str, key: Any) -> None:
     """Raise unless `key` is one random key, typed or raw; what is traced has a shape, too."""
     example = "give a random key, for example jax.random.key(0)"
     if not isinstance(key, jax.Array | np.ndarray):
-        raise ValueError(f"{name} is {shown(key)}; {example}")
+        raise UserError(f"{name} is {shown(key)}; {example}")
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     one = () if typed else _raw_key_shape()
     if not typed and (key.dtype != np.uint32 or key.shape[key.ndim - len(one) :] != one):
-        raise ValueError(f"{name} is an array of {key.dtype} and shape {key.shape}; {example}")
+        raise UserError(f"{name} is an array of {key.dtype} and shape {key.shape}; {example}")
     if key.shape != one:
-        raise ValueError(f"{name} has shape {key.shape}; give one key, and use jax.vmap for many")
+        raise UserError(f"{name} has shape {key.shape}; give one key, and use jax.vmap for many")
 
 
 def _raw_key_shape() -> tuple[int, ...]:

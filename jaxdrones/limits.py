@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from jaxdrones.checks import check_whole
+from jaxdrones.errors import UserError
 
 LARGEST_SEED = 2**31 - 1
 """JAX would use only 32 bits of a larger one, so that two seeds could mean the same."""
@@ -23,7 +24,7 @@ def check_at_most(name: str, value: int, most: int, minimum: int = 1) -> None:
     """Raise unless `value` is an integer from `minimum` to `most`."""
     check_whole(name, value, minimum)
     if value > most:
-        raise ValueError(f"{name} is {str(value)[:30]}; give at most {most}")
+        raise UserError(f"{name} is {str(value)[:30]}; give at most {most}")
 
 
 def check_memory(what: str, size: int, advice: str) -> None:
@@ -36,7 +37,7 @@ def check_memory(what: str, size: int, advice: str) -> None:
     """
     held = memory()
     if size > held:
-        raise ValueError(f"{what} needs about {_readable(size)} of memory, there are {_readable(held)}; {advice}")
+        raise UserError(f"{what} needs about {_readable(size)} of memory, there are {_readable(held)}; {advice}")
 
 
 def memory() -> int:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones.checks import check_params, check_shape, check_whole, shown
+from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 
 
@@ -133,6 +134,6 @@ def repeat(params: Params, n: int) -> Params:
 
 def _check_single(name: str, params: Params, meaning: str) -> None:
     if not isinstance(params, Params):
-        raise ValueError(f"{shown(params)} is given; {meaning}, for example of jaxdrones.load_params")
+        raise UserError(f"{shown(params)} is given; {meaning}, for example of jaxdrones.load_params")
     check_params(params)
     check_shape(name, params.mass, (), meaning)

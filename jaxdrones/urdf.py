@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxdrones import assets
 from jaxdrones.checks import check_choice, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 
 GRAVITY = 9.8  # m/s^2, as in gym-pybullet-drones
@@ -72,7 +73,7 @@ def load_params(vehicle: str | os.PathLike) -> Params:
         ValueError: an unknown vehicle, or a URDF that lacks something or holds nonsense; says what.
     """
     if not isinstance(vehicle, str | os.PathLike):
-        raise ValueError(f"vehicle is {shown(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
+        raise UserError(f"vehicle is {shown(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
     path = Path(vehicle)
     if path.suffix != ".urdf":
         check_choice("vehicle", str(vehicle), assets.vehicles())
@@ -124,7 +125,7 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
 
     def demand(condition, problem: str, remedy: str) -> None:
         if not condition:
-            raise ValueError(f"{file}: {problem}; {remedy}")
+            raise UserError(f"{file}: {problem}; {remedy}")
 
     demand(
         thrust2weight > 1,
@@ -185,26 +186,26 @@ class _Urdf:
         try:
             self._root = ET.fromstring(path.read_bytes() if content is None else content)
         except OSError as error:
-            raise ValueError(f"{path}: cannot be read ({error.strerror}); give the path of a URDF file") from None
+            raise UserError(f"{path}: cannot be read ({error.strerror}); give the path of a URDF file") from None
         except ET.ParseError as error:
-            raise ValueError(f"{path}: is not well-formed XML ({error}); mend the file") from None
+            raise UserError(f"{path}: is not well-formed XML ({error}); mend the file") from None
         except (LookupError, ValueError) as error:  # of its encoding, or of its name
-            raise ValueError(f"{shown(str(path))[1:-1]}: cannot be read ({error}); save it as UTF-8") from None
+            raise UserError(f"{shown(str(path))[1:-1]}: cannot be read ({error}); save it as UTF-8") from None
         if self._root.tag != "robot":
-            raise ValueError(f"{path}: is no URDF, its root is <{self._root.tag}>; give a file with <robot>")
+            raise UserError(f"{path}: is no URDF, its root is <{self._root.tag}>; give a file with <robot>")
 
     def check_what_params_cannot_hold(self) -> None:
         """Raise on what would be flown differently than the file says."""
         for joint in self._root.iter("joint"):
             if re.fullmatch(r"rotor\d+", joint.get("name", "")) and joint.get("name") not in _ROTORS:
-                raise ValueError(
+                raise UserError(
                     f"{self.name}: has a joint {joint.get('name')!r}; only quadrotors fly, rotor0 to rotor3"
                 )
         for rotor in _ROTORS:
             path = f"joint[@name='{rotor}']"
             parent = self._tag(f"{path}/parent")
             if parent is not None and parent.get("link") != "base_link":
-                raise ValueError(
+                raise UserError(
                     f"{self.name}: {rotor} hangs on {parent.get('link')!r}; give its place relative to base_link"
                 )
             self._check_zero(f"{path}/origin", "rpy", slice(2), "rotors push along body z; give no roll and pitch")
@@ -216,11 +217,11 @@ class _Urdf:
         for product in ("ixy", "ixz", "iyz"):
             path = f"{_BASE}/inertial/inertia"
             if self.number(path, product, "product of inertia, kg m^2", default="0") != 0:
-                raise ValueError(f"{self.name}: {product} is not zero; turn the body axes into principal axes")
+                raise UserError(f"{self.name}: {product} is not zero; turn the body axes into principal axes")
         for link in self._root.findall("link"):
             mass = link.find("inertial/mass")
             if link.get("name") != "base_link" and mass is not None and not _is_zero(mass.get("value", "0")):
-                raise ValueError(
+                raise UserError(
                     f"{self.name}: the link {link.get('name')!r} has a mass of its own, {mass.get('value')} kg; "
                     "add it, and its inertia, to those of base_link"
                 )
@@ -242,27 +243,27 @@ class _Urdf:
         text = default if tag is None else tag.get(attribute, default)
         if text is None:
             there = "the tag is missing" if tag is None else f"found {', '.join(tag.keys()) or 'no attribute'}"
-            raise ValueError(f"{self.name}: <{path}> lacks '{attribute}' ({meaning}); {there}")
+            raise UserError(f"{self.name}: <{path}> lacks '{attribute}' ({meaning}); {there}")
         where = f'{self.name}: <{path}> {attribute}="{shown(text)[1:-1]}" ({meaning})'
         try:
             values = np.array([_float(word) for word in text.split()])
         except ValueError:
-            raise ValueError(f"{where} is not a list of numbers; give {length}") from None
+            raise UserError(f"{where} is not a list of numbers; give {length}") from None
         if len(values) != length or not np.all(np.isfinite(values)):
-            raise ValueError(f"{where} should be {length} finite number(s)")
+            raise UserError(f"{where} should be {length} finite number(s)")
         if within == _SIGN and not np.all(np.abs(values) == 1):
-            raise ValueError(f"{where} should be +1 or -1 each")
+            raise UserError(f"{where} should be +1 or -1 each")
         low, high = within
         if low > 0 and not np.all(values > 0):
-            raise ValueError(f"{where} should be positive")
+            raise UserError(f"{where} should be positive")
         if not np.all((values >= low) & (values <= high)):
-            raise ValueError(f"{where} should be {low:g} to {high:g}")
+            raise UserError(f"{where} should be {low:g} to {high:g}")
         return values
 
     def _check_zero(self, path: str, attribute: str, entries: slice, remedy: str) -> None:
         values = self.numbers(path, attribute, 3, "origin, m or rad", default="0 0 0")
         if np.any(values[entries] != 0):
-            raise ValueError(f"{self.name}: <{path}> {attribute} is {shown(values)}; {remedy}")
+            raise UserError(f"{self.name}: <{path}> {attribute} is {shown(values)}; {remedy}")
 
     def _tag(self, path: str) -> ET.Element | None:
         """The only tag at a path, whose parts are the only ones, too; `None` if it is missing."""
@@ -270,7 +271,7 @@ class _Urdf:
         for part in path.split("/"):
             found = tag.findall(part)
             if len(found) > 1:
-                raise ValueError(f"{self.name}: <{part}> of <{path}> is there {len(found)} times; leave one")
+                raise UserError(f"{self.name}: <{part}> of <{path}> is there {len(found)} times; leave one")
             if not found:
                 return None
             tag = found[0]
@@ -280,7 +281,7 @@ class _Urdf:
 def _float(word: str) -> float:
     """The number that a word of XML is; Python's 1_000 is none."""
     if "_" in word:
-        raise ValueError(word)
+        raise UserError(word)
     return float(word)
 
 

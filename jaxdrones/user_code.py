@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.checks import hint
+from jaxdrones.errors import UserError
 
 
 def is_reference(text: str) -> bool:
@@ -27,7 +28,7 @@ def split_reference(reference: str) -> tuple[Path, str]:
     file, _, name = reference.rpartition(":")
     if not (file and name):
         file = reference.removesuffix(":")
-        raise ValueError(f"{reference} names a file alone; give {file}:NAME, with the name of what the file defines")
+        raise UserError(f"{reference} names a file alone; give {file}:NAME, with the name of what the file defines")
     return Path(file), name
 
 
@@ -40,9 +41,9 @@ def read_text(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8")
     except OSError as error:
-        raise ValueError(f"{file}: cannot be read ({error.strerror}); give the path of a file") from None
+        raise UserError(f"{file}: cannot be read ({error.strerror}); give the path of a file") from None
     except UnicodeDecodeError as error:
-        raise ValueError(f"{file}: cannot be read ({error.reason}); save it as UTF-8") from None
+        raise UserError(f"{file}: cannot be read ({error.reason}); save it as UTF-8") from None
 
 
 def load(reference: str) -> Any:
@@ -69,7 +70,7 @@ def definition(file: str, text: str, name: str) -> Any:
     module = _executed(file, text)
     if name not in vars(module):
         own = [key for key, x in vars(module).items() if getattr(x, "__module__", None) == module.__name__]
-        raise ValueError(f"{file} defines no {name!r}{hint(name, own)} (it defines {', '.join(own) or 'nothing'})")
+        raise UserError(f"{file} defines no {name!r}{hint(name, own)} (it defines {', '.join(own) or 'nothing'})")
     return vars(module)[name]
 
 
@@ -88,5 +89,5 @@ def _executed(file: str, text: str) -> types.ModuleType:
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         what = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
         alone = "; a file of yours may import libraries, but no files beside it" * isinstance(error, ImportError)
-        raise ValueError(f"{file}: line {line} raises {what}{alone}") from error
+        raise UserError(f"{file}: line {line} raises {what}{alone}") from error
     return module

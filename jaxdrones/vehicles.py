@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdrones.checks import check_number
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.urdf import AIR_DENSITY, GRAVITY
 
@@ -113,7 +114,7 @@ def check_masses(lightest: float, heaviest: float) -> None:
     for name, mass in ("lightest", lightest), ("heaviest", heaviest):
         check_number(f"mass of the {name} vehicle", mass, "kg", at_least=LIGHTEST, at_most=HEAVIEST)
     if not lightest <= heaviest:
-        raise ValueError(f"the masses are {lightest} to {heaviest} kg; give the lightest first")
+        raise UserError(f"the masses are {lightest} to {heaviest} kg; give the lightest first")
 
 
 def _vehicle(params: Params, mass: Array, vary: Vary) -> Params:

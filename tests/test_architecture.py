@@ -14,6 +14,7 @@ PACKAGE = Path(jaxdrones.__file__).parent
 NOUNS = (
     "assets",
     "checks",
+    "errors",
     "limits",
     "params",
     "pytree",
@@ -149,3 +150,10 @@ def test_importing_the_package_loads_no_optional_library():
     code = "import sys, jaxdrones; print(*(name for name in sys.argv[1:] if name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code, *OPTIONAL], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_a_mistake_of_a_user_has_its_own_error(file):
+    raised = [node.exc for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Raise)]
+    names = {getattr(getattr(exc, "func", exc), "id", None) for exc in raised}
+    assert "ValueError" not in names, "raise jaxdrones.errors.UserError, which the command line prints as one line"

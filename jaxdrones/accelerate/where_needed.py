@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxdrones.errors import UserError
+
 _MOST = 4  # if more than one of so many worlds needs a result, all worlds are computed at once
 
 
@@ -28,7 +30,7 @@ def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[...
         leaves, structure = jax.tree.flatten(args)
         mapped = jax.tree.leaves(batched[1])
         if not any(mapped):
-            raise ValueError(
+            raise UserError(
                 "many worlds are given one and the same key, so that all would get the same result; split the key, "
                 "jax.random.split(key, worlds), and map over the keys"
             )

@@ -16,6 +16,7 @@ from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.chunks import ChunkedProgram
 from jaxdrones.accelerate.fitting import NoKernelError
 from jaxdrones.checks import check_whole
+from jaxdrones.errors import UserError
 
 _TRACER = jax.core.Tracer
 
@@ -142,7 +143,7 @@ class _ManyWorlds:
         axes = tuple(self._in_axes) if isinstance(self._in_axes, Sequence) else (self._in_axes,) * len(arguments)
         worlds = _number_of_worlds(arguments, axes)
         if worlds and len(self._devices) > 1 and worlds % len(self._devices):
-            raise ValueError(
+            raise UserError(
                 f"{worlds} worlds cannot be shared equally by {len(self._devices)} devices; give a multiple"
             )
         if not worlds:
@@ -180,14 +181,14 @@ def _number_of_worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
     for axis in axes:
         check_whole("an axis of in_axes", axis, minimum=0)
     if len(axes) != len(arguments):
-        raise ValueError(f"in_axes is of {len(axes)} arguments, {len(arguments)} were given; give an axis for each")
+        raise UserError(f"in_axes is of {len(axes)} arguments, {len(arguments)} were given; give an axis for each")
     shapes = [(jnp.shape(x), axis) for tree, axis in zip(arguments, axes, strict=True) for x in jax.tree.leaves(tree)]
     for shape, axis in shapes:
         if len(shape) <= axis:
-            raise ValueError(f"an array of shape {shape} has no axis {axis} over worlds; give one, or close over it")
+            raise UserError(f"an array of shape {shape} has no axis {axis} over worlds; give one, or close over it")
     found = {shape[axis] for shape, axis in shapes}
     if len(found) != 1:
-        raise ValueError(f"arguments of {sorted(found)} worlds, by in_axes {axes}; give all of them the same number")
+        raise UserError(f"arguments of {sorted(found)} worlds, by in_axes {axes}; give all of them the same number")
     return found.pop()
 
 

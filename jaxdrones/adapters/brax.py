@@ -23,6 +23,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxdrones import envs
 from jaxdrones.checks import check_whole
+from jaxdrones.errors import UserError
 
 try:
     with contextlib.redirect_stdout(sys.stderr):  # mujoco prints what it could not import
@@ -171,11 +172,11 @@ def wrap_for_training(
     """
     check_whole("episode_length", episode_length)
     if action_repeat != 1:
-        raise ValueError(
+        raise UserError(
             f"action_repeat is {action_repeat}; leave it at 1 and make the environment with a lower control_hz"
         )
     if randomization_fn is not None:
-        raise ValueError("randomization_fn is given; leave it out and make the environment with randomize")
+        raise UserError("randomization_fn is given; leave it out and make the environment with randomize")
     return _Training(env, episode_length)
 
 

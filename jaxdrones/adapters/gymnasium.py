@@ -22,6 +22,7 @@ from jaxdrones.adapters.session import SEEDS, Session, as_env, flat
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.checks import check_choice, check_whole, shown
+from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
 NAMESPACE = "jaxdrones"
@@ -224,7 +225,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             seeds = [first + i for i in range(self.num_envs)]
         else:
             if len(seed) != self.num_envs:
-                raise ValueError(f"seed has {len(seed)} entries; give one number, or one for each of {self.num_envs}")
+                raise UserError(f"seed has {len(seed)} entries; give one number, or one for each of {self.num_envs}")
             given = [int(x) for x in seed if x is not None]
             super().reset(seed=given[0] if given else None)
             seeds = [int(self.np_random.integers(SEEDS)) if x is None else int(x) for x in seed]
@@ -238,7 +239,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         _refuse({name: x for name, x in options.items() if name != "reset_mask"})
         mask = np.asarray(options["reset_mask"])
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
-            raise ValueError(
+            raise UserError(
                 f"reset_mask has shape {mask.shape} and dtype {mask.dtype}; give ({self.num_envs},) of True and False"
             )
         if not self._worlds.started:
@@ -281,7 +282,7 @@ def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
 
 def _refuse(options: dict[str, Any] | None) -> None:
     if options:
-        raise ValueError(f"reset is called with the unknown options {', '.join(map(str, options))}; leave them out")
+        raise UserError(f"reset is called with the unknown options {', '.join(map(str, options))}; leave them out")
 
 
 def _masked(values: dict[str, Any], mask: Any) -> dict[str, Any]:

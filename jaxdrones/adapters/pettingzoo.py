@@ -11,6 +11,7 @@ from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import SEEDS, Session, as_env, flat
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
 try:
@@ -80,7 +81,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
             ValueError: an agent without an action, an action of wrong shape or with NaN, or there is no episode.
         """
         if not self._session.running:
-            raise ValueError("step is called before reset or after the end of an episode; call reset")
+            raise UserError("step is called before reset or after the end of an episode; call reset")
         obs, reward, terminated, truncated, info = self._session.step(self._layout.gather(actions))
         agents = self.agents
         if not self._session.running:
@@ -100,7 +101,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
             ValueError: no episode has begun.
         """
         if self._session.world is None:
-            raise ValueError("state is called before reset; call reset")
+            raise UserError("state is called before reset; call reset")
         return self._state.copy()
 
     def render(self) -> np.ndarray | None:
@@ -113,7 +114,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
             gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
             return None
         if self._session.world is None:
-            raise ValueError("render is called before reset; call reset")
+            raise UserError("render is called before reset; call reset")
         return self._session.photo()
 
     def close(self) -> None:

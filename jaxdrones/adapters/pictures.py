@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import Camera, photograph
 from jaxdrones.tasks.task import World
 
@@ -23,7 +24,7 @@ _AT_A_TIME = 8  # pictures of worlds: what many take at once does not stay in a 
 def check_mode(render_mode: str | None) -> None:
     """Raise unless there are pictures of this mode."""
     if render_mode not in (None, *MODES):
-        raise ValueError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
+        raise UserError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
 
 
 def of_world(env: Env, world: World) -> np.ndarray:

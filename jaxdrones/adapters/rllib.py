@@ -9,6 +9,7 @@ import numpy as np
 from jaxdrones.adapters.session import SEEDS, Session, as_env
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
 try:
@@ -54,7 +55,7 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
             ValueError: an agent without an action, an action of wrong shape or with NaN, or there is no episode.
         """
         if not self._session.running:
-            raise ValueError("step is called before reset or after the end of an episode; call reset")
+            raise UserError("step is called before reset or after the end of an episode; call reset")
         obs, reward, terminated, truncated, _ = self._session.step(self._layout.gather(action_dict))
         everyone = (*self.agents, "__all__")
         return (

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxdrones.adapters import gymnasium
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
 try:
@@ -99,7 +100,7 @@ class VecEnv(vec_env.VecEnv):
         Raises:
             ValueError: always.
         """
-        raise ValueError(f"attribute {attr_name} cannot be set in a compiled environment; give it as an option")
+        raise UserError(f"attribute {attr_name} cannot be set in a compiled environment; give it as an option")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Always raises: all worlds are one compiled step and have no methods of their own.
@@ -107,7 +108,7 @@ class VecEnv(vec_env.VecEnv):
         Raises:
             ValueError: always.
         """
-        raise ValueError(f"method {method_name} cannot be called: the environments are one compiled step")
+        raise UserError(f"method {method_name} cannot be called: the environments are one compiled step")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """False for every world."""

@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from jaxdrones.checks import check_shape
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 
 
 def observation_of_drone(env: Env) -> spaces.Space:
@@ -73,7 +74,7 @@ class Layout:
             return action[..., None, :] if alone else action
         if not isinstance(action, Mapping) or set(action) != set(self.names):
             given = ", ".join(map(str, action)) if isinstance(action, Mapping) else repr(action)
-            raise ValueError(f"action is for {given or 'no drone'}; give a dict with one each for {self._agents}")
+            raise UserError(f"action is for {given or 'no drone'}; give a dict with one each for {self._agents}")
         rows = [_check(action[name], f"action of {name}", (*batch, self.size), "") for name in self.names]
         stack = np.stack if isinstance(rows[0], np.ndarray) else jnp.stack
         return stack(rows, axis=len(batch))
@@ -87,7 +88,7 @@ def _check(action: Any, name: str, shape: tuple[int, ...], meaning: str) -> Any:
     if not isinstance(action, jax.Array):
         action = np.asarray(action, np.float32)
         if not np.isfinite(action).all():
-            raise ValueError(f"{name} is not finite in {_where(action)}; give numbers in [-1, 1]")
+            raise UserError(f"{name} is not finite in {_where(action)}; give numbers in [-1, 1]")
     if action.shape != shape:
         check_shape(name, action, shape, meaning)
     return action

@@ -15,6 +15,7 @@ from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.checks import check_whole
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
 try:
@@ -60,7 +61,7 @@ class VectorEnv(BaseVectorEnv):
         Raises:
             ValueError: always.
         """
-        raise ValueError(f"attribute {key} cannot be set in a compiled environment; give it as an option")
+        raise UserError(f"attribute {key} cannot be set in a compiled environment; give it as an option")
 
     def seed(self, seed: int | Sequence[int] | None = None) -> list[int]:
         """Seed the worlds, of which each draws all its episodes from its own seed.
@@ -75,7 +76,7 @@ class VectorEnv(BaseVectorEnv):
             seed = int(np.random.default_rng().integers(SEEDS))
         seeds = [seed + i for i in range(self.env_num)] if isinstance(seed, int | np.integer) else list(seed)
         if len(seeds) != self.env_num:
-            raise ValueError(f"seed has {len(seeds)} entries; give one number, or one for each of {self.env_num}")
+            raise UserError(f"seed has {len(seeds)} entries; give one number, or one for each of {self.env_num}")
         self._seeds = [np.random.default_rng(int(x) % SEEDS) for x in seeds]
         return seeds
 
@@ -91,7 +92,7 @@ class VectorEnv(BaseVectorEnv):
             self.seed(seed)
         mask = self._mask(env_id)
         if not (mask.all() or self._worlds.started):
-            raise ValueError("some worlds are reset before all were; call reset() first")
+            raise UserError("some worlds are reset before all were; call reset() first")
         seeds = [rng.integers(SEEDS) if chosen else 0 for rng, chosen in zip(self._seeds, mask, strict=True)]
         obs = self._worlds.reset(np.array(seeds, np.uint32), None if mask.all() else mask)
         chosen = self._ids(env_id)
@@ -113,11 +114,11 @@ class VectorEnv(BaseVectorEnv):
             ValueError: no episode has begun, or actions of wrong shape or with NaN.
         """
         if not self._worlds.started:
-            raise ValueError("step is called before reset; call reset")
+            raise UserError("step is called before reset; call reset")
         chosen, action = self._ids(id), np.asarray(action, np.float32)
         everyone = np.zeros((self.env_num, *self._layout.action.shape), np.float32)
         if action.shape != (len(chosen), *everyone.shape[1:]):
-            raise ValueError(f"action has shape {action.shape}; expected {(len(chosen), *everyone.shape[1:])}")
+            raise UserError(f"action has shape {action.shape}; expected {(len(chosen), *everyone.shape[1:])}")
         everyone[chosen] = action
         mask = self._mask(id)
         actions = self._layout.gather(everyone, (self.env_num,))
@@ -132,7 +133,7 @@ class VectorEnv(BaseVectorEnv):
             ValueError: no episode has begun.
         """
         if not self._worlds.started:
-            raise ValueError("render is called before reset; call reset")
+            raise UserError("render is called before reset; call reset")
         return list(pictures.of_worlds(self.env, self._worlds.world))
 
     def close(self) -> None:

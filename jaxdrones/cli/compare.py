@@ -8,6 +8,7 @@ from typing import Any
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, check_writable, folder, table
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.record import Record, divergence
@@ -77,16 +78,16 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
     if options.controllers is None:
         names = _names("backends", options.backends or _BACKENDS)
         if len(names) != 2:
-            raise ValueError(f"--backends is {options.backends!r}; give two different ones, for example {_BACKENDS}")
+            raise UserError(f"--backends is {options.backends!r}; give two different ones, for example {_BACKENDS}")
         for name in names:
             check_choice("backend", name, BACKENDS)
         return "backends", {name: (options, name) for name in names}
     for name in ("backends", "controller"):
         if getattr(options, name) is not None:
-            raise ValueError(f"--{name} {getattr(options, name)} is given beside --controllers; leave one of them out")
+            raise UserError(f"--{name} {getattr(options, name)} is given beside --controllers; leave one of them out")
     names = _names("controllers", options.controllers)
     if len(names) < 2:
-        raise ValueError(f"--controllers is {options.controllers!r}; give two or more, for example pid,lqr")
+        raise UserError(f"--controllers is {options.controllers!r}; give two or more, for example pid,lqr")
     for name in names:
         check_choice("controller", name, CONTROLLERS)
     return "controllers", {
@@ -102,7 +103,7 @@ def _names(option: str, text: str) -> list[str]:
     """
     names = [name.strip() for name in text.split(",")]
     if len(set(names)) < len(names):
-        raise ValueError(f"--{option} is {text!r}; give two different ones, or more")
+        raise UserError(f"--{option} is {text!r}; give two different ones, or more")
     return names
 
 

@@ -13,6 +13,7 @@ from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_o
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.settings import parse_settings
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.record import Record, check_pwm
@@ -94,21 +95,19 @@ def _fly(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
 def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Raise for options that the policy, or the example, says itself."""
     if options.renderer is not None and options.video is None:
-        raise ValueError(f"--renderer {options.renderer} is given without --video FILE; give both or none")
+        raise UserError(f"--renderer {options.renderer} is given without --video FILE; give both or none")
     if options.policy is None:
         if options.set:
-            raise ValueError(f"--set {options.set[0]} is given without --policy file.py:name; give both or none")
+            raise UserError(f"--set {options.set[0]} is given without --policy file.py:name; give both or none")
         if options.task is not None:
-            raise ValueError(
-                f"--task {options.task} is given without --policy file.py:name; leave it out, or give both"
-            )
+            raise UserError(f"--task {options.task} is given without --policy file.py:name; leave it out, or give both")
         return
     own = is_user_policy(options.policy)
     names = ["flight", *([] if own else ["drones", "vehicle"]), *_OF_EXAMPLES]
     for name in names:
         if getattr(options, name) != parser.get_default(name):
             what = "the task" if own else "the run"
-            raise ValueError(f"{name} {getattr(options, name)} is given beside --policy; {what} says what is flown")
+            raise UserError(f"{name} {getattr(options, name)} is given beside --policy; {what} says what is flown")
 
 
 def _fly_example(options: argparse.Namespace) -> int:
@@ -179,7 +178,7 @@ def _options_of_task(options: argparse.Namespace) -> dict[str, Any]:
     chosen = parse_settings(options.set)
     for name in ("drones", "vehicle"):
         if name in chosen:
-            raise ValueError(f"--set {name}={chosen[name]} is given; give --{name} {chosen[name]} in its place")
+            raise UserError(f"--set {name}={chosen[name]} is given; give --{name} {chosen[name]} in its place")
     if is_user_policy(options.policy):
         chosen |= {"vehicle": options.vehicle} | ({} if options.drones is None else {"drones": options.drones})
     return chosen
@@ -220,7 +219,7 @@ def _check_files(options: argparse.Namespace, output: Path) -> None:
         try:
             check_writable(options.video)
         except OSError as error:
-            raise ValueError(f"--video {options.video} cannot be written: {error.strerror}; choose another") from None
+            raise UserError(f"--video {options.video} cannot be written: {error.strerror}; choose another") from None
 
 
 def _write(record: Record, options: argparse.Namespace, output: Path, title: str, panels: Sequence[str]) -> list[Path]:

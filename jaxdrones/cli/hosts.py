@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from jaxdrones.cli.common import run_folder
+from jaxdrones.errors import UserError
 
 HELP = (
     "All devices share the worlds. A CPU counts as N devices with\n"
@@ -38,11 +39,11 @@ def _on_hosts(train: Callable[[argparse.Namespace], int], options: argparse.Name
     if asked == (None, None, None):
         return train(options)
     if None in asked:
-        raise ValueError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
+        raise UserError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
     if options.library in ("rllib", "sb3"):
-        raise ValueError(f"--library {options.library} trains on one host; leave out --hosts, --host and --coordinator")
+        raise UserError(f"--library {options.library} trains on one host; leave out --hosts, --host and --coordinator")
     if options.live is not None:
-        raise ValueError("--live is given with --hosts, whose trainings are not shown; leave one of them out")
+        raise UserError("--live is given with --hosts, whose trainings are not shown; leave one of them out")
     from jaxdrones.training import distributed
 
     with contextlib.ExitStack() as stack:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from jaxdrones.errors import UserError
 from jaxdrones.user_code import is_reference
 
 
@@ -29,10 +30,10 @@ def open_policy(policy: Path, task: str | None, realistic: bool | str, options: 
 
     if is_user_policy(policy):
         if task is None:
-            raise ValueError(f"--task is missing; say which task {policy} flies, for example --task hover")
+            raise UserError(f"--task is missing; say which task {policy} flies, for example --task hover")
         return UserPolicy(str(policy), task, realistic, options)
     given = {"--task": task, "--realistic": realistic, **{f"--set {name}": x for name, x in options.items()}}
     for name, x in given.items():
         if x not in (None, False):
-            raise ValueError(f"{name} is given beside the run {policy}, which says what is flown; leave it out")
+            raise UserError(f"{name} is given beside the run {policy}, which says what is flown; leave it out")
     return open_run(policy)

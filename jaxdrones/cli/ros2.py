@@ -11,6 +11,7 @@ from jaxdrones.checks import check_choice, check_number, check_positive, check_w
 from jaxdrones.cli.common import as_json, folder, print_error, print_warning
 from jaxdrones.dynamics import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS, PHYSICS_HZ
 from jaxdrones.limits import check_at_most
 from jaxdrones.params import repeat
@@ -121,7 +122,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
         return None
     width, _, height = options.camera.partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise ValueError(f"--camera is {options.camera!r}; give width and height in pixels, for example 64x48")
+        raise UserError(f"--camera is {options.camera!r}; give width and height in pixels, for example 64x48")
     return Camera(resolution=(int(width), int(height)), rate=options.camera_hz)
 
 

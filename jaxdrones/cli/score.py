@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.common import as_json, check_writable
+from jaxdrones.errors import UserError
 
 _NOMINAL = "cf2x"
 
@@ -61,7 +62,7 @@ def _score(options: argparse.Namespace) -> int:
     closed_loop = {name: [result.as_dict() for result in flights] for name, flights in simulated.items()}
     if options.figure:
         if not with_setpoints:
-            raise ValueError("no log has set-points, so there are no paths to draw; leave --figure out")
+            raise UserError("no log has set-points, so there are no paths to draw; leave --figure out")
         check_writable(options.figure)
         save_paths(simulated["vehicle"], options.figure)
     results: dict[str, Any] = {

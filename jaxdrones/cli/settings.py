@@ -7,6 +7,7 @@ import itertools
 from typing import Any
 
 from jaxdrones.envs import TASKS
+from jaxdrones.errors import UserError
 from jaxdrones.user_code import is_reference
 
 # Arguments of `Recipe.of` that are options of the command.
@@ -52,9 +53,9 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):
-            raise ValueError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
+            raise UserError(f"--set is {text!r}; give NAME=VALUE, for example worlds=512")
         if name in _NO_SETTINGS:
-            raise ValueError(
+            raise UserError(
                 f"--set {name} is not a setting of a learner or of an environment; see jaxdrones train --help"
             )
         changes[name] = _value(value)
@@ -71,7 +72,7 @@ def asked_settings(options: argparse.Namespace) -> dict[str, Any]:
     if options.vehicle is None:
         return changes
     if "vehicle" in changes:
-        raise ValueError(f"--set vehicle={changes['vehicle']} is given beside --vehicle; give one of them")
+        raise UserError(f"--set vehicle={changes['vehicle']} is given beside --vehicle; give one of them")
     return changes | {"vehicle": options.vehicle}
 
 
@@ -96,4 +97,4 @@ def user_mistakes(changes: dict[str, Any], task: str):
         if not changes:
             raise
         given = ", ".join(f"{name}={x}" for name, x in changes.items())
-        raise ValueError(f"--set {given} does not fit {task}: {error}") from error
+        raise UserError(f"--set {given} does not fit {task}: {error}") from error

@@ -23,6 +23,7 @@ from jaxdrones.cli.training import (
     warn_of_unknown_settings,
 )
 from jaxdrones.envs import TASKS
+from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.visualization import plots
 
@@ -207,6 +208,6 @@ def _check_numbers(options: argparse.Namespace) -> None:
     if options.episodes is not None:
         check_at_most("episodes", options.episodes, LARGEST_COUNT)
     if options.resume and options.library == "rllib":
-        raise ValueError("--resume is given with --library rllib, whose trainings are not continued here; leave it out")
+        raise UserError("--resume is given with --library rllib, whose trainings are not continued here; leave it out")
     if options.resume and options.overwrite:
-        raise ValueError("--resume and --overwrite are given; one continues a run, the other replaces it")
+        raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")

@@ -5,6 +5,7 @@ import dataclasses
 from pathlib import Path
 
 from jaxdrones.cli.training import check_free
+from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT, check_at_most
 
 
@@ -15,7 +16,7 @@ def runs_of(options: argparse.Namespace, output: Path) -> dict:
     run = Run(output)
     if options.seeds > 1:
         if options.resume and run.started:
-            raise ValueError(f"{output} holds the training of one seed; leave out --seeds to --resume it")
+            raise UserError(f"{output} holds the training of one seed; leave out --seeds to --resume it")
         first = options.seed or 0
         return {seed: Run(output / f"seed-{seed}") for seed in range(first, first + options.seeds)}
     if options.resume and not run.started:
@@ -24,9 +25,9 @@ def runs_of(options: argparse.Namespace, output: Path) -> dict:
     return {seed: run}
 
 
-def _nothing_to_resume(run) -> ValueError:
+def _nothing_to_resume(run) -> UserError:
     several = "give --seeds N, or " if list(run.folder.glob("seed-*/state.json")) else ""
-    return ValueError(f"{run.folder} holds no training to continue; {several}leave out --resume")
+    return UserError(f"{run.folder} holds no training to continue; {several}leave out --resume")
 
 
 def recipe_of(options: argparse.Namespace, runs: dict, output: Path, asked: dict, seconds: float | None):
@@ -75,13 +76,13 @@ def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: floa
     updates = wanted.pop("updates", None)
     for name, x in wanted.items():
         if had.get(name) != x:
-            raise ValueError(f"{folder} was started with {name} {had.get(name)}, not {x}; leave {name} out to --resume")
+            raise UserError(f"{folder} was started with {name} {had.get(name)}, not {x}; leave {name} out to --resume")
     finished = len(started) == len(runs) and all(
         run.finished and run.sidecar_entry("state", "update") >= recipe.config.updates for run in started
     )
     total = _total(recipe.config.updates, updates, options.budget is not None, finished)
     if finished and seconds is None and total == recipe.config.updates:
-        raise ValueError(
+        raise UserError(
             f"{folder} is trained to the end, {total} updates; train it longer with --budget N or 60s, or "
             "replace it with --overwrite instead of --resume"
         )
@@ -104,7 +105,7 @@ def _total(had: int, asked: int | None, more: bool, finished: bool) -> int:
     if more and finished:
         asked += had
     elif asked < had or (more and asked != had):
-        raise ValueError(
+        raise UserError(
             f"the run was started with updates {had}, not {asked}; leave updates out to --resume, or give a larger "
             "number by --set updates=N"
         )

@@ -19,6 +19,7 @@ from jaxdrones.cli.training import (
     show_results,
     warn_of_unknown_settings,
 )
+from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.training import user_files
 from jaxdrones.visualization import plots
@@ -84,11 +85,11 @@ def train(options: argparse.Namespace) -> int:
 def _refuse(options: argparse.Namespace) -> None:
     """Raise for options that Stable-Baselines3 does not support here."""
     if options.resume:
-        raise ValueError("--resume is given with --library sb3, whose trainings keep no state; leave it out")
+        raise UserError("--resume is given with --library sb3, whose trainings keep no state; leave it out")
     if options.live is not None:
-        raise ValueError("--live is given with --library sb3, whose trainings are not shown; leave it out")
+        raise UserError("--live is given with --library sb3, whose trainings are not shown; leave it out")
     if options.seeds != 1:
-        raise ValueError(
+        raise UserError(
             f"--seeds {options.seeds} is given with --library sb3, which trains one; leave it out, choose with --seed"
         )
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxdrones.cli.common import as_json, bar, print_warning
 from jaxdrones.cli.evaluate import evaluation_table, percent
+from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.visualization import learning_curves
 
@@ -28,7 +29,7 @@ def parse_budget(text: str | None, unit: str, example: int) -> tuple[int | None,
             return int(text), None
     except ValueError:
         pass
-    raise ValueError(
+    raise UserError(
         f"--budget is {text!r}; give {unit}, for example {example}, or a time up to 1000h, for example 60s, 5m or 2h"
     )
 
@@ -64,7 +65,7 @@ def merge_budget(name: str, changes: dict[str, Any], number: int | None, seconds
         ValueError: --set gives that one too.
     """
     if name in changes and (number is not None or seconds is not None):
-        raise ValueError(f"--set {name}={changes[name]} is given beside --budget; give one of them")
+        raise UserError(f"--set {name}={changes[name]} is given beside --budget; give one of them")
     return changes if number is None else changes | {name: number}
 
 
@@ -76,7 +77,7 @@ def check_free(run, overwrite: bool) -> None:
         what, again = "a finished training", "train it longer with --resume --budget N, " if run.started else ""
     else:
         what, again = "a training that did not finish", "continue it with --resume, " if run.started else ""
-    raise ValueError(f"{run.folder} holds {what}; {again}replace it with --overwrite, or choose another --output")
+    raise UserError(f"{run.folder} holds {what}; {again}replace it with --overwrite, or choose another --output")
 
 
 class ProgressDisplay(contextlib.ExitStack):

@@ -5,6 +5,7 @@ import webbrowser
 
 from jaxdrones.checks import check_choice, check_whole
 from jaxdrones.cli.common import as_json, check_writable, folder
+from jaxdrones.errors import UserError
 from jaxdrones.visualization import video
 from jaxdrones.visualization.viewer.film import CAMERAS, film
 from jaxdrones.visualization.viewer.show import LAYOUTS, find_log, show
@@ -67,5 +68,5 @@ def _size(text: str) -> tuple[int, int]:
     """Width and height of a text such as `1280x720`."""
     width, cross, height = text.partition("x")
     if not (cross and width.isdecimal() and height.isdecimal()) or int(width) % 2 or int(height) % 2:
-        raise ValueError(f"size of the film is {text!r}; give two even numbers of pixels, for example 1280x720")
+        raise UserError(f"size of the film is {text!r}; give two even numbers of pixels, for example 1280x720")
     return int(width), int(height)

@@ -28,6 +28,7 @@ from jaxdrones.control.firmware_loops import (
 )
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_memory, check_single, check_state
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -199,7 +200,7 @@ def _fly(
         memory = memory.replace(age=jnp.minimum(memory.age, _SLOW))  # the slow loops run at once afterwards
         attitude, thrust = rpy(state.quat), jnp.clip(setpoint.thrust, 0, motors.FULL)
     else:
-        raise ValueError(f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude or Rates")
+        raise UserError(f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude or Rates")
     if isinstance(setpoint, Attitude):
         check_shape("setpoint.rpy", setpoint.rpy, (3,), "one target for one drone")
         attitude = degrees(setpoint.rpy)

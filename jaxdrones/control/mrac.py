@@ -18,6 +18,7 @@ from jaxdrones.checks import check_number, check_positive, is_known
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_memory, check_single
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -78,7 +79,7 @@ def gains(params: Params | None = None) -> Gains:
         with jax.ensure_compile_time_eval():  # so that `gains()` may be called during tracing
             params = load_params("cf2x")
     if not all(is_known(leaf) for leaf in (params.mass, params.inertia, params.gravity)):
-        raise ValueError(
+        raise UserError(
             "params are being traced, so poles cannot be placed; give values, outside of jax.jit and jax.vmap"
         )
     check_number("params.gravity", params.gravity, "m/s^2", above=0)

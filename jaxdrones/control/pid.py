@@ -19,6 +19,7 @@ from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -76,7 +77,7 @@ def gains(vehicle: str = "cf2x") -> Gains:
         ValueError: another vehicle; the gains fit a Crazyflie's mass, inertia and PWM.
     """
     if vehicle not in VEHICLES:
-        raise ValueError(
+        raise UserError(
             f"there are no PID gains for {vehicle!r}, only for {', '.join(VEHICLES)}; use another controller"
         )
     return Gains(
@@ -98,7 +99,7 @@ def fits(params: Params) -> bool:
         ValueError: the parameters are being traced.
     """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(params)):
-        raise ValueError(
+        raise UserError(
             "params are being traced, so their numbers cannot be looked at; give values, outside of jax.jit"
         )
     numbers = _numbers(params)

@@ -10,6 +10,7 @@ import jax
 from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_arguments, check_callable, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -33,7 +34,7 @@ class Model:
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"name of a model is {shown(self.name)}; give a string that is not empty")
+            raise UserError(f"name of a model is {shown(self.name)}; give a string that is not empty")
         for field, arguments in ("init", ("params",)), ("rate", ("params", "state", "command")):
             function = getattr(self, field)
             check_callable(f"{field} of the model {self.name!r}", function, f"a function of ({', '.join(arguments)})")
@@ -52,7 +53,7 @@ class Model:
         rate = (self.rate if self.of_team else jax.vmap(self.rate))(params, state, command)
         given, wanted = jax.eval_shape(lambda: rate), jax.eval_shape(lambda: state.aux[self.name])
         if _type(given) != _type(wanted):
-            raise ValueError(
+            raise UserError(
                 f"rate of the model {self.name!r} returned {given}; return a pytree like the model's state, {wanted}"
             )
         return rate
@@ -66,7 +67,7 @@ def constants(params: Params, name: str, example: str) -> Any:
     """
     if name not in params.aux:
         found = ", ".join(params.aux) or "nothing"
-        raise ValueError(
+        raise UserError(
             f"params.aux lacks {name!r}; found {found}; give params.replace(aux=params.aux | {{{name!r}: {example}}})"
         )
     return params.aux[name]

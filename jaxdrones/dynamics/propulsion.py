@@ -12,6 +12,7 @@ from jaxdrones.checks import check_choice, check_finite, check_number, check_sha
 from jaxdrones.dynamics.model import constants
 from jaxdrones.dynamics.power import battery_voltage
 from jaxdrones.dynamics.rotors import lagging_rotors
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -58,7 +59,7 @@ def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
     if is_known(coefficients):
         _, b, c, d = np.asarray(coefficients, float)
         if not (d > 0 and c * c < 3 * b * d):
-            raise ValueError(
+            raise UserError(
                 f"the thrust curve {shown(coefficients)} does not rise everywhere; give a cubic whose slope is positive"
             )
     return Motors(jnp.asarray(coefficients, float), jnp.asarray(supply, float))

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_arguments, check_callable, check_number
 from jaxdrones.dynamics.model import Model
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
@@ -45,7 +46,7 @@ def in_wind(field: WindField, effect: Effect) -> Effect:
     @functools.wraps(effect)
     def blown(params: Params, state: State) -> Wrench:
         if len(arguments) == 2 and "clock" not in state.aux:
-            raise ValueError(
+            raise UserError(
                 "the wind field depends on time and state.aux lacks 'clock'; give models=(jaxdrones.clock(),)"
             )
         wind = field(state.pos, state.aux["clock"]) if len(arguments) == 2 else field(state.pos)

@@ -20,6 +20,7 @@ from jaxdrones.engine.physics import Physics, Rotors, check_functions
 from jaxdrones.engine.step import Step, is_traced
 from jaxdrones.engine.team import check_command, check_values
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
@@ -200,9 +201,9 @@ class ExplicitStep(Step):
 
     def _check_scene(self, scene: Scene) -> None:
         if not isinstance(scene, Scene):
-            raise ValueError(f"scene is {scene!r}; give a jaxdrones.sensing.Scene")
+            raise UserError(f"scene is {scene!r}; give a jaxdrones.sensing.Scene")
         if scene.has_obstacles and not self.physics.takes_scene:
-            raise ValueError(
+            raise UserError(
                 "the scene has obstacles and no effect takes it, so drones would fly through them; give "
                 "jaxdrones.obstacle_contact or another effect (params, state, scene) -> Wrench, leave the obstacles "
                 "out, or take the bullet backend"

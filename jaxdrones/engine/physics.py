@@ -16,6 +16,7 @@ from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench
 from jaxdrones.engine.clearance import FreeBalls, contact_of_team
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
@@ -70,13 +71,13 @@ class Physics:
         models = check_sequence("models", self.models, "jaxdrones.Model(name, init, rate)")
         for model in models:
             if not isinstance(model, Model):
-                raise ValueError(f"models: {model!r} is not a model; give jaxdrones.Model(name, init, rate)")
+                raise UserError(f"models: {model!r} is not a model; give jaxdrones.Model(name, init, rate)")
         names = [model.name for model in models]
         if len(set(names)) < len(names):
-            raise ValueError(f"models are named {', '.join(names)}; give each a name of its own")
+            raise UserError(f"models are named {', '.join(names)}; give each a name of its own")
         object.__setattr__(self, "models", models)
         if not (self.neighbors is None or isinstance(self.neighbors, NeighborGrid)):
-            raise ValueError(
+            raise UserError(
                 f"neighbors is {self.neighbors!r}; give for example jaxdrones.NeighborGrid(cutoff=3.0), or leave it out"
             )
 
@@ -133,7 +134,7 @@ class Physics:
         """
         for model in self.models:
             if model.name not in state.aux:
-                raise ValueError(
+                raise UserError(
                     f"state.aux lacks {model.name!r}, the state of a model; start from step.init(params, state)"
                 )
         return jax.vmap(self.rotors)(params, state, command)
@@ -166,11 +167,11 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
     """
     example = f"jaxdrones.{_EXAMPLE[name]}" if name in _EXAMPLE else "a function (params, state) -> Wrench of the team"
     if callable(functions):
-        raise ValueError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
+        raise UserError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
     functions = check_sequence(name, functions, example)
     for function in functions:
         if not callable(function):
-            raise ValueError(f"{name}: {function!r} is not a function; give for example {example}")
+            raise UserError(f"{name}: {function!r} is not a function; give for example {example}")
         if not (name == "effects" and takes_scene(function)):
             check_arguments(name, function, _ARGUMENTS[name], _ELSEWHERE.get(name, ""))
     return functions

@@ -17,6 +17,7 @@ from jaxdrones.checks import (
     shown,
 )
 from jaxdrones.engine.step import HostStep, Step, is_traced
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -62,7 +63,7 @@ def rollout(
 
     state = step.init(params, state) if isinstance(step, Step) else state
     if isinstance(step, HostStep) and checkpoint is not None:
-        raise ValueError("checkpoint is given and the bullet backend has no backward pass; leave it out")
+        raise UserError("checkpoint is given and the bullet backend has no backward pass; leave it out")
     if isinstance(step, HostStep) and not is_traced((params, state, memory)):
         return _loop(step, control, params, state, memory, length)
 
@@ -81,7 +82,7 @@ def rollout(
         return final, trajectory
     check_whole("checkpoint", checkpoint)
     if length % checkpoint:
-        raise ValueError(f"length is {length}; give a multiple of checkpoint, {checkpoint}")
+        raise UserError(f"length is {length}; give a multiple of checkpoint, {checkpoint}")
     (_, final), legs = jax.lax.scan(jax.checkpoint(fly), (memory, state), ks.reshape(-1, checkpoint))
     return final, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), legs)
 
@@ -91,12 +92,10 @@ def _commanded(control: Control, params: Params, memory: Any, state: State, k: A
     answer = control(params, memory, state, k)
     if not (isinstance(answer, tuple | list) and len(answer) == 2):
         given = f"an array of shape {np.shape(answer)}" if isinstance(answer, jax.Array | np.ndarray) else shown(answer)
-        raise ValueError(
-            f"control returned {given}; return (memory, rpm), with memory as it was given if there is none"
-        )
+        raise UserError(f"control returned {given}; return (memory, rpm), with memory as it was given if there is none")
     given, returned = (str(jax.tree.structure(x)) for x in (memory, answer[0]))
     if given != returned:
-        raise ValueError(
+        raise UserError(
             f"control was given the memory {given} and returned {returned}; "
             "return (memory, rpm) with memory of the same structure"
         )

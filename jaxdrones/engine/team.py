@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -59,13 +60,13 @@ def check_team(params: Params, state: State, rpm: Any) -> None:
 
 def _check_aux(name: str, aux: Any, n: int) -> None:
     if not isinstance(aux, dict):
-        raise ValueError(f"{name} is {shown(aux)}; give a dictionary by the names of models")
+        raise UserError(f"{name} is {shown(aux)}; give a dictionary by the names of models")
     for path, leaf in jax.tree_util.tree_leaves_with_path(aux):
         where = name + jax.tree_util.keystr(path)
         if jnp.shape(leaf)[:1] != (n,):
-            raise ValueError(f"{where} has shape {jnp.shape(leaf)}; give arrays with a leading axis over {n} drones")
+            raise UserError(f"{where} has shape {jnp.shape(leaf)}; give arrays with a leading axis over {n} drones")
         if name == "state.aux" and not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            raise ValueError(f"{where} holds {jnp.result_type(leaf)}; give floating-point numbers")
+            raise UserError(f"{where} holds {jnp.result_type(leaf)}; give floating-point numbers")
 
 
 def check_values(params: Params, state: State) -> None:

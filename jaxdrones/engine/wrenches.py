@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxdrones import rotation
 from jaxdrones.checks import check_shape, shown
 from jaxdrones.engine.neighbors import NeighborGrid
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
@@ -47,7 +48,7 @@ def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | No
     called = f"{name}: {describe([function])}"
     if not isinstance(wrench, Wrench):
         given = f"an array of shape {wrench.shape}" if isinstance(wrench, jax.Array) else shown(wrench)
-        raise ValueError(f"{called} returned {given}; return jaxdrones.Wrench(force, torque), N and N m in body axes")
+        raise UserError(f"{called} returned {given}; return jaxdrones.Wrench(force, torque), N and N m in body axes")
     shape, of = ((3,), "one drone") if drones is None else ((drones, 3), f"each of {drones} drones")
     for part in ("force", "torque"):
         check_shape(f"{called}: {part}", getattr(wrench, part), shape, f"x, y, z of {of}, in body axes")

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_callable, check_whole
 from jaxdrones.control import Setpoint, for_team
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
 from jaxdrones.state import State
@@ -75,13 +76,13 @@ def check_loop(name: str, action: Action, params: Params, lagging: bool, dt: flo
     if action.for_vehicle is None:
         return
     if dt > _MAX_PERIOD * (1 + 1e-6):
-        raise ValueError(
+        raise UserError(
             f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
             f"{1 / _MAX_PERIOD:g} or more"
         )
     time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
     if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
-        raise ValueError(
+        raise UserError(
             f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
             f"{_MAX_ROTOR_TIME} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
             "action type that commands rotors, thrust and torques, or rates"

@@ -16,6 +16,7 @@ from jaxdrones.checks import check_number, check_shape
 from jaxdrones.control import Setpoint, attitude, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.envs.action import Action
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.state import State
@@ -163,7 +164,7 @@ def pid_gains() -> Action:
     def for_vehicle(params):
         if pid.fits(params):
             return Action(6, command, pid.init, entries=entries)
-        raise ValueError(
+        raise UserError(
             f"the action type 'pid_gains' scales the gains of the PID, which suit {', '.join(pid.VEHICLES)} and no "
             "vehicle of other mass, inertia, arm or coefficients; take one of these, or another action type"
         )

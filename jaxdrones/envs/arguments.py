@@ -15,6 +15,7 @@ from jaxdrones.checks import (
     shown,
 )
 from jaxdrones.envs.action import Action
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.tasks.task import ObservationTerm, Task
 
@@ -25,7 +26,7 @@ def check_team(task: Task, params: Params, action: Action, dt: float) -> None:
     """Raise `ValueError` unless these are a task, the parameters of its team, an action type and a control period."""
     for name, given, kind in ("task", task, Task), ("params", params, Params), ("action", action, Action):
         if not isinstance(given, kind):
-            raise ValueError(f"{name} is {shown(given)}; give an object of {kind.__name__}, or use jaxdrones.make")
+            raise UserError(f"{name} is {shown(given)}; give an object of {kind.__name__}, or use jaxdrones.make")
     check_positive("dt", dt, "s")
     check_params(params)
     check_shape("params.mass", params.mass, (task.drones,), f"the task {task.name} has {task.drones} drones")
@@ -35,10 +36,10 @@ def check_terms(observation: Sequence[ObservationTerm]) -> tuple[ObservationTerm
     """The terms of an observation, or an error if there is none or something else among them."""
     terms = check_sequence("observation", observation, "OBSERVATIONS['position_error']")
     if not terms:
-        raise ValueError("observation is empty; name at least one observation term")
+        raise UserError("observation is empty; name at least one observation term")
     for term in terms:
         if not isinstance(term, ObservationTerm):
-            raise ValueError(
+            raise UserError(
                 f"observation: {shown(term)} is not an observation term; give one or a name of OBSERVATIONS"
             )
     return terms
@@ -82,7 +83,7 @@ def episode_steps(task: Task, dt: float) -> int:
     """
     steps = task.duration / dt
     if not 0.5 < steps < _MAX_STEPS:
-        raise ValueError(
+        raise UserError(
             f"duration is {task.duration} s, {steps:.3g} control steps of {dt:.4g} s; give 1 to {_MAX_STEPS:.0e}"
         )
     return round(steps) + task.extra_steps

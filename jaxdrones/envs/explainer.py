@@ -14,6 +14,7 @@ from jaxdrones.engine.step import HostStep
 from jaxdrones.engine.wrenches import describe
 from jaxdrones.envs.env import Env
 from jaxdrones.envs.explanation import Entry, Explanation, Part, number
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, description
 from jaxdrones.sensing import Scene
@@ -37,7 +38,7 @@ def explain(env: Env) -> Explanation:
         ValueError: something else than an environment, or a term that describes more or fewer numbers than it has.
     """
     if not isinstance(env, Env):
-        raise ValueError(f"explain was given {shown(env)}; give an environment, for example jaxdrones.make('hover')")
+        raise UserError(f"explain was given {shown(env)}; give an environment, for example jaxdrones.make('hover')")
     task = env.task
     drone = jax.tree.map(lambda x: x[0], env.params)
     action = _action_quantities(env, drone)
@@ -95,7 +96,7 @@ def _checked(what: str, described: tuple[Quantity, ...], size: int) -> tuple[Qua
     if not described:
         return tuple(Quantity(f"number {i}", _UNKNOWN, _UNKNOWN) for i in range(size))
     if len(described) != size:
-        raise ValueError(f"{what} describes {len(described)} numbers and has {size}; give entries=(...) of {size}")
+        raise UserError(f"{what} describes {len(described)} numbers and has {size}; give entries=(...) of {size}")
     return described
 
 

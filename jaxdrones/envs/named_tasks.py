@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxdrones import user_code
 from jaxdrones.checks import UnexpectedKeyword, check_callable, check_choice, check_keyword, hint, shown
+from jaxdrones.errors import UserError
 from jaxdrones.tasks import follow, forest, gates, gym_pybullet_drones, hover, room, swap, tracking
 from jaxdrones.tasks.task import Task
 
@@ -80,5 +81,5 @@ def make_task(task: str | Task | Callable[..., Task], options: dict[str, Any], o
             check_keyword(f"make({name!r})", option, {*others, *parameters})
     made = function(**options)
     if not isinstance(made, Task):
-        raise ValueError(f"{name} returned {shown(made)}; return a jaxdrones.tasks.Task")
+        raise UserError(f"{name} returned {shown(made)}; return a jaxdrones.tasks.Task")
     return made

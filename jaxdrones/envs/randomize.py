@@ -12,6 +12,7 @@ from jaxtyping import Array
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
 from jaxdrones.checks import POSITIVE, check_choice, check_number
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
@@ -43,7 +44,7 @@ class DisturbanceWithMemory:
     def __call__(self, key: jax.Array, params: Params, dt: float) -> Params:
         """The parameters of a team with the surroundings of the next control step."""
         if self.name not in params.aux:
-            raise ValueError(
+            raise UserError(
                 f"params.aux lacks {self.name!r}, the memory of a disturbance; start from its start(key, params)"
             )
         return self.advance(key, params, dt)
@@ -64,7 +65,7 @@ def _check_range(field: str, low: float, high: float) -> None:
     check_number(f"lower bound of {field}", low)
     check_number(f"upper bound of {field}", high)
     if not low <= high:
-        raise ValueError(f"the range of {field} is ({low}, {high}); give the lower bound first")
+        raise UserError(f"the range of {field} is ({low}, {high}); give the lower bound first")
 
 
 def scaled(field: str, low: float, high: float) -> Randomization:

@@ -54,6 +54,7 @@ from jaxdrones.envs.randomize import (
 )
 from jaxdrones.envs.surroundings import DrawScene, are_solid
 from jaxdrones.envs.vision import Vision, make_vision
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.sensing.sensor import Sensor, check_sensors
@@ -168,7 +169,7 @@ def make(
         from jaxdrones.engine import bullet  # needs an optional library
 
         if integrator != "semi_implicit_euler":
-            raise ValueError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
+            raise UserError(f"integrator is {integrator!r}; the bullet backend integrates by itself, leave it out")
         step = bullet.make_step(**physics, scene=scene if isinstance(scene, Scene) else None)
     else:
         if "ground" in task.contact:
@@ -219,7 +220,7 @@ def _randomizations(
     rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
     if len(whole) > 1 or (whole and vehicle is not None):
         other = "another AnyVehicle" if len(whole) > 1 else f"vehicle={shown(vehicle)}"
-        raise ValueError(f"{other} is given, but every episode draws a vehicle already; leave out one of them")
+        raise UserError(f"{other} is given, but every episode draws a vehicle already; leave out one of them")
     return (*whole, *rest)
 
 
@@ -236,7 +237,7 @@ def _all_named(kind: str, values, table: dict, others: dict) -> list:
     for value in values:
         if isinstance(value, str) and value not in table and value in others:
             other = "pairs" if kind == "effects" else "effects"
-            raise ValueError(f"{value!r} is given as one of {kind}; it is one of {other}, give {other}=({value!r},)")
+            raise UserError(f"{value!r} is given as one of {kind}; it is one of {other}, give {other}=({value!r},)")
     return [_named("effect" if kind == "effects" else "pair effect", value, table) for value in values]
 
 
@@ -252,7 +253,7 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
     kind = _named("action", action, ACTIONS)
     kind = kind() if callable(kind) else kind
     if not isinstance(kind, Action):
-        raise ValueError(
+        raise UserError(
             f"action is {shown(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
         )
     check_loop(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
@@ -264,7 +265,7 @@ def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, Observation
     terms = OBSERVATIONS | dict(task.observations)
     for sensor in sensors:
         if sensor.name in terms:
-            raise ValueError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
+            raise UserError(f"a sensor is named {sensor.name!r}, like an observation term; give it another name")
     terms |= {sensor.name: reading(sensor.name, sensor.bound, sensor.entries) for sensor in sensors}
     return {name: dataclasses.replace(term, name=name) for name, term in terms.items()}
 
@@ -277,7 +278,7 @@ def _vision(
     if images:
         return make_vision(step, images, camera or task.camera or Camera(), dt, scene)
     if camera is not None:
-        raise ValueError(
+        raise UserError(
             "camera is given, but vision asks for no image; give for example vision=('depth',), or leave it out"
         )
     return None

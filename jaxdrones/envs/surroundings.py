@@ -8,6 +8,7 @@ import jax
 
 from jaxdrones.checks import shown
 from jaxdrones.engine.step import HostStep, Step
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import Task, World
 
@@ -24,11 +25,11 @@ def example_of(scene: Scene | DrawScene) -> Scene:
     if isinstance(scene, Scene):
         return scene
     if not callable(scene):
-        raise ValueError(f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
+        raise UserError(f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
     example = jax.eval_shape(scene, jax.random.key(0))
     if not isinstance(example, Scene):
         returned = shown(scene(jax.random.key(0)))
-        raise ValueError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
+        raise UserError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
     return example
 
 
@@ -45,7 +46,7 @@ def check_scene(scene: Scene | DrawScene, step: Step, task: Task) -> int:
     """
     example = example_of(scene)
     if are_solid(scene, task) and not (isinstance(step, HostStep) or step.physics.takes_scene):
-        raise ValueError(
+        raise UserError(
             "the scene has obstacles and on the explicit backend drones would fly through them; give an effect that "
             "takes the scene, such as obstacle_contact, a task whose terminations find obstacles "
             "(obstacles_terminate), no obstacles, or take the bullet backend"

@@ -15,6 +15,7 @@ from jaxdrones.checks import check_choice
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.envs.exposures import where_due
 from jaxdrones.envs.surroundings import DrawScene
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene, render
 from jaxdrones.sensing.camera import check_camera
@@ -159,7 +160,7 @@ def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, sc
     check_camera(camera)
     every = 1 if camera.rate is None else 1 / (camera.rate * dt)
     if every < 1 - 1e-6:
-        raise ValueError(
+        raise UserError(
             f"the rate of the camera is {camera.rate:g} images/s; give at most the control rate, {1 / dt:g}, or a "
             "higher control_hz"
         )

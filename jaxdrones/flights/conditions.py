@@ -10,6 +10,7 @@ from jaxdrones import control, optimal
 from jaxdrones.checks import check_choice, check_positive, check_whole
 from jaxdrones.control import pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.errors import UserError
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.limits import check_at_most, check_memory, check_seed
 
@@ -79,7 +80,7 @@ class Conditions:
         check_at_most("control rate (Hz)", self.control_hz, _MAX_HZ)
         check_positive("duration", self.duration, "s")
         if self.duration > _MAX_DURATION:
-            raise ValueError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
+            raise UserError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
         if self.seed is not None:
             check_seed("seed", self.seed)
         check_choice("controller", self.controller, CONTROLLERS)
@@ -91,11 +92,11 @@ class Conditions:
         _check_once(self.effects)
         if flight.labels and self.drones != len(flight.labels):
             who = ", ".join(flight.labels)
-            raise ValueError(f"drones is {self.drones}; the {self.flight} flight takes {flight.drones}: {who}")
+            raise UserError(f"drones is {self.drones}; the {self.flight} flight takes {flight.drones}: {who}")
         if self.flight == "velocity" and self.controller != "pid":
-            raise ValueError(f"controller is {self.controller!r}; the velocity flight is flown by 'pid'")
+            raise UserError(f"controller is {self.controller!r}; the velocity flight is flown by 'pid'")
         if self.steps == 0:
-            raise ValueError(
+            raise UserError(
                 f"duration is {self.duration} s, less than half a control period; give {self.dt:.4g} s or more"
             )
         size = self.drones * self.steps * _LOG_BYTES
@@ -107,13 +108,9 @@ class Conditions:
             "give fewer drones, a shorter duration or a lower control rate",
         )
         if self.backend == "bullet" and self.integrator != "semi_implicit_euler":
-            raise ValueError(
-                f"integrator is {self.integrator!r}; the bullet backend integrates by itself, leave it out"
-            )
+            raise UserError(f"integrator is {self.integrator!r}; the bullet backend integrates by itself, leave it out")
         if self.obstacles and self.backend != "bullet":
-            raise ValueError(
-                "obstacles are asked for; the explicit backend flies through them, take the bullet backend"
-            )
+            raise UserError("obstacles are asked for; the explicit backend flies through them, take the bullet backend")
 
     @property
     def dt(self) -> float:
@@ -157,5 +154,5 @@ def _check_once(effects: tuple[str, ...]) -> None:
             kind = kind.removesuffix(suffix)
         if kind in seen:
             both = "twice" if seen[kind] == effect else f"beside {seen[kind]!r}, another model of the same effect"
-            raise ValueError(f"effect {effect!r} is given {both}; give one of them, once")
+            raise UserError(f"effect {effect!r} is given {both}; give one of them, once")
         seen[kind] = effect

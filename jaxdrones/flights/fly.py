@@ -12,6 +12,7 @@ from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.legs import leg_length, legs
 from jaxdrones.engine.rollout import Control
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.controllers import controller_of
 from jaxdrones.flights.examples import FLIGHTS, Flight
@@ -107,7 +108,7 @@ def _flown(
     )
     if conditions.backend == "explicit":
         if gui:
-            raise ValueError("a window is asked for; only the bullet backend has one")
+            raise UserError("a window is asked for; only the bullet backend has one")
         step = make_step(**common, integrator=INTEGRATORS[conditions.integrator])
         yield from legs(step, control, params, start, memory, conditions.steps, length)
         return

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.control.pid import VEHICLES, rpm_to_pwm
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.serialization import scene_from_dict, scene_to_dict
@@ -215,7 +216,7 @@ class Record:
         except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
             if isinstance(error, FileNotFoundError):
                 raise
-            raise ValueError(
+            raise UserError(
                 f"{path} is not the log of a flight ({error}); give a log.npz that `jaxdrones fly` wrote"
             ) from None
         texts = {name: json.loads(str(arrays.pop(name))) for name in ("conditions", "params", "scene")}
@@ -244,7 +245,7 @@ class Record:
 def check_pwm(vehicle: str) -> None:
     """Raise `ValueError` unless a vehicle has the motors of the Crazyflie, whose PWM is known."""
     if vehicle not in VEHICLES:
-        raise ValueError(
+        raise UserError(
             f"PWM is asked for with {vehicle!r}; it is known for {' and '.join(VEHICLES)} only, leave it out"
         )
 

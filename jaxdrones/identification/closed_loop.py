@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.control import Setpoint, firmware_pid
 from jaxdrones.dynamics import FULL_PWM, Motors, midpoint
+from jaxdrones.errors import UserError
 from jaxdrones.identification.log import PERIOD, FlightLog
 from jaxdrones.identification.open_loop import equations_of_motion, lagged_rpm
 from jaxdrones.identification.vehicle import Vehicle
@@ -90,7 +91,7 @@ def rows_after_climb(log: FlightLog) -> slice:
     height = log.pos[:, 2]
     up = log.in_flight & (height > _MIN_HEIGHT) & (np.abs(height - ref_pos[:, 2]) < _CLIMB_TOLERANCE)
     if not up.any():
-        raise ValueError(
+        raise UserError(
             f"{log.name}: is never within {_CLIMB_TOLERANCE:g} m of the height of its set-point; give another flight"
         )
     return slice(int(np.argmax(up)), int(np.flatnonzero(log.in_flight & (height > _MIN_HEIGHT))[-1]) + 1)

@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.errors import UserError
 from jaxdrones.identification.fit import Report
 from jaxdrones.identification.instruments import Instruments
 from jaxdrones.identification.open_loop import HORIZONS, QUANTITIES
@@ -67,5 +68,5 @@ def load_vehicle(vehicle: str | os.PathLike) -> Vehicle:
         entries = json.loads(report.read_text())["instruments"]
         instruments = Instruments(**{name: jnp.asarray(entries[name], float) for name in _INSTRUMENTS})
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{report}: cannot be read ({error!r}); give the --output folder of `jaxdrones fit`") from None
+        raise UserError(f"{report}: cannot be read ({error!r}); give the --output folder of `jaxdrones fit`") from None
     return Vehicle(load_params(folder / URDF), instruments)

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxdrones.checks import shown
 from jaxdrones.dynamics import Motors, crazyflie_motors
+from jaxdrones.errors import UserError
 from jaxdrones.identification.least_squares import Normal, normal_equations
 from jaxdrones.identification.log import FlightLog
 from jaxdrones.identification.open_loop import (
@@ -105,10 +106,10 @@ def fit(
     """
     named = bool(names)
     if not logs:
-        raise ValueError("there are no flights to fit; give at least one")
+        raise UserError("there are no flights to fit; give at least one")
     kinds = {log.has_rotor_speeds for log in (*logs, *validate)}
     if len(kinds) > 1:
-        raise ValueError("some logs have rotor speeds and others only PWM; fit them one after the other")
+        raise UserError("some logs have rotor speeds and others only PWM; fit them one after the other")
     motors = motors or crazyflie_motors()
     if not named and all(log.has_setpoints for log in logs):
         return _fit_paths(logs, params, validate, motors, progress)
@@ -124,7 +125,7 @@ def _fit_paths(
     progress: Callable[[str], None],
 ) -> Report:
     if validate:
-        raise ValueError(
+        raise UserError(
             "flights on set-points are fitted without validation; leave --validate out, or name --parameters"
         )
     vehicle, errors = fit_path(logs, Vehicle.of(params), motors, progress)
@@ -248,7 +249,7 @@ class _Problem:
             f"{name} ({shown(e.value)} +- {e.std_error:.2g})" for name, e in estimates.items() if not e.identifiable
         ]
         if unidentifiable and named:
-            raise ValueError(
+            raise UserError(
                 f"the flights do not identify {', '.join(unidentifiable)}; leave such parameters out of --parameters"
             )
         values = {}

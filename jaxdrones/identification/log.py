@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxdrones import assets
 from jaxdrones.checks import shown
+from jaxdrones.errors import UserError
 
 PERIOD = 0.01  # s, time between the rows of a log
 _PERIOD_TOLERANCE = 0.2  # largest relative error of the median time between rows
@@ -83,9 +84,9 @@ class FlightLog:
             with np.load(path, allow_pickle=False) as arrays:
                 columns = {name: np.asarray(arrays[name]) for name in arrays.files if name in (*_COLUMNS, "gyro")}
         except OSError as error:
-            raise ValueError(f"{path}: cannot be read ({error.strerror or error}); give a flight log (.npz)") from None
+            raise UserError(f"{path}: cannot be read ({error.strerror or error}); give a flight log (.npz)") from None
         except (ValueError, EOFError, zipfile.BadZipFile):
-            raise ValueError(f"{path}: is not an .npz file of arrays; give a flight log") from None
+            raise UserError(f"{path}: is not an .npz file of arrays; give a flight log") from None
         if "omega" not in columns and "gyro" in columns:
             columns["omega"] = columns["gyro"]
         columns.pop("gyro", None)
@@ -109,7 +110,7 @@ class FlightLog:
             ValueError: the log lacks one of them.
         """
         if self.ref_pos is None or self.ref_yaw is None or self.pwm is None or self.vbat is None:
-            raise ValueError(f"{self.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop")
+            raise UserError(f"{self.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop")
         return self.ref_pos, self.ref_yaw, self.pwm, self.vbat
 
     @property
@@ -138,19 +139,19 @@ def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]
     for column in ("t", "pos", "quat", "vel", "omega", *inputs):
         if column not in columns:
             others = " (or rpm)" if column in ("pwm", "vbat") else " (or gyro)" if column == "omega" else ""
-            raise ValueError(f"{name}: has no column {column!r}{others}: {_COLUMNS[column][1]}; add it to the log")
+            raise UserError(f"{name}: has no column {column!r}{others}: {_COLUMNS[column][1]}; add it to the log")
     rows = len(np.atleast_1d(columns["t"]))
     for column, array in columns.items():
         count, meaning = _COLUMNS[column]
         shape = (rows,) if count == 1 else (rows, count)
         if array.shape != shape or array.dtype.kind not in "fiu":
-            raise ValueError(
+            raise UserError(
                 f"{name}: {column} is {array.dtype} of shape {array.shape}; give numbers of shape {shape}: {meaning}"
             )
         columns[column] = array.astype(float)
         if not np.isfinite(columns[column]).all():
             row = int(np.argmin(np.isfinite(columns[column].reshape(rows, -1)).all(axis=1)))
-            raise ValueError(f"{name}: {column} is not finite in row {row}; remove or repair such rows")
+            raise UserError(f"{name}: {column} is not finite in row {row}; remove or repair such rows")
     _check_times(name, columns["t"])
     for column in columns:
         _check_units(name, column, columns[column])
@@ -162,17 +163,17 @@ def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]
 
 def _check_times(name: str, t: np.ndarray) -> None:
     if len(t) < _MIN_ROWS:
-        raise ValueError(f"{name}: has {len(t)} rows; give at least {_MIN_ROWS}, one second of flight")
+        raise UserError(f"{name}: has {len(t)} rows; give at least {_MIN_ROWS}, one second of flight")
     steps = np.diff(t)
     if not (steps > 0).all():
         row = int(np.argmin(steps > 0)) + 1
-        raise ValueError(f"{name}: time goes from {t[row - 1]:g} to {t[row]:g} s in row {row}; sort the rows by time")
+        raise UserError(f"{name}: time goes from {t[row - 1]:g} to {t[row]:g} s in row {row}; sort the rows by time")
     period = np.median(steps)
     if abs(period - PERIOD) > _PERIOD_TOLERANCE * PERIOD:
-        raise ValueError(f"{name}: rows are {period:.4g} s apart; resample the log to {PERIOD:g} s")
+        raise UserError(f"{name}: rows are {period:.4g} s apart; resample the log to {PERIOD:g} s")
     if np.max(steps) > _MAX_GAP:
         row = int(np.argmax(steps))
-        raise ValueError(f"{name}: no rows between {t[row]:g} and {t[row + 1]:g} s; cut the log there")
+        raise UserError(f"{name}: no rows between {t[row]:g} and {t[row + 1]:g} s; cut the log there")
 
 
 def _check_units(name: str, column: str, x: np.ndarray) -> None:
@@ -181,7 +182,7 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
     def require(condition, looks: str, give: str) -> None:
         if not condition:
             low, high = np.min(x), np.max(x)
-            raise ValueError(f"{name}: {column} is {low:.4g} to {high:.4g}, which looks like {looks}; give {give}")
+            raise UserError(f"{name}: {column} is {low:.4g} to {high:.4g}, which looks like {looks}; give {give}")
 
     largest = np.max(np.abs(x))
     if column == "quat":

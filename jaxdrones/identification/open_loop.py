@@ -13,6 +13,7 @@ from jaxdrones import rotation
 from jaxdrones.dynamics import Motors, drag, flapping_moment, midpoint, rate_damping, trim_torque
 from jaxdrones.dynamics.propulsion import FULL_PWM
 from jaxdrones.engine.explicit import Derivative, make_derivative
+from jaxdrones.errors import UserError
 from jaxdrones.identification.log import PERIOD, FlightLog
 from jaxdrones.identification.vehicle import Vehicle
 from jaxdrones.params import Params
@@ -72,7 +73,7 @@ def window_starts(log: FlightLog, stride: int = 1) -> np.ndarray:
     flying = np.convolve(~log.in_flight, np.ones(_LENGTH + 1), mode="valid") == 0
     starts = np.flatnonzero(flying)[::stride]
     if not len(starts):
-        raise ValueError(f"{log.name}: the motors never run for {_LENGTH * PERIOD:g} s on end; give a log of a flight")
+        raise UserError(f"{log.name}: the motors never run for {_LENGTH * PERIOD:g} s on end; give a log of a flight")
     return starts
 
 

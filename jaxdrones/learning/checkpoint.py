@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdrones.errors import UserError
 from jaxdrones.learning.files import ADVICE, load_bytes, one_line, read_sidecar, save_bytes
 from jaxdrones.learning.networks import MLP, Network, Policy
 from jaxdrones.learning.normalize import RunningStatistics
@@ -48,7 +49,7 @@ def load(path: str | os.PathLike) -> Policy:
     path = Path(path)
     sidecar = read_sidecar(path)
     if "policy" not in sidecar:
-        raise ValueError(f"{path} holds no policy; found {', '.join(sidecar)}")
+        raise UserError(f"{path} holds no policy; found {', '.join(sidecar)}")
     arrays = _restore(path, sidecar)
     try:
         settings: dict[str, Any] = {
@@ -59,7 +60,7 @@ def load(path: str | os.PathLike) -> Policy:
         params = jax.tree.map(jnp.asarray, arrays["params"])
         policy = Policy(params, obs_stats, network, sidecar["policy"]["per_agent"])
     except (AttributeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} does not hold a policy of this version ({one_line(error)}); {ADVICE}") from error
+        raise UserError(f"{path} does not hold a policy of this version ({one_line(error)}); {ADVICE}") from error
     _check_shapes(path, sidecar, policy)
     _check_finite(_arrays_file(path), policy)
     return policy
@@ -92,7 +93,7 @@ def load_tree(path: str | os.PathLike, like: Any) -> Any:
     try:
         arrays = flax.serialization.from_state_dict(zeros, _restore(path, sidecar))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
+        raise UserError(
             f"{path} does not hold a tree of the structure asked for ({one_line(error)}); {ADVICE}"
         ) from error
     _check_shapes(path, sidecar, arrays)
@@ -116,7 +117,7 @@ def _restore(path: Path, sidecar: dict[str, Any]) -> Any:
     try:
         return flax.serialization.msgpack_restore(content)
     except Exception as error:  # msgpack raises errors of several types
-        raise ValueError(f"{_arrays_file(path)} is damaged: {one_line(error)}; {ADVICE}") from error
+        raise UserError(f"{_arrays_file(path)} is damaged: {one_line(error)}; {ADVICE}") from error
 
 
 def _check_shapes(path: Path, sidecar: dict[str, Any], tree: Any) -> None:
@@ -124,7 +125,7 @@ def _check_shapes(path: Path, sidecar: dict[str, Any], tree: Any) -> None:
     expected, found = _shapes(tree), sidecar.get("shapes", {})
     for name in expected | found:
         if expected.get(name) != found.get(name):
-            raise ValueError(
+            raise UserError(
                 f"{path}: {name} is {found.get(name, 'missing')}, expected {expected.get(name, 'nothing')}; load it "
                 "with the environment, the settings and the precision (JAX_ENABLE_X64) that it was saved with"
             )
@@ -134,7 +135,7 @@ def _check_finite(file: Path, policy: Policy) -> None:
     for path, x in jax.tree_util.tree_leaves_with_path(policy):
         if not np.isfinite(x).all():
             where = jax.tree_util.keystr(path)
-            raise ValueError(f"{file}: the policy's {where} holds numbers that are not finite; {ADVICE}")
+            raise UserError(f"{file}: the policy's {where} holds numbers that are not finite; {ADVICE}")
 
 
 def _is_key(x) -> bool:

@@ -14,6 +14,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from jaxdrones.errors import UserError
+
 FORMAT = 3
 """Version of the format; files of another version are refused."""
 
@@ -53,7 +55,7 @@ def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
     path = file.with_suffix("")
     if not found:
         raise FileNotFoundError(f"no checkpoint at {path}: {file} does not exist")
-    raise ValueError(
+    raise UserError(
         f"{file} is damaged, or of another checkpoint than {file.with_suffix('.json').name}: its checksum differs; "
         + ADVICE
     )
@@ -88,16 +90,16 @@ def read_sidecar(path: str | os.PathLike) -> dict[str, Any]:
     try:
         sidecar = json.loads(content)
         if not isinstance(sidecar, dict):
-            raise ValueError("it holds no JSON object")
+            raise UserError("it holds no JSON object")
         expected, found = sidecar.pop("sidecar_sha256", None), _sidecar_digest(sidecar)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file} is damaged: {one_line(error)}; {ADVICE}") from None
+        raise UserError(f"{file} is damaged: {one_line(error)}; {ADVICE}") from None
     if sidecar.get("format") != FORMAT:
-        raise ValueError(
+        raise UserError(
             f"{file} has format {repr(sidecar.get('format'))[:20]}, this version reads {FORMAT}; train anew"
         )
     if expected != found:
-        raise ValueError(f"{file} is damaged, or was edited after it was saved: its checksum differs; {ADVICE}")
+        raise UserError(f"{file} is damaged, or was edited after it was saved: its checksum differs; {ADVICE}")
     return sidecar
 
 
@@ -122,7 +124,7 @@ def _read(file: Path) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise ValueError(f"{file} cannot be read: {error.strerror}; {ADVICE}") from error
+        raise UserError(f"{file} cannot be read: {error.strerror}; {ADVICE}") from error
 
 
 def _write_temporary(file: Path, content: bytes) -> None:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxdrones.checks import check_choice, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
+from jaxdrones.errors import UserError
 from jaxdrones.learning.layers import CNN, GRU, IMAGE_CHANNELS, MLP, convolutions, image_channels
 from jaxdrones.learning.normalize import RunningStatistics, map_state_vector, state_vector
 from jaxdrones.pytree import PyTreeNode
@@ -183,7 +184,7 @@ class Policy(PyTreeNode):
             ValueError: the policy has a memory.
         """
         if self.recurrent_size:
-            raise ValueError(
+            raise UserError(
                 f"this policy has a memory of {self.recurrent_size} numbers per drone; call policy.act(memory, obs), "
                 "at the start of an episode with policy.initial_memory((drones,))"
             )

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from jaxdrones.checks import check_key, check_keywords, check_number, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
+from jaxdrones.errors import UserError
 from jaxdrones.learning import collect
 from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
 from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob
@@ -104,7 +105,7 @@ class Config:
             low = float(self.min_learning_rate)
             check_number("max_learning_rate", self.max_learning_rate, "not below min_learning_rate", at_least=low)
         if self.worlds % self.minibatches:
-            raise ValueError(f"worlds is {self.worlds}; give a multiple of minibatches, {self.minibatches}")
+            raise UserError(f"worlds is {self.worlds}; give a multiple of minibatches, {self.minibatches}")
 
 
 class TrainState(PyTreeNode):

@@ -17,6 +17,7 @@ import jax
 
 from jaxdrones.checks import check_callable, check_choice, check_number, check_switch, check_whole, is_known, shown
 from jaxdrones.engine.step import Step
+from jaxdrones.errors import UserError
 
 GRADIENTS = ("exact", "decay", "surrogate", "point_mass")
 """Names of the gradients that `learning.gradients` explains."""
@@ -32,7 +33,7 @@ def _check_whole_if_known(name: str, value: Any) -> None:
 
 def _check_layers(name: str, sizes: Any) -> None:
     if not isinstance(sizes, tuple | list) or not sizes:
-        raise ValueError(f"{name} is {shown(sizes)}; give the sizes of the hidden layers, for example (32, 32)")
+        raise UserError(f"{name} is {shown(sizes)}; give the sizes of the hidden layers, for example (32, 32)")
     for size in sizes:
         check_whole(f"an entry of {name}", size)
 
@@ -92,9 +93,9 @@ def check_config(config: Any, kind: type) -> None:
         return
     learner = _learner(kind)
     if isinstance(config, dict):
-        raise ValueError(f"config is a dictionary; give jaxdrones.learning.{learner}.Config(**config)")
+        raise UserError(f"config is a dictionary; give jaxdrones.learning.{learner}.Config(**config)")
     given = f"{_learner(type(config))}.Config" if dataclasses.is_dataclass(config) else shown(config)
-    raise ValueError(f"config is {given}; {learner} learns with jaxdrones.learning.{learner}.Config(...)")
+    raise UserError(f"config is {given}; {learner} learns with jaxdrones.learning.{learner}.Config(...)")
 
 
 def _learner(kind: type) -> str:

@@ -20,6 +20,8 @@ from typing import Any
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from jaxdrones.errors import UserError
+
 _AXIS = "worlds"
 
 WORLDS = PartitionSpec(_AXIS)
@@ -43,7 +45,7 @@ def make_mesh(worlds: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
     devices = jax.devices() if devices is None else devices
     count = len(devices)
     if worlds % count:
-        raise ValueError(
+        raise UserError(
             f"worlds is {worlds}, to be shared by {count} devices; give a multiple of {count}, "
             "or hide devices (CUDA_VISIBLE_DEVICES=0 leaves one)"
         )

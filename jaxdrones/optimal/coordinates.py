@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_shape, is_known, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
@@ -43,7 +44,7 @@ def command_unit(params: Params) -> Float[Array, ""]:
     """
     check_shape("params.mass", params.mass, (), "optimal control is about one drone; use jax.vmap for a team")
     if is_known(params.gravity) and not np.asarray(params.gravity) > 0:
-        raise ValueError(
+        raise UserError(
             f"params.gravity is {shown(params.gravity)}; optimal control counts commands in the rotor speed of hover, "
             "give a positive gravity"
         )

@@ -13,6 +13,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_positive, check_shape
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.errors import UserError
 from jaxdrones.optimal.coordinates import command_unit, tracking_error
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -119,7 +120,7 @@ def check_period(step: Any, dt: float) -> None:
     check_positive("dt", dt, "s")
     period = getattr(step, "period", None)
     if period is not None and not math.isclose(period, dt, rel_tol=1e-6):
-        raise ValueError(f"dt is {dt} s and the step takes {period:g} s; give a step of one control period")
+        raise UserError(f"dt is {dt} s and the step takes {period:g} s; give a step of one control period")
 
 
 def quadratic(params: Params, matrix: Float[Array, "d d"], state: State, target: State) -> Float[Array, ""]:

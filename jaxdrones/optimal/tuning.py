@@ -19,6 +19,7 @@ from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, melli
 from jaxdrones.dynamics import drag, lagging_rotors
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.rollout import rollout
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params, repeat
 from jaxdrones.state import State
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, SHAPES, setpoint_on
@@ -89,7 +90,7 @@ def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500,
     check_whole("iterations", iterations)
     gains, error = _descend(module, control_hz, iterations, params, start(module, params))
     if not jnp.isfinite(error):
-        raise ValueError(f"{_name(module)} cannot fly this vehicle with any gains that were tried; use 'geometric'")
+        raise UserError(f"{_name(module)} cannot fly this vehicle with any gains that were tried; use 'geometric'")
     return gains
 
 
@@ -98,7 +99,7 @@ def start(module: ModuleType, params: Params) -> Any:
     if module in (firmware_pid, mellinger):
         return module.gains(params)
     if module is pid and not pid.fits(params):
-        raise ValueError("pid commands the PWM of a Crazyflie, which this vehicle is not; tune another controller")
+        raise UserError("pid commands the PWM of a Crazyflie, which this vehicle is not; tune another controller")
     gains = module.gains()
     if module is not simple_pid:
         return gains
@@ -115,7 +116,7 @@ def _tunable(controller: str | ModuleType) -> ModuleType:
         controller = control.CONTROLLERS[controller]
     if not isinstance(controller, ModuleType) or controller not in _TUNED:
         known = ", ".join(map(_name, _TUNED))
-        raise ValueError(f"{_name(controller)} has no gains that could be tuned; give one of {known}")
+        raise UserError(f"{_name(controller)} has no gains that could be tuned; give one of {known}")
     return controller
 
 

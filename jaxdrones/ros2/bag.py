@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from jaxdrones.errors import UserError
 from jaxdrones.ros2 import convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2.topics import Topic
@@ -54,7 +55,7 @@ def deserialize(data: bytes, name: str) -> msg.Message:
         ValueError: a type that is not among `messages.MESSAGES`.
     """
     if name not in msg.MESSAGES:
-        raise ValueError(f"messages of type {name} are not known (known: {', '.join(sorted(msg.MESSAGES))})")
+        raise UserError(f"messages of type {name} are not known (known: {', '.join(sorted(msg.MESSAGES))})")
     return msg.decode(msg.MESSAGES[name], _typestore().deserialize_cdr(data, name))
 
 
@@ -76,13 +77,13 @@ class Recorder:
 
         path = Path(path)
         if path.exists():
-            raise ValueError(f"{path} exists already; name a bag that does not")
+            raise UserError(f"{path} exists already; name a bag that does not")
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Any] = {}
         try:
             self._writer.open()
         except OSError as error:
-            raise ValueError(f"{path} cannot be written: {error.strerror}; choose another") from None
+            raise UserError(f"{path} cannot be written: {error.strerror}; choose another") from None
 
     def __enter__(self) -> Recorder:
         return self
@@ -117,7 +118,7 @@ def read(path: Path) -> Iterator[Recorded]:
         reader = Reader(path)
         reader.open()
     except (ReaderError, OSError) as error:
-        raise ValueError(f"{path} is no bag of ROS 2: {error}; give the folder of one") from None
+        raise UserError(f"{path} is no bag of ROS 2: {error}; give the folder of one") from None
     try:
         known = [connection for connection in reader.connections if connection.msgtype in msg.MESSAGES]
         for connection, ns, data in reader.messages(known):
@@ -165,7 +166,7 @@ def read_flight(path: Path) -> dict[str, np.ndarray]:
     streams = {name: [found.get(topics.output(i, name).name, {}) for i in range(n)] for name in ("odom", "motors")}
     times = sorted(set.intersection(*(set(stream) for kind in streams.values() for stream in kind))) if n else []
     if not times:
-        raise ValueError(f"{path} holds no flight: it lacks /drone_0/odom and /drone_0/motors; record it with both")
+        raise UserError(f"{path} holds no flight: it lacks /drone_0/odom and /drone_0/motors; record it with both")
     states = [convert.to_state(*([stream[ns] for stream in kind] for kind in streams.values())) for ns in times]
     arrays = {name: np.stack([getattr(s, name) for s in states]) for name in ("pos", "quat", "vel", "omega", "rpm")}
     return arrays | {"t": np.array(times) / 1e9}

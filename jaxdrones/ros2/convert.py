@@ -11,6 +11,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import shown
+from jaxdrones.errors import UserError
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2 import topics
 from jaxdrones.ros2.command import Command, Mode
@@ -162,11 +163,11 @@ def to_command(name: str, message: Any) -> Command:
 def _pose_command(message: msg.PoseStamped) -> Command:
     frame = message.header.frame_id
     if frame not in ("", topics.WORLD):
-        raise ValueError(f"its frame_id is {frame!r}; give poses in {topics.WORLD!r}")
+        raise UserError(f"its frame_id is {frame!r}; give poses in {topics.WORLD!r}")
     x, y, z, w = _finite(numbers(message.pose.orientation), "orientation")
     length = math.hypot(x, y, z, w)
     if not abs(length - 1) < 1e-3:
-        raise ValueError(f"its orientation has length {length:g}; give a unit quaternion (x, y, z, w)")
+        raise UserError(f"its orientation has length {length:g}; give a unit quaternion (x, y, z, w)")
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return Command.zero(Mode.POSITION, pos=_finite(numbers(message.pose.position), "position"), yaw=yaw)
 
@@ -179,13 +180,13 @@ def _velocity_command(message: msg.Twist) -> Command:
 def _rates_command(message: msg.Twist) -> Command:
     acc, omega = (_finite(numbers(v), name) for v, name in ((message.linear, "linear"), (message.angular, "angular")))
     if acc[2] < 0:
-        raise ValueError(f"its linear.z, the collective thrust per mass, is {acc[2]:g} m/s^2; give 0 or more")
+        raise UserError(f"its linear.z, the collective thrust per mass, is {acc[2]:g} m/s^2; give 0 or more")
     return Command.zero(Mode.RATES, omega=omega, thrust=acc[2])
 
 
 def _motor_command(message: msg.Float64MultiArray) -> Command:
     if len(message.data) != 4:
-        raise ValueError(f"its data has {len(message.data)} numbers; give 4 rotor speeds, RPM")
+        raise UserError(f"its data has {len(message.data)} numbers; give 4 rotor speeds, RPM")
     return Command.zero(Mode.MOTORS, rpm=_finite(message.data, "data"))
 
 
@@ -204,5 +205,5 @@ def numbers(vector: Any) -> tuple[float, ...]:
 
 def _finite(values: tuple[float, ...], name: str) -> tuple[float, ...]:
     if not all(map(math.isfinite, values)):
-        raise ValueError(f"its {name} is {shown(values)}; give finite numbers")
+        raise UserError(f"its {name} is {shown(values)}; give finite numbers")
     return values

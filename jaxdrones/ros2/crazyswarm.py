@@ -22,6 +22,7 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_positive, check_switch
 from jaxdrones.dynamics import downwash, ground_contact
 from jaxdrones.engine.explicit import make_step
+from jaxdrones.errors import UserError
 from jaxdrones.params import repeat
 from jaxdrones.ros2.convert import stamp
 from jaxdrones.state import State
@@ -138,7 +139,7 @@ def _rotors_of_motors(places: np.ndarray) -> np.ndarray:
     ]
     if sorted(signs) != sorted(_PLACES):
         where = places[:, :2].tolist()
-        raise ValueError(f"the rotors of the vehicle are at {where}; Crazyswarm2 flies an X configuration, give cf2x")
+        raise UserError(f"the rotors of the vehicle are at {where}; Crazyswarm2 flies an X configuration, give cf2x")
     return np.array([_PLACES.index(sign) for sign in signs])
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_finite, check_key, check_number, check_positive, check_shape, check_whole, shown
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import clutter
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.shapes import Box, Sphere
@@ -135,7 +136,7 @@ def room(
     if not pillars + spheres + boxes:
         return Scene.of(shell)
     if key is None:
-        raise ValueError("a room with pillars or clutter is drawn from a key; give key=jax.random.key(0)")
+        raise UserError("a room with pillars or clutter is drawn from a key; give key=jax.random.key(0)")
     check_key("key", key)
     pillar_key, sphere_key, box_key = jax.random.split(key, 3)
     free, corners = _points(keep_free), jnp.array([[-x / 2, -y / 2, 0], [x / 2, y / 2, z]])
@@ -213,7 +214,7 @@ def _points(points: ArrayLike) -> Float[Array, "k 3"]:
     array = jnp.asarray(points, float)
     array = array.reshape(0, 3) if array.size == 0 else array
     if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"keep_free has shape {array.shape}; give points (k, 3), m")
+        raise UserError(f"keep_free has shape {array.shape}; give points (k, 3), m")
     check_finite("keep_free", array)
     return array
 
@@ -223,7 +224,7 @@ def _range(
 ) -> tuple[float, float]:
     """The two ends of an interval, of which one number is both."""
     if np.shape(bounds) not in ((), (2,)):
-        raise ValueError(f"{name} is {shown(bounds)}; give a number or (smallest, largest) ({unit})")
+        raise UserError(f"{name} is {shown(bounds)}; give a number or (smallest, largest) ({unit})")
     low, high = np.broadcast_to(np.asarray(bounds), (2,)).tolist()
     check_number(name, low, unit, at_least=at_least, above=above)
     check_number(f"the largest {name}", high, unit, at_least=low)

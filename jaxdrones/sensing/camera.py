@@ -21,6 +21,7 @@ from jaxdrones.checks import (
     check_whole,
     shown,
 )
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import along_z, cross, unit
@@ -64,7 +65,7 @@ class Camera:
 
     def __post_init__(self):
         if not isinstance(self.resolution, tuple | list) or len(self.resolution) != 2:
-            raise ValueError(f"resolution of a camera is {shown(self.resolution)}; give (width, height) in pixels")
+            raise UserError(f"resolution of a camera is {shown(self.resolution)}; give (width, height) in pixels")
         for name, pixels in zip(("width", "height"), self.resolution, strict=True):
             check_whole(f"{name} of a camera", pixels)
         object.__setattr__(self, "resolution", tuple(self.resolution))
@@ -82,7 +83,7 @@ class Camera:
             if value is None and name == "offset":
                 continue
             if np.shape(value) != (length,):
-                raise ValueError(f"{name} of a camera is {shown(value)}; give {length} numbers")
+                raise UserError(f"{name} of a camera is {shown(value)}; give {length} numbers")
             check_finite(f"{name} of a camera", value)
             object.__setattr__(self, name, tuple(map(float, value)))
         check_quaternion("orientation of a camera", self.orientation)
@@ -130,4 +131,4 @@ corners of the pixels in place of their centers."""
 def check_camera(camera: Any) -> None:
     """Raise unless `camera` is a camera."""
     if not isinstance(camera, Camera):
-        raise ValueError(f"camera is {shown(camera)}; give a jaxdrones.Camera, for example Camera(resolution=(16, 12))")
+        raise UserError(f"camera is {shown(camera)}; give a jaxdrones.Camera, for example Camera(resolution=(16, 12))")

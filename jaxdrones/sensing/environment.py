@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_positive, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.sensing.noise import Errors, Noise
@@ -63,7 +64,7 @@ def magnetometer(
         ValueError: errors that are no `Noise`, a rate that is not positive, or a field that is no vector.
     """
     if np.shape(field) != (3,):
-        raise ValueError(f"field of {name} is {shown(field)}; give 3 numbers (uT, world)")
+        raise UserError(f"field of {name} is {shown(field)}; give 3 numbers (uT, world)")
     check_finite(f"field of {name}", field)
 
     def true(state: State) -> jax.Array:
@@ -82,7 +83,7 @@ def _noisy(
 ) -> Sensor:
     """A sensor of what a function `true(state) -> (size,)` says."""
     if not isinstance(errors, Noise):
-        raise ValueError(f"errors of {name} is {shown(errors)}; give jaxdrones.sensing.Noise(density=...)")
+        raise UserError(f"errors of {name} is {shown(errors)}; give jaxdrones.sensing.Noise(density=...)")
     check_positive(f"rate of {name}", rate, "1/s")
 
     def init(key: jax.Array, params: Params) -> Errors:

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_number, check_positive, check_switch, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.quantity import quantities
@@ -92,11 +93,11 @@ def state_estimate(
     """
     inertial.check_part(part)
     if not isinstance(system, MotionCaptureSystem):
-        raise ValueError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
+        raise UserError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
     check_positive(f"rate of {name}", rate, "1/s")
     check_switch(f"attitude of {name}", attitude)
     if not isinstance(start, tuple | list) or len(start) != 3:
-        raise ValueError(f"start of {name} is {shown(start)}; give deviations of position (m), velocity (m/s), angle")
+        raise UserError(f"start of {name} is {shown(start)}; give deviations of position (m), velocity (m/s), angle")
     for what, unit, value in zip(("position", "velocity", "angle"), ("m", "m/s", "rad"), start, strict=True):
         check_positive(f"start of {name}, {what},", value, unit)
     check_number(f"pos_noise of {name}", system.pos_noise, "m", above=0)
@@ -179,7 +180,7 @@ def _whole(name: str, what: str, periods: float, given: str, rate: float, at_lea
     """A number of periods of the IMU that has to be whole."""
     whole = round(periods)
     if whole < at_least or abs(periods - whole) > _ROUNDING * max(periods, 1):
-        raise ValueError(
+        raise UserError(
             f"{what} of the poses of {name} is {given}, {periods:g} periods of the IMU at {rate:g} Hz; "
             "give one that is a whole number of them"
         )

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_positive, check_quaternion
+from jaxdrones.errors import UserError
 from jaxdrones.sensing.shapes import GREY, LENGTHS, Box
 
 
@@ -29,12 +30,12 @@ class File:
         for name in "pos", "quat", "color":
             value, what = np.asarray(getattr(self, name), float), f"{name} of {type(self).__name__}"
             if value.shape != (LENGTHS[name],):
-                raise ValueError(f"{what} has shape {value.shape}; give {LENGTHS[name]} numbers")
+                raise UserError(f"{what} has shape {value.shape}; give {LENGTHS[name]} numbers")
             check_finite(what, value)
             object.__setattr__(self, name, tuple(value.tolist()))
         check_quaternion(f"quat of {type(self).__name__}", self.quat)
         if not Path(self.path).is_file():
-            raise ValueError(f"{self.path}: there is no such file; give the path of a mesh or URDF that exists")
+            raise UserError(f"{self.path}: there is no such file; give the path of a mesh or URDF that exists")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,7 +76,7 @@ def _points(path: Path) -> np.ndarray:
     """The corners (k, 3) of a mesh, in units of its file."""
     data, kind = path.read_bytes(), path.suffix.lower()
     if kind not in (".obj", ".stl"):
-        raise ValueError(f"{path}: the bounding box of {kind or 'such a'} file is not known; give an .obj or .stl")
+        raise UserError(f"{path}: the bounding box of {kind or 'such a'} file is not known; give an .obj or .stl")
     count = int.from_bytes(data[80:_STL_HEADER], "little")
     if kind == ".stl" and len(data) == _STL_HEADER + count * _STL_TRIANGLE.itemsize:
         points = np.frombuffer(data, _STL_TRIANGLE, count, _STL_HEADER)["corners"].reshape(-1, 3).astype(float)
@@ -84,5 +85,5 @@ def _points(path: Path) -> np.ndarray:
         lines = (line.split() for line in data.decode(errors="replace").splitlines())
         points = np.array([line[1:4] for line in lines if line and line[0] == word], float).reshape(-1, 3)
     if not len(points):
-        raise ValueError(f"{path}: it holds no points; give a mesh of triangles")
+        raise UserError(f"{path}: it holds no points; give a mesh of triangles")
     return points

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_positive, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.sensing.noise import Errors, Noise
@@ -75,7 +76,7 @@ def imu(
     check_part(part)
     check_positive(f"rate of {name}", rate, "1/s")
     if np.shape(offset) != (3,):
-        raise ValueError(f"offset of {name} is {shown(offset)}; give 3 numbers")
+        raise UserError(f"offset of {name} is {shown(offset)}; give 3 numbers")
     check_finite(f"offset of {name}", offset)
     at_center = not np.any(np.asarray(offset))
 
@@ -94,7 +95,7 @@ def imu(
 def check_part(part: ImuPart) -> None:
     """Raise unless `part` is one."""
     if not isinstance(part, ImuPart):
-        raise ValueError(f"part of an IMU is {shown(part)}; give jaxdrones.sensing.BMI088 or ImuPart(acc, gyro)")
+        raise UserError(f"part of an IMU is {shown(part)}; give jaxdrones.sensing.BMI088 or ImuPart(acc, gyro)")
 
 
 def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_number, check_positive, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.sensing.scene import Scene
@@ -75,7 +76,7 @@ def motion_capture(system: MotionCaptureSystem = VICON, name: str = "motion_capt
         ValueError: something else than a system.
     """
     if not isinstance(system, MotionCaptureSystem):
-        raise ValueError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
+        raise UserError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
     periods = system.delay * system.rate
     late = math.ceil(periods - 1e-6)
     share = late - periods  # of the later one of the two poses that are `late` and `late` - 1 periods old

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_finite, check_number, check_positive, check_whole
+from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 
 _FLICKER_FLOOR = math.sqrt(2 * math.log(2) / math.pi)  # Allan deviation of flicker noise over its bias instability
@@ -147,7 +148,7 @@ def allan_deviation(readings: ArrayLike, dt: float, samples: int) -> np.ndarray:
     check_positive("dt of an Allan deviation", dt, "s")
     check_whole("samples of an Allan deviation", samples)
     if readings.ndim < 1 or len(readings) <= 2 * samples:
-        raise ValueError(f"{readings.shape} readings are too few to average {samples}; give at least {2 * samples + 1}")
+        raise UserError(f"{readings.shape} readings are too few to average {samples}; give at least {2 * samples + 1}")
     angle = np.concatenate([np.zeros_like(readings[:1]), np.cumsum(readings - readings.mean(axis=0), axis=0)]) * dt
     change = angle[2 * samples :] - 2 * angle[samples:-samples] + angle[: -2 * samples]
     return np.sqrt(np.mean(change**2, axis=0) / 2) / (samples * dt)

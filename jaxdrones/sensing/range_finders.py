@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_number, check_positive, check_quaternion, check_whole, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.geometry import Number
@@ -58,13 +59,13 @@ def range_finder(
     """
     directions = np.asarray(directions, float)
     if directions.shape[-1:] != (3,):
-        raise ValueError(f"directions of {name} have shape {directions.shape}; give unit vectors (..., 3)")
+        raise UserError(f"directions of {name} have shape {directions.shape}; give unit vectors (..., 3)")
     check_positive(f"max_range of {name}", max_range, "m")
     check_number(f"noise of {name}", noise, "m", at_least=0)
     check_number(f"dropout of {name}", dropout, at_least=0, at_most=1)
     for what, value, length in ("offset", offset, 3), ("orientation", orientation, 4):
         if np.shape(value) != (length,):
-            raise ValueError(f"{what} of {name} is {shown(value)}; give {length} numbers")
+            raise UserError(f"{what} of {name} is {shown(value)}; give {length} numbers")
         check_finite(f"{what} of {name}", value)
     check_quaternion(f"orientation of {name}", orientation)
 

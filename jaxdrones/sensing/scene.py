@@ -24,6 +24,7 @@ from jaxdrones.checks import (
     is_known,
     shown,
 )
+from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of, touched_of
 from jaxdrones.sensing.files import File, Mesh, Urdf
@@ -75,7 +76,7 @@ class Scene(PyTreeNode, kw_only=True):
         for obstacle in obstacles:
             if not isinstance(obstacle, Obstacle | File):
                 known = ", ".join(kind.__name__ for kind in (*KINDS.values(), Mesh, Urdf))
-                raise ValueError(f"{shown(obstacle)} is not an obstacle; give each as an argument of its own: {known}")
+                raise UserError(f"{shown(obstacle)} is not an obstacle; give each as an argument of its own: {known}")
         arrays: dict[str, Any] = {}
         for name, kind in KINDS.items():
             rows = [_rows(obstacle) for obstacle in obstacles if isinstance(obstacle, kind)]
@@ -158,7 +159,7 @@ class Scene(PyTreeNode, kw_only=True):
         """
         check_scene(self)
         if not self.has_obstacles:
-            raise ValueError("the scene has no obstacles that could be touched; look at scene.has_obstacles before")
+            raise UserError("the scene has no obstacles that could be touched; look at scene.has_obstacles before")
         return touched_of(self.shapes(points.dtype), points, within)
 
     def contains(self, point: ArrayLike) -> Bool[Array, ""]:
@@ -183,7 +184,7 @@ class Scene(PyTreeNode, kw_only=True):
             stack = getattr(self, name)
             count = 0 if stack is None else len(stack.pos)
             if count > length:
-                raise ValueError(
+                raise UserError(
                     f"the scene has {count} {name} and the array holds {length}; give {name}={count} or more"
                 )
             rest = _inactive(KINDS[name], length - count)
@@ -205,7 +206,7 @@ def check_scene(scene: Any, files: bool = False) -> None:
         files: whether meshes and URDF files are allowed.
     """
     if not isinstance(scene, Scene):
-        raise ValueError(
+        raise UserError(
             f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)"
         )
     for name in KINDS:
@@ -216,7 +217,7 @@ def check_scene(scene: Any, files: bool = False) -> None:
         file = (*scene.meshes, *scene.urdfs)[0]
         builder = "mesh.bounding_box()" if isinstance(file, Mesh) else "jaxdrones.sensing.from_urdf(path)"
         known = ", ".join(kind.__name__ for kind in KINDS.values())
-        raise ValueError(
+        raise UserError(
             f"the scene has a {type(file).__name__}, which only Bullet reads; give {known}, for example "
             f"{builder} in its place, or ask the Bullet backend, for example step.contacts(params, state)"
         )
@@ -256,13 +257,13 @@ def _rows(obstacle: Obstacle) -> Obstacle:
             continue
         arrays[name] = array = jnp.asarray(value, bool if name == "active" else float)
         if name == "active" and jnp.asarray(value).dtype.kind != "b":
-            raise ValueError(f"active of {kind} is {shown(value)}; give True or False")
+            raise UserError(f"active of {kind} is {shown(value)}; give True or False")
         length = LENGTHS.get(name)
         if length and array.shape[-1:] != (length,):
-            raise ValueError(f"{name} of {kind} is {shown(value)}; give {length} numbers")
+            raise UserError(f"{name} of {kind} is {shown(value)}; give {length} numbers")
         check_finite(f"{name} of {kind}", value)
         if name not in ("pos", "quat", "color", "active") and is_known(value) and not (np.asarray(value) > 0).all():
-            raise ValueError(f"{name} of {kind} is {shown(value)}; give positive numbers (m)")
+            raise UserError(f"{name} of {kind} is {shown(value)}; give positive numbers (m)")
     check_quaternion(f"quat of {kind}", obstacle.quat)
     arrays["quat"] = arrays["quat"] / jnp.linalg.norm(arrays["quat"], axis=-1, keepdims=True)
     axes = {name: array.shape[: array.ndim - (name in LENGTHS)] for name, array in arrays.items()}
@@ -270,7 +271,7 @@ def _rows(obstacle: Obstacle) -> Obstacle:
         leading = np.broadcast_shapes(*axes.values())
     except ValueError:
         given = ", ".join(f"{name} {arrays[name].shape}" for name in arrays)
-        raise ValueError(f"the arrays of {kind} do not fit together: {given}; give as many of each, or one") from None
+        raise UserError(f"the arrays of {kind} do not fit together: {given}; give as many of each, or one") from None
 
     def rows(name: str, array: Array) -> Array:
         one = array.shape[array.ndim - (name in LENGTHS) :]

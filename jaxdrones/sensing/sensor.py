@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.checks import check_arguments, check_callable, check_number, check_positive, check_sequence, shown
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.scene import Scene
@@ -61,7 +62,7 @@ class Sensor:
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"name of a sensor is {shown(self.name)}; give a text, for example 'imu'")
+            raise UserError(f"name of a sensor is {shown(self.name)}; give a text, for example 'imu'")
         measured, begun = f"measure of sensor {self.name!r}", f"init of sensor {self.name!r}"
         check_callable(measured, self.measure, "lambda key, params, state, rate, scene, memory: (memory, state.pos)")
         check_arguments(measured, self.measure, ("key", "params", "state", "rate", "scene", "memory"))
@@ -71,7 +72,7 @@ class Sensor:
         if self.rate is not None:
             check_positive(f"rate of sensor {self.name!r}", self.rate, "1/s")
         if self.clocked and self.rate is None:
-            raise ValueError(f"sensor {self.name!r} is clocked, but has no rate; give rate in measurements per second")
+            raise UserError(f"sensor {self.name!r} is clocked, but has no rate; give rate in measurements per second")
 
     def is_due(self, step: jax.Array, dt: float) -> jax.Array:
         """Whether there is a measurement after so many control steps of an episode.
@@ -91,15 +92,15 @@ class Sensor:
 def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[Sensor, ...]:
     """The sensors of a team; raises if one is none, two have the same name, or one does not fit steps of `dt` s."""
     if isinstance(sensors, Sensor):
-        raise ValueError(f"sensors is the single sensor {sensors.name!r}; give a sequence, for example (sensor,)")
+        raise UserError(f"sensors is the single sensor {sensors.name!r}; give a sequence, for example (sensor,)")
     sensors = check_sequence("sensors", sensors, "sensor")
     for sensor in sensors:
         if not isinstance(sensor, Sensor):
-            raise ValueError(f"sensors holds {shown(sensor)}; give jaxdrones.Sensor(name, measure)")
+            raise UserError(f"sensors holds {shown(sensor)}; give jaxdrones.Sensor(name, measure)")
     names = [sensor.name for sensor in sensors]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ValueError(f"two sensors have the name {twice[0]!r}; give every sensor a name of its own")
+        raise UserError(f"two sensors have the name {twice[0]!r}; give every sensor a name of its own")
     if dt is not None:
         _check_clocks(sensors, dt)
     return sensors
@@ -110,7 +111,7 @@ def _check_clocks(sensors: Sequence[Sensor], dt: float) -> None:
     for sensor in sensors:
         steps = 1 / (sensor.rate * dt) if sensor.clocked and sensor.rate else 1.0
         if round(steps) < 1 or abs(steps - round(steps)) > _ROUNDING * steps:
-            raise ValueError(
+            raise UserError(
                 f"sensor {sensor.name!r} measures at {sensor.rate:g} Hz, which does not divide the {1 / dt:g} Hz of "
                 "the control steps; give it a rate that does, or another control_hz"
             )
@@ -202,16 +203,16 @@ def _checked(sensor: Sensor, memory: Any, result: Any) -> tuple[Any, Any]:
     """The memory and the reading that a sensor returned for one drone, or an error if they are not that."""
     called = f"measure of sensor {sensor.name!r}"
     if not isinstance(result, tuple) or len(result) != 2:
-        raise ValueError(f"{called} returned {shown(result)}; return the two values (memory, reading)")
+        raise UserError(f"{called} returned {shown(result)}; return the two values (memory, reading)")
     after, reading = result
     if _types(after) != _types(memory):
-        raise ValueError(
+        raise UserError(
             f"{called} returned a memory of {_described(after)}, but was given one of {_described(memory)}; "
             "return a memory with the shapes and types of the one that init returns"
         )
     for leaf in jax.tree.leaves(reading):
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
-            raise ValueError(f"{called} returned a reading with {shown(leaf)} in it; return arrays")
+            raise UserError(f"{called} returned a reading with {shown(leaf)} in it; return arrays")
     return after, jax.tree.map(jnp.asarray, reading)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_finite, check_quaternion, shown
+from jaxdrones.errors import UserError
 from jaxdrones.sensing.files import Mesh
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.shapes import GREY, Box, Capsule, Cylinder, Sphere
@@ -44,19 +45,19 @@ def from_urdf(
     """
     file = Path(path)
     if not file.is_file():
-        raise ValueError(f"{file}: there is no such file; give the path of a URDF that exists")
+        raise UserError(f"{file}: there is no such file; give the path of a URDF that exists")
     for name, value, length in ("pos", pos, 3), ("quat", quat, 4):
         if np.shape(value) != (length,):
-            raise ValueError(f"{name} of the root link is {shown(value)}; give {length} numbers")
+            raise UserError(f"{name} of the root link is {shown(value)}; give {length} numbers")
         check_finite(f"{name} of the root link", value)
     check_quaternion("quat of the root link", quat)
     try:
         robot = ET.parse(file).getroot()
     except ET.ParseError as error:
-        raise ValueError(f"{file}: it is no XML ({error}); give a URDF") from None
+        raise UserError(f"{file}: it is no XML ({error}); give a URDF") from None
     links = {link.get("name", ""): link for link in robot.findall("link")}
     if not links:
-        raise ValueError(f"{file}: it has no <link>; give a URDF")
+        raise UserError(f"{file}: it has no <link>; give a URDF")
     paints = [(material.get("name"), material.find("color")) for material in robot.iter("material")]
     palette = {name: paint for name, paint in paints if paint is not None}
     places = _places(file, robot, links, (jnp.asarray(pos, float), jnp.asarray(quat, float)))
@@ -77,18 +78,18 @@ def _places(file: Path, robot: ET.Element, links: dict[str, ET.Element], root: P
     for joint in robot.findall("joint"):
         ends = [end.get("link", "") for tag in ("parent", "child") if (end := joint.find(tag)) is not None]
         if len(ends) != 2 or any(end not in links for end in ends):
-            raise ValueError(f"{file}: joint {joint.get('name')!r} connects {ends}; give links of the file as its ends")
+            raise UserError(f"{file}: joint {joint.get('name')!r} connects {ends}; give links of the file as its ends")
         if ends[1] in joints:
-            raise ValueError(f"{file}: link {ends[1]!r} is the child of two joints; give a tree")
+            raise UserError(f"{file}: link {ends[1]!r} is the child of two joints; give a tree")
         joints[ends[1]] = (ends[0], _pose(file, joint))
     roots = links.keys() - joints.keys()
     if len(roots) != 1:
-        raise ValueError(f"{file}: {len(roots)} links are no child of a joint; give a tree with one root")
+        raise UserError(f"{file}: {len(roots)} links are no child of a joint; give a tree with one root")
     places = dict.fromkeys(roots, root)
     while joints:
         ready = [child for child, (parent, _) in joints.items() if parent in places]
         if not ready:
-            raise ValueError(f"{file}: joints form a circle of {', '.join(sorted(joints))}; give a tree")
+            raise UserError(f"{file}: joints form a circle of {', '.join(sorted(joints))}; give a tree")
         for child in ready:
             parent, pose = joints.pop(child)
             places[child] = _in_parent(places[parent], pose)
@@ -115,11 +116,11 @@ def _obstacle(file: Path, collision: ET.Element, pose: Pose, color: tuple[float,
         case "mesh":
             scale = _numbers(file, shape, "scale", 3, "1 1 1")
             if len(set(scale)) > 1:
-                raise ValueError(f"{file}: a mesh has the scale {scale}; give the same number along each axis")
+                raise UserError(f"{file}: a mesh has the scale {scale}; give the same number along each axis")
             mesh = shape.get("filename", "") if shape is not None else ""
             return Mesh(path=file.parent / mesh.removeprefix("file://"), scale=scale[0], **common)
     found = "nothing" if shape is None else f"<{shape.tag}>"
-    raise ValueError(f"{file}: a collision has the shape {found}; give box, sphere, cylinder, capsule or mesh")
+    raise UserError(f"{file}: a collision has the shape {found}; give box, sphere, cylinder, capsule or mesh")
 
 
 def _pose(file: Path, element: ET.Element) -> Pose:
@@ -146,5 +147,5 @@ def _numbers(file: Path, element: ET.Element | None, name: str, count: int, defa
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
         where = "?" if element is None else element.tag
-        raise ValueError(f"{file}: {name} of <{where}> is {text!r}; give {count} numbers")
+        raise UserError(f"{file}: {name} of <{where}> is {text!r}; give {count} numbers")
     return numbers

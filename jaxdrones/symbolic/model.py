@@ -17,6 +17,7 @@ from jaxdrones.dynamics import Model, instant_rotors
 from jaxdrones.engine.explicit import make_derivative
 from jaxdrones.engine.physics import Physics, Rotors
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
@@ -54,7 +55,7 @@ class CasadiModel:
         """(nx,) the numbers of a state in the order of `names`."""
         given, wanted = (jax.tree.map(np.shape, s) for s in (state, self.start))
         if given != wanted:
-            raise ValueError(f"the state has the shapes {shown(str(given))}; the model's are {shown(str(wanted))}")
+            raise UserError(f"the state has the shapes {shown(str(given))}; the model's are {shown(str(wanted))}")
         return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(state)])
 
     def state(self, vector: ArrayLike) -> State:
@@ -113,7 +114,7 @@ def casadi_model(
         team, one = params, np.ndim(params.mass) == 0
         if one:
             if pairs or team_effects:
-                raise ValueError(
+                raise UserError(
                     "pairs or team_effects are given and the constants are of one drone; give those of a team, for "
                     "example of jaxdrones.repeat(params, 2)"
                 )

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_keywords, check_number, check_switch, check_whole, shown
 from jaxdrones.control import Setpoint
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described, quantities
 from jaxdrones.sensing import BEAMS, Cylinder, Scene, gate, track
@@ -73,7 +74,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
     check_whole("level", level, minimum=0)
     check_switch("random_start", random_start)
     if level not in LEVELS:
-        raise ValueError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
+        raise UserError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """On the ground at the start of the track, or in the air in front of a random gate."""
@@ -217,7 +218,7 @@ def _gates_of(scene: Scene, dtype) -> Float[Array, "4 4"]:
     beams = BEAMS * len(GATES)
     if scene.boxes is None or len(scene.boxes.pos) < beams:
         found = 0 if scene.boxes is None else len(scene.boxes.pos)
-        raise ValueError(
+        raise UserError(
             f"the task gates needs a scene whose first {beams} boxes are the beams of its {len(GATES)} gates; this one "
             f"has {found} boxes; give one of jaxdrones.sensing.track"
         )

@@ -14,6 +14,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from jaxdrones.checks import check_whole
+from jaxdrones.errors import UserError
 
 _TIMEOUT = 60.0  # s that hosts wait for each other at the start
 _SHUTDOWN_TIMEOUT = 10  # s that a host waits for the others at the end; JAX then ends those that still run
@@ -36,15 +37,15 @@ def join_hosts(hosts: int, host: int, coordinator: str, timeout: float = _TIMEOU
     """
     check_whole("hosts", hosts)
     if not 0 <= host < hosts:
-        raise ValueError(f"host is {host}; give 0 to {hosts - 1}, a different number on each of the {hosts} hosts")
+        raise UserError(f"host is {host}; give 0 to {hosts - 1}, a different number on each of the {hosts} hosts")
     name, _, port = coordinator.rpartition(":")
     if not (name and port.isdecimal() and 0 < int(port) < 2**16):
-        raise ValueError(f"coordinator is {coordinator!r}; give ADDRESS:PORT of host 0, for example 127.0.0.1:9911")
+        raise UserError(f"coordinator is {coordinator!r}; give ADDRESS:PORT of host 0, for example 127.0.0.1:9911")
     deadline, address = time.monotonic() + timeout, (name, int(port))
     try:  # before JAX connects, since it ends the process when it has waited too long
         _accept_hosts(address, hosts, deadline) if host == 0 else _connect(address, host, deadline)
     except (OSError, TypeError, UnicodeError) as error:  # the last two come from an impossible name
-        raise ValueError(
+        raise UserError(
             f"host {host} of {hosts} did not reach all others at {coordinator} within {timeout:g} s ({error}); start "
             f"the same command with --host 0 to --host {hosts - 1}, and with a --coordinator at which host 0 can listen"
         ) from None
@@ -81,7 +82,7 @@ def fail_together() -> Iterator[None]:
     if jax.process_count() > 1:
         stopped = np.flatnonzero(multihost_utils.process_allgather(np.asarray(raised is not None)))
         if raised is None and len(stopped):
-            raise ValueError(f"host {stopped[0]} stopped; its message says why")
+            raise UserError(f"host {stopped[0]} stopped; its message says why")
     if raised is not None:
         raise raised
 

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
 from jaxdrones.learning.evaluation import Report, evaluate
 from jaxdrones.learning.networks import Policy
@@ -71,7 +72,7 @@ def _load(trainer: Trainer, run: Run) -> tuple[Any, float, Score, float]:
     """State, seconds of training, score of the best policy and highest success rate of a run."""
     state = run.load_state(trainer.shapes)
     if not _is_finite(state):
-        raise ValueError(f"{run.folder / 'state'} holds numbers that are not finite; train anew with --overwrite")
+        raise UserError(f"{run.folder / 'state'} holds numbers that are not finite; train anew with --overwrite")
     run.policy("best", trainer.env)
     for entry in ("seed", "episodes"):
         if run.sidecar_entry("best", entry) != run.sidecar_entry("state", entry):
@@ -204,7 +205,7 @@ def _without_updates(recipe: dict) -> dict:
 
 
 def _different_runs(run: Run) -> ValueError:
-    return ValueError(
+    return UserError(
         f"{run.folder}: best.json and state.json are of two runs; restore the files of one, or train anew with "
         "--overwrite"
     )

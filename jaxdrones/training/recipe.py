@@ -10,6 +10,7 @@ from typing import Any
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.named_tasks import task_function
+from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 from jaxdrones.tasks.task import Task
 from jaxdrones.training import user_files
@@ -102,7 +103,7 @@ class Recipe:
             settings_type = config_type(entries.get("library", "jaxdrones"), entries["algorithm"])
             return cls(**entries | {"config": settings_type(**config)})
         except (AttributeError, KeyError, TypeError) as error:
-            raise ValueError(f"the recipe is not one of this version ({error!r}); train anew") from error
+            raise UserError(f"the recipe is not one of this version ({error!r}); train anew") from error
 
 
 def split_changes(
@@ -132,7 +133,7 @@ def checked_preset(
         return preset(task, algorithm, realistic, **options)
     except TypeError as error:
         name = task if isinstance(task, str) else task.__name__
-        raise ValueError(f"options {options} do not fit {name}: {error}") from None
+        raise UserError(f"options {options} do not fit {name}: {error}") from None
 
 
 def convert_setting(name: str, value: Any, current: Any) -> Any:
@@ -146,5 +147,5 @@ def convert_setting(name: str, value: Any, current: Any) -> Any:
     if isinstance(current, tuple) and isinstance(value, list):
         value = tuple(value)
     if current is not None and type(value) is not type(current):
-        raise ValueError(f"{name} is {value!r}; give something like {current!r}")
+        raise UserError(f"{name} is {value!r}; give something like {current!r}")
     return value

@@ -22,6 +22,7 @@ from typing import Any
 import jax
 
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.learning import checkpoint, files
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
@@ -90,7 +91,7 @@ class Run:
         sidecar = self.sidecar(name)
         if entry not in sidecar:
             file = self.folder / f"{name}.json"
-            raise ValueError(f"{file} has no entry {entry}; it is not the {name} of a run of `jaxdrones train`")
+            raise UserError(f"{file} has no entry {entry}; it is not the {name} of a run of `jaxdrones train`")
         return sidecar[entry]
 
     def verify(self, name: str) -> None:
@@ -132,7 +133,7 @@ class Run:
             ValueError: they differ.
         """
         if sizes != expected:
-            raise ValueError(
+            raise UserError(
                 f"{self.folder / name} was trained on another version of {env.task.name}: its observations and "
                 f"actions have {sizes} numbers, those of the environment {expected}; train anew"
             )
@@ -179,7 +180,7 @@ class Run:
         try:
             return json.loads(file.read_bytes())
         except (OSError, ValueError, RecursionError) as error:
-            raise ValueError(f"{file} cannot be read: {error}; remove it and --resume, which writes it anew") from error
+            raise UserError(f"{file} cannot be read: {error}; remove it and --resume, which writes it anew") from error
 
     def history(self) -> list[dict[str, float]]:
         """The rows of progress.csv, each without the numbers that were not measured in its update.
@@ -195,10 +196,10 @@ class Run:
                 lines = [{name: x for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
             rows = [{name: float(x) for name, x in line.items()} for line in lines]
             if not all(math.isfinite(row.get("update", math.nan)) for row in rows):
-                raise ValueError("a row lacks its update")
+                raise UserError("a row lacks its update")
         except (OSError, ValueError, TypeError, csv.Error) as error:
             why = files.one_line(error)
-            raise ValueError(f"{path} is damaged: {why}; remove it, training continues without its rows") from error
+            raise UserError(f"{path} is damaged: {why}; remove it, training continues without its rows") from error
         return rows
 
 

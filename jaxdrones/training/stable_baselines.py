@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from jaxdrones.adapters.sb3 import VecEnv  # names the extra to install, so it comes before the libraries of the extra
 from jaxdrones.checks import check_choice, check_whole
 from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
 from jaxdrones.learning import files
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.training import user_files
@@ -104,7 +105,7 @@ class SB3Recipe:
             check_choice("algorithm", entries["algorithm"], SB3_ALGORITHMS)
             return cls(**entries)
         except (KeyError, TypeError) as error:
-            raise ValueError(f"the recipe is not one of this version ({error!r}); train anew") from error
+            raise UserError(f"the recipe is not one of this version ({error!r}); train anew") from error
 
     def as_dict(self) -> dict[str, Any]:
         """The recipe for JSON."""
@@ -136,7 +137,7 @@ class SB3Recipe:
         try:
             return _class(self.algorithm)("MlpPolicy", envs, seed=seed, policy_kwargs=network, **settings)
         except (AssertionError, TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"settings {settings} do not fit {self.trained_by}: {error}") from error
+            raise UserError(f"settings {settings} do not fit {self.trained_by}: {error}") from error
 
 
 def _class(algorithm: str) -> type[BaseAlgorithm]:
@@ -221,9 +222,9 @@ class SB3Run(Run):
         try:
             model = algorithm.load(io.BytesIO(content), device="cpu")
         except Exception as error:  # zip, pickle and torch raise errors of several types
-            raise ValueError(f"{file} cannot be loaded: {files.one_line(error)}; {files.ADVICE}") from error
+            raise UserError(f"{file} cannot be loaded: {files.one_line(error)}; {files.ADVICE}") from error
         if not all(torch.isfinite(x).all() for x in model.policy.parameters()):
-            raise ValueError(f"{file} holds numbers that are not finite; {files.ADVICE}")
+            raise UserError(f"{file} holds numbers that are not finite; {files.ADVICE}")
         return model
 
     def save_model(self, name: str, model: BaseAlgorithm, **about: Any) -> None:

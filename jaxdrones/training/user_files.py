@@ -13,6 +13,7 @@ from typing import Any
 from jaxdrones import user_code
 from jaxdrones.checks import check_callable, check_choice
 from jaxdrones.envs import TASKS
+from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 from jaxdrones.urdf import parse_params
 
@@ -88,7 +89,7 @@ def check_unchanged(folder: Path, kept: Mapping[str, str], found: Mapping[str, s
     """
     for name, text in found.items():
         if kept.get(name, text) != text:
-            raise ValueError(
+            raise UserError(
                 f"{name} has changed since {folder} was started; undo the change to --resume (best.json there has the "
                 "old text), or train anew with --overwrite or in another --output"
             )
@@ -102,5 +103,5 @@ def _read(file: Path, kept: Mapping[str, str] | None) -> Files:
 
 def _text(name: str, files: Mapping[str, str]) -> str:
     if name not in files:
-        raise ValueError(f"the recipe lacks the text of {name}; train anew")
+        raise UserError(f"the recipe lacks the text of {name}; train anew")
     return files[name]

@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxdrones import user_code
 from jaxdrones.envs import Env, make
+from jaxdrones.errors import UserError
 from jaxdrones.learning.recurrence import AnyPolicy, RecurrentPolicy
 
 
@@ -47,7 +48,7 @@ class UserPolicy:
         """
         policy = user_code.load(self.reference)
         if not (callable(policy) or isinstance(policy, RecurrentPolicy)):
-            raise ValueError(
+            raise UserError(
                 f"{self.reference} is {policy!r:.60}; give a function from observations ({env.drones}, "
                 f"{env.observation_size}) to actions ({env.drones}, {env.action_size}), or a policy with a memory"
             )

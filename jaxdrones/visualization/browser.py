@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from jaxdrones.errors import UserError
+
 _PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = ("--headless=new", "--remote-debugging-pipe", "--no-first-run", "--hide-scrollbars", "--disable-extensions")
 _SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -129,7 +131,7 @@ def open_tab() -> Iterator[Tab]:
     """
     program = find_browser()
     if program is None:
-        raise ValueError(f"there is no Chromium; install it, under one of the names {', '.join(_PROGRAMS)}")
+        raise UserError(f"there is no Chromium; install it, under one of the names {', '.join(_PROGRAMS)}")
     from_us, write = os.pipe()
     read, to_us = os.pipe()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.checks import check_choice
+from jaxdrones.errors import UserError
 from jaxdrones.flights.record import Record
 from jaxdrones.visualization import video
 from jaxdrones.visualization.browser import find_browser
@@ -28,7 +29,7 @@ def choose_renderer(renderer: str | None, path: Path) -> str:
         return "page" if find_browser() else "jax"
     check_choice("renderer", renderer, RENDERERS)
     if renderer == "page" and not find_browser():
-        raise ValueError("there is no Chromium for --renderer page; install it, or take --renderer jax")
+        raise UserError("there is no Chromium for --renderer page; install it, or take --renderer jax")
     if renderer == "bullet":
         from jaxdrones.visualization import replay  # noqa: F401  says which extra to install
     return renderer

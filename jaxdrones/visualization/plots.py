@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdrones.errors import UserError
 from jaxdrones.flights.record import Record
 from jaxdrones.visualization import paths, style
 from jaxdrones.visualization.palette import colors
@@ -45,7 +46,7 @@ def check_matplotlib() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError:
-        raise ValueError(
+        raise UserError(
             'matplotlib is not installed, so no figure can be drawn; pip install "jaxdrones[cli]", or pass --no-figure'
         ) from None
 

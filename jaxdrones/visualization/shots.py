@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxdrones.errors import UserError
 from jaxdrones.flights.record import Record
 from jaxdrones.sensing import Mesh, Scene, Urdf, from_urdf, ray
 
@@ -92,7 +93,7 @@ def rows_of_frames(record: Record, fps: int) -> np.ndarray:
     """
     finite = _finite_rows(record)
     if not len(finite):
-        raise ValueError("the film is not written: no state of the flight is finite")
+        raise UserError("the film is not written: no state of the flight is finite")
     times = np.arange(max(1, round(record.t[-1] * fps))) / fps
     return finite[[int(np.abs(record.t[finite] - time).argmin()) for time in times]]
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxdrones.errors import UserError
+
 SUFFIXES = (".mp4", ".gif")
 
 
@@ -17,14 +19,14 @@ def check_video(path: Path) -> None:
         ValueError: an unknown suffix, or a package that is not installed; says which extra to install.
     """
     if path.suffix not in SUFFIXES:
-        raise ValueError(f"{path}: films end in {' or '.join(SUFFIXES)}")
+        raise UserError(f"{path}: films end in {' or '.join(SUFFIXES)}")
     try:
         import PIL  # noqa: F401
 
         if path.suffix == ".mp4":
             import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
-        raise ValueError(
+        raise UserError(
             f'{error.name} is not installed, so {path} cannot be written; pip install "jaxdrones[video]"'
         ) from None
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxdrones.checks import check_choice
 from jaxdrones.engine.bullet.surroundings import Surroundings, quiet
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.images import BACK, FRONT, HUB
 
@@ -77,7 +78,7 @@ class Client:
     def check_open(self) -> None:
         """Raise if the connection is gone."""
         if self.closed:
-            raise ValueError("this Bullet step is closed; make a new one, and use it inside its `with` block")
+            raise UserError("this Bullet step is closed; make a new one, and use it inside its `with` block")
 
     def names(self) -> dict[int, str]:
         """Name of every body: `ground`, `drone i`, `obstacle i`; the order is that of segmentations."""

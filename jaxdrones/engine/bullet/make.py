@@ -14,6 +14,7 @@ from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Physics, Rotors
 from jaxdrones.engine.step import is_traced
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
+from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.scene import check_scene
 
@@ -67,14 +68,14 @@ def make_step(
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
     for contact in ground_contact, obstacle_contact, drone_contact:
         if physics.contains(contact):
-            raise ValueError(
+            raise UserError(
                 f"{contact.__name__} is given and Bullet resolves contacts by itself, so drones would touch twice; "
                 "leave it out"
             )
     scene = Scene() if scene is None else scene
     check_scene(scene, files=True)
     if is_traced(scene):
-        raise ValueError(
+        raise UserError(
             "the scene is traced by jit, vmap or grad and has no values yet; make the step outside, of a scene of "
             "numbers, and give the traced one to its calls"
         )

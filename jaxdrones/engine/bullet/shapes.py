@@ -3,6 +3,7 @@
 from types import ModuleType
 from typing import Any
 
+from jaxdrones.errors import UserError
 from jaxdrones.sensing.files import Mesh
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
@@ -24,4 +25,4 @@ def shape_of(p: ModuleType, obstacle: Any) -> dict[str, Any]:
             return dict(shapeType=p.GEOM_CAPSULE, radius=radius, height=height)
         case Mesh(path=path, scale=scale):
             return dict(shapeType=p.GEOM_MESH, fileName=str(path), meshScale=[scale] * 3)
-    raise ValueError(f"Bullet has no shape for a {type(obstacle).__name__}; leave it out of the scene")
+    raise UserError(f"Bullet has no shape for a {type(obstacle).__name__}; leave it out of the scene")

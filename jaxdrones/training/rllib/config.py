@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from jaxdrones.checks import check_keywords
+from jaxdrones.errors import UserError
 from jaxdrones.learning.settings import (
     BelowOne,
     Count,
@@ -75,7 +76,7 @@ class Config:
     def __post_init__(self):
         check_settings(self)
         if self.worlds * self.horizon < self.minibatches:
-            raise ValueError(f"minibatches is {self.minibatches}; give at most worlds * horizon")
+            raise UserError(f"minibatches is {self.minibatches}; give at most worlds * horizon")
 
     def std_bounds(self, update: float) -> tuple[float, float]:
         """Bounds of the standard deviation of actions after an update."""

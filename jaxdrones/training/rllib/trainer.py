@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
 from jaxdrones.learning.evaluation import check_episodes
 from jaxdrones.learning.networks import Policy
@@ -48,7 +49,7 @@ class RLlibTrainer(BaseTrainer):
         self.mesh = sharding.make_mesh(1, jax.devices()[:1])
         self.env, self.practice_env = recipe.env(), recipe.env(practice=True)
         if self.env.vision:
-            raise ValueError(f"{recipe.task} has images, which --library rllib does not take; train without vision")
+            raise UserError(f"{recipe.task} has images, which --library rllib does not take; train without vision")
         check_episodes(self.env, episodes)
         self.metrics = sorted((*_SIMULATED, *_LEARNED, "action_std", "learning_rate", "nonfinite_gradients"))
         self._agents = [f"drone_{i}" for i in range(self.env.drones)]

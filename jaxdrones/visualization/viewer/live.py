@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdrones.errors import UserError
 from jaxdrones.flights.record import Record
 from jaxdrones.limits import check_at_most
 from jaxdrones.visualization.viewer.page import Page
@@ -58,7 +59,7 @@ class Live:
         try:
             self._server = _Server((HOST, port), self)
         except OSError as error:
-            raise ValueError(
+            raise UserError(
                 f"port {port} cannot be used: {error.strerror}; give another, or 0 for a free one"
             ) from None
         self.url = f"http://{HOST}:{self._server.server_port}/"

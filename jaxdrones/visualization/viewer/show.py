@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_choice, check_params, check_positive, shown
+from jaxdrones.errors import UserError
 from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -96,7 +97,7 @@ def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, Record]:
         records = records_of(flight, of_trajectory)
         return {f"world {i}": record for i, record in enumerate(records)}
     if not named:
-        raise ValueError("there is no flight to show; give at least one")
+        raise UserError("there is no flight to show; give at least one")
     return {
         name if len(records) == 1 else f"{name}, world {i}": record
         for name, records in named.items()
@@ -112,7 +113,7 @@ def records_of(flight: Any, of_trajectory: dict[str, Any]) -> list[Record]:
         flight: what was given to `show`.
         of_trajectory: arguments of `show` that only a bare trajectory needs; `None` where they were left out.
     """
-    raise ValueError(
+    raise UserError(
         f"{shown(flight)} cannot be shown; give a trajectory of jaxdrones.rollout, a record, an episode, or the path "
         "of a log.npz"
     )
@@ -122,7 +123,7 @@ def refuse(of_trajectory: dict[str, Any]) -> None:
     """Raise if an argument is given that the flight knows itself."""
     for name, value in of_trajectory.items():
         if value is not None:
-            raise ValueError(f"{name} is given beside a flight that has its own; leave it out")
+            raise UserError(f"{name} is given beside a flight that has its own; leave it out")
 
 
 @records_of.register
@@ -149,7 +150,7 @@ def find_log(path: Path) -> Path:
     found = [log for log in (path / "log.npz", path / "flight" / "log.npz") if log.is_file()]
     if not found:
         what = "has no log of a flight" if path.is_dir() else "is not there"
-        raise ValueError(f"{path} {what}; fly first, `jaxdrones fly circle --output {path}`, or give another path")
+        raise UserError(f"{path} {what}; fly first, `jaxdrones fly circle --output {path}`, or give another path")
     return found[0]
 
 
@@ -158,7 +159,7 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[Record]:
     params, dt = of_trajectory["params"], of_trajectory["dt"]
     for name, value, what in ("params", params, "the team's"), ("dt", dt, "seconds between two rows"):
         if value is None:
-            raise ValueError(
+            raise UserError(
                 f"{name} is left out; a trajectory needs {name}, {what}: jd.show(trajectory, params, dt=1 / 120)"
             )
     check_positive("dt", dt, "s")
@@ -166,14 +167,12 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[Record]:
     check_size(flight.pos)
     flight = jax.tree.map(np.asarray, flight.replace(aux={}))
     if flight.pos.ndim not in (3, 4):
-        raise ValueError(
+        raise UserError(
             f"pos of the trajectory has shape {flight.pos.shape}; give (K, n, 3) of K times and n drones, or "
             "(W, K, n, 3) of W worlds"
         )
     if flight.pos.ndim == 4 and of_trajectory["images"] is not None:
-        raise ValueError(
-            "images are given beside many worlds; show one world, jax.tree.map(lambda x: x[0], trajectory)"
-        )
+        raise UserError("images are given beside many worlds; show one world, jax.tree.map(lambda x: x[0], trajectory)")
     if flight.pos.ndim == 3:
         return [_record(flight, params, of_trajectory)]
 
@@ -193,20 +192,20 @@ def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Rec
     """One world of arrays (K, n, ...)."""
     steps, n = flight.pos.shape[:2]
     if np.shape(params.mass) != (n,):
-        raise ValueError(
+        raise UserError(
             f"params are of a team of shape {np.shape(params.mass)} and the trajectory has {n} drones; give one drone "
             "axis, for example by jaxdrones.repeat"
         )
     labels = of_trajectory["labels"]
     labels = tuple(f"drone {i}" for i in range(n)) if labels is None else tuple(map(str, labels))
     if len(labels) != n:
-        raise ValueError(f"labels are {len(labels)} names and there are {n} drones; give as many")
+        raise UserError(f"labels are {len(labels)} names and there are {n} drones; give as many")
     nowhere = np.full((steps, n, 3), np.nan)
     targets = nowhere if of_trajectory["targets"] is None else of_trajectory["targets"]
     try:
         targets = np.broadcast_to(targets, nowhere.shape)
     except ValueError:
-        raise ValueError(
+        raise UserError(
             f"targets have shape {targets.shape}; give (n, 3) or (K, n, 3) of {steps} times and {n} drones"
         ) from None
     dt = of_trajectory["dt"]
@@ -229,7 +228,7 @@ def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str,
         shape = np.shape(frames)
         if shape[:2] != (len(t), n) or len(shape) != (5 if CHANNELS[name] else 4):
             axes = "(K, n, height, width" + (", channels)" if CHANNELS[name] else ")")
-            raise ValueError(f"images {name!r} have shape {shape}; give {axes} of {len(t)} times and {n} drones")
+            raise UserError(f"images {name!r} have shape {shape}; give {axes} of {len(t)} times and {n} drones")
     return {name: ImageSequence(t, np.asarray(frames)) for name, frames in images.items()}
 
 
@@ -237,7 +236,7 @@ def check_size(*positions: ArrayLike) -> None:
     """Raise if arrays of positions (..., 3) are more than a page plays."""
     samples = sum(math.prod(np.shape(pos)[:-1]) for pos in positions)
     if samples > _MOST:
-        raise ValueError(
+        raise UserError(
             f"the flights have {samples:,} states of drones, more than a page plays ({_MOST:,}); give "
             "fewer worlds, or every tenth row: jax.tree.map(lambda x: x[::10], trajectory)"
         )

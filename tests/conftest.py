@@ -1,9 +1,6 @@
 """Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
 
 import importlib.util
-import os
-import random
-import time
 from pathlib import Path
 
 import jax
@@ -21,22 +18,11 @@ jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
-MINUTES = float(os.environ.get("TEST_MINUTES", "inf"))
-BEGIN = time.monotonic()
-
-
-def pytest_collection_modifyitems(items):
-    """With `TEST_SEED`, another file comes first: so that within `TEST_MINUTES` all tests have their day."""
-    if "TEST_SEED" in os.environ:
-        files = sorted({item.path for item in items})
-        random.Random(int(os.environ["TEST_SEED"])).shuffle(files)
-        items.sort(key=lambda item: files.index(item.path))
+pytest_plugins = ["shards"]
 
 
 def pytest_runtest_setup(item):
-    """Skip a test when the time is over, or one marked with `needs` where a library that it names is not installed."""
-    if time.monotonic() > BEGIN + 60 * MINUTES:
-        pytest.skip(f"the {MINUTES:g} minutes are over")
+    """Skip a test marked with `needs` where a library that it names is not installed."""
     for mark in item.iter_markers("needs"):
         for library in mark.args:
             if importlib.util.find_spec(library) is None:

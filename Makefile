@@ -21,8 +21,8 @@ rllib: .venv-rllib/installed  ## the paper's leader and follower by RLlib, three
 test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
 
-test-slow: .venv/installed
-	$(BIN)/pytest -n 2 --dist worksteal -m slow
+test-slow: .venv/installed  ## all of them, or a part: make test-slow ONLY="--shard 2/6 --since '3 hours ago'"
+	$(BIN)/pytest -n 2 --dist load -m slow $(ONLY)
 
 test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Baselines3, gymnax and JaxMARL, in an environment of their own
 	.venv-libraries/bin/pytest tests/test_examples.py $(patsubst %,tests/adapters/test_%.py,other_libraries gymnasium gymnax jaxmarl sb3)

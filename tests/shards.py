@@ -1,6 +1,7 @@
-"""`pytest --shard K/N --since TIME`: one part of the tests, and all tests of the files that changed."""
+"""`pytest --shard K/N --since TIME --minutes M`: first the tests of files that changed, then one part of the others."""
 
 import subprocess
+import time
 import zlib
 from collections import Counter
 from pathlib import Path
@@ -8,15 +9,18 @@ from pathlib import Path
 import pytest
 
 NOT_RUN = pytest.StashKey[Counter]()
+END = pytest.StashKey[float]()
 
 
 def pytest_addoption(parser):
     parser.addoption("--shard", metavar="K/N", help="run the K-th of N parts of the tests, and those of changed files")
     parser.addoption("--since", metavar="TIME", help="a file is changed if a commit after TIME touched it (git log)")
+    parser.addoption("--minutes", type=float, default=float("inf"), help="skip what has not begun by then")
 
 
 def pytest_configure(config):
     config.stash[NOT_RUN] = Counter()
+    config.stash[END] = time.monotonic() + 60 * config.getoption("minutes")
     if config.pluginmanager.hasplugin("xdist"):
         config.pluginmanager.register(FromWorkers(config), "shards-from-workers")
 
@@ -29,7 +33,12 @@ def pytest_collection_modifyitems(config, items):
     changed = changed_tests(config.rootpath, config.getoption("since"))
     kept = [item for item in items if item.path in changed or zlib.crc32(item.nodeid.encode()) % parts == part % parts]
     config.stash[NOT_RUN].update(item.location[0] for item in set(items) - set(kept))
-    items[:] = kept
+    items[:] = sorted(kept, key=lambda item: item.path not in changed)
+
+
+def pytest_runtest_setup(item):
+    if time.monotonic() > item.config.stash[END]:
+        pytest.skip(f"NOT RUN: the {item.config.getoption('minutes'):g} minutes are over")
 
 
 @pytest.hookimpl(trylast=True)

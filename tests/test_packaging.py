@@ -41,3 +41,9 @@ def test_what_an_sdist_takes_along_is_there():
     for name in PROJECT["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]:
         assert name == "jaxdrones" or (ROOT / name).exists(), name  # the package may be installed from a wheel
     assert (ROOT / "LICENSE").read_text().startswith("MIT License\n\nCopyright (c) 2026 The jaxdrones developers")
+
+
+def test_the_citation_has_the_version_and_licenses_of_the_package():
+    text = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {PROJECT['project']['version']}\n" in text
+    assert re.search(r"\nlicense: \[(.*)\]\n", text)[1].split(", ") == PROJECT["project"]["license"].split(" AND ")

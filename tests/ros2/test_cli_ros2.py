@@ -88,11 +88,3 @@ def test_the_launch_file_starts_a_command_that_exists():
     assert "$(" not in command
     program, *arguments = shlex.split(command)
     assert program == "jaxdrones" and _parser().parse_args(arguments).drones == int(defaults["drones"])
-
-
-def test_the_container_starts_a_command_that_exists():
-    lines = (FILES / "Dockerfile").read_text().splitlines()
-    (entry,) = [json.loads(line.removeprefix("ENTRYPOINT")) for line in lines if line.startswith("ENTRYPOINT")]
-    (default,) = [json.loads(line.removeprefix("CMD")) for line in lines if line.startswith("CMD")]
-    assert entry[-1] == "jaxdrones" or entry[-2:] == ["jaxdrones", "ros2"]
-    _parser().parse_args(["ros2", *default])

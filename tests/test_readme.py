@@ -98,6 +98,7 @@ TRAININGS = {
         TRAINED.replace("trained", "seed 2:\ntrained"), TRAINING
     ),
     "train gates --set level=2": Short(f"gates by ppo, level 2: ... {TRAINED}", TRAINING),
+    "train gates --stop-at 0.99 --output runs/stopped": Short(TRAINED, f"{TRAINING} --episodes 400"),
     "train tracking --realistic --set period=5 --set worlds=512": Short(TRAINED, TRAINING),
     "train hover --realistic any --output runs/any": Short(
         f"hover by bptt, realistic, any vehicle: ... {TRAINED}", TRAINING

@@ -1,22 +1,25 @@
 """`jaxdrones train`."""
 
 import argparse
+import contextlib
 import time
+from pathlib import Path
+from typing import Any
 
 from jaxdrones import assets
 from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
+from jaxdrones.cli.budget import Deadlines, parse_budget
 from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
 from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
-from jaxdrones.cli.train_runs import episodes_of, recipe_of, runs_of
+from jaxdrones.cli.train_runs import episodes_of, folders_of, recipe_of, remaining, runs_of
 from jaxdrones.cli.training import (
     ProgressDisplay,
     draw_curves,
     merge_budget,
-    parse_budget,
     quiet,
     remaining_best,
     show_results,
@@ -47,7 +50,7 @@ def add(commands) -> None:
         "--overwrite.\n\n"
         "  --resume                     continue a run that was stopped, with its own settings\n"
         "  --resume --budget 100        train a finished run for 100 more updates\n"
-        "  --resume --budget 60s        train a stopped or finished run for 60 s more, without compiling\n"
+        "  --resume --budget 60s        train a stopped or finished run for 60 s more\n"
         "  --resume --set updates=400   train to 400 updates in total\n\n"
         "A longer training continues as if all its updates had been asked for at the start: the learning rate rises\n"
         "to its value at this point of the longer schedule. The best policy is replaced only by a better one.\n\n"
@@ -72,8 +75,15 @@ def add(commands) -> None:
     parser.add_argument(
         "--budget",
         metavar="N|Ns",
-        help="number of updates, such as 300 (with sb3 control steps, such as 100000), or time per seed with "
-        "compiling, such as 60s, 5m, 2h",
+        help="number of updates, such as 300 (with sb3 control steps, such as 100000), or time per seed, such as "
+        "60s, 5m, 2h, for everything: compiling, updates, evaluations and files",
+    )
+    parser.add_argument(
+        "--stop-at",
+        type=float,
+        metavar="RATE",
+        help="stop when the lower bound of the success rate, such as 0.99, was reached in three evaluations in a row; "
+        "evaluates more often",
     )
     parser.add_argument(
         "--set",
@@ -104,52 +114,61 @@ def _train(options: argparse.Namespace) -> int:
         from jaxdrones.cli import train_sb3
 
         return train_sb3.train(options)
-    from jaxdrones.learning import Diverged
     from jaxdrones.training import loop
     from jaxdrones.training.distributed import fail_together
-    from jaxdrones.training.presets import settings_known
+    from jaxdrones.training.lock import locked
     from jaxdrones.training.run import Run
 
     begin = time.perf_counter()
-    with fail_together():
-        if not options.no_figure:
-            plots.check_matplotlib()
-        output = options.output or run_folder(options.task, _ending(options))
-        _check_numbers(options)
-        updates, seconds = parse_budget(options.budget, "updates", 300)
-        asked = merge_budget("updates", asked_settings(options), updates, seconds)
-        runs = runs_of(options, output)
-        with user_mistakes(asked, options.task):
-            recipe = recipe_of(options, runs, output, asked, seconds)
-            trainer = _trainer_type(options.library)(recipe, episodes_of(options, runs))
-        resumed = [run for run in runs.values() if run.started and options.resume]
-        for run in resumed:
-            loop.check_resumable(trainer, run)
-        for run in (*runs.values(), Run(output)):
-            trainer.prepare(run)
-    print_line = quiet if options.json else print
+    with contextlib.ExitStack() as stack:
+        with fail_together():
+            if not options.no_figure:
+                plots.check_matplotlib()
+            output = options.output or run_folder(options.task, _ending(options))
+            _check_numbers(options)
+            updates, seconds = parse_budget(options.budget, "updates", 300)
+            asked = merge_budget("updates", asked_settings(options), updates, seconds)
+            for folder in folders_of(options, output):
+                stack.enter_context(locked(folder, print_warning))
+            runs = runs_of(options, output)
+            with user_mistakes(asked, options.task):
+                recipe = recipe_of(options, runs, output, asked, seconds)
+                trainer = _trainer_type(options.library)(recipe, episodes_of(options, runs))
+            resumed = [run for run in runs.values() if run.started and options.resume]
+            for run in resumed:
+                loop.check_resumable(trainer, run)
+            for run in (*runs.values(), Run(output)):
+                trainer.prepare(run)
+        return _train_runs(options, runs, output, trainer, Deadlines(options, begin, seconds, len(runs)))
+
+
+def _train_runs(options: argparse.Namespace, runs: dict, output: Path, trainer: Any, deadlines: Deadlines) -> int:
+    """Train every run in its locked folder, and print the results."""
+    from jaxdrones.learning import Diverged
+    from jaxdrones.training import loop
+    from jaxdrones.training.presets import settings_known
+    from jaxdrones.training.run import Run
+
+    recipe, print_line = trainer.recipe, quiet if options.json else print
     known = recipe.realistic != "any" and settings_known(recipe.task, recipe.algorithm, recipe.library)
     if not options.resume and not known:
         warn_of_unknown_settings(recipe)
     print_line(f"{_headline(recipe)}; compiling")
     trainer.compile()
-    made = max((run.sidecar_entry("state", "update") for run in resumed), default=0)
-    if seconds is not None:
-        spent = 0.0 if options.resume else time.perf_counter() - begin
-        if spent > seconds:
-            more = "; --resume continues it" * (options.library != "rllib")
-            print_warning(f"compiling took all of --budget {options.budget}, so one update is made{more}")
-        trainer.fit_budget(seconds - spent, made)
-    total = trainer.recipe.config.updates
-    print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total}{f', {made} of them made' * bool(made)}")
+    made = {
+        seed: run.sidecar_entry("state", "update") if options.resume and run.started else 0
+        for seed, run in runs.items()
+    }
+    deadlines.start(resumable=options.library != "rllib")
+    total = recipe.config.updates if deadlines.seconds is None else None
+    so_far = f", {max(made.values())} of them made" * (max(made.values()) > 0)
+    print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total or 'as many as the time allows'}{so_far}")
     if not options.resume:
         for run in (*runs.values(), Run(output)):
             run.clear()
 
     with live_server(options) as live:
-        for seed, run in runs.items():
-            if run.finished and run.sidecar_entry("state", "update") >= total:
-                continue
+        for seed, run in remaining(runs, recipe.config.updates, deadlines.seconds).items():
             display = ProgressDisplay(
                 total, f"seed {seed}" if len(runs) > 1 else "training", trainer.episodes, print_line
             )
@@ -159,7 +178,7 @@ def _train(options: argparse.Namespace) -> int:
                 on_progress = LiveTraining(live, trainer, run, what, on_progress).update
             try:
                 with display:
-                    loop.train(trainer, run, seed, on_progress)
+                    loop.train(trainer, run, seed, on_progress, deadlines.next())
             except KeyboardInterrupt:
                 if not (run.folder / "last.json").exists():
                     return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
@@ -175,7 +194,9 @@ def _train(options: argparse.Namespace) -> int:
                 return print_error(
                     f"training diverged: {error}, for example --set learning_rate=1e-3; {remaining_best(run)}", 1
                 )
-    return show_results(options, runs, output)
+    code = show_results(options, runs, output)
+    deadlines.warn_if_missed()
+    return code
 
 
 def _ending(options: argparse.Namespace) -> str:

@@ -25,6 +25,34 @@ def runs_of(options: argparse.Namespace, output: Path) -> dict:
     return {seed: run}
 
 
+def folders_of(options: argparse.Namespace, output: Path) -> list[Path]:
+    """The folders that a training writes to: that of the command, and those of several seeds."""
+    first = options.seed or 0
+    return [output] + [output / f"seed-{seed}" for seed in range(first, first + options.seeds) if options.seeds > 1]
+
+
+def remaining(runs: dict, updates: int, seconds: float | None) -> dict:
+    """The runs that are to be trained, without those that are finished and not to be trained longer.
+
+    Args:
+        runs: run of each seed.
+        updates: number of updates that were asked for.
+        seconds: time that was asked for, s.
+    """
+    had = {seed: _updates(run) for seed, run in runs.items() if run.started}
+    longer = seconds is not None or updates > max(had.values(), default=0)
+    return {seed: run for seed, run in runs.items() if longer or not (run.finished and _is_complete(run))}
+
+
+def _updates(run) -> int:
+    """Number of updates that the training of a run was to make, or after which it stopped early."""
+    return run.sidecar_entry("state", "recipe")["config"]["updates"]
+
+
+def _is_complete(run) -> bool:
+    return run.started and run.sidecar_entry("state", "update") >= _updates(run)
+
+
 def _nothing_to_resume(run) -> UserError:
     several = "give --seeds N, or " if list(run.folder.glob("seed-*/state.json")) else ""
     return UserError(f"{run.folder} holds no training to continue; {several}leave out --resume")
@@ -44,6 +72,7 @@ def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
     default = "ppo" if options.library == "rllib" else default_algorithm(options.task)
     algorithm = default if options.algo is None else options.algo
     recipe = Recipe.of(options.task, algorithm, options.realistic, options.library, **asked)
+    recipe = dataclasses.replace(recipe, stop_at=options.stop_at)
     for run in (*runs.values(), Run(output)):
         check_free(run, options.overwrite)
     return recipe
@@ -58,8 +87,8 @@ def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: floa
     if not started:
         raise _nothing_to_resume(next(iter(runs.values())))
     for run in started:
-        run.verify("best")
-        run.verify("state")
+        for name in ("best", "state", *["last"] * (run.folder / "last.json").exists()):
+            run.verify(name)
     recipes = [Recipe.from_dict(run.sidecar_entry("state", "recipe")) for run in started]
     folder, recipe = started[0].folder, max(recipes, key=lambda recipe: recipe.config.updates)
     had = {"task": recipe.task, "algo": recipe.algorithm, "realistic": recipe.realistic}
@@ -77,16 +106,15 @@ def _resumed(options: argparse.Namespace, runs: dict, asked: dict, seconds: floa
     for name, x in wanted.items():
         if had.get(name) != x:
             raise UserError(f"{folder} was started with {name} {had.get(name)}, not {x}; leave {name} out to --resume")
-    finished = len(started) == len(runs) and all(
-        run.finished and run.sidecar_entry("state", "update") >= recipe.config.updates for run in started
-    )
+    finished = len(started) == len(runs) and all(run.finished and _is_complete(run) for run in started)
     total = _total(recipe.config.updates, updates, options.budget is not None, finished)
     if finished and seconds is None and total == recipe.config.updates:
         raise UserError(
             f"{folder} is trained to the end, {total} updates; train it longer with --budget N or 60s, or "
             "replace it with --overwrite instead of --resume"
         )
-    return dataclasses.replace(recipe, config=dataclasses.replace(recipe.config, updates=total))
+    stop_at = recipe.stop_at if options.stop_at is None else options.stop_at
+    return dataclasses.replace(recipe, config=dataclasses.replace(recipe.config, updates=total), stop_at=stop_at)
 
 
 def _total(had: int, asked: int | None, more: bool, finished: bool) -> int:

@@ -1,10 +1,12 @@
 """`jaxdrones train --library sb3`: training by Stable-Baselines3, as in the paper."""
 
 import argparse
+import dataclasses
 import time
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import INTERRUPTED, print_error, run_folder
+from jaxdrones.cli.budget import Deadlines, parse_budget
+from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.names import SB3_ALGORITHMS
 from jaxdrones.cli.settings import asked_settings, user_mistakes
@@ -13,7 +15,6 @@ from jaxdrones.cli.training import (
     check_free,
     draw_curves,
     merge_budget,
-    parse_budget,
     quiet,
     remaining_best,
     show_results,
@@ -50,36 +51,45 @@ def train(options: argparse.Namespace) -> int:
 
     # isort: split
     from jaxdrones.learning import Diverged
+    from jaxdrones.training.lock import locked
     from jaxdrones.training.stable_baselines_trainer import SB3Trainer
 
     run = SB3Run(options.output or run_folder(options.task, f"-sb3-{algorithm}"))
-    with user_mistakes(asked, options.task):
-        recipe = SB3Recipe.of(options.task, algorithm, options.realistic, **asked)
-    check_free(run, options.overwrite)
+    deadlines = Deadlines(options, begin, seconds, 1)
     print_line = quiet if options.json else print
-    print_line(f"{_headline(recipe)}; compiling")
-    with user_mistakes(asked, options.task):
-        trainer = SB3Trainer(recipe, seed, episodes)
-    trainer.prepare(run)
-    if recipe.task != PRESET_TASK or recipe.realistic == "any":
-        warn_of_unknown_settings(recipe)
-    run.clear()
-    total = recipe.config["steps"] if seconds is None else None
-    print_line(f"compiled in {trainer.compile_seconds:.1f} s; control steps: {total or 'as many as the time allows'}")
-    try:
-        with ProgressDisplay(total, "training", episodes, print_line, "step") as display:
-            trainer.train(run, display.update, None if seconds is None else begin + seconds)
-    except KeyboardInterrupt:
-        if not run.files:
-            return print_error("interrupted before the first evaluation; nothing is kept", INTERRUPTED)
-        draw_curves(options, {seed: run}, run.folder)
-        return print_error(f"interrupted; {remaining_best(run)}", INTERRUPTED)
-    except Diverged as error:
-        draw_curves(options, {seed: run}, run.folder)
-        return print_error(
-            f"training diverged: {error}, for example --set learning_rate=1e-4; {remaining_best(run)}", 1
+    with locked(run.folder, print_warning):
+        with user_mistakes(asked, options.task):
+            recipe = SB3Recipe.of(options.task, algorithm, options.realistic, **asked)
+            recipe = dataclasses.replace(recipe, stop_at=options.stop_at)
+        check_free(run, options.overwrite)
+        print_line(f"{_headline(recipe)}; compiling")
+        with user_mistakes(asked, options.task):
+            trainer = SB3Trainer(recipe, seed, episodes)
+        trainer.prepare(run)
+        if recipe.task != PRESET_TASK or recipe.realistic == "any":
+            warn_of_unknown_settings(recipe)
+        deadlines.start(resumable=False)
+        run.clear()
+        total = recipe.config["steps"] if seconds is None else None
+        print_line(
+            f"compiled in {trainer.compile_seconds:.1f} s; control steps: {total or 'as many as the time allows'}"
         )
-    return show_results(options, {seed: run}, run.folder)
+        try:
+            with ProgressDisplay(total, "training", episodes, print_line, "step") as display:
+                trainer.train(run, display.update, deadlines.next())
+        except KeyboardInterrupt:
+            if not run.files:
+                return print_error("interrupted before the first evaluation; nothing is kept", INTERRUPTED)
+            draw_curves(options, {seed: run}, run.folder)
+            return print_error(f"interrupted; {remaining_best(run)}", INTERRUPTED)
+        except Diverged as error:
+            draw_curves(options, {seed: run}, run.folder)
+            return print_error(
+                f"training diverged: {error}, for example --set learning_rate=1e-4; {remaining_best(run)}", 1
+            )
+        code = show_results(options, {seed: run}, run.folder)
+        deadlines.warn_if_missed()
+        return code
 
 
 def _refuse(options: argparse.Namespace) -> None:

@@ -9,29 +9,7 @@ from typing import Any
 from jaxdrones.cli.common import as_json, bar, print_warning
 from jaxdrones.cli.evaluate import evaluation_table, percent
 from jaxdrones.errors import UserError
-from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.visualization import learning_curves
-
-_MAX_SECONDS = 3.6e6
-_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-
-
-def parse_budget(text: str | None, unit: str, example: int) -> tuple[int | None, float | None]:
-    """The number of `unit`, or the seconds, that --budget gives; the other is `None`."""
-    if text is None:
-        return None, None
-    try:
-        if text[-1:] in _UNITS:
-            seconds = float(text[:-1]) * _UNITS[text[-1]]
-            if 0 < seconds <= _MAX_SECONDS:
-                return None, seconds
-        elif 0 < int(text) <= LARGEST_COUNT:
-            return int(text), None
-    except ValueError:
-        pass
-    raise UserError(
-        f"--budget is {text!r}; give {unit}, for example {example}, or a time up to 1000h, for example 60s, 5m or 2h"
-    )
 
 
 def warn_of_unknown_settings(recipe) -> None:
@@ -141,11 +119,12 @@ def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[P
     if options.no_figure:
         return []
     histories = {f"seed {seed}": run.history() for seed, run in runs.items()}
+    kept = {f"seed {seed}": run.sidecar_entry("best", "update") for seed, run in runs.items()}
     recipe = next(iter(runs.values())).recipe()
     episodes = next(iter(runs.values())).sidecar().get("episodes")
     title = f"training {recipe.task} by {recipe.trained_by}"
     interval = (lambda success: wilson_interval(round(success * episodes), episodes)) if episodes else None
-    learning_curves.save_curves(histories, folder / "curve.png", title, interval)
+    learning_curves.save_curves(histories, folder / "curve.png", title, interval, kept)
     return [folder / "curve.png"]
 
 
@@ -166,9 +145,10 @@ def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
     best = list(runs)[best_of(scores, min(evaluation["episodes"] for evaluation in evaluations))]
     run = runs[best]
     if len(runs) > 1:
-        about = {entry: run.sidecar_entry("best", entry) for entry in ("recipe", "seed", "update")}
+        about = {entry: run.sidecar_entry("best", entry) for entry in ("run_id", "recipe", "seed", "update")}
+        Run(output).remove_report()  # that of an earlier best seed
         Run(output).save_policy("best", run.policy(), **about)
-        Run(output).save_report({"best_seed": best, "seeds": list(reports.values())})
+        Run(output).save_report({"run_id": about["run_id"], "best_seed": best, "seeds": list(reports.values())})
     files = [output / f"best.{run.policy_suffix}", output / "report.json", *draw_curves(options, runs, output)]
     if options.json:
         result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
@@ -181,10 +161,18 @@ def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
             print(f"seed {seed}:")
         print(
             f"trained in {spent['training']:.1f} s, {spent['training'] + spent['compiling']:.1f} s with compiling; "
-            f"{spent['evaluating']:.1f} s for evaluations. The best policy is that of update {report['best_update']}:"
+            f"{spent['evaluating']:.1f} s for evaluations{_early(run, report)}. The best policy is that of update "
+            f"{report['best_update']}:"
         )
         print(evaluation_table(report["evaluation"]))
     print("wrote " + ", ".join(map(str, files)))
     print(f"fly it: jaxdrones fly --policy {output}")
     warn_of_failure(run, reports[best])
     return 0
+
+
+def _early(run, report: dict[str, Any]) -> str:
+    """A phrase that says that a training stopped early because its policy was good enough."""
+    if not report["stopped_at_success"]:
+        return ""
+    return f"; stopped at update {report['updates']}, success {run.recipe('last').stop_at:g} was reached"

@@ -19,6 +19,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.serialization import scene_from_dict, scene_to_dict
+from jaxdrones.writing import replaced
 
 _ARRAYS = ("t", "pos", "quat", "rpy", "vel", "omega", "rpm", "target_pos", "target_vel", "labels")  # of a log
 _IMAGES = "images/"  # that names of arrays begin with
@@ -194,7 +195,8 @@ class Record:
     def save_npz(self, path: Path, pwm: bool = False) -> None:
         """Write the log as named arrays."""
         arrays: dict[str, Any] = self.arrays(pwm)
-        np.savez_compressed(path, **arrays)
+        with replaced(path) as new:
+            np.savez_compressed(new, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> "Record":
@@ -234,7 +236,7 @@ class Record:
         axes = {"pos": "xyz", "quat": "xyzw", "rpy": "rpy", "vel": "xyz", "omega": "xyz", "rpm": "0123", "pwm": "0123"}
         axes |= {"target_pos": "xyz", "target_vel": "xyz"}
         arrays = {name: array for name, array in self.arrays(pwm).items() if name in axes}
-        with path.open("w", newline="") as file:
+        with replaced(path) as new, new.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["t", "drone"] + [f"{name}_{axis}" for name in arrays for axis in axes[name]])
             for k, t in enumerate(self.t):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +69,25 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
     return _report(env, jax.tree.map(np.asarray, outcomes))
 
 
+def compile_evaluation(env: Env, policy: Any, episodes: int) -> Callable[[AnyPolicy, jax.Array], Report]:
+    """`evaluate` of so many episodes, compiled for all policies of one structure: (policy, key) -> report.
+
+    Args:
+        env: environment of the explicit backend.
+        policy: a policy that is a pytree, or the shapes of one.
+        episodes: number of episodes.
+
+    Raises:
+        ValueError: more episodes than the memory holds.
+    """
+    check_episodes(env, episodes)
+    split = functools.partial(jax.random.split, num=episodes)
+    keys = jax.eval_shape(split, jax.random.key(0))
+    shapes = jax.eval_shape(lambda policy: policy, policy)
+    outcomes = _compiled_outcomes().lower(compilation.Static(env), shapes, keys).compile()
+    return lambda policy, key: _report(env, jax.tree.map(np.asarray, outcomes(policy, split(key))))
+
+
 def check_episodes(env: Env, episodes: int) -> None:
     """Raise if an evaluation of so many episodes needs more memory than there is."""
     check_at_most("episodes", episodes, LARGEST_COUNT)
@@ -75,7 +95,7 @@ def check_episodes(env: Env, episodes: int) -> None:
 
 
 @functools.cache
-def _compiled_outcomes() -> Callable:
+def _compiled_outcomes() -> Any:
     return compilation.jit(lambda env, policy, keys: _outcomes(env.value, policy, keys), static_argnums=0)
 
 

@@ -2,7 +2,7 @@
 
 The sidecar holds the SHA-256 checksum of the file and one of its own content, so that a file that was changed,
 truncated or taken from elsewhere is refused. The sidecar decides which content is valid: that of the file, or that of
-the `.new` file that a process leaves when it is killed between two renames.
+the file beside it (`state.new.msgpack`) that a process leaves when it is killed between two renames.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import os
 from pathlib import Path
 from typing import Any
 
+from jaxdrones import writing
 from jaxdrones.errors import UserError
 
-FORMAT = 3
+FORMAT = 4
 """Version of the format; files of another version are refused."""
 
 ADVICE = "take another checkpoint, or train anew"
@@ -28,13 +29,15 @@ def save_bytes(file: Path, content: bytes, **about: Any) -> None:
     sidecar = json.loads(json.dumps(sidecar, default=str))
     sidecar["sidecar_sha256"] = _sidecar_digest(sidecar)
     file.parent.mkdir(parents=True, exist_ok=True)
-    _write_temporary(file, content)
+    new = writing.beside(file)
+    _finish(file)
     try:
-        write(file.with_suffix(".json"), json.dumps(sidecar, indent=2).encode())
-    except OSError:
-        _temporary(file).unlink(missing_ok=True)
-        raise
-    _rename(file)  # after a crash before this line, `load_bytes` finds the content under its temporary name
+        new.write_bytes(content)
+        writing.write(file.with_suffix(".json"), json.dumps(sidecar, indent=2).encode())
+    except OSError as error:  # that of a full disk names no file
+        new.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(file)) from error
+    writing.rename(file)  # after a crash before this line, `load_bytes` finds the content beside the file
 
 
 def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
@@ -48,7 +51,7 @@ def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
         FileNotFoundError: there is no such file.
         ValueError: it cannot be read, or is not the file that the sidecar describes.
     """
-    found = [content for content in map(_read, (file, _temporary(file))) if content is not None]
+    found = [content for content in map(_read, (file, writing.beside(file))) if content is not None]
     for content in found:
         if _digest(content) == sidecar["sha256"]:
             return content
@@ -59,20 +62,6 @@ def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
         f"{file} is damaged, or of another checkpoint than {file.with_suffix('.json').name}: its checksum differs; "
         + ADVICE
     )
-
-
-def write(file: Path, content: bytes) -> None:
-    """Write a whole file, or nothing if that fails.
-
-    Raises:
-        OSError: the file cannot be written; the error names it.
-    """
-    _write_temporary(file, content)
-    try:
-        _rename(file)
-    except OSError:
-        _temporary(file).unlink(missing_ok=True)
-        raise
 
 
 def read_sidecar(path: str | os.PathLike) -> dict[str, Any]:
@@ -127,26 +116,17 @@ def _read(file: Path) -> bytes | None:
         raise UserError(f"{file} cannot be read: {error.strerror}; {ADVICE}") from error
 
 
-def _write_temporary(file: Path, content: bytes) -> None:
-    """Write under a temporary name, so that a crash or a full disk does not damage the file."""
-    temporary = _temporary(file)
+def _finish(file: Path) -> None:
+    """Rename the content that a killed process left beside the file, if it is the one that the sidecar describes."""
+    left = _read(writing.beside(file))
+    if left is None:
+        return
     try:
-        temporary.write_bytes(content)
-    except OSError as error:  # that of a full disk names no file
-        temporary.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(file)) from error
-
-
-def _rename(file: Path) -> None:
-    """Replace the file by what was written under its temporary name."""
-    try:
-        os.replace(_temporary(file), file)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(file)) from error
-
-
-def _temporary(file: Path) -> Path:
-    return file.with_name(file.name + ".new")
+        valid = _digest(left) == read_sidecar(file.with_suffix(""))["sha256"]
+    except (FileNotFoundError, KeyError, ValueError):
+        valid = False
+    if valid:
+        writing.rename(file)
 
 
 def _sidecar_file(path: Path) -> Path:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import secrets
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,17 +14,17 @@ import numpy as np
 
 from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
-from jaxdrones.learning.evaluation import Report, evaluate
+from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.result import PATIENCE, Diverged, check_gradients
+from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.training import distributed
+from jaxdrones.training.plan import EVALUATIONS, IN_A_ROW, STOPPING_EVALUATIONS, TimePlan, next_evaluation
 from jaxdrones.training.progress import Progress
 from jaxdrones.training.run import Run, report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM, Score, best_of, score_of
 from jaxdrones.training.trainer import MAX_CALL, BaseTrainer, Trainer
 
-EVALUATIONS = 10
-"""Number of evaluations in the course of a training."""
 _CALL_SECONDS = 0.3  # aimed at for one call of the compiled program, during which Ctrl-C has to wait
 _SAVE_SECONDS = 30.0  # longest time between two training states on disk
 _EVALUATED = ("success", "evaluated_return", "evaluated_error")
@@ -31,7 +33,7 @@ OnProgress = Callable[[int, dict[str, float]], None]
 """(number of updates made, newest metrics) -> None: shows progress."""
 
 
-def train(trainer: BaseTrainer, run: Run, seed: int, on_progress: OnProgress) -> None:
+def train(trainer: BaseTrainer, run: Run, seed: int, on_progress: OnProgress, deadline: float | None = None) -> None:
     """Train one seed to the end, from the start or from the state that the run holds; evaluate the best policy.
 
     Args:
@@ -39,22 +41,28 @@ def train(trainer: BaseTrainer, run: Run, seed: int, on_progress: OnProgress) ->
         run: run whose folder was prepared.
         seed: seed of everything that is random.
         on_progress: function that shows progress.
+        deadline: time of `time.perf_counter` at which everything has to be written, s; the number of updates then
+            follows from the time that updates and evaluations take, and is at least one more.
 
     Raises:
         Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so far is
             kept.
         KeyboardInterrupt: passed on after the state was saved, unless other hosts would have to help.
     """
-    loop = _Loop(trainer, run, seed)
-    run.remove_report()
-    loop.save()
+    recipe = trainer.recipe
     try:
-        loop.run_updates(on_progress)
-    except KeyboardInterrupt:
-        if jax.process_count() == 1:
-            loop.save()
-        raise
-    loop.finish()
+        loop = _Loop(trainer, run, seed, deadline)
+        run.remove_report()
+        loop.save()
+        try:
+            loop.run_updates(on_progress)
+        except KeyboardInterrupt:
+            if jax.process_count() == 1:
+                loop.save()
+            raise
+        loop.finish()
+    finally:
+        trainer.recipe = recipe  # whose number of updates a deadline or a success rate has changed
 
 
 def check_resumable(trainer: Trainer, run: Run) -> None:
@@ -62,66 +70,75 @@ def check_resumable(trainer: Trainer, run: Run) -> None:
 
     Raises:
         FileNotFoundError: a file is missing.
-        ValueError: a file is damaged, or the files belong to different runs.
+        ValueError: a file is damaged, or the files belong to different trainings.
     """
     _load(trainer, run)
     run.history()
 
 
-def _load(trainer: Trainer, run: Run) -> tuple[Any, float, Score, float]:
-    """State, seconds of training, score of the best policy and highest success rate of a run."""
+def _load(trainer: Trainer, run: Run) -> Any:
+    """The training state of a run, whose files were all checked."""
     state = run.load_state(trainer.shapes)
     if not _is_finite(state):
         raise UserError(f"{run.folder / 'state'} holds numbers that are not finite; train anew with --overwrite")
     run.policy("best", trainer.env)
-    for entry in ("seed", "episodes"):
-        if run.sidecar_entry("best", entry) != run.sidecar_entry("state", entry):
-            raise _different_runs(run)
-    if _without_updates(run.sidecar_entry("best", "recipe")) != _without_updates(run.sidecar_entry("state", "recipe")):
-        raise _different_runs(run)
-    score = tuple(run.sidecar_entry("best", "score"))
-    highest_success = max(score[0], run.sidecar_entry("state", "highest_success"))
-    return state, run.sidecar_entry("state", "seconds"), score, highest_success
+    return state
 
 
 class _Loop:
     """The training of one seed: its state, and the results so far."""
 
-    def __init__(self, trainer: BaseTrainer, run: Run, seed: int):
+    def __init__(self, trainer: BaseTrainer, run: Run, seed: int, deadline: float | None = None):
         """Start a training, or continue the one that the run holds."""
-        self.trainer, self.run, self.config = trainer, run, trainer.recipe.config
+        self.trainer, self.run, self.seed = trainer, run, seed
         self.key = jax.random.key(seed)
-        self.about = {"recipe": trainer.recipe.as_dict(), "seed": seed, "episodes": trainer.episodes}
-        self.evaluation_seconds = 0.0
+        self.evaluation_seconds, self.last_evaluation_seconds = 0.0, 0.0
         self.nonfinite_streak = 0  # updates in a row, up to the newest, with numbers that were not finite
         self.best: Score | None = None
         self.highest_success = 0.0
+        self.reached = 0  # evaluations in a row, up to the newest, that reached the success rate to stop at
+        self.seconds, self.update = 0.0, 0
+        self.plan: TimePlan | None = None
         if run.started:
             assert isinstance(trainer, Trainer)
-            state, self.seconds, self.best, self.highest_success = _load(trainer, run)
-            self.state = sharding.shard_state(trainer.mesh, state)
+            self.state = sharding.shard_state(trainer.mesh, _load(trainer, run))
             self.update = int(self.state.step)
+            about, best = run.sidecar("state"), run.sidecar_entry("best", "score")
+            self.id, self.seconds, self.reached = about["run_id"], about["seconds"], about["reached"]
+            self.best, self.highest_success = (best[0], best[1]), max(best[0], about["highest_success"])
+            self.last_evaluation_seconds = about["evaluation_seconds"]
         else:
-            self.state, self.seconds, self.update = trainer.start(self.key), 0.0, 0
+            self.id, self.state = secrets.token_hex(8), trainer.start(self.key)
             self.evaluate(self.state.policy, 0)
+        if deadline is not None:
+            self.plan = TimePlan(deadline, self.update, self._evaluations, self.last_evaluation_seconds)
+            self._set_updates(max(self.updates, self.update + 1))  # until an update was timed
 
     def run_updates(self, on_progress: OnProgress) -> None:
         """Make all updates that remain."""
-        updates, saved, length = self.config.updates, self.seconds, 1
-        evaluations = {updates * (i + 1) // EVALUATIONS for i in range(EVALUATIONS)}
+        saved, length = self.seconds, 1
         with Progress(self.run, self._columns(), self.update) as progress:
-            while self.update < updates:
-                next_evaluation = min(update for update in evaluations if update > self.update)
-                length = min(length, next_evaluation - self.update, MAX_CALL)
+            while self.update < self.updates:
+                length = min(length, self._next_evaluation() - self.update, MAX_CALL)
                 state, rows, seconds = self.advance(length)
                 self.seconds += seconds
-                if self.update + length in evaluations:
-                    rows[-1] |= self.evaluate(state.policy, self.update + length)
+                update = self.update + length
+                if self.plan is not None:
+                    self.plan.add_updates(length, seconds)
+                    self._set_updates(self.plan.updates(update))
+                evaluated = update == self.updates or update >= self._next_evaluation()
+                if evaluated:
+                    rows[-1] |= self.evaluate(state.policy, update)
                     if self.nonfinite_streak and not math.isfinite(rows[-1]["evaluated_return"]):
-                        raise _diverged("the return of an evaluation is not finite", self.update + length)
+                        raise _diverged("the return of an evaluation is not finite", update)
+                    if self.reached >= IN_A_ROW:
+                        self._set_updates(update)
+                    elif self.plan is not None:
+                        self._set_updates(self.plan.updates(update))
                 progress.add(rows)
-                self.state, self.update = state, self.update + length
-                if self.update in evaluations or self.seconds - saved > _SAVE_SECONDS:
+                self.state, self.update = state, update
+                if evaluated or self.seconds - saved > _SAVE_SECONDS:
+                    progress.synchronize()
                     self.save()
                     saved = self.seconds
                 on_progress(self.update, rows[-1] | {"steps_per_s": length * self._steps / seconds})
@@ -137,7 +154,7 @@ class _Loop:
         state, metrics = self.trainer.advance(self.state, length)
         seconds = distributed.from_first_host(time.perf_counter() - start)
         nonfinite = metrics["nonfinite_gradients"] + np.any([~np.isfinite(x) for x in metrics.values()], axis=0)
-        self.nonfinite_streak = check_gradients(nonfinite, min(PATIENCE, self.config.updates), self.nonfinite_streak)
+        self.nonfinite_streak = check_gradients(nonfinite, min(PATIENCE, self.updates), self.nonfinite_streak)
         if not _is_finite(state):
             raise _diverged("parameters are not finite", self.update + length)
         rows = [
@@ -157,18 +174,24 @@ class _Loop:
         report = self._evaluate(policy, SELECTION_STREAM)
         score = score_of(report.success, report.mean_return)
         self.highest_success = max(self.highest_success, report.success)
+        stop_at = self.trainer.recipe.stop_at
+        self.reached = self.reached + 1 if stop_at is not None and report.success_interval[0] >= stop_at else 0
         if self.best is None or best_of([self.best, score], self.trainer.episodes, self.highest_success) == 1:
             self.best = score
-            self.run.save_policy("best", policy, **self.about, update=update, score=score)
+            self.run.save_policy("best", policy, **self._about(update), score=score)
+        if self.plan is not None:
+            self.plan.add_evaluation(update, self.last_evaluation_seconds)
         results = (report.success, report.mean_return, report.final_error_percentiles[50])
         return dict(zip(_EVALUATED, results, strict=True))
 
     def save(self) -> None:
         """Write the newest policy and the training state."""
         state = sharding.gather(self.trainer.mesh, self.state)
-        about = self.about | {"update": self.update}
+        about = self._about(self.update)
         self.run.save_policy("last", state.policy, **about)
-        self.trainer.save(self.run, state, **about, seconds=self.seconds, highest_success=self.highest_success)
+        progress = {"seconds": self.seconds, "evaluation_seconds": self.last_evaluation_seconds}
+        progress |= {"highest_success": self.highest_success, "reached": self.reached}
+        self.trainer.save(self.run, state, **about, **progress)
 
     def finish(self) -> None:
         """Evaluate the best policy, in other episodes than those that chose it, and write the report."""
@@ -178,37 +201,50 @@ class _Loop:
             "compiling": self.trainer.compile_seconds,
             "evaluating": self.evaluation_seconds,
         }
-        self.run.save_report(
-            self.about
-            | {"best_update": self.run.sidecar_entry("best", "update"), "updates": self.update, "seconds": seconds}
-            | {"evaluation": report_as_dict(report)}
-        )
+        best_update, stopped = self.run.sidecar_entry("best", "update"), self.reached >= IN_A_ROW
+        about = self._about(self.update) | {"best_update": best_update, "updates": self.update}
+        about |= {"stopped_at_success": stopped, "seconds": seconds, "evaluation": report_as_dict(report)}
+        self.run.save_report(about)
+
+    @property
+    def updates(self) -> int:
+        """Number of updates of the whole training."""
+        return self.trainer.recipe.config.updates
+
+    def _set_updates(self, updates: int) -> None:
+        recipe = self.trainer.recipe
+        config = dataclasses.replace(recipe.config, updates=min(updates, LARGEST_COUNT))
+        self.trainer.recipe = dataclasses.replace(recipe, config=config)
+
+    def _next_evaluation(self) -> int:
+        if self.plan is not None:
+            return self.plan.next_evaluation(self.updates, self.update)
+        return next_evaluation(self.updates, self.update, self._evaluations)
+
+    @property
+    def _evaluations(self) -> int:
+        return EVALUATIONS if self.trainer.recipe.stop_at is None else STOPPING_EVALUATIONS
 
     @property
     def _steps(self) -> int:
         """Control steps of an update, of all drones."""
-        return self.config.worlds * self.config.horizon * self.trainer.env.drones
+        config = self.trainer.recipe.config
+        return config.worlds * config.horizon * self.trainer.env.drones
+
+    def _about(self, update: int) -> dict[str, Any]:
+        """What every file of this training says of it; `run_id` is a random number that no other training has."""
+        about = {"run_id": self.id, "recipe": self.trainer.recipe.as_dict(), "seed": self.seed}
+        return about | {"episodes": self.trainer.episodes, "update": update}
 
     def _columns(self) -> list[str]:
         return ["update", "steps", "seconds", *self.trainer.metrics, *_EVALUATED]
 
     def _evaluate(self, policy: Policy, stream: int) -> Report:
         start = time.perf_counter()
-        report = evaluate(self.trainer.env, policy, jax.random.fold_in(self.key, stream), self.trainer.episodes)
-        self.evaluation_seconds += time.perf_counter() - start
+        report = self.trainer.evaluate(policy, jax.random.fold_in(self.key, stream))
+        self.last_evaluation_seconds = time.perf_counter() - start
+        self.evaluation_seconds += self.last_evaluation_seconds
         return report
-
-
-def _without_updates(recipe: dict) -> dict:
-    """A recipe without the number of updates, which a longer training changes."""
-    return recipe | {"config": recipe["config"] | {"updates": None}}
-
-
-def _different_runs(run: Run) -> ValueError:
-    return UserError(
-        f"{run.folder}: best.json and state.json are of two runs; restore the files of one, or train anew with "
-        "--overwrite"
-    )
 
 
 def _diverged(what: str, update: int) -> Diverged:

@@ -36,6 +36,8 @@ class Recipe:
     files: user_files.Files = dataclasses.field(default_factory=dict)
     """Texts of the user's files that task and vehicle are in."""
     library: str = "jaxdrones"
+    stop_at: float | None = None
+    """Lower bound of the success rate at which to stop; `None` to make all updates."""
 
     @classmethod
     def of(

@@ -5,7 +5,8 @@
     progress.csv     a row for each update; an event file holds the same for TensorBoard
     report.json      the evaluation of the best policy, and the time that training took
 
-Each of best, last and state is a .msgpack and a .json that describes it.
+Each of best, last and state is a .msgpack and a .json that describes it. All name the training that they are of, and
+files of different trainings in one folder are refused.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Any
 
 import jax
 
+from jaxdrones import writing
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import checkpoint, files
@@ -29,6 +31,7 @@ from jaxdrones.learning.networks import Policy
 from jaxdrones.training.events import PREFIX
 from jaxdrones.training.recipe import Recipe
 
+CHECKPOINTS = ("best", "last", "state")
 RLLIB_CHECKPOINT = "rllib"
 """Folder of a run that holds a checkpoint of RLlib, if RLlib trained it."""
 
@@ -45,10 +48,10 @@ class Run:
     @property
     def files(self) -> list[Path]:
         """The files of a run, of whichever library, that exist: checkpoints, progress, report."""
-        endings = [f"{suffix}{new}" for suffix in ("msgpack", "zip", "json") for new in ("", ".new")]
-        names = [f"{name}.{ending}" for name in ("best", "last", "state") for ending in endings]
-        names += ["progress.csv", "report.json", "report.json.new"]
-        return [file for file in (*map(self.folder.joinpath, names), *self.event_files()) if file.exists()]
+        names = [f"{name}.{suffix}" for name in CHECKPOINTS for suffix in ("msgpack", "zip", "json")]
+        whole = [self.folder / name for name in (*names, "progress.csv", "report.json")]
+        candidates = (*whole, *map(writing.beside, whole), *self.event_files())
+        return [file for file in candidates if file.exists()]
 
     def event_files(self) -> list[Path]:
         """The event files, oldest first."""
@@ -95,16 +98,37 @@ class Run:
         return sidecar[entry]
 
     def verify(self, name: str) -> None:
-        """Check that a checkpoint is not damaged.
+        """Check that a checkpoint is not damaged, and of the same training as the others.
 
         Raises:
             FileNotFoundError: there is no such checkpoint.
-            ValueError: it is damaged.
+            ValueError: it is damaged, or of another training.
         """
+        self.check_identity(name)
         files.load_bytes(self.folder / f"{name}.{self.policy_suffix}", self.sidecar(name))
 
+    def check_identity(self, name: str) -> None:
+        """Check that a checkpoint is of the same training as all that is readable beside it.
+
+        Raises:
+            FileNotFoundError: there is no such checkpoint.
+            ValueError: it is damaged, or of another training.
+        """
+        own = self.sidecar(name).get("run_id")
+        for other in (*CHECKPOINTS, "report"):
+            try:
+                found = self._report() if other == "report" else self.sidecar(other)
+            except (FileNotFoundError, ValueError):
+                continue  # what is damaged is refused where it is used
+            if found.get("run_id") != own:
+                raise UserError(
+                    f"{self.folder / name}.json and {other}.json are of two trainings; restore the files of one, or "
+                    "train anew with --overwrite"
+                )
+
     def recipe(self, name: str = "best") -> Recipe:
-        """The recipe of the training."""
+        """The recipe of the training; raises as `check_identity` does."""
+        self.check_identity(name)
         return Recipe.from_dict(self.sidecar_entry(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Policy:
@@ -112,8 +136,9 @@ class Run:
 
         Raises:
             FileNotFoundError: there is no such policy.
-            ValueError: it is damaged, or does not fit `env`.
+            ValueError: it is damaged, of another training than the files beside it, or does not fit `env`.
         """
+        self.check_identity(name)
         policy = checkpoint.load(self.folder / name)
         if env is not None:
             sizes = (policy.obs_stats.mean.size, policy.network.output_size)
@@ -162,7 +187,7 @@ class Run:
 
     def save_report(self, report: dict[str, Any]) -> None:
         """Write report.json, which marks the run as finished."""
-        files.write(self.folder / "report.json", json.dumps(report, indent=2).encode())
+        writing.write(self.folder / "report.json", json.dumps(report, indent=2).encode())
 
     def remove_report(self) -> None:
         """Mark the run as not finished."""
@@ -174,16 +199,28 @@ class Run:
         Raises:
             ValueError: the file is damaged.
         """
-        file = self.folder / "report.json"
         if not self.finished:
             return None
+        report = self._report()
+        if (self.folder / "best.json").exists():
+            self.check_identity("best")
+        return report
+
+    def _report(self) -> dict[str, Any]:
+        file = self.folder / "report.json"
         try:
-            return json.loads(file.read_bytes())
+            report = json.loads(file.read_bytes())
+            if not isinstance(report, dict):
+                raise UserError("it holds no JSON object")
+            return report
         except (OSError, ValueError, RecursionError) as error:
-            raise UserError(f"{file} cannot be read: {error}; remove it and --resume, which writes it anew") from error
+            why = files.one_line(error)
+            raise UserError(f"{file} cannot be read: {why}; remove it and --resume, which writes it anew") from error
 
     def history(self) -> list[dict[str, float]]:
         """The rows of progress.csv, each without the numbers that were not measured in its update.
+
+        A last line that was cut short, as a killed process leaves it, is no row.
 
         Raises:
             ValueError: the file is damaged.
@@ -192,8 +229,8 @@ class Run:
         if not path.exists():
             return []
         try:
-            with path.open(newline="") as file:
-                lines = [{name: x for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(file)]
+            whole = path.read_text().rpartition("\n")[0].splitlines()
+            lines = [{name: x for name, x in row.items() if x not in ("", None)} for row in csv.DictReader(whole)]
             rows = [{name: float(x) for name, x in line.items()} for line in lines]
             if not all(math.isfinite(row.get("update", math.nan)) for row in rows):
                 raise UserError("a row lacks its update")

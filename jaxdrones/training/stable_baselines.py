@@ -63,6 +63,8 @@ class SB3Recipe:
     library: str = "sb3"
     files: user_files.Files = dataclasses.field(default_factory=dict)
     """Texts of the user's files that task and vehicle are in."""
+    stop_at: float | None = None
+    """Lower bound of the success rate at which to stop; `None` to make all steps."""
 
     @classmethod
     def of(cls, task: str, algorithm: str = "ppo", realistic: bool | str = False, **changes: Any) -> SB3Recipe:
@@ -198,10 +200,12 @@ class SB3Run(Run):
 
     def recipe(self, name: str = "best") -> Any:
         """The recipe of the training."""
+        self.check_identity(name)
         return SB3Recipe.from_dict(self.sidecar_entry(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Any:
         """The policy `best` or `last`; raises as `load` does, and if it does not fit `env`."""
+        self.check_identity(name)
         policy = SB3Policy.of(self.load(name))
         if env is not None:
             sizes = (policy.layers[0][0].shape[1], policy.layers[-1][0].shape[0])

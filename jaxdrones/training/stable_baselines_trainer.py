@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+import secrets
 import time
+from typing import Any
 
 import jax
 import numpy as np
 
 from jaxdrones.adapters.sb3 import VecEnv
-from jaxdrones.learning.evaluation import Report, check_episodes, evaluate
+from jaxdrones.learning.evaluation import Report, check_episodes, compile_evaluation
 from jaxdrones.learning.result import Diverged
 from jaxdrones.training.loop import OnProgress
+from jaxdrones.training.plan import IN_A_ROW, check_stop_at
 from jaxdrones.training.progress import Progress
 from jaxdrones.training.run import report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM
@@ -38,17 +41,19 @@ class SB3Trainer:
             episodes: number of episodes of an evaluation.
 
         Raises:
-            ValueError: Stable-Baselines3 refuses the settings.
+            ValueError: Stable-Baselines3 refuses the settings, or no evaluation reaches the success rate to stop at.
         """
         self.recipe, self.seed, self.episodes = recipe, seed, episodes
         start = time.perf_counter()
         self.env = recipe.env()
         check_episodes(self.env, episodes)
+        check_stop_at(recipe.stop_at, self.env.task.success is not None, episodes)
         self.worlds = VecEnv(self.env, recipe.config["worlds"])
         self.model = recipe.model(self.worlds, seed)
         self.worlds.reset()
         self.worlds.step(np.zeros((self.worlds.num_envs, *self.worlds.action_space.shape), np.float32))
         self.worlds.seed(seed)
+        self.evaluate = compile_evaluation(self.env, SB3Policy.of(self.model), episodes)
         self.compile_seconds = time.perf_counter() - start
 
     def prepare(self, run: SB3Run) -> None:
@@ -65,8 +70,8 @@ class SB3Trainer:
         Args:
             run: run whose folder was prepared.
             on_progress: function that shows progress, by control steps.
-            deadline: time of `time.perf_counter` at which to stop, s; when left out, training stops after the number of
-                steps of the recipe.
+            deadline: time of `time.perf_counter` at which everything has to be written, s; when left out, training
+                stops after the number of steps of the recipe.
 
         Raises:
             Diverged: parameters are not finite; the best model so far is kept.
@@ -100,39 +105,48 @@ class _Callback(BaseCallback):
             progress,
             deadline,
         )
-        self.about = {"recipe": trainer.recipe.as_dict(), "seed": trainer.seed, "episodes": trainer.episodes}
+        self.about: dict[str, Any] = {"run_id": secrets.token_hex(8), "recipe": trainer.recipe.as_dict()}
+        self.about |= {"seed": trainer.seed, "episodes": trainer.episodes}
         key = jax.random.key(trainer.seed)
         self.selection_key, self.report_key = (jax.random.fold_in(key, x) for x in (SELECTION_STREAM, REPORT_STREAM))
         self.best: float | None = None  # return
-        self.update = 0
+        self.update, self.evaluated = 0, -1  # the last of each
         self.next_evaluation = 0.0  # fraction of the budget
-        self.evaluation_seconds = 0.0
+        self.evaluation_seconds, self.last_evaluation_seconds = 0.0, 0.0
+        self.reached = 0  # evaluations in a row, up to the newest, that reached the success rate to stop at
         self.reward_sum, self.reward_count = 0.0, 0  # since the last evaluation
-        self.start = time.perf_counter()
+        self.start = self.rollout_end = time.perf_counter()
+        self.learning_seconds = 0.0  # of the last update, without its rollout
 
     def _on_rollout_start(self) -> None:
         """Evaluate between two updates, if an evaluation is due."""
-        if self._spent() >= self.next_evaluation:
+        if self.update:
+            self.learning_seconds = time.perf_counter() - self.rollout_end
+        if self.next_evaluation <= self._spent() and (self.update == 0 or self._spent() < 1):
             self.evaluate()
 
     def _on_step(self) -> bool:
         self.reward_sum += float(self.locals["rewards"].sum())
         self.reward_count += self.trainer.worlds.num_envs * self.trainer.env.drones
-        return self.deadline is None or self.update == 0 or self._spent() < 1
+        return self.reached < IN_A_ROW and (self.deadline is None or self.update == 0 or self._spent() < 1)
 
     def _on_rollout_end(self) -> None:
         self.update += 1
+        self.rollout_end = time.perf_counter()
         self.on_progress(self.num_timesteps, self._metrics())
 
     def _on_training_end(self) -> None:
-        self.evaluate()
+        if self.evaluated < self.update:
+            self.evaluate()
         self.save()
 
     def evaluate(self) -> None:
         """Evaluate the model, always in the same episodes; save it if its return is the best, as in the paper."""
-        self.next_evaluation = self._spent() + 1 / _EVALUATIONS
+        self.evaluated = self.update
         metrics = self._metrics()
         report = self._evaluate(SB3Policy.of(self.model), self.selection_key)
+        stop_at = self.trainer.recipe.stop_at
+        self.reached = self.reached + 1 if stop_at is not None and report.success_interval[0] >= stop_at else 0
         score = report.mean_return if math.isfinite(report.mean_return) else -math.inf
         if self.best is None or score > self.best:
             self.best = score
@@ -143,6 +157,7 @@ class _Callback(BaseCallback):
         self.progress.add([row | {name: metrics[name] for name in _COLUMNS if name in metrics}])
         self.reward_sum, self.reward_count = 0.0, 0
         self.on_progress(self.num_timesteps, metrics)
+        self.next_evaluation = self._spent() + self._interval()
 
     def save(self) -> None:
         """Write the newest model."""
@@ -155,14 +170,25 @@ class _Callback(BaseCallback):
         self.run.save_report(
             self.about
             | {"best_update": self.run.sidecar()["update"], "updates": self.update, "steps": self.num_timesteps}
+            | {"stopped_at_success": self.reached >= IN_A_ROW}
             | {"seconds": seconds | {"evaluating": self.evaluation_seconds}, "evaluation": report_as_dict(report)}
         )
 
     def _spent(self) -> float:
-        """Fraction of the budget that is spent."""
-        if self.deadline is not None:
-            return (time.perf_counter() - self.start) / max(self.deadline - self.start, 1e-9)
-        return self.num_timesteps / self.trainer.recipe.config["steps"]
+        """Fraction of the budget that is spent; of a time, one update, the last evaluation and the report are kept."""
+        if self.deadline is None:
+            return self.num_timesteps / self.trainer.recipe.config["steps"]
+        return (time.perf_counter() - self.start) / max(self._time(), 1e-9)
+
+    def _time(self) -> float:
+        assert self.deadline is not None
+        return self.deadline - self.start - self.learning_seconds - 2 * self.last_evaluation_seconds
+
+    def _interval(self) -> float:
+        """Fraction of the budget between two evaluations, which take at most a quarter of a time."""
+        if self.deadline is None:
+            return 1 / _EVALUATIONS
+        return max(1 / _EVALUATIONS, 4 * self.last_evaluation_seconds / max(self._time(), 1e-9))
 
     def _seconds(self) -> float:
         """Seconds of training, without evaluations."""
@@ -176,6 +202,7 @@ class _Callback(BaseCallback):
 
     def _evaluate(self, policy: SB3Policy, key: jax.Array) -> Report:
         start = time.perf_counter()
-        report = evaluate(self.trainer.env, policy, key, self.trainer.episodes)
-        self.evaluation_seconds += time.perf_counter() - start
+        report = self.trainer.evaluate(policy, key)
+        self.last_evaluation_seconds = time.perf_counter() - start
+        self.evaluation_seconds += self.last_evaluation_seconds
         return report

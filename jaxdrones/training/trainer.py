@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,15 +15,15 @@ from jax.sharding import Mesh
 
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
-from jaxdrones.learning.evaluation import check_episodes
-from jaxdrones.limits import LARGEST_COUNT, check_memory
-from jaxdrones.training import algorithms, distributed
+from jaxdrones.learning.evaluation import Report, check_episodes, compile_evaluation
+from jaxdrones.limits import check_memory
+from jaxdrones.training import algorithms
+from jaxdrones.training.plan import check_stop_at
 from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.run import Run, size_of
 
 MAX_CALL = 64
 """Largest number of updates in one call of `Trainer.advance`."""
-_TIMED_UPDATES = 3  # to estimate the time of an update
 _DISK_FACTOR = 4  # the disk must have space for so many training states
 
 
@@ -40,6 +41,8 @@ class BaseTrainer(abc.ABC):
     """Names of the metrics of an update."""
     compile_seconds: float
     """Seconds that `compile` took."""
+    evaluate: Callable[[Any, jax.Array], Report]
+    """The compiled evaluation of a policy with a random key; `compile` sets it."""
 
     @abc.abstractmethod
     def compile(self) -> None:
@@ -65,16 +68,6 @@ class BaseTrainer(abc.ABC):
     def save(self, run: Run, state: Any, **about: Any) -> None:
         """Write what a training can continue from, with entries of its description."""
 
-    def fit_budget(self, seconds: float, made: int = 0) -> None:
-        """Set the number of updates to those already made and those that take about so many seconds."""
-        state, _ = self.advance(self.start(jax.random.key(0)), 1)
-        start = time.perf_counter()
-        self.advance(state, _TIMED_UPDATES)
-        update_seconds = (time.perf_counter() - start) / _TIMED_UPDATES
-        more = max(1, int(distributed.from_first_host(seconds / update_seconds)))
-        config = dataclasses.replace(self.recipe.config, updates=min(made + more, LARGEST_COUNT))
-        self.recipe = dataclasses.replace(self.recipe, config=config)
-
 
 class Trainer(BaseTrainer):
     """The compiled programs of a recipe; all seeds share them, and all devices of all hosts share the worlds."""
@@ -87,7 +80,8 @@ class Trainer(BaseTrainer):
             episodes: number of episodes of an evaluation.
 
         Raises:
-            ValueError: the devices cannot share the worlds equally, or have too little memory for them.
+            ValueError: the devices cannot share the worlds equally, or have too little memory for them, or no
+                evaluation reaches the success rate to stop at.
         """
         self.recipe, self.episodes = recipe, episodes
         self.mesh = sharding.make_mesh(recipe.config.worlds)
@@ -96,6 +90,7 @@ class Trainer(BaseTrainer):
         self.compile_seconds = 0.0
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
         check_episodes(self.env, episodes)
+        check_stop_at(recipe.stop_at, self.env.task.success is not None, episodes)
         self._check_memory()
         self.metrics = sorted(jax.eval_shape(self._update, self.shapes)[1])
 
@@ -109,6 +104,7 @@ class Trainer(BaseTrainer):
         with jax.set_mesh(self.mesh):
             self._start = init.lower(jax.random.key(0)).compile()
             self._advance = updates.lower(self.shapes, count, count).compile()
+        self.evaluate = compile_evaluation(self.env, self.shapes.policy, self.episodes)
         self.compile_seconds = time.perf_counter() - start
 
     def prepare(self, run: Run) -> None:

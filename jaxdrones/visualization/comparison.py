@@ -43,7 +43,7 @@ def save_comparison(records: Mapping[str, Record], path: Path, title: str) -> No
         figure.suptitle(title + "\n")
         handles = _handles(records, tints)
         figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)))
-        figure.savefig(path, dpi=style.DPI)
+        style.save(figure, path)
 
 
 def _widths(count: int) -> np.ndarray:

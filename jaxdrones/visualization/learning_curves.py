@@ -16,6 +16,7 @@ PANELS = {
     "evaluated_error": "median error in the end (m), evaluated",
 }
 _MEDIAN, _BAND = COLORS[-1], "#b4bac1"
+_STAR: dict[str, Any] = {"marker": "*", "markersize": 18, "color": "#f2b705", "markeredgecolor": "black", "zorder": 5}
 _GRID = 400
 _MOST_NAMED = 7  # runs that have lines and names of their own
 
@@ -25,17 +26,19 @@ def save_curves(
     path: Path,
     title: str,
     interval: Callable[[float], tuple[float, float]] | None = None,
+    kept: Mapping[str, int] | None = None,
 ) -> None:
     """Draw learning curves over the number of control steps.
 
     Each run is a line. Several runs have their median besides, and a band from the lowest to the highest of them. The
-    success of a single run has its confidence interval.
+    success of a single run has its confidence interval. A star marks the evaluation of the policy that each run keeps.
 
     Args:
         histories: label -> rows of progress.csv, as `training.run.Run.history` returns them.
         path: path of the picture.
         title: title of the figure.
         interval: function that returns the 95 % interval of a success rate; without it none is drawn.
+        kept: label -> update of the policy that is kept; there is no star where it is the untrained one.
     """
     from matplotlib.ticker import EngFormatter
 
@@ -44,6 +47,8 @@ def save_curves(
         for axis, (name, label) in zip(axes, PANELS.items(), strict=True):
             curves = {run: points for run, rows in histories.items() if len(points := _points(rows, name))}
             _draw_runs(axis, curves, list(histories))
+            if name != "reward":
+                _draw_stars(axis, {run: _points(_rows_of(histories, kept, run), name) for run in curves})
             if len(curves) > 1:
                 steps, median, lowest, highest = spread(list(curves.values()))
                 axis.fill_between(steps, lowest, highest, color=_BAND, alpha=0.5, linewidth=0)
@@ -66,10 +71,11 @@ def save_curves(
             axis.set_xlabel("control steps flown")
             axis.xaxis.set_major_formatter(EngFormatter(sep=" "))
         figure.suptitle(title + "\n")
-        handles = _handles(list(histories), interval is not None)
+        starred = any(_rows_of(histories, kept, run) for run in histories)
+        handles = _handles(list(histories), interval is not None, starred)
         if handles:
-            figure.legend(handles=handles, loc="outside lower center", ncols=5)
-        figure.savefig(path, dpi=style.DPI)
+            figure.legend(handles=handles, loc="outside lower center", ncols=6)
+        style.save(figure, path)
 
 
 def spread(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -103,11 +109,23 @@ def _draw_runs(axis: Any, curves: Mapping[str, np.ndarray], names: Sequence[str]
         axis.plot(*points.T, color=tints[name], linewidth=1.8 if alone else 1.2, marker=marker, markersize=4)
 
 
+def _rows_of(
+    histories: Mapping[str, Sequence[Mapping[str, float]]], kept: Mapping[str, int] | None, run: str
+) -> list[Mapping[str, float]]:
+    """The row of the policy that a run keeps; none of the untrained one."""
+    return [row for row in histories[run] if kept and "update" in row and row["update"] == kept.get(run)]
+
+
+def _draw_stars(axis: Any, points: Mapping[str, np.ndarray]) -> None:
+    for x in points.values():
+        axis.plot(*x.T, linestyle="none", **_STAR)
+
+
 def _tints(runs: int) -> tuple[str, ...]:
     return colors(runs) if runs <= _MOST_NAMED else (_BAND,) * runs
 
 
-def _handles(names: Sequence[str], has_interval: bool) -> list[Any]:
+def _handles(names: Sequence[str], has_interval: bool, starred: bool) -> list[Any]:
     """The lines of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -115,8 +133,9 @@ def _handles(names: Sequence[str], has_interval: bool) -> list[Any]:
     def band(label: str) -> Any:
         return Patch(facecolor=_BAND, alpha=0.5, label=label)
 
+    star = [Line2D([], [], linestyle="none", label="policy that is kept", **_STAR)] * starred
     if len(names) == 1:
-        return [band("95 % interval")] * has_interval
+        return [band("95 % interval")] * has_interval + star
     runs = [Line2D([], [], color=tint, label=name) for tint, name in zip(_tints(len(names)), names, strict=True)]
     median = Line2D([], [], color=_MEDIAN, linewidth=2.6, label=f"median of {len(names)}")
-    return [*(runs if len(names) <= _MOST_NAMED else []), median, band("lowest to highest")]
+    return [*(runs if len(names) <= _MOST_NAMED else []), median, band("lowest to highest"), *star]

@@ -79,7 +79,7 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
         figure.align_ylabels(list(axes))
         figure.suptitle(title + "\n")
         figure.legend(handles=_handles(record, tints), loc="outside lower center", ncols=4)
-        figure.savefig(path, dpi=style.DPI)
+        style.save(figure, path)
 
 
 def _draw_signal(axis: Any, record: Record, name: str, tints: Sequence[str]) -> None:

@@ -29,7 +29,7 @@ def save_errors(errors: dict[str, np.ndarray], path: Path) -> None:
                 axis.plot(t, table[:, i], "o-", color=color, label=flight.removesuffix(".npz"))
             axis.set(xlabel="after (s)", title=_UNITS[quantity], xticks=t, ylim=(0, None))
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize="small")
-        figure.savefig(path)
+        style.save(figure, path)
 
 
 def save_paths(results: Sequence[ClosedLoopResult], path: Path) -> None:
@@ -52,4 +52,4 @@ def save_paths(results: Sequence[ClosedLoopResult], path: Path) -> None:
             axis.set_axis_off()
         entries_in_a_row = 1 if columns == 1 else 3  # all three are wider than one panel
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=entries_in_a_row)
-        figure.savefig(path)
+        style.save(figure, path)

@@ -1,12 +1,15 @@
 """What all figures have in common: fonts that are readable at half size, lines, and limits of axes."""
 
 import contextlib
+import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxdrones.visualization.palette import COLORS
+from jaxdrones.writing import replaced
 
 DPI = 110
 TARGET: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.3, "alpha": 0.75}
@@ -41,6 +44,16 @@ def figure(width: float, height: float) -> Iterator[Any]:
     look: Any = _LOOK | {"axes.prop_cycle": cycler(color=COLORS)}
     with matplotlib.rc_context(look):
         yield Figure(figsize=(width, height), layout="constrained")
+
+
+def save(figure: Any, path: str | os.PathLike) -> None:
+    """Write a figure as a file, whose suffix chooses the format.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with replaced(path) as new:
+        figure.savefig(new, dpi=DPI, format=Path(path).suffix[1:] or "png")
 
 
 def limits(lines: np.ndarray, smallest: float = 0.0) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.errors import UserError
+from jaxdrones.writing import replaced
 
 SUFFIXES = (".mp4", ".gif")
 
@@ -80,5 +81,6 @@ def _write_gif(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
     images = [Image.fromarray(frame) for frame in frames]
     ends = 10 * np.round(100 * np.arange(len(images) + 1) / fps)  # ms; GIF counts in hundredths of a second
     durations = np.diff(ends).astype(int).tolist()
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
+    with replaced(path) as new:
+        images[0].save(new, save_all=True, append_images=images[1:], duration=durations, loop=0)
     return len(images)

@@ -1,7 +1,10 @@
 """A run on disk."""
 
+import contextlib
 import errno
+import itertools
 import json
+import os
 import struct
 from pathlib import Path
 
@@ -9,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxdrones import writing
 from jaxdrones.envs import make
 from jaxdrones.learning.networks import Policy
 from jaxdrones.training import events
@@ -59,6 +63,66 @@ def test_lines_after_the_update_that_training_goes_on_from_are_dropped(tmp_path)
         {"update": 2, "reward": 0.2, "success": 0.5},
         {"update": 3, "reward": 0.4},
     ]
+
+
+def test_every_prefix_of_progress_has_the_rows_that_are_complete(tmp_path):
+    """A process may be killed while it writes a row; what it left is neither refused nor taken for a row."""
+    run, columns = Run(tmp_path), ["update", "reward"]
+    with Progress(run, columns, 0) as progress:
+        progress.add([{"update": 1, "reward": 1e-5}, {"update": 12, "reward": -0.25}])
+    rows, content = run.history(), (tmp_path / "progress.csv").read_bytes()
+    assert len(rows) == 2
+    for length in range(len(content)):
+        (tmp_path / "progress.csv").write_bytes(content[:length])
+        assert run.history() == rows[: max(0, content[:length].count(b"\r") - 1)]
+
+
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # files that a killed process leaves open
+def test_rows_are_never_missing_while_a_training_goes_on(tmp_path, monkeypatch):
+    """Killed at any operation on files by which a training continues, it has all its rows, and so have its events."""
+    run, columns = Run(tmp_path), ["update", "reward"]
+    with Progress(run, columns, 0) as progress:
+        progress.add([{"update": i, "reward": 0.1 * i} for i in range(1, 4)])
+    rows, (events,) = run.history(), run.event_files()
+    before = events.stat().st_size
+    reached = set()
+    for place, name in [(os, "open"), (os, "fsync"), (os, "replace"), (Path, "open"), (Path, "unlink")]:
+        for call in range(1, 4):
+            calls, function = itertools.count(1), getattr(place, name)
+
+            def killed(*arguments, function=function, calls=calls, call=call, name=name, **keywords):
+                if next(calls) == call:
+                    reached.add(name)
+                    raise SystemExit
+                return function(*arguments, **keywords)
+
+            with monkeypatch.context() as patch, contextlib.suppress(SystemExit):
+                patch.setattr(place, name, killed)
+                Progress(run, columns, 3).__exit__()
+            assert run.history() == rows
+            assert max(file.stat().st_size for file in run.event_files()) == before
+    assert reached == {"open", "fsync", "replace", "unlink"}
+
+
+def test_a_file_is_replaced_whole_or_stays(tmp_path):
+    file, link = tmp_path / "log.npz", tmp_path / "link.npz"
+    file.write_text("old")
+    link.symlink_to(file)
+    for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
+        with pytest.raises(type(error)), writing.replaced(file) as new:
+            new.write_text("half")
+            assert file.read_text() == "old" and new.suffix == ".npz"
+            raise error
+        assert sorted(tmp_path.iterdir()) == [link, file]
+    with writing.replaced(link) as new:
+        new.write_text("new")
+    assert file.read_text() == link.read_text() == "new" and link.is_symlink()
+    with pytest.raises(OSError, match=r"No space left on device: .*log\.npz"), writing.replaced(file):
+        raise OSError(28, "No space left on device")
+    with open(os.devnull, "rb"), writing.replaced(os.devnull) as new:
+        assert str(new) == os.devnull
 
 
 @pytest.mark.parametrize("realistic", [True, "any"])

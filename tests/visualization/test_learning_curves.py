@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers import mostly_slow
 
+from jaxdrones.visualization import learning_curves
 from jaxdrones.visualization.learning_curves import save_curves, spread
 
 
@@ -11,7 +12,7 @@ def history(seed, updates=12):
     random = np.random.default_rng(seed)
     rows = []
     for update in range(1, updates + 1):
-        row = {"steps": 1000.0 * update, "reward": float(random.normal())}
+        row = {"update": float(update), "steps": 1000.0 * update, "reward": float(random.normal())}
         if update % 3 == 0:
             row |= {"evaluated_return": 10.0 * update, "success": update / updates, "evaluated_error": 1 / update}
         rows.append(row)
@@ -41,10 +42,28 @@ def test_a_figure_is_drawn_of_any_number_of_runs(runs, tmp_path):
     from matplotlib.image import imread
 
     histories = {f"seed {seed}": history(seed) for seed in range(runs)}
-    save_curves(histories, tmp_path / "curve.png", "a title", lambda success: (success - 0.1, success + 0.1))
+    kept = {"seed 0": 6, "seed 1": 9, "seed 2": 0}
+    save_curves(histories, tmp_path / "curve.png", "a title", lambda success: (success - 0.1, success + 0.1), kept)
     assert imread(tmp_path / "curve.png").shape[:2] == (990, 1430)
 
 
 def test_a_run_that_was_never_evaluated_is_drawn(tmp_path):
     save_curves({"seed 0": history(0, updates=2)}, tmp_path / "curve.png", "a title")
     assert (tmp_path / "curve.png").stat().st_size > 1000
+
+
+def test_the_policy_that_is_kept_is_marked_where_it_was_evaluated(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(learning_curves.style, "save", lambda figure, path: drawn.append(figure))
+    save_curves({"a": history(0), "b": history(1)}, tmp_path / "curve.png", "", kept={"a": 6, "b": 0})
+    (figure,) = drawn
+    stars = [[line.get_xydata().tolist() for line in axis.lines if line.get_marker() == "*"] for axis in figure.axes]
+    assert [[x for x in axis if x] for axis in stars] == [[], [[[6000, 60]]], [[[6000, 0.5]]], [[[6000, 1 / 6]]]]
+    assert "policy that is kept" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_a_figure_that_cannot_be_drawn_leaves_the_old_one(tmp_path):
+    (tmp_path / "curve.png").write_text("old")
+    with pytest.raises(KeyError):
+        save_curves({"a": [{"steps": 1.0}, {"reward": 1.0}]}, tmp_path / "curve.png", "")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]

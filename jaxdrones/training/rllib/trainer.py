@@ -10,9 +10,10 @@ import numpy as np
 
 from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
-from jaxdrones.learning.evaluation import check_episodes
+from jaxdrones.learning.evaluation import check_episodes, compile_evaluation
 from jaxdrones.learning.networks import Policy
 from jaxdrones.pytree import PyTreeNode
+from jaxdrones.training.plan import check_stop_at
 from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.rllib.algorithm import build, start_ray
 from jaxdrones.training.rllib.learner import AdaptiveLearner
@@ -51,6 +52,7 @@ class RLlibTrainer(BaseTrainer):
         if self.env.vision:
             raise UserError(f"{recipe.task} has images, which --library rllib does not take; train without vision")
         check_episodes(self.env, episodes)
+        check_stop_at(recipe.stop_at, self.env.task.success is not None, episodes)
         self.metrics = sorted((*_SIMULATED, *_LEARNED, "action_std", "learning_rate", "nonfinite_gradients"))
         self._agents = [f"drone_{i}" for i in range(self.env.drones)]
         self._algorithm: Any = None
@@ -59,7 +61,8 @@ class RLlibTrainer(BaseTrainer):
         """Start ray, and compile the simulation."""
         start = time.perf_counter()
         start_ray()
-        self.start(jax.random.key(0))
+        state = self.start(jax.random.key(0))
+        self.evaluate = compile_evaluation(self.env, state.policy, self.episodes)
         self._algorithm.env_runner.sample()
         self.compile_seconds = time.perf_counter() - start
 

@@ -8,6 +8,8 @@ import html
 import os
 from pathlib import Path
 
+from jaxdrones.writing import write
+
 _TEMPLATE = Path(__file__).with_name("page.html")
 
 
@@ -34,7 +36,7 @@ class Page:
         """
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(self.html, encoding="utf-8")
+        write(path, self.html.encode())
         return path
 
     def _repr_html_(self) -> str:

@@ -1,0 +1,87 @@
+"""When a training evaluates its policy and when it ends: by the number of updates, by success, or by the clock."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+
+from jaxdrones.errors import UserError
+from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.training import distributed
+
+EVALUATIONS = 10
+"""Number of evaluations in the course of a training."""
+STOPPING_EVALUATIONS = 30
+"""The same of a training that stops at a success rate."""
+IN_A_ROW = 3
+"""Number of evaluations in a row that have to reach this rate."""
+_EVALUATION_SHARE = 0.25  # largest share of a time budget for evaluations, but for the first and the last two
+
+
+def check_stop_at(stop_at: float | None, has_success: bool, episodes: int) -> None:
+    """Raise unless evaluations of so many episodes can reach a lower bound of the success rate.
+
+    Raises:
+        ValueError: they cannot, or the task has no criterion of success.
+    """
+    if stop_at is None:
+        return
+    if not 0 < stop_at < 1:
+        raise UserError(f"stop_at is {stop_at:g}; give a success rate between 0 and 1, for example 0.99")
+    if not has_success:
+        raise UserError(f"stop_at is {stop_at:g}, but the task has no criterion of success; leave it out")
+    highest = wilson_interval(episodes, episodes)[0]
+    if highest < stop_at:
+        enough = math.ceil(1.96**2 * stop_at / (1 - stop_at))
+        raise UserError(
+            f"stop_at is {stop_at:g}, but the 95 % interval of {episodes:,} successes of {episodes:,} begins at "
+            f"{highest:.4f}; give at least {enough:,} episodes"
+        )
+
+
+def next_evaluation(updates: int, made: int, evaluations: int) -> int:
+    """The update after which the policy is evaluated next, of evaluations that share all updates evenly."""
+    return next(update for i in range(evaluations) if (update := updates * (i + 1) // evaluations) > made)
+
+
+@dataclasses.dataclass
+class TimePlan:
+    """Shares the time until a deadline between updates, evaluations and the final report, as it measures them."""
+
+    deadline: float
+    """Time of `time.perf_counter` at which everything has to be written, s."""
+    evaluated: int
+    """Update of the last evaluation."""
+    evaluations: int = EVALUATIONS
+    """Number of evaluations to come, but for the final report."""
+    evaluation_seconds: float = 0.0
+    """Seconds that an evaluation takes, with writing its results."""
+    _calls: int = 0
+    _updates: int = 0
+    _seconds: float = 0.0
+
+    def add_updates(self, updates: int, seconds: float) -> None:
+        """Take into account that some updates took so many seconds; the first call counts only until the second."""
+        if self._calls == 1:
+            self._updates, self._seconds = 0, 0.0
+        self._calls, self._updates, self._seconds = self._calls + 1, self._updates + updates, self._seconds + seconds
+
+    def add_evaluation(self, update: int, seconds: float) -> None:
+        """Take into account that the evaluation after an update took so many seconds."""
+        self.evaluated, self.evaluations, self.evaluation_seconds = update, self.evaluations - 1, seconds
+
+    def updates(self, made: int) -> int:
+        """The number of updates that can be made in all, at least those that were made."""
+        left = distributed.from_first_host(self.deadline - time.perf_counter())
+        evaluation = distributed.from_first_host(self.evaluation_seconds)
+        for_updates = max(0.0, left - 2 * evaluation)  # the last evaluation and the report have to follow
+        if evaluation > 0:
+            self.evaluations = min(self.evaluations, 1 + int(_EVALUATION_SHARE * for_updates / evaluation))
+        self.evaluations = max(self.evaluations, 1)
+        for_updates -= (self.evaluations - 1) * evaluation
+        return made + int(for_updates * self._updates / max(self._seconds, 1e-9))
+
+    def next_evaluation(self, updates: int, made: int) -> int:
+        """The update after which the policy is evaluated next, of `updates` in all."""
+        return max(made + 1, self.evaluated + math.ceil((updates - self.evaluated) / self.evaluations))

@@ -1,5 +1,6 @@
 """Params -> URDF, the inverse of `jaxdrones.load_params`."""
 
+import re
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -26,6 +27,8 @@ _PROPERTIES = (
     "prop_radius",
 )
 
+_INVALID = re.compile(r"[^\t\n\r\x20-\uD7FF\uE000-\uFFFD\U00010000-\U0010FFFF]")  # characters in XML
+
 
 def to_urdf(params: Params, name: str, comment: str = "") -> str:
     """The text of a URDF of one drone, which `load_params` reads as these params.
@@ -35,8 +38,9 @@ def to_urdf(params: Params, name: str, comment: str = "") -> str:
     Args:
         params: of one drone, with a highest rotor speed.
         name: of the robot.
-        comment: to stand at the top, without two hyphens in a row.
+        comment: at the top; characters that XML does not allow there are left out or separated.
     """
+    comment, name = re.sub("-(?=-)", "- ", _INVALID.sub("", comment)), _INVALID.sub("", name)
     thrust2weight = 4 * params.kf * params.max_rpm**2 / (params.mass * GRAVITY)
     properties = {field: getattr(params, field) for field in _PROPERTIES}
     properties |= {"thrust2weight": thrust2weight, "max_speed_kmh": params.max_speed * 3.6}

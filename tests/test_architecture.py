@@ -14,6 +14,7 @@ NOUNS = (
     "checks",
     "errors",
     "limits",
+    "npz",
     "params",
     "pytree",
     "quantity",

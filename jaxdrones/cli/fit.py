@@ -2,9 +2,10 @@
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from jaxdrones.cli.common import as_json, check_writable, folder
+from jaxdrones.cli.common import as_json, check_writable, folder, print_warning
 
 _FIGURE = "errors.png"
 
@@ -42,32 +43,69 @@ def add(commands) -> None:
     parser.add_argument(
         "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
     )
-    parser.add_argument("--output", type=folder, default=Path("runs/fit"), metavar="FOLDER", help="(runs/fit)")
+    add_consistency(parser)
+    parser.add_argument(
+        "--output",
+        type=folder,
+        default=Path("runs/fit"),
+        metavar="FOLDER",
+        help="(runs/fit); no earlier fit is replaced",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=_fit)
 
 
 def _fit(options: argparse.Namespace) -> int:
+    from jaxdrones.control import firmware_pid
     from jaxdrones.dynamics import crazyflie_motors
-    from jaxdrones.identification import FlightLog, fit
-    from jaxdrones.identification.files import REPORT, report_as_dict, write_vehicle
+    from jaxdrones.identification import fit
+    from jaxdrones.identification.files import REPORT, URDF, check_no_fit, report_as_dict, write_vehicle
     from jaxdrones.urdf import load_params
     from jaxdrones.visualization.residuals import save_errors
 
     params = load_params(options.vehicle)
-    motors = crazyflie_motors(options.propellers)
+    motors, gains = crazyflie_motors(options.propellers), firmware_pid.gains(propellers=options.propellers)
     names = [name.strip() for name in (options.parameters or "").split(",") if name.strip()]
-    logs, validate = ([FlightLog.load(file) for file in files] for files in (options.logs, options.validate))
+    check_no_fit(options.output)
     check_writable(options.output / REPORT)
-    report = fit(logs, params, names, validate, motors, progress=lambda line: print(line, file=sys.stderr))
+    logs = load_logs([*options.logs, *options.validate], options.allow_inconsistent)
+    fitted, validate = logs[: len(options.logs)], logs[len(options.logs) :]
+    report = fit(fitted, params, names, validate, motors, lambda line: print(line, file=sys.stderr), gains)
     write_vehicle(options.output, report, options.vehicle)
-    save_errors(report.errors, options.output / _FIGURE)
     if options.json:
         print(as_json(report_as_dict(report) | {"output": str(options.output)}))
     else:
         print(parameter_table(report))
-        print(f"{options.output}: vehicle.urdf, {REPORT}, {_FIGURE}")
+    files = [URDF, REPORT]
+    try:
+        save_errors(report.errors, options.output / _FIGURE)
+        files.append(_FIGURE)
+    except ImportError as error:
+        print_warning(f'no {_FIGURE}: {error}; pip install "jaxdrones[cli]"')
+    if not options.json:
+        print(f"{options.output}: {', '.join(files)}")
     return 0
+
+
+def add_consistency(parser: argparse.ArgumentParser) -> None:
+    """Add the option that takes logs whose columns contradict each other."""
+    parser.add_argument(
+        "--allow-inconsistent",
+        action="store_true",
+        help="take logs whose columns contradict each other (wrong clock, axes, order of motors), with a warning",
+    )
+
+
+def load_logs(files: Sequence[Path], allow_inconsistent: bool) -> list:
+    """The flight logs of files, with different names; warns of contradictions that are allowed."""
+    from jaxdrones.identification import FlightLog, inconsistencies
+    from jaxdrones.identification.log import named_apart
+
+    logs = named_apart([FlightLog.load(file, allow_inconsistent) for file in files])
+    for log in logs if allow_inconsistent else ():
+        for found in inconsistencies(log):
+            print_warning(f"{log.name}: {found}")
+    return logs
 
 
 def parameter_table(report) -> str:

@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import as_json, check_writable
+from jaxdrones.cli.common import as_json, bar, check_writable
+from jaxdrones.cli.fit import add_consistency, load_logs
 from jaxdrones.errors import UserError
 
 _NOMINAL = "cf2x"
@@ -33,6 +34,7 @@ def add(commands) -> None:
     parser.add_argument(
         "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
     )
+    add_consistency(parser)
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw recorded and simulated paths (.png or .pdf)")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=_score)
@@ -43,22 +45,30 @@ def _score(options: argparse.Namespace) -> int:
 
     from jaxdrones.control import firmware_pid
     from jaxdrones.dynamics import crazyflie_motors
-    from jaxdrones.identification import FlightLog, hold_errors, open_loop_errors, simulate_closed_loop
+    from jaxdrones.identification import hold_errors, open_loop_errors, simulate_closed_loop
     from jaxdrones.identification.files import errors_as_dict, load_vehicle
     from jaxdrones.visualization.residuals import save_paths
 
     motors = crazyflie_motors(options.propellers)
     vehicles = {"nominal": load_vehicle(options.nominal), "vehicle": load_vehicle(options.vehicle)}
-    logs = [FlightLog.load(file) for file in options.logs]
-    errors = {"hold": np.mean([hold_errors(log) for log in logs], axis=0)}
-    for name, vehicle in vehicles.items():
-        errors[name] = np.mean([open_loop_errors(log, vehicle, motors) for log in logs], axis=0)
+    logs = load_logs(options.logs, options.allow_inconsistent)
     gains = firmware_pid.gains(propellers=options.propellers)
     with_setpoints = [log for log in logs if log.has_setpoints]
-    simulated = {
-        name: [simulate_closed_loop(log, vehicle, motors, gains) for log in with_setpoints]
-        for name, vehicle in vehicles.items()
-    }
+    flights = len(logs) + len(vehicles) * (len(logs) + len(with_setpoints))
+    with bar(flights, "score", " flights") as shown:
+
+        def counted(result):
+            if shown is not None:
+                shown.update()
+            return result
+
+        errors = {"hold": np.mean([counted(hold_errors(log)) for log in logs], axis=0)}
+        for name, vehicle in vehicles.items():
+            errors[name] = np.mean([counted(open_loop_errors(log, vehicle, motors)) for log in logs], axis=0)
+        simulated = {
+            name: [counted(simulate_closed_loop(log, vehicle, motors, gains)) for log in with_setpoints]
+            for name, vehicle in vehicles.items()
+        }
     closed_loop = {name: [result.as_dict() for result in flights] for name, flights in simulated.items()}
     if options.figure:
         if not with_setpoints:

@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import functools
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +15,8 @@ import numpy as np
 from jaxdrones import rotation
 from jaxdrones.control.pid import VEHICLES, rpm_to_pwm
 from jaxdrones.errors import UserError
+from jaxdrones.flights.arrays import check_arrays_of_flight
+from jaxdrones.npz import read_arrays
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.serialization import scene_from_dict, scene_to_dict
@@ -207,29 +208,33 @@ class Record:
         """
         names = {field.name for field in dataclasses.fields(cls)} - {"images"}
         try:
-            with np.load(path) as log:
-                arrays: dict[str, Any] = {name: log[name] for name in names}
-                about = str(log["about"])
-                kinds = sorted({name.split("/")[1] for name in log if name.startswith(_IMAGES)})
-                images = {
-                    kind: ImageSequence(*(log[f"{_IMAGES}{kind}/{name}"] for name in ImageSequence._fields))
-                    for kind in kinds
-                }
-        except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-            if isinstance(error, FileNotFoundError):
-                raise
+            log = read_arrays(path)
+            arrays: dict[str, Any] = {name: log[name] for name in names}
+            about = str(log["about"])
+            kinds = sorted({name.split("/")[1] for name in log if name.startswith(_IMAGES)})
+            images = {
+                kind: ImageSequence(*(log[f"{_IMAGES}{kind}/{name}"] for name in ImageSequence._fields))
+                for kind in kinds
+            }
+            texts = {name: json.loads(str(arrays.pop(name))) for name in ("conditions", "params", "scene")}
+            constants: dict[str, Any] = {name: np.asarray(x, float) for name, x in texts["params"].items()}
+            params, scene = Params(**constants), scene_from_dict(texts["scene"])
+            labels = tuple(map(str, arrays.pop("labels")))
+            record = cls(
+                **arrays,
+                labels=labels,
+                conditions=LoggedConditions(texts["conditions"], about),
+                params=params,
+                scene=scene,
+                images=images,
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            why = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) and error.args else error
             raise UserError(
-                f"{path} is not the log of a flight ({error}); give a log.npz that `jaxdrones fly` wrote"
+                f"{path} is not the log of a flight ({why}); give a log.npz that `jaxdrones fly` wrote"
             ) from None
-        texts = {name: json.loads(str(arrays.pop(name))) for name in ("conditions", "params", "scene")}
-        constants: dict[str, Any] = {name: np.asarray(x) for name, x in texts["params"].items()}
-        return cls(
-            **arrays | {"labels": tuple(map(str, arrays["labels"]))},
-            conditions=LoggedConditions(texts["conditions"], about),
-            params=Params(**constants),
-            scene=scene_from_dict(texts["scene"]),
-            images=images,
-        )
+        check_arrays_of_flight(record, str(path))
+        return record
 
     def save_csv(self, path: Path, pwm: bool = False) -> None:
         """Write one line per time and drone."""

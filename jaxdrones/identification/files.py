@@ -25,14 +25,26 @@ _INSTRUMENTS = tuple(field.name for field in dataclasses.fields(Instruments))
 
 
 def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
-    """Write `vehicle.urdf` and `report.json`; create the folder, and replace the files of an earlier fit."""
+    """Write `vehicle.urdf` and `report.json` into a folder, which is created.
+
+    Raises:
+        ValueError: the folder has the files of an earlier fit.
+    """
+    check_no_fit(folder)
     folder.mkdir(parents=True, exist_ok=True)
     flights = ", ".join(report.per_flight) or "flights"
     comment = (
         f"Identified by `jaxdrones fit` from {started_from} and {flights}.\n     {REPORT} has the standard errors."
     )
-    (folder / URDF).write_text(to_urdf(report.vehicle.params, "identified", comment.replace("--", "- -")))
+    (folder / URDF).write_text(to_urdf(report.vehicle.params, "identified", comment))
     (folder / REPORT).write_text(json.dumps(report_as_dict(report) | {"started_from": started_from}, indent=1) + "\n")
+
+
+def check_no_fit(folder: Path) -> None:
+    """Raise `ValueError` if a folder has the files of a fit."""
+    for file in (folder / URDF, folder / REPORT):
+        if file.exists():
+            raise UserError(f"{file} exists already; remove it, or give another --output")
 
 
 def report_as_dict(report: Report) -> dict[str, Any]:

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.checks import shown
+from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import Motors, crazyflie_motors
 from jaxdrones.errors import UserError
-from jaxdrones.identification.least_squares import Normal, normal_equations
-from jaxdrones.identification.log import FlightLog
+from jaxdrones.identification.least_squares import Normal, normal_equations, standard_errors
+from jaxdrones.identification.log import FlightLog, named_apart
 from jaxdrones.identification.open_loop import (
     HORIZONS,
     Windows,
@@ -45,7 +46,9 @@ _INITIAL_DAMPING = 1e-3
 _PRIOR_PRECISION = 1e-2  # inverse variance of x, which keeps parameters finite that are not identifiable
 _LOG_PRIOR_PRECISION = 1.0  # inverse variance of x where x is a logarithm
 _PRIOR_REMAINDER = 1e-3  # fraction of the prior in the information matrix, which keeps it invertible
-_MAX_RELATIVE_ERROR = 0.5  # standard error over value of an identifiable parameter
+_MAX_RELATIVE_ERROR = 0.5  # standard error over value of an identifiable parameter: two standard errors exclude zero
+_RATIOS = ("position_scale", "estimate_tilt")  # parameters that are 1 without an error, not 0
+_MIN_SPEED = 0.01  # m/s rms, of a log that flies
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +60,9 @@ class Estimate:
     std_error: float
     """Standard error from the Gauss-Newton matrix, which assumes independent residuals, SI units."""
     identifiable: bool
-    """Whether the flights identify the parameter."""
+    """Whether the flights identify the parameter: zero is at least two standard errors away.
+
+    Ratios that are 1 for ideal instruments need a standard error below the scale of their coordinate."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +88,7 @@ def fit(
     validate: Sequence[FlightLog] = (),
     motors: Motors | None = None,
     progress: Callable[[str], None] = lambda line: None,
+    gains: firmware_pid.Gains | None = None,
 ) -> Report:
     """Estimate parameters of a vehicle from recorded flights.
 
@@ -99,20 +105,26 @@ def fit(
         validate: flights that are not fitted, on which the best round is chosen.
         motors: motors for logs of PWM; those of the Crazyflie 2.1+ when left out.
         progress: called with a line after each round.
+        gains: gains of the firmware that flew on set-points; those with 2.1+ propellers when left out.
 
     Raises:
-        ValueError: there are no flights, some have rotor speeds and others do not, or the flights do not identify a
-            named parameter.
+        ValueError: there are no flights, one is given twice or rests, some have rotor speeds and others do not, or the
+            flights do not identify a named parameter.
     """
     named = bool(names)
     if not logs:
         raise UserError("there are no flights to fit; give at least one")
+    named_logs = named_apart((*logs, *validate))
+    logs, validate = named_logs[: len(logs)], named_logs[len(logs) :]
+    for log in named_logs:
+        if np.sqrt(np.mean(log.vel**2)) < _MIN_SPEED:
+            raise UserError(f"{log.name}: the drone rests in the whole log; give a log of a flight")
     kinds = {log.has_rotor_speeds for log in (*logs, *validate)}
     if len(kinds) > 1:
         raise UserError("some logs have rotor speeds and others only PWM; fit them one after the other")
     motors = motors or crazyflie_motors()
     if not named and all(log.has_setpoints for log in logs):
-        return _fit_paths(logs, params, validate, motors, progress)
+        return _fit_paths(logs, params, validate, motors, gains or firmware_pid.gains(), progress)
     names = select_parameters(names) if named else default_parameters(kinds.pop())
     return _Problem(logs, params, names, motors).solve(validate, named, progress)
 
@@ -122,13 +134,14 @@ def _fit_paths(
     params: Params,
     validate: Sequence[FlightLog],
     motors: Motors,
+    gains: firmware_pid.Gains,
     progress: Callable[[str], None],
 ) -> Report:
     if validate:
         raise UserError(
             "flights on set-points are fitted without validation; leave --validate out, or name --parameters"
         )
-    vehicle, errors = fit_path(logs, Vehicle.of(params), motors, progress)
+    vehicle, errors = fit_path(logs, Vehicle.of(params), motors, gains, progress)
     estimates = {name: _estimate(vehicle, name, error) for name, error in errors.items()}
     return Report(vehicle, estimates, {}, (), {log.name: open_loop_errors(log, vehicle, motors) for log in logs})
 
@@ -137,7 +150,8 @@ def _estimate(vehicle: Vehicle, name: str, error: float) -> Estimate:
     """The estimate of a parameter, from the standard error of its coordinate x."""
     value, scale = value_of(vehicle, name), scale_of(vehicle, name)
     std_error = error * scale
-    return Estimate(value, std_error, bool(std_error < max(scale, _MAX_RELATIVE_ERROR * abs(value))))
+    limit = scale if name in _RATIOS else _MAX_RELATIVE_ERROR * abs(value)
+    return Estimate(value, std_error, bool(std_error < limit))
 
 
 class _Problem:
@@ -240,13 +254,15 @@ class _Problem:
         self, x: np.ndarray, normal: Normal, losses: tuple[float, ...], validate: Sequence[FlightLog], named: bool
     ) -> Report:
         information = normal.matrix - (1 - _PRIOR_REMAINDER) * np.diag(self.prior)  # of the flights, not of the prior
-        vehicle, errors = self.vehicle(x), np.sqrt(np.diag(np.linalg.inv(information)))
+        vehicle, errors = self.vehicle(x), standard_errors(information)
         shared = errors[: len(self.shared)]
         per_flight = errors[len(self.shared) :].reshape(len(self.flights), len(self.per_flight))
         by_name = np.concatenate([shared, np.sqrt(np.sum(per_flight**2, axis=0)) / len(self.flights)])
         estimates = {name: _estimate(vehicle, name, error) for name, error in zip(self.names, by_name, strict=True)}
         unidentifiable = [
-            f"{name} ({shown(e.value)} +- {e.std_error:.2g})" for name, e in estimates.items() if not e.identifiable
+            f"{name} ({shown(e.value)} +- {e.std_error:.2g})"
+            for name, e in estimates.items()
+            if not e.identifiable and e.std_error >= scale_of(vehicle, name)
         ]
         if unidentifiable and named:
             raise UserError(

@@ -85,3 +85,8 @@ def normal_equations(
         vehicle, names, jnp.asarray(x, float), jnp.asarray(scale, float), windows, mask, motors
     )
     return Normal(np.asarray(matrix, float), np.asarray(gradient, float), float(loss), np.asarray(robust, float))
+
+
+def standard_errors(information: np.ndarray) -> np.ndarray:
+    """Standard errors of parameters with this information matrix (n, n), the inverse of their covariance."""
+    return np.sqrt(np.diag(np.linalg.inv(information)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +12,19 @@ import numpy as np
 from jaxdrones import assets
 from jaxdrones.checks import shown
 from jaxdrones.errors import UserError
+from jaxdrones.identification import quaternions
+from jaxdrones.identification.consistency import inconsistencies
+from jaxdrones.npz import read_arrays
 
 PERIOD = 0.01  # s, time between the rows of a log
 _PERIOD_TOLERANCE = 0.2  # largest relative error of the median time between rows
 _MAX_GAP = 0.05  # s
+_MAX_JITTER = 0.5e-3  # s, by which the times of rows that are not resampled differ from 100 Hz
 _MIN_ROWS = 100
 _FULL_PWM = 65535
 _TAKE_OFF = slice(150, 350)  # rows after the motors start, over which the voltage at take-off is averaged
 _MAX_RATE = 60.0  # rad/s; gyroscopes of small quadrotors saturate at 35
-_MAX_VOLTAGE = 60.0  # V
+_MIN_VOLTAGE, _MAX_VOLTAGE = 1.0, 60.0  # V
 _MAX_RPM = 1e6
 _MIN_MEDIAN_RPM = 2700.0  # small quadrotors do not fly at a lower median speed; 16,000 RPM are 1,700 rad/s
 _MAX_PERCENT = 100.0  # PWM that never exceeds this is a percentage; a motor with more than this runs
@@ -67,30 +71,38 @@ class FlightLog:
     """(T, 3) set-points of the position, m, world."""
     ref_yaw: np.ndarray | None = None
     """(T,) set-points of the heading, rad."""
+    file: Path | None = None
+    """The file of the log."""
 
     @classmethod
-    def load(cls, file: str | os.PathLike) -> FlightLog:
+    def load(cls, file: str | os.PathLike, allow_inconsistent: bool = False) -> FlightLog:
         """Read a log from an .npz file, or a bundled one by its name (`jaxdrones.assets.flights`).
 
         Columns are `t`, `pos`, `quat`, `vel`, `omega` (or `gyro`), and either `rpm` or `pwm` with `vbat`; a flight on
-        set-points has `ref_pos` and `ref_yaw`. Other columns are ignored.
+        set-points has `ref_pos` and `ref_yaw`. Other columns are ignored. Rows 8 to 12 ms apart are resampled to 100
+        Hz by their times: linearly, attitudes at a constant rate.
+
+        Args:
+            file: the file, or the name of a bundled log.
+            allow_inconsistent: whether to load a log whose columns contradict each other, see `inconsistencies`.
 
         Raises:
             ValueError: the file is not a log, lacks a column, or has invalid data: NaN, times that run backwards, a
-                rate other than 100 Hz, other units, too few rows.
+                rate far from 100 Hz, other units, too few rows; or its columns contradict each other.
         """
         path = assets.flights().get(os.fspath(file), Path(file))
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                columns = {name: np.asarray(arrays[name]) for name in arrays.files if name in (*_COLUMNS, "gyro")}
-        except OSError as error:
-            raise UserError(f"{path}: cannot be read ({error.strerror or error}); give a flight log (.npz)") from None
-        except (ValueError, EOFError, zipfile.BadZipFile):
-            raise UserError(f"{path}: is not an .npz file of arrays; give a flight log") from None
+        columns = read_arrays(path, (*_COLUMNS, "gyro"))
         if "omega" not in columns and "gyro" in columns:
             columns["omega"] = columns["gyro"]
         columns.pop("gyro", None)
-        return cls(path.name, **_checked(path.name, columns))
+        log = cls(path.name, **_resampled(_checked(path.name, columns)), file=path)
+        found = [] if allow_inconsistent else inconsistencies(log)
+        if found:
+            raise UserError(
+                f"{path.name}: {'; '.join(found)}; repair the log, or pass allow_inconsistent=True "
+                "(--allow-inconsistent) to take it as it is"
+            )
+        return log
 
     @property
     def has_rotor_speeds(self) -> bool:
@@ -131,6 +143,53 @@ class FlightLog:
         return float(np.max(self.vbat[:begin]) - np.mean(self.vbat[begin:][_TAKE_OFF]))
 
 
+def named_apart(logs: Sequence[FlightLog]) -> list[FlightLog]:
+    """The logs with different names: those of equal names get as many folders of their files as tell them apart.
+
+    Raises:
+        ValueError: a file is given twice.
+    """
+    files = [log.file.resolve() for log in logs if log.file is not None]
+    for file in files:
+        if files.count(file) > 1:
+            raise UserError(f"{file} is given twice; give each flight once")
+    names = [log.name for log in logs]
+    named = []
+    for i, log in enumerate(logs):
+        name = log.name
+        if names.count(name) > 1 and log.file is not None:
+            others = [
+                other.file.resolve() for other in logs if other.name == name and other.file not in (None, log.file)
+            ]
+            parts = log.file.resolve().parts
+            count = next(n for n in range(2, len(parts) + 1) if all(parts[-n:] != o.parts[-n:] for o in others))
+            name = "/".join(parts[-count:])
+        elif names.index(name) < i:
+            name = f"{name} ({names[: i + 1].count(name)})"
+        named.append(dataclasses.replace(log, name=name))
+    return named
+
+
+def _resampled(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns at 100 Hz by their times; rows that are at 100 Hz already stay as they are."""
+    times = columns["t"]
+    even = times[0] + PERIOD * np.arange(len(times))
+    if np.max(np.abs(times - even)) <= _MAX_JITTER:
+        return columns
+    t = times[0] + PERIOD * np.arange(int((times[-1] - times[0]) / PERIOD + 1e-6) + 1)
+    resampled = {"t": t}
+    for name, x in columns.items():
+        if name == "quat":
+            resampled[name] = quaternions.slerp(t, times, x)
+        elif name == "ref_yaw":
+            resampled[name] = np.interp(t, times, np.unwrap(x))
+        elif name != "t":
+            resampled[name] = (
+                np.stack([np.interp(t, times, c) for c in x.T], axis=-1) if x.ndim > 1 else np.interp(t, times, x)
+            )
+    return resampled
+
+
 def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The columns of a log as float64, with unit quaternions; raises `ValueError` on invalid ones."""
     if "rpm" in columns:
@@ -140,7 +199,7 @@ def _checked(name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]
         if column not in columns:
             others = " (or rpm)" if column in ("pwm", "vbat") else " (or gyro)" if column == "omega" else ""
             raise UserError(f"{name}: has no column {column!r}{others}: {_COLUMNS[column][1]}; add it to the log")
-    rows = len(np.atleast_1d(columns["t"]))
+    rows = np.size(columns["t"])
     for column, array in columns.items():
         count, meaning = _COLUMNS[column]
         shape = (rows,) if count == 1 else (rows, count)
@@ -169,7 +228,7 @@ def _check_times(name: str, t: np.ndarray) -> None:
         row = int(np.argmin(steps > 0)) + 1
         raise UserError(f"{name}: time goes from {t[row - 1]:g} to {t[row]:g} s in row {row}; sort the rows by time")
     period = np.median(steps)
-    if abs(period - PERIOD) > _PERIOD_TOLERANCE * PERIOD:
+    if abs(period - PERIOD) > (_PERIOD_TOLERANCE + 1e-6) * PERIOD:
         raise UserError(f"{name}: rows are {period:.4g} s apart; resample the log to {PERIOD:g} s")
     if np.max(steps) > _MAX_GAP:
         row = int(np.argmax(steps))
@@ -198,6 +257,7 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
         require(largest <= 1e4, "mm", "m")
     elif column == "vbat":
         require(largest <= _MAX_VOLTAGE, "millivolts", "V")
+        require(np.min(x) >= _MIN_VOLTAGE, "no voltage that turns motors", "V")
     elif column == "pwm":
         require(0 <= np.min(x) and largest <= _FULL_PWM, "no duty cycle of 16 bits", "0 to 65535")
         require(largest > _MAX_PERCENT, "percent", "0 to 65535")

@@ -20,6 +20,7 @@ from jaxdrones.identification.closed_loop import (
     rows_after_climb,
     simulate,
 )
+from jaxdrones.identification.least_squares import standard_errors
 from jaxdrones.identification.log import PERIOD, FlightLog
 from jaxdrones.identification.parameters import with_parameters
 from jaxdrones.identification.vehicle import Vehicle
@@ -42,7 +43,11 @@ Residuals = Callable[[Array], Float[Array, " n"]]
 
 
 def fit_path(
-    logs: Sequence[FlightLog], start: Vehicle, motors: Motors, progress: Callable[[str], None]
+    logs: Sequence[FlightLog],
+    start: Vehicle,
+    motors: Motors,
+    gains: firmware_pid.Gains,
+    progress: Callable[[str], None],
 ) -> tuple[Vehicle, dict[str, float]]:
     """Estimate parameters of a vehicle from flights on set-points.
 
@@ -54,6 +59,7 @@ def fit_path(
         logs: flights with set-points, PWM and battery voltage.
         start: the vehicle with the initial values.
         motors: motors of the vehicle.
+        gains: gains of the firmware that flew.
         progress: called with a line after each of the two fits.
 
     Returns:
@@ -67,7 +73,7 @@ def fit_path(
     vehicle = with_parameters(start, BALANCE_PARAMETERS, list(x))
 
     inputs, recorded, mask = _path_data(logs)
-    path = functools.partial(_path_residuals, vehicle, motors, firmware_pid.gains(), inputs, recorded, mask)
+    path = functools.partial(_path_residuals, vehicle, motors, gains, inputs, recorded, mask)
     x, path_errors = _least_squares(path, len(PATH_PARAMETERS), _CAUCHY_SCALE_SQUARED)
     compared = np.repeat(np.asarray(mask).reshape(-1), 2) > 0
     progress(f"paths: {_rms(path(x)[compared]) * _PATH_STD:.3f} m rms along an axis")
@@ -168,7 +174,7 @@ def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float
             damping *= 10
         if 0 < decrease < _MIN_DECREASE * loss:
             break
-    return jnp.asarray(x, float), np.sqrt(np.diag(np.linalg.inv(matrix)))
+    return jnp.asarray(x, float), standard_errors(matrix)
 
 
 def _rms(x: Array) -> float:

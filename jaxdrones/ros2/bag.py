@@ -108,23 +108,19 @@ def read(path: Path) -> Iterator[Recorded]:
     """The messages of a bag in the order of their times; those of types that are not known here are left out.
 
     Raises:
-        ValueError: there is no bag at this path.
+        ValueError: there is no bag at this path, or it is damaged.
         ImportError: rosbags is not installed.
     """
     _typestore()
-    from rosbags.rosbag2 import Reader, ReaderError
+    from rosbags.rosbag2 import Reader
 
     try:
-        reader = Reader(path)
-        reader.open()
-    except (ReaderError, OSError) as error:
-        raise UserError(f"{path} is no bag of ROS 2: {error}; give the folder of one") from None
-    try:
-        known = [connection for connection in reader.connections if connection.msgtype in msg.MESSAGES]
-        for connection, ns, data in reader.messages(known):
-            yield Recorded(connection.topic.removeprefix("/"), ns, deserialize(data, connection.msgtype))
-    finally:
-        reader.close()
+        with Reader(path) as reader:
+            known = [connection for connection in reader.connections if connection.msgtype in msg.MESSAGES]
+            for connection, ns, data in reader.messages(known):
+                yield Recorded(connection.topic.removeprefix("/"), ns, deserialize(data, connection.msgtype))
+    except Exception as error:  # the reader raises errors of any type on damaged bytes
+        raise UserError(f"{path} is no bag of ROS 2, or is damaged: {error}; give the folder of a sound one") from None
 
 
 def write_flight(record: Record, path: Path) -> None:

@@ -98,3 +98,45 @@ def test_the_words_below_a_table_say_from_when_its_numbers_count(after):
     peaks = [changed(record, "pos", row, [3, 0, 1]).results(after)[1]["peak_error_m"] for row in (at - 1, at)]
     np.testing.assert_allclose(peaks, [0.1, 3], rtol=1e-6)
     assert "mm/s" in hovering(commanded="velocity").definitions(after)
+
+
+def broken(array, row, value):
+    array = np.array(array)
+    array[row] = value
+    return array
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda a: a.update(params="{}"), "is not the log of a flight"),
+        (lambda a: a.update(params="[]"), "is not the log of a flight"),
+        (lambda a: a.update(params="{"), "is not the log of a flight"),
+        (lambda a: a.update(scene="[]"), "is not the log of a flight"),
+        (lambda a: a.update(scene='{"ground": true, "obstacles": [{"kind": "Cat"}]}'), "'Cat' is missing"),
+        (lambda a: a.update(scene='{"ground": true}'), "'obstacles' is missing"),
+        (lambda a: a.pop("vel"), "'vel' is missing"),
+        (lambda a: a.update(t=a["t"][::-1]), "t is not finite or does not increase"),
+        (lambda a: a.update(t=broken(a["t"], 5, np.nan)), "t is not finite or does not increase"),
+        (
+            lambda a: a.update(pos=a["pos"][:3]),
+            r"pos is float32 of shape \(3, 2, 3\); give numbers of shape \(100, 2, 3\)",
+        ),
+        (lambda a: a.update(quat=a["quat"][..., :3]), r"quat is float32 of shape \(100, 2, 3\)"),
+        (lambda a: a.update(labels=a["labels"][:1]), "100 times and 1 drones"),
+        (lambda a: a.update(pos=broken(a["pos"], (5, 1), np.nan)), "drone 1 is not finite before row 6"),
+        (lambda a: a.update(vel=broken(a["vel"], slice(None), np.inf)), "drone 0 is not finite in row 0"),
+    ],
+)
+def test_a_damaged_log_is_refused(tmp_path, change, says):
+    arrays = hovering().arrays()
+    change(arrays)
+    np.savez(tmp_path / "log.npz", **arrays)
+    with pytest.raises(ValueError, match=says):
+        Record.load(tmp_path / "log.npz")
+
+
+def test_a_flight_that_diverged_is_read(tmp_path):
+    """Its states are not finite from some time on, to the end."""
+    changed(hovering(), "pos", slice(90, None), np.nan).save_npz(tmp_path / "log.npz")
+    assert list(Record.load(tmp_path / "log.npz").not_finite()) == ["drone 1"]

@@ -1,16 +1,24 @@
 """A vehicle is identified from its flights, and repeats them."""
 
+import builtins
+import dataclasses
+import importlib
 import json
+import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxdrones
 from jaxdrones.cli import main
+from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import crazyflie_motors
 from jaxdrones.identification import FlightLog, Vehicle, fit, hold_errors, open_loop_errors
 from jaxdrones.identification.files import load_vehicle, write_vehicle
+from jaxdrones.identification.fit import _estimate
+from jaxdrones.identification.log import named_apart
 from jaxdrones.urdf import parse_params
 from jaxdrones.urdf_writer import to_urdf
 
@@ -54,6 +62,111 @@ def test_unidentifiable_parameters_are_named(flown):
     params, log = flown
     with pytest.raises(ValueError, match=r"do not identify rotor_lag \(\S+ \+- \S+\); leave .* out of --parameters"):
         fit([log], params, ("kf", "rotor_lag"))
+
+
+@pytest.fixture(scope="module")
+def fits(flown):
+    """Fits of kf to a flight, to two of them, and to one with a validation flight of a stronger vehicle."""
+    params, log = flown
+    other = dataclasses.replace(log, name="other.npz", rpm=1.3 * log.rpm)
+    start = params.replace(kf=params.kf / 1.2)
+    return [
+        fit(logs, start, ("kf",), validate).parameters["kf"]
+        for logs, validate in (([log], ()), ([log, log], ()), ([log], [other]))
+    ]
+
+
+def test_a_fit_finds_the_thrust_whatever_the_validation_flight(flown, fits):
+    """Validation flights choose a round and move no estimate; the start is 17 % off."""
+    for estimate in fits:
+        np.testing.assert_allclose(estimate.value, flown[0].kf, rtol=0.01)
+        assert estimate.identifiable
+
+
+def test_standard_errors_fall_with_the_root_of_the_number_of_flights(fits):
+    one, two, _ = fits
+    assert two.std_error / one.std_error == pytest.approx(2**-0.5, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "identifiable"),
+    [
+        ("trim_torque_x", 0.24, False),  # 1.8e-5 +- 2.4e-5 N m
+        ("trim_torque_x", 0.091, False),  # a bit more than half of the value
+        ("trim_torque_x", 0.089, True),
+        ("kf", 0.51, False),
+        ("kf", 0.49, True),
+        ("position_scale", 1.1, False),  # 1 +- 0.022, which says nothing of a scale error
+        ("position_scale", 0.9, True),
+    ],
+)
+def test_an_estimate_whose_interval_has_zero_is_not_identifiable(name, error, identifiable):
+    params = jaxdrones.load_params("cf2x").replace(trim_torque=jnp.array([1.8e-5, 0, 0]))
+    assert _estimate(Vehicle.of(params), name, error).identifiable is identifiable
+
+
+def test_a_resting_drone_is_no_flight(flown):
+    params, log = flown
+    rest = dataclasses.replace(log, name="rest.npz", pos=0 * log.pos, vel=0 * log.vel)
+    for logs, validate in (([log], [rest]), ([rest], ())):
+        with pytest.raises(ValueError, match=r"rest\.npz: the drone rests"):
+            fit(logs, params, ("kf",), validate)
+
+
+def test_logs_of_equal_names_are_different_flights(flown, tmp_path):
+    log = flown[1]
+    files = [tmp_path / folder / "log.npz" for folder in ("a", "b")]
+    logs = named_apart([dataclasses.replace(log, name="log.npz", file=file) for file in files])
+    assert [log.name for log in logs] == ["a/log.npz", "b/log.npz"]
+    with pytest.raises(ValueError, match="is given twice"):
+        named_apart([dataclasses.replace(log, file=files[0])] * 2)
+    assert [log.name for log in named_apart([log, log])] == ["flown.npz", "flown.npz (2)"]
+
+
+def test_the_firmware_has_the_gains_of_the_propellers(monkeypatch, tmp_path):
+    """`--propellers 2.1` flies its motors with its gains, not with those of the 2.1+."""
+    given = []
+    module = importlib.import_module("jaxdrones.identification.fit")
+    monkeypatch.setattr(module, "fit_path", lambda *a: given.append(a) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(["fit", NANOBENCH, "--propellers", "2.1", "--output", str(tmp_path)])
+    ((_, _, motors, gains, _),) = given
+    jax.tree.map(np.testing.assert_array_equal, gains, firmware_pid.gains(propellers="2.1"))
+    jax.tree.map(np.testing.assert_array_equal, motors, crazyflie_motors("2.1"))
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_fit_is_written_without_matplotlib_and_never_over_another(flown, monkeypatch, tmp_path, capsys, hidden):
+    params, log = flown
+    columns = {k: v for k, v in vars(log).items() if isinstance(v, np.ndarray)}
+    np.savez(tmp_path / "a---.npz", **columns)
+    real = builtins.__import__
+
+    def missing(name, *args):
+        if hidden and name.partition(".")[0] == "matplotlib":
+            raise ImportError("No module named 'matplotlib'")
+        return real(name, *args)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    (tmp_path / "x---y.urdf").write_text(to_urdf(params, "x"))
+    command = ["fit", str(tmp_path / "a---.npz"), "--vehicle", str(tmp_path / "x---y.urdf"), "--parameters", "kf"]
+    command += ["--output", str(tmp_path / "fit")]
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert re.search(r"kf +\S+ \+- ", said.out)
+    assert ('pip install "jaxdrones[cli]"' in said.err) is hidden
+    assert (tmp_path / "fit" / "errors.png").exists() is not hidden
+    load_vehicle(tmp_path / "fit")
+    before = {file: file.read_bytes() for file in (tmp_path / "fit").iterdir()}
+    assert main(command) == 2
+    assert "exists already; remove it, or give another --output" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in (tmp_path / "fit").iterdir()} == before
+
+
+@pytest.mark.parametrize("text", ["a---b", "--", "ends with -", "-->", 'quo"te & <tag>', "bell \x07 \x00"])
+def test_any_name_and_comment_make_a_sound_urdf(text):
+    params = jaxdrones.load_params("cf2x")
+    np.testing.assert_allclose(parse_params("x.urdf", to_urdf(params, text, text)).kf, params.kf, rtol=1e-6)
 
 
 def test_what_cannot_be_fitted_is_named(flown):

@@ -1,5 +1,8 @@
 """Logs of flights are loaded, and invalid ones are refused."""
 
+import io
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -46,3 +49,22 @@ def test_what_is_no_file_of_arrays_is_named(tmp_path):
         FlightLog.load(tmp_path / "text.npz")
     with pytest.raises(ValueError, match="cannot be read"):
         FlightLog.load(tmp_path / "missing.npz")
+
+
+def test_headers_that_claim_too_much_and_plain_arrays_are_refused(columns, tmp_path):
+    """A header of 8 TB over a few bytes allocates nothing; a .npy is no .npz."""
+    np.savez(tmp_path / "flight.npz", **columns)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    with zipfile.ZipFile(tmp_path / "huge.npz", "w") as archive:
+        archive.writestr("t.npy", header.getvalue() + b"few bytes")
+    with pytest.raises(ValueError, match="t claims 8,000,000,000,000 bytes"):
+        FlightLog.load(tmp_path / "huge.npz")
+    np.save(tmp_path / "plain.npy", columns["pos"])
+    with pytest.raises(ValueError, match=r"is not an \.npz file"):
+        FlightLog.load(tmp_path / "plain.npy")
+    whole = (tmp_path / "flight.npz").read_bytes()
+    for cut in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.npz").write_bytes(whole[:cut])
+        with pytest.raises(ValueError, match=r"is not an \.npz file"):
+            FlightLog.load(tmp_path / "cut.npz")

@@ -86,6 +86,27 @@ def test_what_is_no_bag_is_refused(tmp_path):
         list(bag.read(tmp_path / "nothing"))
 
 
+def test_a_damaged_bag_is_refused(tmp_path):
+    """Cut anywhere, or with a byte of its index changed, a bag is a mistake in one sentence."""
+    with bag.Recorder(tmp_path / "bag") as recorder:
+        for ns in range(20):
+            recorder.write(topics.CLOCK, msg.Clock(convert.stamp(ns)), ns)
+    (file,) = (tmp_path / "bag").glob("*.mcap")
+    whole = file.read_bytes()
+    damaged = [whole[:cut] for cut in (0, 1, 8, 9, 100, len(whole) // 2, len(whole) - 1)]
+    for at in range(9, len(whole), 50):
+        damaged.append(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
+    refused = 0
+    for data in damaged:
+        file.write_bytes(data)
+        try:
+            list(bag.read(tmp_path / "bag"))
+        except ValueError as error:
+            assert "is no bag of ROS 2, or is damaged" in str(error)
+            refused += 1
+    assert refused >= 7
+
+
 def test_a_bag_without_a_flight_is_refused(tmp_path):
     with bag.Recorder(tmp_path / "bag") as recorder:
         recorder.write(topics.CLOCK, msg.Clock(convert.stamp(5)), 5)

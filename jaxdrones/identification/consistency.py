@@ -1,0 +1,281 @@
+"""Tests of a flight log against itself: which columns contradict each other, and what would explain it.
+
+The velocity is the derivative of the position, the angular velocity that of the attitude, the acceleration follows the
+thrust, which acts along body z, and the angular acceleration follows the motors. A test is only made where the log
+moves enough for it. `docs/reality.md` has the margins on recorded flights.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jaxdrones.identification import quaternions
+from jaxdrones.identification.motor_effects import motor_effects
+
+if TYPE_CHECKING:
+    from jaxdrones.identification.log import FlightLog
+
+_PERIOD = 0.01  # s
+_GRAVITY = 9.81  # m/s^2
+_SHIFT_ROWS, _TURN_ROWS, _FORCE_ROWS = 50, 25, 25  # rows over which positions, attitudes and velocities change
+_MAX_WINDOWS = 1500
+_MIN_WINDOWS = 10
+_MIN_SHIFT, _MIN_TURN, _MIN_ACC = 0.02, 0.01, 0.25  # m, rad, m/s^2, rms; a test needs more motion than that
+_MAX_SHIFT_MISFIT, _MAX_SHIFT_ERROR = 0.05, 0.03  # misfit; m, rms
+_MAX_TURN_MISFIT, _MAX_TURN_ERROR = 0.45, 0.04  # misfit; rad, median
+_MAX_FORCE_MISFIT, _MAX_FORCE_ERROR = 0.45, 0.3  # misfit; m/s^2, median
+_MIN_UP = 0.5  # cosine of the mean tilt; drones do not fly tilted by more than 60 degrees on average
+_HORIZONTAL_RATIO, _VERTICAL_RATIO = (0.87, 1.08), (0.94, 1.06)  # of distances in the positions and by the velocities
+_TURN_RATIO = (0.88, 1.14)  # of turns of the attitudes and by the rates
+_ACC_RATIO = (0.5, 1.5)  # of accelerations and those of the tilted thrust
+_MAX_CLOCK_MISFIT = 0.1  # a ratio is meaningful up to this misfit
+_NED, _SWAPPED = np.array([1, -1, -1]), np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+_MIN_LIKENESS, _MIN_LEAD = 0.75, 0.15  # of an order of the motors; over the documented order
+_PATTERNS = {
+    "X": np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]]) / 2,  # roll and pitch by each motor
+    "+": np.array([[0, -1, 0, 1], [-1, 0, 1, 0]]) / np.sqrt(2),
+}
+_MAX_RISE = 0.1  # V, by which a battery may rise when the motors start
+_NAMES = ("front right", "back right", "back left", "front left")
+
+Change = tuple[str, Callable[[np.ndarray], np.ndarray]]
+
+
+class _Columns(NamedTuple):
+    pos: np.ndarray
+    quat: np.ndarray
+    vel: np.ndarray
+    omega: np.ndarray
+
+
+def _flipped(x: np.ndarray) -> np.ndarray:
+    return x * _NED
+
+
+def _turned(quat: np.ndarray) -> np.ndarray:
+    """Attitudes of z-up axes from those of z-down axes in world and body."""
+    return quat * np.array([1, -1, -1, 1])
+
+
+_HALF_TURN = np.array([1.0, 0, 0, 0])  # about x: between z-up and z-down axes
+_W_FIRST: Change = ("the quaternions look like w, x, y, z", lambda q: q[:, [1, 2, 3, 0]])
+_CONJUGATED: Change = ("the quaternions look conjugated (world to body)", quaternions.conjugate)
+_READINGS: dict[str, tuple[Change, ...]] = {
+    "pos": (("pos looks like x, -y, -z (NED axes)", _flipped), ("pos looks like NED axes", lambda x: x @ _SWAPPED)),
+    "vel": (("vel looks like x, -y, -z (NED axes)", _flipped), ("vel looks like NED axes", lambda x: x @ _SWAPPED)),
+    "quat": (
+        _W_FIRST,
+        _CONJUGATED,
+        ("the quaternions look like w, x, y, z and conjugated", lambda q: quaternions.conjugate(_W_FIRST[1](q))),
+        ("the attitude looks like that of NED axes (z down in world and body)", _turned),
+        ("the attitude looks like that of a z-down body", lambda q: quaternions.multiply(q, _HALF_TURN)),
+        ("the attitude looks like that of a z-down world", lambda q: quaternions.multiply(_HALF_TURN, q)),
+    ),
+    "omega": (
+        ("omega looks like p, -q, -r (z-down body axes)", _flipped),
+        ("omega has the opposite sign", np.negative),
+    ),
+}
+_ALL_NED = "all columns look like NED axes (z down in world and body)"
+
+
+def inconsistencies(log: FlightLog) -> list[str]:
+    """Contradictions within a log, a sentence each with the likely cause; none for a sound log."""
+    logged = _Columns(log.pos, log.quat, log.vel, log.omega)
+    rows = _flying_rows(log)
+    logged = _Columns(*(x[rows] for x in logged))
+    found, columns = _check_axes(logged)
+    found = found or _check_scales(logged)
+    motors = log.rpm if log.rpm is not None else log.pwm
+    if motors is not None:
+        found += _check_motors(motors[rows] ** (2 if log.rpm is not None else 1), columns)
+    return found + _check_battery(log)
+
+
+def _flying_rows(log: FlightLog) -> slice:
+    """The rows from the first to the last in which all motors run."""
+    flying = np.flatnonzero(log.in_flight)
+    return slice(int(flying[0]), int(flying[-1]) + 1) if len(flying) else slice(0)
+
+
+def _starts(rows: int, length: int) -> np.ndarray:
+    """First rows of at most `_MAX_WINDOWS` windows of a length."""
+    last = rows - length
+    return np.arange(0, last, max(5, last // _MAX_WINDOWS)) if last > 0 else np.zeros(0, int)
+
+
+class _Test(NamedTuple):
+    """What a log has (n, 3) and what its other columns imply (n, 3), with the bounds on their difference."""
+
+    has: np.ndarray
+    implied: np.ndarray
+    min_motion: float
+    max_misfit: float
+    max_error: float
+
+    @property
+    def observable(self) -> bool:
+        """Whether either moves enough to be compared."""
+        return len(self.has) >= _MIN_WINDOWS and max(_rms(self.has), _rms(self.implied)) > self.min_motion
+
+    @property
+    def misfit(self) -> float:
+        """0 for equal ones, 1 for unrelated ones, 2 for opposite ones; single glitches do not count."""
+        scale = _typical(self.has) + _typical(self.implied)
+        return _typical(self.has - self.implied) / max(scale, 1e-12)
+
+    @property
+    def passes(self) -> bool:
+        """Whether the log fits, or does not move enough to tell."""
+        error = np.sqrt(_typical(self.has - self.implied))
+        return not self.observable or self.misfit < self.max_misfit or float(error) < self.max_error
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(x**2, axis=-1))))
+
+
+def _typical(x: np.ndarray) -> float:
+    """Mean square without the tenth of the largest."""
+    squares = np.sort(np.sum(x**2, axis=-1))
+    return float(np.mean(squares[: max(1, int(0.9 * len(squares)))]))
+
+
+def shift_test(pos: np.ndarray, vel: np.ndarray) -> _Test:
+    """Changes of the position, m, and the integrals of the velocity."""
+    starts = _starts(len(pos), _SHIFT_ROWS)
+    path = np.concatenate([np.zeros((1, 3)), np.cumsum((vel[1:] + vel[:-1]) / 2 * _PERIOD, axis=0)])
+    ends = starts + _SHIFT_ROWS
+    return _Test(pos[ends] - pos[starts], path[ends] - path[starts], _MIN_SHIFT, _MAX_SHIFT_MISFIT, _MAX_SHIFT_ERROR)
+
+
+def turn_test(quat: np.ndarray, omega: np.ndarray) -> _Test:
+    """Rotation vectors of the attitude in the body frame, rad, and those of the integrated rates."""
+    starts = _starts(len(quat), _TURN_ROWS)
+    turned = np.tile([0, 0, 0, 1.0], (len(starts), 1))
+    for row in range(_TURN_ROWS):
+        mean = (omega[starts + row] + omega[starts + row + 1]) / 2
+        turned = quaternions.multiply(turned, quaternions.exp(mean * _PERIOD))
+    relative = quaternions.multiply(quaternions.conjugate(quat[starts]), quat[starts + _TURN_ROWS])
+    return _Test(quaternions.log(relative), quaternions.log(turned), _MIN_TURN, _MAX_TURN_MISFIT, _MAX_TURN_ERROR)
+
+
+def force_test(vel: np.ndarray, quat: np.ndarray) -> _Test:
+    """Horizontal accelerations, m/s^2, and those of a thrust along body z that carries the weight, without means."""
+    starts = _starts(len(vel), _FORCE_ROWS)
+    ends = starts + _FORCE_ROWS
+    acc = (vel[ends] - vel[starts]) / (_FORCE_ROWS * _PERIOD)
+    up = quaternions.rotate(quat, np.array([0, 0, 1.0]))
+    summed = np.concatenate([np.zeros((1, 3)), np.cumsum(up, axis=0)])
+    mean_up = (summed[ends + 1] - summed[starts]) / (_FORCE_ROWS + 1)
+    implied = mean_up[:, :2] * (acc[:, 2:] + _GRAVITY)
+    has, implied = (x - np.median(x, axis=0) if len(x) else x for x in (acc[:, :2], implied))
+    return _Test(has, implied, _MIN_ACC, _MAX_FORCE_MISFIT, _MAX_FORCE_ERROR)
+
+
+def _failures(columns: _Columns) -> list[str]:
+    pos, quat, vel, omega = columns
+    found = []
+    if not (test := shift_test(pos, vel)).passes:
+        found.append(f"vel is not the derivative of pos (misfit {test.misfit:.2f} of 1)")
+    if not (test := turn_test(quat, omega)).passes:
+        found.append(f"omega is not the rate of quat (misfit {test.misfit:.2f} of 1)")
+    force = force_test(vel, quat)
+    axes = [force._replace(has=force.has[:, i : i + 1], implied=force.implied[:, i : i + 1]) for i in range(2)]
+    if not all(axis.passes for axis in axes):
+        misfit = max(axis.misfit for axis in axes if not axis.passes)
+        found.append(f"the acceleration does not follow the tilt of the thrust (misfit {misfit:.2f} of 1)")
+    up = np.mean(quaternions.rotate(quat, np.array([0, 0, 1.0]))[:, 2]) if len(quat) else 1.0
+    if up < _MIN_UP:
+        found.append(f"body z points down or sideways (mean cosine of the tilt {up:.2f})")
+    return found
+
+
+def _check_axes(logged: _Columns) -> tuple[list[str], _Columns]:
+    """What does not fit, with the simplest reading of the columns that explains it, and the columns so read."""
+    failures = _failures(logged)
+    if not failures:
+        return [], logged
+    for causes, columns in _readings(logged):
+        if not _failures(columns):
+            return [f"{'; '.join(failures)}: {' and '.join(causes)}"], columns
+    hint = ": vel has another unit, or belongs to other positions, axes or times" if "vel" in failures[0] else ""
+    return ["; ".join(failures) + hint], logged
+
+
+def _readings(logged: _Columns):
+    """Other readings of the columns, those with the fewest changes first: their causes, and the columns so read."""
+    every = [(name, cause, change) for name, changes in _READINGS.items() for cause, change in changes]
+    yield ["vel looks like body axes"], logged._replace(vel=quaternions.rotate(logged.quat, logged.vel))
+    yield [_ALL_NED], _Columns(_flipped(logged.pos), _turned(logged.quat), _flipped(logged.vel), _flipped(logged.omega))
+    for count in (1, 2):
+        for changes in itertools.combinations(every, count):
+            if len({name for name, _, _ in changes}) == count:
+                read = logged._replace(**{name: change(getattr(logged, name)) for name, _, change in changes})
+                yield [cause for _, cause, _ in changes], read
+
+
+def _ratio(test: _Test, axes: slice) -> float | None:
+    """Ratio of what a log has to what is implied along some axes; `None` where they move or agree too little."""
+    has, implied = test.has[:, axes], test.implied[:, axes]
+    if len(has) < _MIN_WINDOWS or max(_rms(has), _rms(implied)) < 2 * test.min_motion:
+        return None
+    has, implied = has - np.mean(has, axis=0), implied - np.mean(implied, axis=0)
+    ratio = np.sqrt(np.sum(has**2) / max(np.sum(implied**2), 1e-12))
+    unlike = np.sum((has - ratio * implied) ** 2) / max(np.sum(has**2), 1e-12)
+    return float(ratio) if unlike < 2 * _MAX_CLOCK_MISFIT else None
+
+
+def _check_scales(columns: _Columns) -> list[str]:
+    """Whether distances and turns are as large as the velocities and rates imply; a wrong clock scales both."""
+    pos, quat, vel, omega = columns
+    shifts = shift_test(pos, vel)
+    ratios = {
+        "horizontal distances over integrals of vel": (_ratio(shifts, slice(0, 2)), _HORIZONTAL_RATIO),
+        "vertical distances over integrals of vel": (_ratio(shifts, slice(2, 3)), _VERTICAL_RATIO),
+        "turns of quat over integrals of omega": (_ratio(turn_test(quat, omega), slice(0, 3)), _TURN_RATIO),
+        "accelerations over those of the tilted thrust": (_ratio(force_test(vel, quat), slice(0, 2)), _ACC_RATIO),
+    }
+    off = [
+        f"{name}: {ratio:.2f}"
+        for name, (ratio, (low, high)) in ratios.items()
+        if ratio is not None and not low <= ratio <= high
+    ]
+    if not off:
+        return []
+    turns = ratios["turns of quat over integrals of omega"][0]
+    values = [ratio for name, (ratio, _) in ratios.items() if ratio is not None and any(name in each for each in off)]
+    clock = turns is None or all((turns - 1) * (ratio - 1) > 0 for ratio in values)
+    cause = (
+        "t runs at another rate than the flight (a wrong clock)" if clock else "pos or vel has another unit or scale"
+    )
+    return [f"{'; '.join(off)} instead of 1: {cause}"]
+
+
+def _check_motors(squares: np.ndarray, columns: _Columns) -> list[str]:
+    """Whether roll and pitch accelerate as the documented order of the motors implies."""
+    effect = motor_effects(squares, columns.quat, columns.vel, columns.omega)
+    if effect is None:
+        return []
+    orders = list(itertools.permutations(range(4)))
+    likeness = np.array([max(_likeness(effect, p[:, list(order)]) for p in _PATTERNS.values()) for order in orders])
+    best = int(np.argmax(likeness))
+    documented = likeness[0]
+    if likeness[best] < _MIN_LIKENESS or likeness[best] - documented < _MIN_LEAD:
+        return []
+    order = ", ".join(_NAMES[motor] for motor in orders[best])
+    return [f"the motors turn the drone as if their columns were {order}: give {', '.join(_NAMES)}"]
+
+
+def _likeness(effect: np.ndarray, pattern: np.ndarray) -> float:
+    return float(np.mean(np.sum(effect * pattern, axis=1)))
+
+
+def _check_battery(log: FlightLog) -> list[str]:
+    if log.sag < -_MAX_RISE:
+        return [f"vbat rises by {-log.sag:.2f} V when the motors start: the load of the battery has the wrong sign"]
+    return []

@@ -1,0 +1,50 @@
+"""The effect of each motor on roll and pitch, estimated from a flight log."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxdrones.identification import quaternions
+
+_PERIOD = 0.01  # s
+_MAX_MOTOR_ROWS = 6000  # a minute of flight shows the order of the motors
+_RIDGE = 1e-9  # of the trace of the moment matrix, where motors or velocities are constant
+_LAGS = range(-1, 7)  # rows by which motors act later than they are logged
+_MOTOR_ROWS, _TREND_ROWS = 4, 101  # of the angular acceleration; of the slow part that is removed
+_MIN_EXPLAINED = 0.15  # share of the angular acceleration that the motors explain
+
+
+def motor_effects(squares: np.ndarray, quat: np.ndarray, vel: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
+    """(2, 4) relative effect of each motor on roll and pitch, rows of length 1; `None` where it is not observable."""
+    n = _MOTOR_ROWS
+    squares, quat, vel, omega = (x[:_MAX_MOTOR_ROWS] for x in (squares, quat, vel, omega))
+    if len(squares) < 2 * _TREND_ROWS:
+        return None
+    acc = (omega[n:, :2] - omega[:-n, :2]) / (n * _PERIOD)
+    body_vel = quaternions.rotate(quaternions.conjugate(quat), vel)
+    others = [(x[n:] + x[:-n]) / 2 for x in (body_vel, omega)]
+    summed = np.cumsum((squares[1:] + squares[:-1]) / 2 / np.mean(squares), axis=0)
+    mean = np.concatenate([summed[n - 1 : n], summed[n:] - summed[:-n]]) / n
+    best: tuple[float, np.ndarray | None] = (_MIN_EXPLAINED, None)
+    for lag in _LAGS:
+        # acceleration of row k beside the motors of row k - lag
+        later, earlier = slice(max(lag, 0), len(acc) + min(lag, 0)), slice(max(-lag, 0), len(acc) - max(lag, 0))
+        known = np.concatenate([mean[earlier], *(x[later] for x in others)], axis=1)
+        known, target = _without_trend(known), _without_trend(acc[later])
+        moment = known.T @ known
+        coefficients = np.linalg.solve(moment + _RIDGE * np.trace(moment) * np.eye(len(moment)), known.T @ target)
+        explained = 1 - np.sum((target - known @ coefficients) ** 2) / max(np.sum(target**2), 1e-12)
+        if explained > best[0]:
+            best = (float(explained), coefficients[:4].T)
+    if best[1] is None:
+        return None
+    effect = best[1] - np.mean(best[1], axis=1, keepdims=True)
+    length = np.linalg.norm(effect, axis=1, keepdims=True)
+    return effect / length if (length > 0).all() else None
+
+
+def _without_trend(x: np.ndarray) -> np.ndarray:
+    """Columns (K, n) without their moving mean."""
+    half = _TREND_ROWS // 2
+    summed = np.cumsum(np.pad(x, ((half + 1, half), (0, 0)), mode="edge"), axis=0)
+    return x - (summed[_TREND_ROWS:] - summed[:-_TREND_ROWS]) / _TREND_ROWS

@@ -83,9 +83,10 @@ def compile_evaluation(env: Env, policy: Any, episodes: int) -> Callable[[AnyPol
     check_episodes(env, episodes)
     split = functools.partial(jax.random.split, num=episodes)
     keys = jax.eval_shape(split, jax.random.key(0))
-    shapes = jax.eval_shape(lambda policy: policy, policy)
-    outcomes = _compiled_outcomes().lower(compilation.Static(env), shapes, keys).compile()
-    return lambda policy, key: _report(env, jax.tree.map(np.asarray, outcomes(policy, split(key))))
+    leaves, structure = jax.tree.flatten(policy)
+    function = compilation.jit(lambda leaves, keys: _outcomes(env, jax.tree.unflatten(structure, leaves), keys))
+    outcomes = function.lower(leaves, keys).compile()
+    return lambda policy, key: _report(env, jax.tree.map(np.asarray, outcomes(jax.tree.leaves(policy), split(key))))
 
 
 def check_episodes(env: Env, episodes: int) -> None:
@@ -95,7 +96,7 @@ def check_episodes(env: Env, episodes: int) -> None:
 
 
 @functools.cache
-def _compiled_outcomes() -> Any:
+def _compiled_outcomes() -> Callable:
     return compilation.jit(lambda env, policy, keys: _outcomes(env.value, policy, keys), static_argnums=0)
 
 

@@ -21,7 +21,8 @@ def add(commands) -> None:
         "eval",
         help="evaluate a trained policy over many episodes",
         description="Fly many episodes with the best policy of a run, or with a policy of your own (file.py:name). "
-        "Prints the success rate with its 95 % interval, errors, and how episodes ended.",
+        "Prints the success rate with its 95 % interval, which counts repetitions of a flight once, errors, and how "
+        "episodes ended.",
         allow_abbrev=False,
     )
     parser.add_argument(
@@ -93,7 +94,7 @@ def evaluation_table(report: dict) -> str:
     ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["end_rates"].items()) or "none"
     others = ", ".join(f"{name} {x:.3g}" for name, x in report["final_metrics"].items() if name not in ("error",))
     rows = [
-        ["episodes", f"{episodes:,}, {report['mean_length']:.2f} s long on average"],
+        ["episodes", f"{_counted(report)}, {report['mean_length']:.2f} s long on average"],
         ["success", success(report)],
         [
             "final error",
@@ -110,11 +111,24 @@ def evaluation_table(report: dict) -> str:
 
 def success(report: dict) -> str:
     """Success rate, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
-    episodes = report["episodes"]
-    low, high = (100 * x for x in report["success_interval"])
+    if report["success"] is None:
+        return "the task has no criterion"
+    episodes, interval = report["episodes"], report["success_interval"]
+    rate = f"{percent(report['success'], episodes)}, {round(report['success'] * episodes):,} of {episodes:,}"
+    if interval is None:
+        return f"{rate}, no interval of one distinct episode"
+    low, high = (100 * x for x in interval)
     digits = _digits(episodes) + 1
-    count = f"{round(report['success'] * episodes):,} of {episodes:,}"
-    return f"{percent(report['success'], episodes)}, {count}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"
+    return f"{rate}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"
+
+
+def _counted(report: dict) -> str:
+    """The number of episodes, and of distinct ones if some are repetitions."""
+    episodes, distinct = report["episodes"], report["distinct_episodes"]
+    if distinct == episodes:
+        return f"{episodes:,}"
+    repeated = "deterministic: 1 distinct episode" if distinct == 1 else f"{distinct:,} of them distinct"
+    return f"{episodes:,}, {repeated}"
 
 
 def percent(share: float, episodes: int) -> str:

@@ -58,7 +58,7 @@ class LiveTraining:
 
     def update(self, count: int, now: dict[str, float]) -> None:
         """Pass the progress on; fly and show an episode, if the newest metrics are those of an evaluation."""
-        if "success" in now:
+        if "evaluated_return" in now:
             self._show(count, now)
         self._then(count, now)
 

@@ -24,16 +24,15 @@ def warn_of_unknown_settings(recipe) -> None:
 def warn_of_failure(run, report: dict[str, Any]) -> None:
     """Say that a training did not succeed, if that is so, and what to try."""
     advice = "try --seeds 3, a longer --budget, another --algo, or a smaller --set learning_rate"
-    successes = report["evaluation"]["successes"]
+    evaluation = report["evaluation"]
+    successes, success, episodes = (evaluation[name] for name in ("successes", "success", "episodes"))
+    share = "" if success is None else f" ({percent(success, episodes)} success)"
     if report["best_update"] == 0:
         print_warning(
-            f"{run.folder}: nothing was learned, the best policy is the untrained one of update 0 "
-            f"({percent(report['evaluation']['success'], report['evaluation']['episodes'])} success); {advice}"
+            f"{run.folder}: nothing was learned, the best policy is the untrained one of update 0{share}; {advice}"
         )
-    elif successes == 0 and run.recipe().env().task.success is not None:
-        print_warning(
-            f"{run.folder}: the best policy succeeds in 0 of {report['evaluation']['episodes']:,} episodes; {advice}"
-        )
+    elif successes == 0:
+        print_warning(f"{run.folder}: the best policy succeeds in 0 of {episodes:,} episodes; {advice}")
 
 
 def merge_budget(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:
@@ -82,9 +81,10 @@ class ProgressDisplay(contextlib.ExitStack):
             self._started = True
             self._bar = self.enter_context(bar(self._total, self._what, self._unit, initial=count))
         speed = _speed(now["steps_per_s"])
-        if "success" in now:
-            success = percent(now["success"], self._episodes)
-            self._evaluated = f"return {now['evaluated_return']:.1f}, success {success}"
+        if "evaluated_return" in now:
+            self._evaluated = f"return {now['evaluated_return']:.1f}"
+            if "success" in now:
+                self._evaluated += f", success {percent(now['success'], self._episodes)}"
             of = "" if self._total is None else f"/{self._total}"
             line = f"{self._what}: {self._unit} {count:4}{of}  {self._evaluated}, "
             line += f"median error {now['evaluated_error']:.3f} m, {speed}, {now['seconds']:.1f} s"
@@ -121,9 +121,9 @@ def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[P
     histories = {f"seed {seed}": run.history() for seed, run in runs.items()}
     kept = {f"seed {seed}": run.sidecar_entry("best", "update") for seed, run in runs.items()}
     recipe = next(iter(runs.values())).recipe()
-    episodes = next(iter(runs.values())).sidecar().get("episodes")
+    episodes = next(iter(runs.values())).sidecar().get("distinct_episodes", 1)
     title = f"training {recipe.task} by {recipe.trained_by}"
-    interval = (lambda success: wilson_interval(round(success * episodes), episodes)) if episodes else None
+    interval = (lambda success: wilson_interval(success * episodes, episodes)) if episodes > 1 else None
     learning_curves.save_curves(histories, folder / "curve.png", title, interval, kept)
     return [folder / "curve.png"]
 

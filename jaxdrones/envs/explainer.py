@@ -60,10 +60,15 @@ def explain(env: Env) -> Explanation:
         action=tuple(Entry(env.action.name or "own", quantity, -1.0, 1.0) for quantity in action),
         rewards=tuple(Part(name, description(term), scale) for name, (scale, term) in task.rewards.items()),
         metrics=_parts(_STANDARD_METRICS | {name: description(metric) for name, metric in task.metrics.items()}),
-        terminations=_parts({name: description(condition) for name, condition in task.terminations.items()}),
+        terminations=_parts(
+            {
+                name: f"{description(condition)} {'Success' if name in task.success_terminations else 'Failure'}."
+                for name, condition in task.terminations.items()
+            }
+        ),
         truncations=_parts(
             {"time": f"The time is up: {env.steps} control steps."}
-            | {name: description(condition) for name, condition in task.truncations.items()}
+            | {name: f"{description(condition)} Failure." for name, condition in task.truncations.items()}
         ),
         physics=_physics(env),
         vehicle=_vehicle(env, drone),

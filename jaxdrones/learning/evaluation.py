@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, UInt32
 
 from jaxdrones.checks import check_key
 from jaxdrones.engine.step import HostStep
@@ -19,23 +20,27 @@ from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 from jaxdrones.pytree import PyTreeNode
 
 _CHUNK = 1000  # episodes simulated at a time
-_EPISODE_BYTES = 64  # memory that the results of an episode take per drone until the evaluation ends
+_ROUNDING = 1e-4  # relative, and absolute in SI units: by how much repetitions of a flight may differ
+_EPISODE_BYTES = 128  # memory that the results of an episode take per drone until the evaluation ends
 
 
 class Report(PyTreeNode):
     """Results of an evaluation."""
 
     episodes: int
-    success: float
-    """Fraction of the episodes in which every drone met the task's criterion of success."""
-    success_interval: tuple[float, float]
-    """95 % confidence interval of `success` (Wilson)."""
+    distinct_episodes: int
+    """Number of episodes that differ in their start or in what is drawn on the way; 1 where all are one flight."""
+    success: float | None
+    """Fraction of the episodes in which every drone met the task's criterion of success and that no failure ended;
+    `None` of a task without a criterion."""
+    success_interval: tuple[float, float] | None
+    """95 % confidence interval of `success` (Wilson) from the distinct episodes; `None` where there is only one."""
     final_error: float
     """Mean distance from the target at the end of an episode, m."""
     final_error_percentiles: dict[int, float]
     """50th, 95th and 99th percentile of that distance over all drones, m."""
     rms_error: float
-    """Root mean square distance from the target over the last four fifths of all episodes, m."""
+    """Root mean square distance from the target over the last four fifths of every episode, m."""
     mean_return: float
     """Mean over drones and episodes of the sum of rewards."""
     mean_length: float
@@ -45,9 +50,14 @@ class Report(PyTreeNode):
     final_metrics: dict[str, float]
     """Mean over drones of each of the task's metrics at the end of an episode."""
 
+    @property
+    def success_lower_bound(self) -> float:
+        """Lower end of the interval; the success itself of one repeated flight, 0 of a task without a criterion."""
+        return self.success_interval[0] if self.success_interval else self.success or 0.0
+
 
 def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) -> Report:
-    """Simulate whole episodes; after an episode has ended, its metrics keep their last values.
+    """Simulate whole episodes; nothing after the end of an episode counts.
 
     Args:
         env: environment of either backend.
@@ -108,9 +118,11 @@ def _outcomes(env: Env, policy: AnyPolicy, keys: jax.Array) -> dict:
 
 
 def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:
-    """The outcome of one episode; an episode in which a position is ever not finite is no success."""
+    """The outcome of one episode; one in which a position is not finite before its end is no success."""
     start_key, key = jax.random.split(key)
     obs, world = env.reset(start_key)
+    first_state = (world.drones.pos, world.drones.quat, world.drones.vel, world.drones.omega)
+    start = _fingerprint(world.replace(images={}, poses=None))
     info = jax.eval_shape(env.step, key, world, jnp.zeros((env.drones, env.action_size)))[-1]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), _metrics_and_ends(info))
 
@@ -121,7 +133,7 @@ def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:
         last = jax.tree.map(lambda new, old: jnp.where(done, old, new), _metrics_and_ends(info), last)
         episode_return = episode_return + jnp.where(done, 0, reward)
         length = length + ~done
-        diverged = diverged | ~jnp.all(jnp.isfinite(world.drones.pos))
+        diverged = diverged | (~done & ~jnp.all(jnp.isfinite(world.drones.pos)))
         return (memory, obs, world, diverged, done | terminated | truncated, last, episode_return, length), last[0]
 
     zero = jnp.zeros(env.drones, world.drones.pos.dtype)
@@ -129,10 +141,13 @@ def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:
     carry = (initial_memory(policy, env.drones), obs, world, false, false, zeros, zero, jnp.zeros((), jnp.int32))
     carry, metrics = jax.lax.scan(control_step, carry, jax.random.split(key, env.steps))
     _, _, _, diverged, _, (final_metrics, ends), episode_return, length = carry
-    success = false if env.task.success is None else jnp.all(env.task.success(metrics, env.dt)) & ~diverged
-    rms_error = jnp.sqrt(jnp.mean(metrics["error"][env.steps // 5 :] ** 2, axis=0))
-    return {
-        "success": success,
+    flown = jnp.arange(env.steps)[:, None]
+    counts = (flown >= length // 5) & (flown < length)
+    rms_error = jnp.sqrt(jnp.mean(metrics["error"] ** 2, axis=0, where=counts))
+    success = {} if env.task.success is None else {"success": env.task.succeeded(metrics, ends, env.dt) & ~diverged}
+    return success | {
+        "start": start,
+        "first_state": first_state,
         "final_metrics": final_metrics,
         "ends": ends,
         "return": episode_return,
@@ -145,13 +160,55 @@ def _metrics_and_ends(info: dict) -> tuple[dict, dict]:
     return info["metrics"], info["terminations"] | info["truncations"]
 
 
+def _fingerprint(tree: Any) -> UInt32[Array, "2"]:
+    """Two sums of all bits of a tree with random odd weights, which are the same for equal trees."""
+    total = jnp.zeros(2, jnp.uint32)
+    rng = np.random.default_rng(0)
+    for leaf in jax.tree.leaves(tree):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            leaf = leaf.astype(jnp.promote_types(leaf.dtype, jnp.float32))
+            bits = jax.lax.bitcast_convert_type(jnp.where(leaf == 0, 0, leaf), jnp.uint32)  # -0 is 0
+        else:
+            bits = leaf.astype(jnp.uint32)
+        weights = rng.integers(2**32, size=(2, bits.size), dtype=np.uint32) | np.uint32(1)
+        total = total + jnp.sum(weights * bits.reshape(1, -1), axis=1, dtype=jnp.uint32)
+    return total
+
+
+def _count_distinct(env: Env, outcomes: dict) -> int:
+    """Number of episodes that are not repetitions of another one.
+
+    Two episodes are the same if their worlds start alike and nothing is drawn on the way. All that start in one state
+    are the same if they also come out alike: then nothing that was drawn has an effect.
+    """
+
+    def rows(names: list[str]) -> np.ndarray:
+        leaves = jax.tree.leaves([outcomes[name] for name in names])
+        return np.concatenate([np.asarray(x, np.float64).reshape(len(x), -1) for x in leaves], axis=1)
+
+    results = rows(["return", "rms_error", "length", "final_metrics"])
+    firsts, state = np.unique(np.round(rows(["first_state"]), 6), axis=0, return_inverse=True)
+    state = state.reshape(-1)
+    most, least = (np.full((len(firsts), results.shape[1]), sign * -np.inf) for sign in (1, -1))
+    np.maximum.at(most, state, results)
+    np.minimum.at(least, state, results)
+    alike = np.all(most - least <= _ROUNDING * (1 + np.abs(most)), axis=1)
+    drawn_on_the_way = env.noise or env.disturbance or env.sensors or (env.vision and env.vision.camera.noise)
+    told_apart = np.concatenate([rows(["start"]), results], axis=1) if drawn_on_the_way else rows(["start"])
+    return len(np.unique(np.where(alike[state, None], state[:, None], told_apart), axis=0))
+
+
 def _report(env: Env, outcomes: dict) -> Report:
-    episodes = len(outcomes["success"])
+    episodes, distinct = len(outcomes["length"]), _count_distinct(env, outcomes)
     error = outcomes["final_metrics"]["error"]
+    success = float(np.mean(outcomes["success"])) if "success" in outcomes else None
     return Report(
         episodes=episodes,
-        success=float(np.mean(outcomes["success"])),
-        success_interval=wilson_interval(int(np.sum(outcomes["success"])), episodes),
+        distinct_episodes=distinct,
+        success=success,
+        success_interval=None if success is None or distinct == 1 else wilson_interval(success * distinct, distinct),
         final_error=float(np.mean(error)),
         final_error_percentiles={q: float(np.percentile(error, q)) for q in (50, 95, 99)},
         rms_error=float(np.sqrt(np.mean(outcomes["rms_error"] ** 2))),
@@ -162,7 +219,7 @@ def _report(env: Env, outcomes: dict) -> Report:
     )
 
 
-def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
+def wilson_interval(successes: float, trials: int, z: float = 1.959964) -> tuple[float, float]:
     """Wilson's score interval of a proportion, of 95 % confidence by default."""
     p, n = successes / trials, trials
     center = p + z**2 / (2 * n)

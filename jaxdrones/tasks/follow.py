@@ -52,7 +52,7 @@ def follow(
         distance: distance that a drone is to keep from the one that it follows, m.
         size: amplitude of the leader's curve, a Lissajous figure, m.
         period: period of that curve, s.
-        duration: duration of an episode, s.
+        duration: duration of an episode, s; of 2 s or less there is no criterion of success.
 
     Raises:
         ValueError: a number out of range.
@@ -123,7 +123,7 @@ def follow(
             "in_view": _seen,
             "touched": _TOUCHED,
         },
-        success=functools.partial(_followed, distance=distance),
+        success=functools.partial(_followed, distance=distance) if duration > _SETTLED else None,
         observations={
             "velocity_error_body": ObservationTerm(
                 _observe_velocity_error,

@@ -184,6 +184,7 @@ def forest(
         advance=_advance,
         metrics=_METRICS | {"detour": _detour, "traversability": traversability},
         success=_reached_untouched,
+        success_terminations=("reached",),
         observations={
             "desired_velocity": ObservationTerm(
                 observe_desired, _MAX_SPEED, entries=quantities("velocity to the goal", "m/s", "body")

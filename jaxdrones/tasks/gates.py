@@ -32,6 +32,7 @@ OPENING, FRAME = 0.40, 0.16  # m, edge of the square hole and width of the beams
 POLE_RADIUS, POLE_HEIGHT = 0.015, 1.52  # m
 LEVELS = (0, 1, 2, 3)
 _START_SPACING = 0.5  # m in y between drones at the start
+_MAX_SPREAD = 0.15  # m, so that drones stay apart at the start
 _ARENA = 3.0  # m from the middle of the track along every axis, beyond which a drone is lost
 _MAX_DRONES = 5  # so that all start inside the arena
 
@@ -56,7 +57,9 @@ _POLE_ENTRIES = tuple(
 
 
 @check_keywords
-def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start: bool = False) -> Task:
+def gates(
+    drones: int = 1, level: int = 0, duration: float = 12.0, random_start: bool = False, start_spread: float = 0.0
+) -> Task:
     """One lap through four gates.
 
     Gates and poles are obstacles of the scene: solid in Bullet, visible to cameras, and hit as `sensing.collisions`
@@ -68,23 +71,27 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
         duration: duration of an episode, s.
         random_start: for training: drones start in the air in front of a random gate, one time in five on the ground
             at the start of the track; else always there.
+        start_spread: on the ground, drones start within +-start_spread of the start along x and y, m; at most 0.15.
     """
     check_whole("number of drones of gates", drones)
     check_number("number of drones of gates", drones, at_most=_MAX_DRONES)
     check_whole("level", level, minimum=0)
     check_switch("random_start", random_start)
+    check_number("start_spread", start_spread, "m", at_least=0, at_most=_MAX_SPREAD)
     if level not in LEVELS:
         raise UserError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """On the ground at the start of the track, or in the air in front of a random gate."""
-        gate_key, place_key = jax.random.split(key)
+        gate_key, place_key, spread_key = jax.random.split(key, 3)
         n, dtype = len(params.mass), params.mass.dtype
         variables = {"gates": _gates_of(scene, dtype), "poles": _poles_of(scene, dtype)}
         x, y = START
         pos = jnp.stack(
             [jnp.full(n, x, dtype), y + _START_SPACING * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1
         )
+        if start_spread:
+            pos = pos.at[:, :2].add(jax.random.uniform(spread_key, (n, 2), dtype, -start_spread, start_spread))
         index = jnp.zeros(n, jnp.int32)
         if random_start:
             place = jax.random.randint(gate_key, (n,), -1, len(GATES))
@@ -143,6 +150,7 @@ def gates(drones: int = 1, level: int = 0, duration: float = 12.0, random_start:
             "lap_time": shaping.variable("lap_time", "Time until the last gate was passed, or so far, s."),
         },
         success=_finished,
+        success_terminations=("finished",),
         randomize=() if level == 0 else (_random_inertia,),
         observations={
             "gates": ObservationTerm(_observe_gates, 20.0, entries=_GATE_ENTRIES),

@@ -3,6 +3,10 @@
 Rewards, terminations, truncations and starts are those of gym-pybullet-drones. It reads its clock before the step:
 rewards that follow a moving target lag one control step behind, and an episode of T seconds has two steps more than
 T / dt.
+
+gym-pybullet-drones has no criteria of success and starts all episodes of a task alike. With `start_spread` (m, at most
+0.5) every drone starts up to so much higher or lower, but above the ground; most of these tasks command one speed for
+all rotors, which does not move a drone sideways.
 """
 
 import dataclasses
@@ -15,15 +19,15 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.checks import check_keywords, check_whole
 from jaxdrones.control import Setpoint
-from jaxdrones.params import Params
 from jaxdrones.quantity import described
-from jaxdrones.state import State
-from jaxdrones.tasks.starts import hovering, on_diagonal
-from jaxdrones.tasks.task import Task, World, distance, square
+from jaxdrones.tasks.starts import above_ground
+from jaxdrones.tasks.task import Task, Term, World, distance, norm, square
 
 _DURATION_2021, _DURATION_2X = 5.0, 8.0  # s
 _SOLVED = 0.05  # m, at the end of an episode
 _TUNE_RATE = 0.288  # rad/s: 0.006 rad per control step at 48 Hz
+_OFF_GROUND = 1.0  # m
+_NEAR_PARTNER = 0.05  # m between the hulls
 _TILT = 0.4  # rad of roll or pitch, at which (2.x) truncates the episode
 
 Starts = Float[Array, "n 3"]
@@ -31,16 +35,18 @@ Starts = Float[Array, "n 3"]
 Target = Callable[[Starts, Array], Setpoint]
 Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]
 """(target positions, world after a step) -> the negative reward of every drone."""
+Criterion = Callable[[Mapping[str, Array], float], Array]
 
 
 @check_keywords
-def hover(drones: int = 1) -> Task:
+def hover(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Equation 12: the negative squared distance from (0, 0, 1)."""
-    return _task_2021("hover-2021", "hover at z = 1 m (equation 12)", drones, _at(0.0, 0.0, 1.0), _squared_distance)
+    summary, success = "hover at z = 1 m (equation 12)", _of_one(drones)
+    return _task_2021("hover-2021", summary, drones, start_spread, _at(0.0, 0.0, 1.0), _squared_distance, success)
 
 
 @check_keywords
-def takeoff(drones: int = 1) -> Task:
+def takeoff(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Get off the ground: -5 below 2 cm, else -1 / (10 z)."""
 
     def cost(target, world):
@@ -49,12 +55,16 @@ def takeoff(drones: int = 1) -> Task:
         low = z < 0.02
         return jnp.where(low, 5, 1 / (10 * jnp.where(low, 1, z)))
 
-    return _task_2021("takeoff", "climb from the ground", drones, _at(0.0, 0.0, 1.0), cost)
+    summary, target, metrics = "climb from the ground", _at(0.0, 0.0, 1.0), {"height": _height}
+    return _task_2021("takeoff", summary, drones, start_spread, target, cost, _high, metrics=metrics)
 
 
 @check_keywords
-def fly_through_gate(drones: int = 1) -> Task:
-    """Follow a point that moves through the gate at (0, -1, 0.75) in the five seconds of an episode."""
+def fly_through_gate(drones: int = 1, start_spread: float = 0.0) -> Task:
+    """Follow a point that moves through the gate at (0, -1, 0.75) in the five seconds of an episode.
+
+    There is no criterion of success: the default action, one speed for all rotors, does not move a drone sideways.
+    """
 
     def target(starts, t):
         """A point that moves through the gate."""
@@ -66,11 +76,12 @@ def fly_through_gate(drones: int = 1) -> Task:
         """Ten times the squared distance from the target, m^2."""
         return 10 * _squared_distance(target, world)
 
-    return _task_2021("fly-through-gate", "fly through the gate at y = -1 m", drones, target, cost)
+    summary = "fly through the gate at y = -1 m"
+    return _task_2021("fly-through-gate", summary, drones, start_spread, target, cost, None)
 
 
 @check_keywords
-def tune(drones: int = 1) -> Task:
+def tune(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m.
 
     As in gym-pybullet-drones (2021), the target velocity is a difference over the last 1/48 s.
@@ -85,37 +96,40 @@ def tune(drones: int = 1) -> Task:
         return _everywhere(starts, [zero, y(t), zero + 1], vel=[zero, 48 * (y(t) - y(t - 1 / 48)), zero])
 
     summary = "tune the gains of the PID in flight"
-    return _task_2021("tune", summary, drones, target, _squared_distance, action="pid_gains")
+    task = _task_2021("tune", summary, drones, start_spread, target, _squared_distance, _of_one(drones))
+    return dataclasses.replace(task, action="pid_gains")
 
 
 @check_keywords
-def leader_follower(drones: int = 2) -> Task:
+def leader_follower(drones: int = 2, start_spread: float = 0.0) -> Task:
     """Equation 13: the leader, drone 0, hovers at (0, 0, 0.5); the others are to be as high as the leader."""
 
     def cost(target, world):
         """Leader: squared distance from its target, m^2; others: squared height over the leader over n, m^2."""
         pos = world.drones.pos
         follower = (pos[:, 2] - pos[0, 2]) ** 2 / len(pos)
-        return _first_then(_squared_distance(target, world), follower)
+        return follower.at[0].set(_squared_distance(target, world)[0])
 
     summary = "follow the leader's height (equation 13)"
-    return _task_2021("leader-follower", summary, drones, _at_height(0.5), cost, minimum=2)
+    return _task_2021("leader-follower", summary, drones, start_spread, _at_height(0.5), cost, minimum=2)
 
 
 @check_keywords
-def flock(drones: int = 2) -> Task:
+def flock(drones: int = 2, start_spread: float = 0.0) -> Task:
     """The first drone hovers at (0, 0, 1); every other one is to be as high as the one before it."""
 
     def cost(target, world):
         """First drone: squared distance from its target, m^2; others: squared height over the drone before, m^2."""
         pos = world.drones.pos
-        return _first_then(_squared_distance(target, world), (jnp.roll(pos, 1, 0) - pos)[:, 2] ** 2)
+        follower = (jnp.roll(pos, 1, 0) - pos)[:, 2] ** 2
+        return follower.at[0].set(_squared_distance(target, world)[0])
 
-    return _task_2021("flock", "fly at the height of the drone before", drones, _at_height(1.0), cost, minimum=2)
+    summary = "fly at the height of the drone before"
+    return _task_2021("flock", summary, drones, start_spread, _at_height(1.0), cost, minimum=2)
 
 
 @check_keywords
-def meetup(drones: int = 2) -> Task:
+def meetup(drones: int = 2, start_spread: float = 0.0) -> Task:
     """Drone i and drone n - 1 - i meet; the reward is the negative squared distance between them."""
 
     def target(starts, t):
@@ -126,29 +140,45 @@ def meetup(drones: int = 2) -> Task:
         """Squared distance from the partner, m^2."""
         return square(world.drones.pos - world.drones.pos[::-1])
 
-    task = _task_2021("meetup", "meet the partner half-way", drones, target, cost, action="velocity", minimum=2)
-    return dataclasses.replace(task, contact=("ground", "drones"))
+    more = {"gap": _gap_to_partner}
+    task = _task_2021("meetup", "meet the partner half-way", drones, start_spread, target, cost, _met, 2, more)
+    return dataclasses.replace(task, action="velocity", contact=("ground", "drones"))
 
 
 @check_keywords
-def hover_2x(drones: int = 1) -> Task:
+def hover_2x(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Hover at (0, 0, 1), rewarded by max(0, 2 - d^4)."""
-    return _task_2x("hover-2x", "hover at z = 1 m, bounded reward", drones, _at(0.0, 0.0, 1.0), box=1.5)
+    target, success = _at(0.0, 0.0, 1.0), _of_one(drones)
+    return _task_2x("hover-2x", "hover at z = 1 m, bounded reward", drones, start_spread, target, 1.5, success)
 
 
 @check_keywords
-def multi_hover(drones: int = 2) -> Task:
+def multi_hover(drones: int = 2, start_spread: float = 0.0) -> Task:
     """Drone i hovers 1 / (i + 1) m above its start; the reward of (2.x) is the sum over the team."""
 
     def target(starts, t):
         """Above the start of the drone, the first one highest."""
         return Setpoint.at(starts.at[:, 2].add(1 / (1 + jnp.arange(len(starts), dtype=starts.dtype))))
 
-    return _task_2x("multi-hover", "every drone hovers at a height of its own", drones, target, box=2.0)
+    summary = "every drone hovers at a height of its own"
+    return _task_2x("multi-hover", summary, drones, start_spread, target, 2.0, _close_at_the_end)
+
+
+def _close_at_the_end(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone was within 5 cm of its target in the end."""
+    return metrics["error"][-1] < _SOLVED
 
 
 def _task_2021(
-    name: str, summary: str, drones: int, target: Target, cost: Cost, action: str = "one_d_rpm", minimum: int = 1
+    name: str,
+    summary: str,
+    drones: int,
+    start_spread: float,
+    target: Target,
+    cost: Cost,
+    success: Criterion | None = _close_at_the_end,
+    minimum: int = 1,
+    metrics: Mapping[str, Term] | None = None,
 ) -> Task:
     check_whole(f"number of drones of {name}", drones, minimum)
 
@@ -161,19 +191,22 @@ def _task_2021(
         summary=summary,
         drones=drones,
         duration=_DURATION_2021,
-        start=_start,
+        start=above_ground(start_spread),
         target=target,
         rewards={"cost": (-1.0, described(cost.__doc__ or "", late_cost))},
-        success=_close_at_the_end,
+        success=success,
+        metrics=metrics or {},
         contact=("ground",),
-        action=action,
+        action="one_d_rpm",
         observation=("normalized_kinematics",),
         control_hz=48.0,
         extra_steps=2,
     )
 
 
-def _task_2x(name: str, summary: str, drones: int, target: Target, box: float) -> Task:
+def _task_2x(
+    name: str, summary: str, drones: int, start_spread: float, target: Target, box: float, success: Criterion | None
+) -> Task:
     check_whole(f"number of drones of {name}", drones)
 
     def closeness(task: Task, world: World) -> Float[Array, " n"]:
@@ -199,12 +232,13 @@ def _task_2x(name: str, summary: str, drones: int, target: Target, box: float) -
         summary=summary,
         drones=drones,
         duration=_DURATION_2X,
-        start=_start,
+        start=above_ground(start_spread),
         target=target,
         rewards={"closeness": (1.0, closeness)},
         terminations={"arrived": arrived},
         truncations={"out_of_box": out_of_box, "tilted": tilted},
-        success=_close_at_the_end,
+        success=success,
+        success_terminations=("arrived",),
         contact=("ground",),
         action="one_d_rpm",
         observation=("kinematics_2x", "last_actions_2x"),
@@ -212,12 +246,6 @@ def _task_2x(name: str, summary: str, drones: int, target: Target, box: float) -
         substeps=8,
         extra_steps=2,
     )
-
-
-def _start(key: jax.Array, params: Params) -> tuple[State, Starts]:
-    """On a diagonal, 0.1 m above the ground, with the rotors standing still."""
-    pos = on_diagonal(params)
-    return hovering(params, pos).replace(rpm=jnp.zeros((len(pos), 4), pos.dtype)), pos
 
 
 def _at(x: float, y: float, z: float) -> Target:
@@ -246,10 +274,27 @@ def _squared_distance(target: Float[Array, "n 3"], world: World) -> Float[Array,
     return square(target - world.drones.pos)
 
 
-def _first_then(first: Float[Array, " n"], rest: Float[Array, " n"]) -> Float[Array, " n"]:
-    return jnp.concatenate([first[:1], rest[1:]])
+def _of_one(drones: int) -> Criterion | None:
+    """The criterion of tasks whose drones have one target: a team cannot be at one place, and has none."""
+    return _close_at_the_end if drones == 1 else None
 
 
-def _close_at_the_end(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Whether a drone was within 5 cm of its target in the end."""
-    return metrics["error"][-1] < _SOLVED
+def _height(task: Task, world: World) -> Float[Array, " n"]:
+    """Height above the ground, m."""
+    return world.drones.pos[:, 2]
+
+
+def _high(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone was 1 m or more above the ground in the end."""
+    return metrics["height"][-1] >= _OFF_GROUND
+
+
+def _gap_to_partner(task: Task, world: World) -> Float[Array, " n"]:
+    """Distance from the partner's center less both collision radii, m."""
+    radius = world.params.collision_radius
+    return norm(world.drones.pos - world.drones.pos[::-1]) - radius - radius[::-1]
+
+
+def _met(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone touched its partner or was within 5 cm of doing so in the end."""
+    return metrics["gap"][-1] < _NEAR_PARTNER

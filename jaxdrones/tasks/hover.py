@@ -22,6 +22,7 @@ _MAX_HEIGHT = 1000.0  # m; float32 resolves 0.1 mm there
 _MAX_SPEED = 100.0  # m/s
 _TOUCHING = 0.02  # m above the ground: sinking is then that of the touch
 _SOFT = 0.6  # m/s
+SETTLED = 2.0  # s: how long a drone has to hover in the end
 
 
 @check_keywords
@@ -43,7 +44,7 @@ def hover(
         omega: the initial body rates are within +-omega about each axis, rad/s; below 100, where episodes terminate.
         tilt: largest initial tilt, degrees.
         height: height of the goal, m; at most 1,000.
-        duration: duration of an episode, s.
+        duration: duration of an episode, s; of 2 s or less there is no criterion of success.
 
     Raises:
         ValueError: a number out of range.
@@ -69,7 +70,7 @@ def hover(
         target=_stay,
         rewards=shaping.REACH_AND_STAY,
         terminations=out_of_control(_MAX_REACH + SPACING * drones),
-        success=settled,
+        success=settled if duration > SETTLED else None,
     )
 
 
@@ -169,7 +170,7 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
 
 
 def settled(
-    metrics: Mapping[str, Array], dt: float, within: float = 0.05, speed: float = 0.1, last: float = 2.0
+    metrics: Mapping[str, Array], dt: float, within: float = 0.05, speed: float = 0.1, last: float = SETTLED
 ) -> Array:
     """Whether a drone was within 5 cm of the target and slower than 0.1 m/s for the last two seconds."""
     steps = round(last / dt)

@@ -1,15 +1,20 @@
 """Initial states of episodes."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
+from jaxdrones.checks import check_number
 from jaxdrones.params import Params
+from jaxdrones.quantity import described
 from jaxdrones.state import State
 
-CLEARANCE = 0.1  # m between the ground and the drones of gym-pybullet-drones at the start
+_CLEARANCE = 0.1  # m between the ground and the drones of gym-pybullet-drones at the start
+_MAX_SPREAD = 0.5  # m
 _GRID = 4.0  # arms between consecutive drones in x and in y
 
 
@@ -20,11 +25,26 @@ def hovering(params: Params, pos: Float[Array, "n 3"]) -> State:
     return State(pos, quat, zero, zero, jnp.broadcast_to(params.hover_rpm[:, None], (len(pos), 4)))
 
 
-def on_diagonal(params: Params) -> Float[Array, "n 3"]:
-    """Starting positions of gym-pybullet-drones: four arms apart in x and in y, 0.1 m above the ground."""
-    i = jnp.arange(len(params.mass))
-    across = _GRID * params.arm * i
-    return jnp.stack([across, across, standing_height(params) + CLEARANCE], axis=-1)
+def above_ground(spread: float) -> Callable[[jax.Array, Params], tuple[State, Float[Array, "n 3"]]]:
+    """The start of gym-pybullet-drones, or one whose heights are drawn about it: the state, and the positions in it.
+
+    Args:
+        spread: drones start up to this much higher or lower, m, but above the ground.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+    check_number("start_spread", spread, "m", at_least=0, at_most=_MAX_SPREAD)
+    lower = min(spread, _CLEARANCE)
+
+    def start(key: jax.Array, params: Params) -> tuple[State, Float[Array, "n 3"]]:
+        pos = _on_diagonal(params)
+        if spread:
+            pos = pos.at[:, 2].add(jax.random.uniform(key, (len(pos),), pos.dtype, -lower, spread))
+        return hovering(params, pos).replace(rpm=jnp.zeros((len(pos), 4), pos.dtype)), pos
+
+    drawn = f", or up to {lower:g} m lower or {spread:g} m higher" if spread else ""
+    return described(f"On a diagonal, 0.1 m above the ground{drawn}, with the rotors standing still.", start)
 
 
 def standing_height(params: Params) -> Float[Array, " n"]:
@@ -62,3 +82,10 @@ def thrown(
     rpm = jnp.broadcast_to(params.hover_rpm[:, None], (n, 4))
     reach = jnp.broadcast_to(jnp.asarray(reach, dtype), (3,))
     return State(pos + reach[None] * u[:, :3], quat, speed * u[:, 3:6], omega * u[:, 6:9], rpm)
+
+
+def _on_diagonal(params: Params) -> Float[Array, "n 3"]:
+    """Starting positions of gym-pybullet-drones: four arms apart in x and in y, 0.1 m above the ground."""
+    i = jnp.arange(len(params.mass))
+    across = _GRID * params.arm * i
+    return jnp.stack([across, across, standing_height(params) + _CLEARANCE], axis=-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -118,7 +119,11 @@ class Task:
     metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     """Quantities that are reported but not rewarded, beside the `error` (m) and `speed` (m/s) of every task."""
     success: Callable[[Mapping[str, Array], float], Array] | None = None
-    """(metrics over an episode (T, n), control period) -> (n,): whether a drone did what it should."""
+    """(metrics over an episode (T, n), control period) -> (n,): whether a drone did what it should. Metrics keep their
+    last values after the end of an episode. An episode that ends by a failure is none, whatever they are."""
+    success_terminations: tuple[str, ...] = ()
+    """Names of the terminations by which an episode may end in success, such as a goal that is reached. Every other
+    termination, and every truncation but that of the time, is a failure."""
     observations: Mapping[str, ObservationTerm] = dataclasses.field(default_factory=dict)
     """Observation terms that only this task has, by name."""
     randomize: tuple[Callable[[jax.Array, Params], Params], ...] = ()
@@ -155,6 +160,8 @@ class Task:
             check_number(f"scale of the reward {name!r}", scale)
         for contact in check_sequence("contact", self.contact, "'ground'"):
             check_choice("contact", contact, CONTACTS)
+        for name in check_sequence("success_terminations", self.success_terminations, "'reached'"):
+            check_choice("success termination", name, self.terminations)
 
     def begin(self, key: jax.Array, params: Params, scene: Scene) -> tuple[State, Any]:
         """The team at the start of an episode in a scene, and the task's variables."""
@@ -164,6 +171,18 @@ class Task:
         """All metrics by name; the task's own metrics replace standard ones of the same name."""
         standard = {"error": distance(self, world), "speed": norm(world.drones.vel)}
         return standard | {name: metric(self, world) for name, metric in self.metrics.items()}
+
+    def succeeded(self, metrics: Mapping[str, Array], ends: Mapping[str, Array], dt: float) -> Bool[Array, ""]:
+        """Whether every drone met the criterion of success in an episode that no failure ended.
+
+        Args:
+            metrics: (T, n) metrics over the longest possible episode, which keep their last values after its end.
+            ends: () by name, whether a termination or truncation of the task held in the last step of the episode.
+            dt: control period, s.
+        """
+        assert self.success is not None, "asked only of tasks with a criterion"
+        failures = [jnp.asarray(ended) for name, ended in ends.items() if name not in self.success_terminations]
+        return jnp.all(self.success(metrics, dt)) & ~functools.reduce(jnp.logical_or, failures, jnp.zeros((), bool))
 
     def target_now(self, world: World) -> Setpoint:
         """Where every drone should be at this moment."""

@@ -185,7 +185,7 @@ def fly_episode(
             watch(log(parts[-1], flown), env.steps * env.dt)
         flown, ended = flown + count, bool(np.any(done[:count]))
     rows = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return log(rows, 0, _success(env, rows[0], rows[3]))
+    return log(rows, 0, _success(env, rows[0], rows[3], rows[4]))
 
 
 def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
@@ -214,10 +214,11 @@ def _compiled_leg() -> Callable:
     return jax.jit(lambda env, policy, carry, keys: _leg(env.value, policy, carry, keys), static_argnums=0)
 
 
-def _success(env: Env, drones: State, metrics: dict[str, np.ndarray]) -> bool | None:
-    """The criterion of `evaluate`, for which metrics keep their values after the end of the episode."""
+def _success(env: Env, drones: State, metrics: dict[str, np.ndarray], ends: dict[str, np.ndarray]) -> bool | None:
+    """Whether an episode is a success, as `evaluate` counts it."""
     if env.task.success is None:
         return None
     missing = env.steps - len(drones.pos)
     padded = {name: jnp.asarray(np.pad(x, ((0, missing), (0, 0)), mode="edge")) for name, x in metrics.items()}
-    return bool(jnp.all(env.task.success(padded, env.dt)) and np.isfinite(drones.pos).all())
+    last = {name: ended[-1] for name, ended in ends.items()}
+    return bool(env.task.succeeded(padded, last, env.dt)) and bool(np.isfinite(drones.pos).all())

@@ -173,16 +173,17 @@ class _Loop:
         policy = sharding.gather(self.trainer.mesh, policy)
         report = self._evaluate(policy, SELECTION_STREAM)
         score = score_of(report.success, report.mean_return)
-        self.highest_success = max(self.highest_success, report.success)
+        self.highest_success = max(self.highest_success, score[0])
         stop_at = self.trainer.recipe.stop_at
-        self.reached = self.reached + 1 if stop_at is not None and report.success_interval[0] >= stop_at else 0
+        self.reached = self.reached + 1 if stop_at is not None and report.success_lower_bound >= stop_at else 0
         if self.best is None or best_of([self.best, score], self.trainer.episodes, self.highest_success) == 1:
             self.best = score
-            self.run.save_policy("best", policy, **self._about(update), score=score)
+            about = self._about(update) | {"distinct_episodes": report.distinct_episodes, "score": score}
+            self.run.save_policy("best", policy, **about)
         if self.plan is not None:
             self.plan.add_evaluation(update, self.last_evaluation_seconds)
         results = (report.success, report.mean_return, report.final_error_percentiles[50])
-        return dict(zip(_EVALUATED, results, strict=True))
+        return {name: x for name, x in zip(_EVALUATED, results, strict=True) if x is not None}
 
     def save(self) -> None:
         """Write the newest policy and the training state."""

@@ -17,9 +17,9 @@ Score = tuple[float, float]
 """Success rate and mean return of an evaluation."""
 
 
-def score_of(success: float, mean_return: float) -> Score:
-    """The score of an evaluation; a return that is not a number is the worst."""
-    return success, mean_return if math.isfinite(mean_return) else -math.inf
+def score_of(success: float | None, mean_return: float) -> Score:
+    """The score of an evaluation; a task without success counts as 0, a return that is not a number is the worst."""
+    return success or 0.0, mean_return if math.isfinite(mean_return) else -math.inf
 
 
 def best_of(scores: Sequence[Score], episodes: int, highest_success: float = 0.0) -> int:

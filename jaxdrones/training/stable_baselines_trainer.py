@@ -146,12 +146,14 @@ class _Callback(BaseCallback):
         metrics = self._metrics()
         report = self._evaluate(SB3Policy.of(self.model), self.selection_key)
         stop_at = self.trainer.recipe.stop_at
-        self.reached = self.reached + 1 if stop_at is not None and report.success_interval[0] >= stop_at else 0
+        self.reached = self.reached + 1 if stop_at is not None and report.success_lower_bound >= stop_at else 0
         score = report.mean_return if math.isfinite(report.mean_return) else -math.inf
         if self.best is None or score > self.best:
             self.best = score
-            self.run.save_model("best", self.model, **self.about, update=self.update, score=score)
-        metrics |= {"success": report.success, "evaluated_return": report.mean_return}
+            about = self.about | {"distinct_episodes": report.distinct_episodes, "update": self.update, "score": score}
+            self.run.save_model("best", self.model, **about)
+        metrics |= {} if report.success is None else {"success": report.success}
+        metrics |= {"evaluated_return": report.mean_return}
         metrics |= {"evaluated_error": report.final_error_percentiles[50]}
         row = {"update": self.update, "steps": self.num_timesteps * self.trainer.env.drones}
         self.progress.add([row | {name: metrics[name] for name in _COLUMNS if name in metrics}])

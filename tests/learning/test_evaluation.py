@@ -1,4 +1,6 @@
-"""Episodes are counted as the task says, and the interval is the known one."""
+"""Episodes are counted as the task says, nothing after their end counts, and the interval is the known one."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +8,18 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
+from jaxdrones.control import Setpoint
+from jaxdrones.engine.physics import Physics
+from jaxdrones.engine.step import Step
+from jaxdrones.envs.actions import ACTIONS
+from jaxdrones.envs.env import Env
+from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.tasks.shaping import alive
+from jaxdrones.tasks.starts import hovering
+from jaxdrones.tasks.task import Task
 
 
 def test_wilson_interval_against_known_numbers():
@@ -17,47 +29,124 @@ def test_wilson_interval_against_known_numbers():
     np.testing.assert_allclose(wilson_interval(0, 50), (0.0, 0.0713476), atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def env():
-    return envs.make("hover", reach=0.0, speed=0.0, omega=0.0, tilt=0.0)
+class Lift(Step):
+    """Every drone is lifted by 10 cm in a step, times the excess of its rotor speed as a share of the hover speed."""
+
+    def __init__(self):
+        self.physics = Physics()
+
+    def rate(self, params, state, rpm, scene=None):
+        raise NotImplementedError("nothing asks for it")
+
+    def __call__(self, params, state, rpm, scene=None):
+        climb = rpm[:, 0] / params.hover_rpm - 1
+        return state.replace(pos=state.pos.at[:, 2].add(0.1 * climb))
 
 
-def hovering(obs):
-    return jnp.zeros((1, 4))
+class UntilTheEnd(PyTreeNode):
+    """One action as long as the first drone is between 0.55 and 1.1 m, and another one from then on."""
+
+    before: jax.Array  # of every drone
+    after: jax.Array
+
+    def __call__(self, obs):
+        over = (obs[:1, 2] < 0.55) | (obs[:1, 2] > 1.1)
+        return jnp.where(over, self.after, self.before)[:, None] * jnp.ones((1, 4))
 
 
-def falling(obs):
-    return -jnp.ones((1, 4))
+def lift(starts=(0.0,), drones=1, noise=None, **changes):
+    """An environment of 10 steps from 1 m plus one of the offsets, which fails below 0.55 m and is done above 1.1 m."""
+
+    def start(key, params):
+        chosen, unused = jax.random.split(key)
+        offset = jax.random.choice(chosen, jnp.array(starts))
+        pos = jnp.array([[3.0 * i, 0, 1] for i in range(drones)]).at[:, 2].add(offset)
+        return hovering(params, pos), {"unused": jax.random.uniform(unused)}
+
+    task = Task(
+        name="lift",
+        summary="",
+        drones=drones,
+        duration=1.0,
+        start=start,
+        target=lambda variables, t: Setpoint.at(jnp.array([[3.0 * i, 0, 1] for i in range(drones)])),
+        rewards={"alive": (1.0, alive)},
+        terminations={
+            "fell": lambda task, world: world.drones.pos[:, 2] < 0.55,
+            "done": lambda task, world: world.drones.pos[:, 2] > 1.1,
+        },
+        success=lambda metrics, dt: metrics["error"][-1] < 2,
+        success_terminations=("done",),
+    )
+    nominal = envs.make("hover", drones=drones).params
+    terms = dict(observation=[OBSERVATIONS["position"]], action=ACTIONS["rpm"]())
+    return Env(dataclasses.replace(task, **changes), nominal, Lift(), dt=0.1, noise=noise, **terms)
 
 
-@pytest.mark.slow
-def test_a_drone_that_stays_succeeds_in_every_episode(env):
-    report = evaluate(env, hovering, jax.random.key(0), episodes=20)
-    assert report.success == 1 and report.episodes == 20
-    assert report.final_error < 1e-6 and report.end_rates["lost"] == 0
-    np.testing.assert_allclose(report.mean_length, 5.0)
+KEY = jax.random.key(0)
+LIFT = lift()
 
 
-@pytest.mark.slow
-def test_a_drone_that_falls_is_lost_and_its_metrics_stay_what_they_were_then(env):
-    report = evaluate(env, falling, jax.random.key(0), episodes=20)
-    assert report.success == 0 and report.end_rates["lost"] == 1
-    seconds = np.sqrt(2 * 8 / 9.8)  # 8 m of free fall
-    np.testing.assert_allclose(report.mean_length, seconds, atol=0.01)
-    np.testing.assert_allclose(report.final_error, 8.0, atol=0.2)
+def flown(before, after=0.0, env=LIFT, episodes=3):
+    actions = (jnp.broadcast_to(jnp.asarray(x, float), (env.drones,)) for x in (before, after))
+    return evaluate(env, UntilTheEnd(*actions), KEY, episodes)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("before", "succeeds", "ended", "steps"), [(-1, 0, "fell", 5), (0, 1, None, 10), (1, 1, "done", 3)]
+)
+def test_an_episode_is_what_it_was_at_its_end_whatever_comes_after(before, succeeds, ended, steps):
+    """A failure is none of the successes, though the criterion holds; nor does a later failure undo a success."""
+    reports = [flown(before, after) for after in (-1, 0, 1, jnp.nan)] if ended else [flown(before)]
+    assert all(report == reports[0] for report in reports)
+    report = reports[0]
+    assert report.success == succeeds and report.mean_return == steps
+    assert report.end_rates == {"fell": ended == "fell", "done": ended == "done"}
+    np.testing.assert_allclose(report.mean_length, 0.1 * steps, rtol=1e-6)
+    climb = 0.1 * before * (1 if before < 0 else float(LIFT.params.max_rpm[0] / LIFT.params.hover_rpm[0]) - 1)
+    errors = np.abs(climb) * np.arange(1, steps + 1)
+    np.testing.assert_allclose(report.final_error, errors[-1], atol=1e-6)
+    np.testing.assert_allclose(report.rms_error, np.sqrt(np.mean(errors[steps // 5 :] ** 2)), atol=1e-6)
+
+
+def test_a_failure_counts_where_the_goal_is_reached_in_the_same_step_and_any_other_end_is_one():
+    metrics = {"error": jnp.zeros((10, 1))}
+    ends = {"fell": (0, 1, 0, 1, 0), "done": (0, 0, 1, 1, 0), "cut": (0, 0, 0, 0, 1)}
+    found = [
+        LIFT.task.succeeded(metrics, {name: jnp.array(bool(x[k])) for name, x in ends.items()}, 0.1) for k in range(5)
+    ]
+    assert [bool(x) for x in found] == [True, False, True, False, False]
+    assert not LIFT.task.succeeded({"error": jnp.full((10, 1), 3.0)}, {}, 0.1)
+    with pytest.raises(ValueError, match="unknown success termination 'cut'"):
+        dataclasses.replace(LIFT.task, success_terminations=("cut",))
+
+
 def test_an_episode_of_a_team_succeeds_when_all_of_it_does():
-    env = envs.make("hover", drones=2, reach=0.0, speed=0.0, omega=0.0, tilt=0.0)
-
-    def one_stays(obs):
-        return jnp.array([[0.0], [-1.0]]) * jnp.ones((1, 4))
-
-    assert evaluate(env, lambda obs: jnp.zeros((2, 4)), jax.random.key(0), episodes=3).success == 1
-    assert evaluate(env, one_stays, jax.random.key(0), episodes=3).success == 0
+    team = lift(drones=2)
+    assert flown([0, 0], env=team).success == 1 and flown([0, -1], env=team).success == 0
 
 
-def test_episodes_must_be_a_whole_number(env):
+@pytest.mark.parametrize(
+    ("env", "distinct"),
+    [
+        (LIFT, lambda n: 1),  # what is drawn has no effect
+        (lift(starts=(0.0, 0.01, 0.02, 0.03)), lambda n: 4),
+        (lift(noise=lambda key, state: state.replace(pos=state.pos + jax.random.uniform(key, (1, 3)))), lambda n: n),
+    ],
+    ids=["one start", "four starts", "noise"],
+)
+def test_the_interval_is_that_of_the_distinct_episodes(env, distinct):
+    report = evaluate(env, lambda obs: 0.1 * jnp.tanh(obs[:, :1]) * jnp.ones((1, 4)), KEY, 50)
+    n = distinct(50)
+    assert report.episodes == 50 and report.distinct_episodes == n and report.success == 1
+    assert report.success_interval == (None if n == 1 else wilson_interval(n, n))
+
+
+def test_a_task_without_a_criterion_has_no_success():
+    report = flown(0, env=lift(success=None))
+    assert report.success is None and report.success_interval is None
+
+
+def test_episodes_must_be_a_whole_number():
     with pytest.raises(ValueError, match="episodes is 0"):
-        evaluate(env, hovering, jax.random.key(0), episodes=0)
+        flown(0, episodes=0)

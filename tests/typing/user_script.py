@@ -42,4 +42,4 @@ obs, world = env.reset(jax.random.key(0))
 obs, world, reward, terminated, truncated, info = env.step(jax.random.key(1), world, jnp.zeros((1, env.action_size)))
 result = bptt.train(jax.random.key(2), env, bptt.Config(updates=1, worlds=2, horizon=4))
 report = evaluate(env, result.policy, jax.random.key(3), episodes=4)
-success: float = report.success
+success: float | None = report.success

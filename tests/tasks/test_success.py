@@ -1,0 +1,100 @@
+"""What a success is: each task's criterion can be met by a scripted flight, or the task has none; starts are drawn."""
+
+from collections.abc import Callable
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import mostly_slow
+
+from jaxdrones import load_params, repeat
+from jaxdrones.envs import TASKS, make
+from jaxdrones.learning import evaluate
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.tasks.starts import above_ground, standing_height
+
+KEY = jax.random.key(0)
+GAINS = jnp.array([[-0.663, -0.403, -0.507, -0.341, -0.015, 0.379]])  # the best of 400 random ones
+HEIGHTS = {
+    "hover-2021": [1.0],
+    "takeoff": [2.0],
+    "leader-follower": [0.5, 0.5],
+    "flock": [1.0, 1.0],
+    "hover-2x": [1.0],
+    "multi-hover": [1.1125, 0.6125],
+}
+
+
+def climb_to(heights, position=5, velocity=3):
+    """All rotors alike, from the error of the height and its rate, which observations are divided by."""
+    return lambda obs: jnp.clip(2 * (jnp.array(heights) - position * obs[:, 2]) - 3 * velocity * obs[:, 8], -1, 1)[
+        :, None
+    ]
+
+
+def come_near(obs):
+    """Slowly towards the partner, level, as long as it is out of reach."""
+    away = jnp.flip(obs[:, :2], axis=0) - obs[:, :2]
+    return jnp.concatenate([15 * away, jnp.full((2, 1), 0.5), jnp.full((2, 1), -0.8)], axis=1)
+
+
+SCRIPTED = {name: climb_to(heights) for name, heights in HEIGHTS.items()} | {
+    "hover-2x": climb_to([1.0], 1, 1),
+    "multi-hover": climb_to([1.1125, 0.6125], 1, 1),
+    "tune": lambda obs: GAINS,
+    "meetup": come_near,
+}
+
+
+class Script(PyTreeNode):
+    """A scripted policy, or one that gives full negative actions."""
+
+    flies: jax.Array
+    script: Callable = flax.struct.field(pytree_node=False)
+
+    def __call__(self, obs):
+        return jnp.where(self.flies, self.script(obs), -1)
+
+
+@pytest.mark.parametrize("name", mostly_slow(sorted(SCRIPTED), ["takeoff"]))
+def test_a_scripted_flight_succeeds_and_one_without_thrust_does_not(name):
+    env = make(name)
+    assert [evaluate(env, Script(jnp.array(flies), SCRIPTED[name]), KEY, 1).success for flies in (True, False)] == [
+        1,
+        0,
+    ]
+
+
+def test_tasks_whose_goal_cannot_be_reached_have_no_criterion():
+    assert TASKS["fly-through-gate"]().success is None
+    for name in "hover-2021", "tune", "hover-2x":  # two drones cannot be at one place
+        assert TASKS[name](drones=2).success is None
+    for name, least in ("hover", 2.0), ("tracking", 1.0), ("follow", 2.0):  # shorter than what the criterion asks for
+        assert TASKS[name](duration=least).success is None and TASKS[name](duration=least + 0.5).success is not None
+
+
+@pytest.mark.parametrize("name", [*HEIGHTS, "fly-through-gate", "tune", "meetup", "gates"])
+def test_starts_are_one_unless_a_spread_is_given(name):
+    """Every drone has a start of its own, within the spread, and what the task keeps of the start is the same."""
+    task, spread = TASKS[name](), TASKS[name](start_spread=0.12)
+    params = repeat(load_params("cf2x"), task.drones)
+    (usual, _), (same, _) = (task.begin(jax.random.key(k), params, task.scene) for k in range(2))
+    found = [spread.begin(jax.random.key(k), params, task.scene) for k in range(3)]
+    np.testing.assert_array_equal(usual.pos, same.pos)
+    off = np.array([state.pos - usual.pos for state, _ in found])
+    drawn = off[..., :2] if name == "gates" else off[..., 2:]
+    assert len(np.unique(drawn)) == drawn.size and np.all(np.abs(drawn) < 0.12)
+    assert np.count_nonzero(off) == drawn.size
+    for state, variables in found:
+        np.testing.assert_array_equal(variables["pos"] if name == "gates" else variables, state.pos)
+    with pytest.raises(ValueError, match="start_spread"):
+        TASKS[name](start_spread=0.6)
+
+
+def test_a_spread_beyond_the_height_of_the_start_leaves_drones_above_the_ground():
+    params = repeat(load_params("cf2x"), 1)
+    keys = jax.random.split(KEY, 1000)
+    z = jax.jit(jax.vmap(lambda key: above_ground(0.4)(key, params)[0].pos[0, 2]))(keys) - standing_height(params)
+    assert 0 <= z.min() < 0.01 and 0.49 < z.max() <= 0.5

@@ -18,6 +18,7 @@ from jaxdrones.identification.open_loop import HORIZONS, QUANTITIES
 from jaxdrones.identification.vehicle import Vehicle
 from jaxdrones.urdf import load_params
 from jaxdrones.urdf_writer import to_urdf
+from jaxdrones.writing import write
 
 URDF = "vehicle.urdf"
 REPORT = "report.json"
@@ -36,8 +37,10 @@ def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
     comment = (
         f"Identified by `jaxdrones fit` from {started_from} and {flights}.\n     {REPORT} has the standard errors."
     )
-    (folder / URDF).write_text(to_urdf(report.vehicle.params, "identified", comment))
-    (folder / REPORT).write_text(json.dumps(report_as_dict(report) | {"started_from": started_from}, indent=1) + "\n")
+    write(folder / URDF, to_urdf(report.vehicle.params, "identified", comment).encode())
+    write(
+        folder / REPORT, (json.dumps(report_as_dict(report) | {"started_from": started_from}, indent=1) + "\n").encode()
+    )
 
 
 def check_no_fit(folder: Path) -> None:

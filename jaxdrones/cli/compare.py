@@ -23,7 +23,8 @@ def add(commands) -> None:
         "compare",
         help="fly an example on both backends, or by several controllers, and print how they differ",
         description="Fly an example on two backends from the same start and print their divergence over time, or fly "
-        "it by several controllers and print the errors of each. With --output draw paths and errors of all, too.",
+        "it by several controllers, which receive the same set-points, and print the errors of each. With --output "
+        "draw paths and errors of all, too.",
         allow_abbrev=False,
     )
     parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
@@ -90,9 +91,9 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
         raise UserError(f"--controllers is {options.controllers!r}; give two or more, for example pid,lqr")
     for name in names:
         check_choice("controller", name, CONTROLLERS)
-    return "controllers", {
-        name: (argparse.Namespace(**vars(options) | {"controller": name}), "explicit") for name in names
-    }
+    feedforward = options.feedforward is not False and options.flight != "velocity"
+    same = vars(options) | {"feedforward": feedforward}
+    return "controllers", {name: (argparse.Namespace(**same | {"controller": name}), "explicit") for name in names}
 
 
 def _names(option: str, text: str) -> list[str]:

@@ -19,6 +19,13 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
     parser.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
     parser.add_argument("--controller", help=f"{', '.join(CONTROLLERS)} (the vehicle's own)")
+    parser.add_argument(
+        "--feedforward",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="whether the controller receives velocity and acceleration of the target (all do but pid, which receives "
+        "them in a comparison of controllers)",
+    )
     parser.add_argument("--control-hz", type=int, metavar="HZ", help="control rate; physics runs at 240 Hz or above")
     parser.add_argument("--duration", type=float, metavar="S", help="simulated time in seconds")
     parser.add_argument("--rotors", default="instant", help=f"{', '.join(ROTORS)} (instant)")
@@ -45,7 +52,7 @@ def check_conditions(options: argparse.Namespace, **more) -> None:
 
 def _conditions(options: argparse.Namespace) -> dict[str, Any]:
     """Fields of `Conditions`."""
-    names = ("vehicle", "drones", "controller", "control_hz", "duration", "rotors", "integrator", "seed")
+    names = ("vehicle", "drones", "controller", "feedforward", "control_hz", "duration", "rotors", "integrator", "seed")
     return {name: getattr(options, name) for name in names} | {"effects": _names(options.effects)}
 
 

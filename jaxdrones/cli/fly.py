@@ -21,7 +21,17 @@ from jaxdrones.limits import check_seed
 from jaxdrones.visualization import films, plots
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
-_OF_EXAMPLES = ("effects", "controller", "control_hz", "duration", "rotors", "integrator", "obstacles", "gui")
+_OF_EXAMPLES = (
+    "effects",
+    "controller",
+    "feedforward",
+    "control_hz",
+    "duration",
+    "rotors",
+    "integrator",
+    "obstacles",
+    "gui",
+)
 
 
 def add(commands) -> None:

@@ -1,7 +1,10 @@
 """`jaxdrones view`."""
 
 import argparse
+import sys
 import webbrowser
+import zipfile
+from pathlib import Path
 
 from jaxdrones.checks import check_choice, check_whole
 from jaxdrones.cli.common import as_json, check_writable, folder
@@ -21,7 +24,11 @@ def add(commands) -> None:
         allow_abbrev=False,
     )
     parser.add_argument(
-        "flights", type=folder, nargs="+", metavar="FLIGHT", help="a folder of `jaxdrones fly`, a run, or a log.npz"
+        "flights",
+        type=folder,
+        nargs="+",
+        metavar="FLIGHT",
+        help="a folder of `jaxdrones fly`, a run, or a log.npz; others of several are skipped",
     )
     parser.add_argument(
         "-o", "--output", type=folder, metavar="FILE", help="path of the page (flight.html beside the first log)"
@@ -38,9 +45,9 @@ def add(commands) -> None:
 
 
 def _view(options: argparse.Namespace) -> int:
-    logs = [find_log(flight) for flight in options.flights]
+    given, skipped = _flights(options.flights)
+    names, logs = [*map(str, given)], [*given.values()]
     output = options.output or logs[0].with_name("flight.html")
-    names = list(map(str, options.flights))
     check_writable(output)
     size = _size(options.size)
     check_choice("camera", options.camera, CAMERAS)
@@ -48,6 +55,8 @@ def _view(options: argparse.Namespace) -> int:
     if options.video:
         video.check_video(options.video)
         check_writable(options.video)
+    if skipped:
+        print(f"skipped, as no flights: {', '.join(map(str, skipped))}", file=sys.stderr)
     flights = logs[0] if len(logs) == 1 else dict(zip(names, logs, strict=True))
     page = show(flights, others=options.others, title=options.title)
     page.save(output)
@@ -58,10 +67,35 @@ def _view(options: argparse.Namespace) -> int:
     if options.open:
         webbrowser.open(output.absolute().as_uri())
     if options.json:
-        print(as_json({"flights": names, "files": list(map(str, files))}))
+        print(as_json({"flights": names, "skipped": [*map(str, skipped)], "files": [*map(str, files)]}))
     else:
         print("wrote " + ", ".join(f"{file} ({file.stat().st_size / 1e6:.1f} MB)" for file in files))
     return 0
+
+
+def _flights(paths: list[Path]) -> tuple[dict[Path, Path], list[Path]]:
+    """The logs of flights by the paths that were given, and those of the paths, as of `runs/compare/*`, without a log.
+
+    Raises:
+        ValueError: none of them is a flight, or one is not there.
+    """
+    skipped = [path for path in paths if path.exists() and not _is_flight(path)]
+    if len(skipped) == len(paths) > 1:
+        raise ValueError(f"none of {', '.join(map(str, paths))} is a flight; give the folders of `jaxdrones fly`")
+    others = paths if len(paths) == 1 else [path for path in paths if path not in skipped]
+    return {path: find_log(path) for path in others}, skipped if len(paths) > 1 else []
+
+
+def _is_flight(path: Path) -> bool:
+    """Whether a path leads to a log; a damaged .npz counts, so that it is not passed over."""
+    try:
+        log = find_log(path)
+    except ValueError:
+        return False
+    if not zipfile.is_zipfile(log):
+        return log.suffix == ".npz"
+    with zipfile.ZipFile(log) as archive:
+        return "conditions.npy" in archive.namelist()
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -7,7 +7,7 @@ import math
 import os
 
 from jaxdrones import control, optimal
-from jaxdrones.checks import check_choice, check_positive, check_whole
+from jaxdrones.checks import check_choice, check_positive, check_switch, check_whole
 from jaxdrones.control import pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.errors import UserError
@@ -44,6 +44,9 @@ class Conditions:
     """Names of `EFFECTS` and `PAIRS`."""
     controller: str | None = None
     """A name of `CONTROLLERS`; the vehicle's own when left out."""
+    feedforward: bool | None = None
+    """Whether the controller receives velocity and acceleration of the target beside position and heading. When left
+    out, all but `pid` do: the examples of gym-pybullet-drones (2021) command positions alone."""
     control_hz: int | None = None
     duration: float | None = None
     """Duration of the flight, s."""
@@ -67,6 +70,7 @@ class Conditions:
         default["controller"] = "pid" if self.flight == "velocity" or self.vehicle in pid.VEHICLES else "geometric"
         if self.controller in ("firmware_pid", "mellinger"):
             default["control_hz"] = _FIRMWARE_HZ
+        default["feedforward"] = (self.controller or default["controller"]) != "pid"
         for name, value in default.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
@@ -84,6 +88,7 @@ class Conditions:
         if self.seed is not None:
             check_seed("seed", self.seed)
         check_choice("controller", self.controller, CONTROLLERS)
+        check_switch("feedforward", self.feedforward)
         check_choice("rotors", self.rotors, ROTORS)
         check_choice("integrator", self.integrator, INTEGRATORS)
         check_choice("backend", self.backend, BACKENDS)
@@ -95,6 +100,8 @@ class Conditions:
             raise UserError(f"drones is {self.drones}; the {self.flight} flight takes {flight.drones}: {who}")
         if self.flight == "velocity" and self.controller != "pid":
             raise UserError(f"controller is {self.controller!r}; the velocity flight is flown by 'pid'")
+        if self.flight == "velocity" and self.feedforward:
+            raise UserError("feedforward is asked for; the velocity flight commands velocities, leave it out")
         if self.steps == 0:
             raise UserError(
                 f"duration is {self.duration} s, less than half a control period; give {self.dt:.4g} s or more"
@@ -138,8 +145,9 @@ class Conditions:
 
     def __str__(self) -> str:
         integrator = "Bullet" if self.backend == "bullet" else self.integrator
+        controller = f"{self.controller} with feedforward" if self.feedforward else self.controller
         return (
-            f"{self.flight}: {self.drones} x {self.vehicle}, {self.controller} at {self.control_hz} Hz, "
+            f"{self.flight}: {self.drones} x {self.vehicle}, {controller} at {self.control_hz} Hz, "
             f"{integrator} at {self.physics_hz} Hz, {self.rotors} rotors, "
             f"effects: {', '.join(self.effects) or 'none'}, {self.steps * self.dt:g} s"
         )

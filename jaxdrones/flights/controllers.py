@@ -1,4 +1,4 @@
-"""The controllers that a flight can be flown by, and what each is told of the target."""
+"""Controllers of the demonstrations and the set-points that they receive."""
 
 import functools
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import control, optimal
-from jaxdrones.control import Setpoint, firmware_pid, for_team, mellinger, mrac, pid, velocity
+from jaxdrones.control import firmware_pid, for_team, mellinger, mrac, pid, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, ROTORS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.flights.conditions import Conditions
@@ -35,16 +35,27 @@ def controller_of(conditions: Conditions) -> Controller:
     """The controller of a flight."""
     if conditions.controller in optimal.CONTROLLERS:
         return _optimal(conditions)
-    example, n = FLIGHTS[conditions.flight], conditions.drones
+    n = conditions.drones
     module = velocity if conditions.flight == "velocity" else control.CONTROLLERS[conditions.controller]
     gains = _gains(module, conditions.vehicle)
     memory = for_team((pid if module is velocity else module).init(), n)
     one = functools.partial(module.control, gains, dt=conditions.dt)
 
     def fly(params: Params, memory: Any, state: State, t: jax.Array) -> tuple[Any, jax.Array]:
-        return jax.vmap(one)(params, memory, state, example.target(n, t, conditions.duration))
+        return jax.vmap(one)(params, memory, state, setpoints(conditions, t))
 
     return Controller(lambda params, start: memory, fly)
+
+
+def setpoints(conditions: Conditions, t: jax.Array) -> Any:
+    """Set-points of a team at a time (s), with velocity and acceleration if `feedforward`; or velocity actions."""
+
+    def target(t: jax.Array) -> Any:
+        return FLIGHTS[conditions.flight].target(conditions.drones, t, conditions.duration)
+
+    if not conditions.feedforward:
+        return target(t)
+    return setpoint_on(lambda t: target(t).pos, t).replace(yaw=target(t).yaw)
 
 
 def _gains(module: ModuleType, vehicle: str) -> Any:
@@ -57,8 +68,8 @@ def _gains(module: ModuleType, vehicle: str) -> Any:
 
 
 def _optimal(conditions: Conditions) -> Controller:
-    """One that plans over the step of the flight, each drone as if it were alone, and knows how its target moves."""
-    example, n, module = FLIGHTS[conditions.flight], conditions.drones, optimal.CONTROLLERS[conditions.controller]
+    """One that plans over the step of the flight, each drone as if it were alone, towards the set-points to come."""
+    n, module = conditions.drones, optimal.CONTROLLERS[conditions.controller]
     step = make_step(
         effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
         rotors=ROTORS[conditions.rotors],
@@ -74,15 +85,9 @@ def _optimal(conditions: Conditions) -> Controller:
         own = (keys,) if module is optimal.mppi else ()
         return jax.vmap(functools.partial(module.init, settings))(params, start, *own)
 
-    def target(i: int, t: jax.Array) -> Setpoint:
-        def now(t: jax.Array) -> Setpoint:
-            return jax.tree.map(lambda x: x[i], example.target(n, t, conditions.duration))
-
-        return setpoint_on(lambda t: now(t).pos, t).replace(yaw=now(t).yaw)
-
     def fly(params: Params, memory: Any, state: State, t: jax.Array) -> tuple[Any, jax.Array]:
         times = t + conditions.dt * jnp.arange(settings.horizon + 1)
-        setpoints = jax.vmap(lambda i: jax.vmap(functools.partial(target, i))(times))(jnp.arange(n))
-        return jax.vmap(one)(params, memory, state, setpoints)
+        ahead = jax.vmap(functools.partial(setpoints, conditions), out_axes=1)(times)
+        return jax.vmap(one)(params, memory, state, ahead)
 
     return Controller(init, fly)

@@ -1,11 +1,19 @@
 """The four flights do what figures 6 to 9 of the gym-pybullet-drones paper show."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones import optimal
+from jaxdrones import State, optimal
+from jaxdrones.control import Setpoint
+from jaxdrones.flights.conditions import CONTROLLERS, Conditions
+from jaxdrones.flights.controllers import setpoints
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.fly import fly
+from jaxdrones.tasks.curves import figure_eight
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +122,11 @@ def test_progress_goes_from_nothing_to_all():
         (dict(flight="circle", control_hz=0), "control rate .* is 0"),
         (dict(flight="ground-effect", drones=3), "drones is 3.*takes 2"),
         (dict(flight="velocity", controller="geometric"), "velocity flight is flown by 'pid'"),
+        (
+            dict(flight="velocity", feedforward=True),
+            "feedforward is asked for; the velocity flight commands velocities",
+        ),
+        (dict(flight="circle", feedforward=1), "feedforward is 1; give True or False"),
         (dict(flight="velocity", vehicle="hb"), "no PID gains for 'hb'"),
     ],
 )
@@ -131,3 +144,36 @@ def test_optimal_controllers_fly_the_examples_closer_than_pid(flight, controller
     assert record.diverged() == {}
     for row, pid_row in zip(results(record), results(by_pid), strict=True):
         assert row["rms_error_m"] < 0.7 * pid_row["rms_error_m"]  # the take-off has only 0.5 s: measured 0.57
+
+
+def test_every_controller_receives_the_same_motion_of_the_target():
+    """Position, velocity, acceleration and heading, but those of the 2021 example, which commands positions alone."""
+    t, speed = 1.3, 2 * np.pi / 10  # rad/s
+    conditions = {name: Conditions("circle", controller=name, feedforward=True) for name in ("pid", "mrac", "lqr")}
+    conditions["positions"] = Conditions("circle")
+    told = jax.jit(lambda t: {name: setpoints(of, t) for name, of in conditions.items()})(t)
+    assert [name for name in CONTROLLERS if not Conditions("circle", controller=name).feedforward] == ["pid"]
+    bare = told.pop("positions")
+    for given in told.values():
+        place = np.asarray(given.pos) - [[0, -0.3, 0]]
+        np.testing.assert_allclose(given.vel, speed * np.cross([0, 0, 1], place * [1, 1, 0]), atol=1e-9)
+        np.testing.assert_allclose(given.acc, -(speed**2) * place * [1, 1, 0], atol=1e-9)
+        np.testing.assert_allclose(given.yaw, np.arange(4) * np.pi / 8)
+    assert not np.any(bare.vel) and not np.any(bare.acc) and np.array_equal(bare.pos, given.pos)
+
+
+@pytest.mark.slow
+def test_given_the_same_motion_geometric_tracking_is_closer_than_pid(monkeypatch):
+    """On the circle and on a figure-eight of 5 s, after two seconds: by a factor of 9 and of 4."""
+
+    def eight(n, t, duration=None):
+        pos = jnp.array([0, 0, 2.0]) + figure_eight(None, jnp.asarray(t, float) / 5)
+        return Setpoint.at(jnp.broadcast_to(pos, (n, 3)))
+
+    start = lambda n: State.at_rest(eight(n, 0.0).pos)  # noqa: E731
+    monkeypatch.setitem(FLIGHTS, "eight", dataclasses.replace(FLIGHTS["circle"], target=eight, start=start))
+    for flight in "circle", "eight":
+        options = dict(drones=1, duration=6.0, feedforward=True)
+        names = ("pid", "geometric", "lqr")
+        error = {name: results(fly(flight, controller=name, **options))[0]["rms_error_m"] for name in names}
+        assert error["geometric"] < error["pid"] / 2 and error["lqr"] < error["geometric"]

@@ -92,6 +92,7 @@ def test_the_command_line_compares_controllers(tmp_path, capsys):
     assert report["controllers"] == ["pid", "geometric"]
     assert [row["controller"] for row in report["results"]] == ["pid", "geometric"]
     logs = [Record.load(tmp_path / name / "log.npz") for name in report["controllers"]]
+    assert all(log.conditions.as_dict()["feedforward"] for log in logs)
     for row, log in zip(report["results"], logs, strict=True):
         peak = log.error[log.t >= 0.1].max()  # the flight is shorter than it takes to settle: its second half counts
         assert row["peak_error_m"] == pytest.approx(peak, rel=1e-4)

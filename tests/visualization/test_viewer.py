@@ -15,6 +15,7 @@ from documents import ROOT
 from helpers import flying
 
 import jaxdrones as jd
+from jaxdrones.cli import main
 from jaxdrones.flights.fly import fly
 from jaxdrones.flights.record import ImageSequence, Record
 from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
@@ -235,3 +236,28 @@ def test_near_is_bright_in_images_of_depth(team):
     depth = np.broadcast_to([[0.0, 2.5], [5.0, 1000.0]], (20, 3, 2, 2))
     grey = header(show(trajectory(team), team, dt=0.01, images={"depth": depth}))["worlds"][0]["images"][0]["frames"]
     assert grey[0, 0, ..., 0].tolist() == [[255, 191], [128, 0]]  # black from 10 m on
+
+
+def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(record, tmp_path, capsys):
+    """As `runs/compare/*` holds a figure beside the logs; but not one that is not there, a damaged log, or all."""
+    for name in "one", "other":
+        (tmp_path / name).mkdir()
+        record.save_npz(tmp_path / name / "log.npz")
+    (tmp_path / "compare.png").write_bytes(b"\x89PNG")
+    (tmp_path / "empty").mkdir()
+    np.savez(tmp_path / "weights.npz", weights=np.zeros(3))
+    page = ["--json", "--output", str(tmp_path / "page.html")]
+    assert main(["view", *map(str, sorted(tmp_path.iterdir())), *page]) == 0
+    told = capsys.readouterr()
+    skipped = [str(tmp_path / name) for name in ("compare.png", "empty", "weights.npz")]
+    assert told.err == f"skipped, as no flights: {', '.join(skipped)}\n"
+    assert json.loads(told.out)["skipped"] == skipped
+    assert json.loads(told.out)["flights"] == [str(tmp_path / name) for name in ("one", "other")]
+    (tmp_path / "damaged.npz").write_bytes((tmp_path / "one" / "log.npz").read_bytes()[:2000])
+    for others, message in (
+        (["nowhere"], "nowhere is not there"),
+        (["damaged.npz"], "damaged.npz is not the log of a flight"),
+    ):
+        assert main(["view", str(tmp_path / "one"), *(str(tmp_path / x) for x in others), *page]) == 2
+        assert message in capsys.readouterr().err
+    assert main(["view", *skipped, *page]) == 2 and "is a flight" in capsys.readouterr().err

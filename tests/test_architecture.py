@@ -20,6 +20,7 @@ NOUNS = (
     "quantity",
     "rotation",
     "state",
+    "status",
     "thrust_curves",
     "urdf",
     "urdf_writer",

@@ -81,7 +81,7 @@ def _flights(paths: list[Path]) -> tuple[dict[Path, Path], list[Path]]:
     """
     skipped = [path for path in paths if path.exists() and not _is_flight(path)]
     if len(skipped) == len(paths) > 1:
-        raise ValueError(f"none of {', '.join(map(str, paths))} is a flight; give the folders of `jaxdrones fly`")
+        raise UserError(f"none of {', '.join(map(str, paths))} is a flight; give the folders of `jaxdrones fly`")
     others = paths if len(paths) == 1 else [path for path in paths if path not in skipped]
     return {path: find_log(path) for path in others}, skipped if len(paths) > 1 else []
 

@@ -19,11 +19,12 @@ from jaxdrones.control.single import check_single
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.box_qp import box_qp, solve_free
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, check_period, reference
+from jaxdrones.optimal.problem import Reference, Weights, check_period, hover, reference, replaced_unless
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
+from jaxdrones.status import Status, check_on_failure, is_finite, raise_unless_ok, status_of
 
 _STEP_SIZES = tuple(0.5**k for k in range(8))  # of the line search
 _MIN_REGULARIZATION, _MAX_REGULARIZATION = 1e-6, 1e6
@@ -51,6 +52,10 @@ class Memory(PyTreeNode):
     """The regulator about hover: its value is the cost at the end of the horizon, its gain the first guess."""
     started: Array
     """() whether there is a plan of the call before."""
+    rpm: Array
+    """(4,) the last safe command, RPM; at first that of hover."""
+    status: Array
+    """() a `Status` as an integer: how the last call planned."""
 
 
 class Solution(PyTreeNode):
@@ -86,11 +91,20 @@ def settings(step: Any, weights: Weights | None = None, horizon: int = 25, itera
 def init(settings: Settings, params: Params, state: State) -> Memory:
     """The memory of one drone before its first call."""
     regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
-    return Memory(jnp.zeros((settings.horizon, 4), regulator.gain.dtype), regulator, jnp.zeros((), bool))
+    always = jnp.ones((), bool)
+    correction = jnp.zeros((settings.horizon, 4), regulator.gain.dtype)
+    return Memory(correction, regulator, jnp.zeros((), bool), hover(params, state).rpm, status_of(always, always))
 
 
 def control(
-    settings: Settings, params: Params, memory: Memory, state: State, setpoints: Setpoint, *, dt: float
+    settings: Settings,
+    params: Params,
+    memory: Memory,
+    state: State,
+    setpoints: Setpoint,
+    *,
+    dt: float,
+    on_failure: str = "hold",
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of a plan over the horizon.
 
@@ -103,14 +117,20 @@ def control(
         state: of the drone.
         setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
         dt: time between calls, s.
+        on_failure: where there is no new plan, `hold` repeats the last safe command and `raise` raises. Inside
+            `jax.jit` only `hold` is possible. The memory has the status of the call.
 
     Raises:
+        PlanningError: there is no new plan, and `on_failure` is `raise`.
         ValueError: arrays of a team (use `jax.vmap`), a number of setpoints that does not fit the horizon, or `dt` is
             not the period of the step.
     """
     check_single(params, state)
     check_period(settings.step, dt)
     check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
+    check_on_failure(on_failure, params, memory, state, setpoints)
+    valid = is_finite((state, setpoints))
+    state, setpoints = replaced_unless(valid, params, state, setpoints)
     target = reference(params, setpoints, state.aux, dt)
     unit = command_unit(params)
 
@@ -120,8 +140,13 @@ def control(
 
     guess = jax.lax.cond(memory.started, kept, lambda: regulated(settings.step, params, state, target, memory.lqr.gain))
     plan = solve(settings, params, state, target, guess, memory.lqr.value)
-    correction = (plan.rpm - target.rpm[:-1]) / unit
-    return memory.replace(correction=correction, started=jnp.ones((), bool)), plan.rpm[0]
+    status = status_of(valid, is_finite((plan.cost, plan.rpm)))
+    solved = status == Status.OK
+    correction = jnp.where(solved, (plan.rpm - target.rpm[:-1]) / unit, 0)
+    command = jnp.where(solved, plan.rpm[0], memory.rpm)
+    if on_failure == "raise":
+        raise_unless_ok(status, "ilqr")
+    return memory.replace(correction=correction, started=solved, rpm=command, status=status), command
 
 
 def regulated(
@@ -201,6 +226,7 @@ def solve(
         return (*chosen, regularization), chosen[2]
 
     after, commands, cost = fly(rpm / unit, None, None)
+    cost = jnp.where(jnp.isfinite(cost), cost, jnp.inf)
     gains = jnp.zeros((*rpm.shape, len(value)), rpm.dtype)
     regularization = jnp.asarray(_MIN_REGULARIZATION, rpm.dtype)
     (after, commands, cost, gains, _), costs = jax.lax.scan(

@@ -21,11 +21,12 @@ from jaxdrones.control.allocation import mixer
 from jaxdrones.control.single import check_single
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, check_period, reference
+from jaxdrones.optimal.problem import Reference, Weights, check_period, hover, reference, replaced_unless
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
+from jaxdrones.status import Status, check_on_failure, is_finite, raise_unless_ok, status_of
 
 
 class Settings(PyTreeNode):
@@ -55,6 +56,10 @@ class Memory(PyTreeNode):
     """(H, 4) planned corrections of the feedback's commands, over the rotor speed of hover."""
     lqr: lqr.Memory
     """The regulator about hover: the feedback, and the cost at the end of the horizon."""
+    rpm: Array
+    """(4,) the last safe command, RPM; at first that of hover."""
+    status: Array
+    """() a `Status` as an integer: how the last call planned."""
 
 
 def settings(
@@ -102,11 +107,20 @@ def init(settings: Settings, params: Params, state: State, key: Array) -> Memory
         key: random key; one per drone.
     """
     regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
-    return Memory(key, jnp.zeros((settings.horizon, 4), regulator.gain.dtype), regulator)
+    always = jnp.ones((), bool)
+    correction = jnp.zeros((settings.horizon, 4), regulator.gain.dtype)
+    return Memory(key, correction, regulator, hover(params, state).rpm, status_of(always, always))
 
 
 def control(
-    settings: Settings, params: Params, memory: Memory, state: State, setpoints: Setpoint, *, dt: float
+    settings: Settings,
+    params: Params,
+    memory: Memory,
+    state: State,
+    setpoints: Setpoint,
+    *,
+    dt: float,
+    on_failure: str = "hold",
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of the averaged plan.
 
@@ -117,14 +131,20 @@ def control(
         state: of the drone.
         setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
         dt: time between calls, s.
+        on_failure: where there is no new plan, `hold` repeats the last safe command and `raise` raises. Inside
+            `jax.jit` only `hold` is possible. The memory has the status of the call.
 
     Raises:
+        PlanningError: there is no new plan, and `on_failure` is `raise`.
         ValueError: arrays of a team (use `jax.vmap`), a number of setpoints that does not fit the horizon, or `dt` is
             not the period of the step.
     """
     check_single(params, state)
     check_period(settings.step, dt)
     check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
+    check_on_failure(on_failure, params, memory, state, setpoints)
+    valid = is_finite((state, setpoints))
+    state, setpoints = replaced_unless(valid, params, state, setpoints)
     next_key, noise_key = jax.random.split(memory.key)
     target = reference(params, setpoints, state.aux, dt)
     guess = jnp.concatenate([memory.correction[1:], memory.correction[-1:]])
@@ -132,23 +152,28 @@ def control(
     plans = plans.at[0].set(guess).at[1].set(0)
     costs = jax.vmap(lambda plan: cost(settings, params, state, target, plan, memory.lqr))(plans)
     plan = jnp.tensordot(importance(costs, settings.temperature), plans, 1)
+    status = status_of(valid, jnp.any(jnp.isfinite(costs)) & is_finite(plan))
+    plan = jnp.where(status == Status.OK, plan, 0)  # the next call plans as if it were the first
     now = jax.tree.map(lambda x: x[0], target)
     rpm = now.rpm + command_unit(params) * plan[0]
     command = lqr.feedback(params, memory.lqr.gain, state, now.state, rpm)
-    return memory.replace(key=next_key, correction=plan), command
+    command = jnp.where(status == Status.OK, command, memory.rpm)
+    if on_failure == "raise":
+        raise_unless_ok(status, "mppi")
+    return memory.replace(key=next_key, correction=plan, rpm=command, status=status), command
 
 
 def importance(costs: Float[Array, " k"], temperature: Float[Array, ""]) -> Float[Array, " k"]:
     """Weights of the samples, exp(-cost / (temperature x standard deviation of the costs)); their sum is one.
 
-    A sample whose cost is not finite counts nothing.
+    A sample whose cost is not finite counts nothing; without a finite cost all weights are the same.
     """
     finite = jnp.isfinite(costs)
     lowest = jnp.min(jnp.where(finite, costs, jnp.inf))
-    above = jnp.where(finite, costs - lowest, 0)
+    above = jnp.where(finite, jnp.where(finite, costs, 0) - lowest, 0)
     spread = jnp.sqrt(jnp.sum(above**2) / jnp.maximum(jnp.sum(finite), 1))
     scaled = above / jnp.maximum(temperature * spread, jnp.finfo(costs.dtype).tiny)
-    return jax.nn.softmax(jnp.where(finite, -scaled, -jnp.inf))
+    return jax.nn.softmax(jnp.where(finite | ~jnp.any(finite), -scaled, -jnp.inf))
 
 
 def cost(

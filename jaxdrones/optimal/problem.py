@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_positive, check_shape
@@ -113,6 +113,16 @@ def hover(params: Params, state: State) -> State:
     return state.replace(
         pos=zero, quat=quat, vel=zero, omega=zero, rpm=jnp.broadcast_to(command_unit(params), state.rpm.shape)
     )
+
+
+def replaced_unless(
+    valid: Bool[Array, ""], params: Params, state: State, setpoints: Setpoint
+) -> tuple[State, Setpoint]:
+    """A state and set-points, or where they are not valid hover at the origin: so no NaN gets into plan or gradient."""
+    rest = hover(params, state)
+    rest = rest.replace(aux=jax.tree.map(jnp.zeros_like, rest.aux))
+    zero = jax.tree.map(jnp.zeros_like, setpoints)
+    return jax.tree.map(lambda x, safe: jnp.where(valid, x, safe), (state, setpoints), (rest, zero))
 
 
 def check_period(step: Any, dt: float) -> None:

@@ -87,6 +87,8 @@ class Camera:
             check_finite(f"{name} of a camera", value)
             object.__setattr__(self, name, tuple(map(float, value)))
         check_quaternion("orientation of a camera", self.orientation)
+        length = math.hypot(*self.orientation)
+        object.__setattr__(self, "orientation", tuple(x / length for x in self.orientation))
         if self.noise is not None:
             check_callable(
                 "apply of the noise of a camera", getattr(self.noise, "apply", None), "that of a DepthNoise()"

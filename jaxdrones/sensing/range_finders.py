@@ -46,7 +46,7 @@ def range_finder(
 
     Args:
         name: by which observation terms ask for the reading.
-        directions: (..., 3) unit vectors of the rays in the axes of the device, x forward, y left, z up.
+        directions: (..., 3) directions of the rays, of any length, in the axes of the device, x forward, y left, z up.
         max_range: m; also the reading where nothing is nearer.
         rate: measurements per second; one every control step when left out.
         noise: standard deviation of a range, m.
@@ -59,7 +59,12 @@ def range_finder(
     """
     directions = np.asarray(directions, float)
     if directions.shape[-1:] != (3,):
-        raise UserError(f"directions of {name} have shape {directions.shape}; give unit vectors (..., 3)")
+        raise UserError(f"directions of {name} have shape {directions.shape}; give vectors (..., 3)")
+    check_finite(f"directions of {name}", directions)
+    length = np.linalg.norm(directions, axis=-1, keepdims=True)
+    if not length.all():
+        raise UserError(f"directions of {name} are {shown(directions)}; give vectors that are not zero")
+    directions = directions / length
     check_positive(f"max_range of {name}", max_range, "m")
     check_number(f"noise of {name}", noise, "m", at_least=0)
     check_number(f"dropout of {name}", dropout, at_least=0, at_most=1)
@@ -68,9 +73,10 @@ def range_finder(
             raise UserError(f"{what} of {name} is {shown(value)}; give {length} numbers")
         check_finite(f"{what} of {name}", value)
     check_quaternion(f"orientation of {name}", orientation)
+    quat = np.asarray(orientation, float) / np.linalg.norm(orientation)
 
     def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: None):
-        mounted = jnp.asarray(orientation, state.pos.dtype)
+        mounted = jnp.asarray(quat, state.pos.dtype)
         origin = state.pos + rotation.rotate(state.quat, jnp.asarray(offset, state.pos.dtype))
 
         def along(direction: Float[Array, "3"]) -> Number:
@@ -168,7 +174,7 @@ def time_of_flight(
     rays = np.stack([np.ones_like(left), left, up], axis=-1)
     return range_finder(
         "time_of_flight",
-        rays / np.linalg.norm(rays, axis=-1, keepdims=True),
+        rays,
         max_range=max_range,
         rate=rate,
         noise=noise,

@@ -16,6 +16,7 @@ from jaxdrones.optimal.problem import Weights, reference
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.state import State
+from jaxdrones.status import PlanningError, Status, check_on_failure, is_finite
 from jaxdrones.symbolic.interpreter import on_symbols
 from jaxdrones.symbolic.model import CasadiModel
 from jaxdrones.symbolic.primitives import casadi
@@ -28,6 +29,8 @@ SOLVERS: dict[str, dict[str, Any]] = {
 
 Ipopt is given the Gauss-Newton Hessian; fatrop, which takes none, has the exact one, and uses the structure in time.
 """
+
+_INSIDE = 1e-6  # distance of the bounds from the limits of the motors, over the largest rotor speed
 
 
 class Mpc:
@@ -64,13 +67,16 @@ class Mpc:
         self.model, self.horizon = model, horizon
         self.seconds = float("nan")
         """Seconds that the last call of the solver took."""
-        self.status = "not called"
+        self.status = Status.OK
+        """How the last call planned."""
+        self.message = "not called"
         """What the solver said at its last call."""
         self._unit = float(model.params.hover_rpm)
         self._reference = jax.jit(lambda setpoints: reference(model.params, setpoints, model.start.aux, dt))
         self._kept = _moving(model)
         self._scale = np.array([self._unit if name.startswith("rpm") else 1.0 for name in model.names])[self._kept]
-        self._plan: np.ndarray | None = None
+        self._plan: np.ndarray | None
+        self.reset()
         self._write(dt, default_weights() if weights is None else weights, terminal, solver)
 
     def _write(self, dt: float, weights: Weights, terminal: float, solver: str) -> None:
@@ -112,8 +118,9 @@ class Mpc:
         else:
             options["equality"] = [True] * constraint.numel()
         self._solver = casadi.nlpsol("mpc", solver, program, options)
-        high = np.full(4, float(model.params.max_rpm) / self._unit)
-        free, bounded = np.full(n, np.inf), [np.zeros(4), high]
+        most = float(model.params.max_rpm) / self._unit
+        # Solvers relax bounds a little, and beyond the limits of the motors the model does not depend on the commands.
+        free, bounded = np.full(n, np.inf), [np.full(4, _INSIDE * most), np.full(4, (1 - _INSIDE) * most)]
         self._low = np.concatenate([*[-free, bounded[0]] * self.horizon, -free])
         self._high = np.concatenate([*[free, bounded[1]] * self.horizon, free])
 
@@ -135,31 +142,49 @@ class Mpc:
         k4 = rate(x + dt * k3)
         return casadi.Function("advance", [x, u, model.p], [x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
 
-    def __call__(self, state: State, setpoints: Setpoint, params: Params | None = None) -> np.ndarray:
+    def __call__(
+        self, state: State, setpoints: Setpoint, params: Params | None = None, *, on_failure: str = "hold"
+    ) -> np.ndarray:
         """Commanded rotor speeds of one drone, (4,) RPM, between 0 and `max_rpm`.
 
         Args:
             state: of the drone.
             setpoints: at this and the next H control steps, arrays (H + 1, ...).
             params: constants that the model keeps as symbols are taken from here; those of the model when left out.
+            on_failure: where there is no new plan, `hold` repeats the last safe command, which is that of hover at
+                first, and `raise` raises. `status` and `message` say how the call planned.
 
         Raises:
             ValueError: arrays of a team, or a number of setpoints that does not fit the horizon.
-            RuntimeError: the solver found no finite plan.
+            PlanningError: there is no new plan, and `on_failure` is `raise`.
         """
-        model, horizon, n = self.model, self.horizon, len(self._kept)
-        check_single(model.params, state)
-        check_shape("setpoints.pos", setpoints.pos, (horizon + 1, 3), "this and the next H control steps")
+        n = len(self._kept)
+        check_single(self.model.params, state)
+        check_shape("setpoints.pos", setpoints.pos, (self.horizon + 1, 3), "this and the next H control steps")
+        check_on_failure(on_failure, params, state, setpoints)
+        if is_finite((state, setpoints)):
+            self._plan = self._solved(state, setpoints, params)
+            self.status = Status.NOT_CONVERGED if self._plan is None else Status.OK
+        else:
+            self._plan, self.status, self.message = None, Status.INVALID_STATE, "not called"
+        if self._plan is not None:
+            self._held = np.clip(self._plan[n : n + 4], self._low[n : n + 4], self._high[n : n + 4]) * self._unit
+        elif on_failure == "raise":
+            raise PlanningError(self.status, f"mpc, {self.message}")
+        return self._held.copy()
+
+    def _solved(self, state: State, setpoints: Setpoint, params: Params | None) -> np.ndarray | None:
+        """States and commands of the plan, one after the other; `None` where the solver does not converge."""
+        model = self.model
         target = jax.device_get(self._reference(setpoints))
-        rows = [jax.tree.map(lambda x, k=k: x[k], target) for k in range(horizon + 1)]
+        rows = [jax.tree.map(lambda x, k=k: x[k], target) for k in range(self.horizon + 1)]
         targets = np.stack([model.vector(row.state) for row in rows])
         nominal = np.stack([row.rpm for row in rows[:-1]]) / self._unit
         now = model.vector(state)[self._kept] / self._scale
         constants = model.parameters(model.params if params is None else params)
-        guess = self._guess(now, targets, nominal)
         start = time.perf_counter()
         result = self._solver(
-            x0=guess,
+            x0=self._guess(now, targets, nominal),
             p=np.concatenate([now, targets.ravel(), nominal.ravel(), constants]),
             lbx=self._low,
             ubx=self._high,
@@ -167,13 +192,10 @@ class Mpc:
             ubg=0,
         )
         self.seconds = time.perf_counter() - start
-        self.status = str(self._solver.stats()["return_status"])
+        said = self._solver.stats()
+        self.message = str(said["return_status"])
         plan = np.asarray(result["x"]).ravel()
-        if not np.isfinite(plan).all():
-            self._plan = None
-            raise RuntimeError(f"the solver found no finite plan: {self.status}; check the state and the setpoints")
-        self._plan = plan
-        return np.clip(plan[n : n + 4], self._low[n : n + 4], self._high[n : n + 4]) * self._unit
+        return plan if said["success"] and np.isfinite(plan).all() else None
 
     def _guess(self, now: np.ndarray, targets: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """The last plan, one interval later; the reference, where there is none."""
@@ -186,8 +208,9 @@ class Mpc:
         return np.concatenate([self._plan[n + 4 :], self._plan[-n - 4 :]])
 
     def reset(self) -> None:
-        """Forget the last plan, before another flight."""
+        """Forget the last plan and command, before another flight."""
         self._plan = None
+        self._held = np.full(4, min(self._unit, float(self.model.params.max_rpm)))
 
 
 def _moving(model: CasadiModel) -> np.ndarray:

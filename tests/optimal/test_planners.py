@@ -15,6 +15,7 @@ from jaxdrones.control import Setpoint, for_team, pid
 from jaxdrones.optimal import ilqr, lqr, mppi
 from jaxdrones.optimal.box_qp import box_qp
 from jaxdrones.optimal.mppi import importance
+from jaxdrones.status import PlanningError, Status
 from jaxdrones.tasks.curves import SHAPES, setpoint_on
 
 DT = 1 / 100
@@ -115,6 +116,80 @@ def test_setpoints_that_do_not_fit_the_horizon_are_refused():
         memory = jax.eval_shape(functools.partial(module.init, settings), params, state, *keys)
         with pytest.raises(ValueError, match=r"setpoints.pos has shape \(3, 3\); expected \(9, 3\)"):
             module.control(settings, params, memory, state, short, dt=DT)
+
+
+@functools.cache
+def _control(module):
+    settings = module.settings(jd.make_step(dt=DT), horizon=2, **({"samples": 8} if module is mppi else {}))
+    return settings, jax.jit(functools.partial(module.control, settings, dt=DT))
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("module", [mppi, pytest.param(ilqr, marks=pytest.mark.slow)], ids=["mppi", "ilqr"])
+def test_after_a_state_that_is_not_finite_or_cannot_be_planned_for_the_next_one_is_planned_as_if_it_were_the_first(
+    module,
+):
+    """The command between is the last safe one, and its status says what happened; an error where one is asked for."""
+    team = team_of("cf2x")
+    params, state = one(team), one(hovering(team))
+    near = Setpoint.at(jnp.broadcast_to(jnp.array([0.1, 0.2, 1.3]), (3, 3)))
+    settings, control = _control(module)
+    keys = (jax.random.key(0),) if module is mppi else ()
+    memory = module.init(settings, params, state, *keys)
+    before, safe = control(params, memory, state, near)
+    assert before.status == Status.OK and np.max(np.abs(safe - params.hover_rpm)) > 10
+    bad = [
+        (state.replace(pos=state.pos.at[0].set(jnp.nan)), near, Status.INVALID_STATE),
+        (state.replace(omega=state.omega.at[2].set(jnp.inf)), near, Status.INVALID_STATE),
+        (state, near.replace(vel=near.vel.at[2, 1].set(jnp.nan)), Status.INVALID_STATE),
+        (state.replace(vel=jnp.full(3, 1e30)), near, Status.NOT_CONVERGED),  # its cost is beyond float32
+    ]
+    for unlucky, target, status in bad:
+        after, held = control(params, before, unlucky, target)
+        assert after.status == status and np.array_equal(held, safe)
+        fresh = memory.replace(key=after.key) if module is mppi else memory
+        found, rpm = control(params, after, state, near)
+        expected = control(params, fresh, state, near)[1]
+        assert found.status == Status.OK and np.array_equal(rpm, expected)
+    first, hover = control(params, memory, bad[0][0], near)
+    np.testing.assert_allclose(hover, params.hover_rpm, rtol=1e-6)  # without a command before it
+    assert first.status == Status.INVALID_STATE
+    with pytest.raises(ValueError, match="on_failure is 'raise' inside"):
+        jax.eval_shape(
+            functools.partial(module.control, settings, dt=DT, on_failure="raise"), params, memory, state, near
+        )
+    with pytest.raises(ValueError, match="unknown on_failure 'stop'"):
+        module.control(settings, params, memory, state, near, dt=DT, on_failure="stop")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("module", [mppi, ilqr], ids=["mppi", "ilqr"])
+def test_one_state_that_is_not_finite_does_not_end_a_flight(module):
+    """Of 200 steps the 100th is measured as NaN; all others are planned, and the target is reached."""
+    team = team_of("cf2x")
+    params, start = one(team), one(hovering(team))
+    settings = module.settings(_step(), horizon=HORIZON)
+    keys = (jax.random.key(0),) if module is mppi else ()
+    near = Setpoint.at(jnp.broadcast_to(jnp.array([0.1, 0.2, 1.3]), (HORIZON + 1, 3)))
+
+    @jax.jit
+    def fly(memory):
+        def advance(carry, k):
+            state, memory = carry
+            seen = state.replace(pos=jnp.where(k == 100, jnp.nan, state.pos))
+            memory, rpm = module.control(settings, params, memory, seen, near, dt=DT)
+            return (optimal.single(_step())(params, state, rpm), memory), (memory.status, rpm, state.pos)
+
+        return jax.lax.scan(advance, (start, memory), jnp.arange(200))[1]
+
+    status, rpm, pos = fly(module.init(settings, params, start, *keys))
+    assert np.flatnonzero(status).tolist() == [100] and status[100] == Status.INVALID_STATE
+    assert np.all(np.isfinite(rpm) & (rpm >= 0) & (rpm <= params.max_rpm)) and np.array_equal(rpm[100], rpm[99])
+    assert np.linalg.norm(pos[-1] - near.pos[0]) < 0.05
+    with pytest.raises(PlanningError, match=f"{'mppi' if keys else 'ilqr'}: The state or a set-point is not finite"):
+        memory = module.init(settings, params, start, *keys)
+        lost = start.replace(pos=jnp.full(3, jnp.nan))
+        module.control(settings, params, memory, lost, near, dt=DT, on_failure="raise")
 
 
 ROWS = [("figure-eight", 5.0), ("figure-eight", 3.0), ("circle", 5.0), ("lissajous", 10.0), ("polynomial", 10.0)]

@@ -89,6 +89,18 @@ def test_a_device_is_turned_and_placed_on_the_body():
     np.testing.assert_allclose(reading(backwards, at(rpy=(0, 0, np.pi))), 1.9)
 
 
+def test_a_range_is_in_meters_whatever_the_length_of_its_direction():
+    """The directions of one device have lengths from 1e-3 to 1e3, and its quaternion the largest error that passes."""
+    lengths = np.array([1.0, 2.0, 0.5, 1e-3, 1e3])
+    turned = range_finder(
+        "turned", lengths[:, None] * [1.0, 0, 0], max_range=9.0, orientation=tuple(1.0009 * np.array([0, 0, 1, 0]))
+    )
+    np.testing.assert_allclose(reading(turned, at()), np.ones(5), rtol=1e-12)
+    assert {entry.name for entry in turned.entries} == {"range along (1.00, 0.00, 0.00)"}
+    camera = jd.sensing.Camera(orientation=tuple(1.0009 * np.array([0, 0, 0.6, 0.8])))
+    np.testing.assert_allclose(np.linalg.norm(camera.orientation), 1, rtol=1e-12)
+
+
 def test_optical_flow_is_the_velocity_over_the_height_and_the_turn():
     """It vanishes where the drone turns about a point of the ground below."""
     flow = optical_flow()
@@ -166,6 +178,9 @@ def test_in_an_environment_a_sensor_measures_at_its_rate():
         (lambda: time_of_flight(field_of_view=180), "field_of_view of a time-of-flight sensor is 180"),
         (lambda: time_of_flight(orientation=(0, 0, 0, 2)), "orientation of time_of_flight has length 2"),
         (lambda: lidar(offset=(0, 0)), r"offset of lidar is \(0, 0\); give 3 numbers"),
+        (lambda: range_finder("x", np.array([[1, 0, 0], [0, 0, 0.0]]), max_range=1.0), "vectors that are not zero"),
+        (lambda: range_finder("x", np.array([np.nan, 0, 1]), max_range=1.0), "directions of x is not finite"),
+        (lambda: range_finder("x", np.array([np.inf, 0, 1]), max_range=1.0), "directions of x is not finite"),
         (lambda: range_finder("x", np.zeros((2, 2)), max_range=1.0), r"directions of x have shape \(2, 2\)"),
     ],
 )

@@ -8,6 +8,7 @@ from closed_loop import hovering, one, team_of
 
 import jaxdrones as jd
 from jaxdrones.control import Setpoint
+from jaxdrones.status import PlanningError, Status
 from jaxdrones.tasks.curves import figure_eight, setpoint_on
 
 pytestmark = pytest.mark.needs("casadi")
@@ -27,7 +28,7 @@ def test_at_the_target_the_plan_is_hover_and_far_off_it_keeps_to_the_limits():
     params, state = one(team), one(hovering(team))
     stay = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.0]), (5, 3)))
     np.testing.assert_allclose(mpc(state, stay), np.full(4, params.hover_rpm), rtol=1e-5)
-    assert mpc.status == "Solve_Succeeded" and mpc.seconds > 0
+    assert mpc.message == "Solve_Succeeded" and mpc.seconds > 0
     mpc.reset()
     rpm = mpc(state, Setpoint.at(stay.pos + jnp.array([[0, 0, 3.0]])))
     assert np.all(rpm <= params.max_rpm) and np.all(rpm > 1.2 * params.hover_rpm)
@@ -40,6 +41,27 @@ def test_constants_that_are_symbols_are_given_at_each_call():
     stay = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.0]), (5, 3)))
     light, heavy = mpc(state, stay), mpc(state, stay, params.replace(mass=1.2 * params.mass))
     assert np.all(heavy > 1.01 * light)
+
+
+def test_a_state_that_is_not_finite_or_a_plan_that_does_not_converge_gives_the_last_safe_command_or_an_error():
+    mpc, team = controller(horizon=4), team_of("cf2x")
+    params, state = one(team), one(hovering(team))
+    near = Setpoint.at(jnp.broadcast_to(jnp.array([0, 0, 1.3]), (5, 3)))
+    lost = state.replace(pos=state.pos.at[0].set(jnp.nan))
+    np.testing.assert_allclose(mpc(lost, near), params.hover_rpm, rtol=1e-6)  # without a command before it
+    first = mpc(state, near)
+    for unlucky, target, status in (
+        (lost, near, Status.INVALID_STATE),
+        (state, near.replace(yaw=near.yaw.at[1].set(jnp.inf)), Status.INVALID_STATE),
+        (state.replace(omega=jnp.full(3, 1e12)), near, Status.NOT_CONVERGED),
+    ):
+        assert np.array_equal(mpc(unlucky, target), first) and mpc.status == status
+        with pytest.raises(PlanningError, match=status.sentence) as error:
+            mpc(unlucky, target, on_failure="raise")
+        assert error.value.status == status
+        again = mpc(state, near)
+        np.testing.assert_array_equal(again, first)  # planned as if it were the first
+        assert mpc.status == Status.OK and mpc.message == "Solve_Succeeded"
 
 
 def test_what_does_not_fit_is_refused():
@@ -68,5 +90,6 @@ def test_the_figure_eight_of_five_seconds_is_tracked_within_three_centimeters(so
     for k in range(240):
         rpm = mpc(one(state), target(k * DT + ahead))
         state = step(team, state, jnp.asarray(rpm, jnp.float32)[None])
+        assert mpc.status == Status.OK
         errors.append(np.linalg.norm(state.pos[0] - target(jnp.array([(k + 1) * DT])).pos[0]))
     assert np.sqrt(np.mean(np.square(errors[40:]))) < 0.03

@@ -1,0 +1,78 @@
+"""What a controller that plans, or a fit, says of its result: one enumeration for all of them."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from jaxdrones.checks import check_choice, is_known
+from jaxdrones.errors import UserError
+
+ON_FAILURE = ("hold", "raise")
+"""What a planner without a new plan does: repeat the last safe command, or raise."""
+
+
+class Status(enum.IntEnum):
+    """How a problem was solved; inside `jax.jit` an integer."""
+
+    OK = 0
+    NOT_CONVERGED = 1
+    INVALID_STATE = 2
+
+    @property
+    def sentence(self) -> str:
+        """The status in words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Status.OK: "A solution was found.",
+    Status.NOT_CONVERGED: "The solver did not converge to a finite solution.",
+    Status.INVALID_STATE: "The state or a set-point is not finite, so nothing was planned.",
+}
+
+
+class PlanningError(RuntimeError):
+    """A planner has no new command; `status` says why."""
+
+    def __init__(self, status: Status, planner: str):
+        """Keep the status beside its sentence."""
+        super().__init__(f"{planner}: {status.sentence}")
+        self.status = status
+
+
+def status_of(valid: Bool[Array, ""], solved: Bool[Array, ""]) -> Int[Array, ""]:
+    """The status of a problem that was posed with finite numbers, or not, and solved, or not."""
+    failed = jnp.where(valid, int(Status.NOT_CONVERGED), int(Status.INVALID_STATE))
+    return jnp.where(valid & solved, int(Status.OK), failed).astype(jnp.int32)
+
+
+def is_finite(tree: Any) -> Bool[Array, ""]:
+    """Whether all floating-point numbers of a pytree are finite."""
+    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]))
+
+
+def check_on_failure(on_failure: str, *given: Any) -> None:
+    """Raise `ValueError` unless a planner can do what is asked where it has no new plan.
+
+    Args:
+        on_failure: a name of `ON_FAILURE`.
+        given: arguments of the planner; what is traced has no status that could be looked at.
+    """
+    check_choice("on_failure", on_failure, ON_FAILURE)
+    if on_failure == "raise" and not all(map(is_known, jax.tree.leaves(given))):
+        raise UserError(
+            "on_failure is 'raise' inside jax.jit or jax.vmap, where no error depends on values; leave it out, and "
+            "look at the status of the memory"
+        )
+
+
+def raise_unless_ok(status: Any, planner: str) -> None:
+    """Raise `PlanningError` unless the status is `OK`."""
+    if int(status) != Status.OK:
+        raise PlanningError(Status(int(status)), planner)

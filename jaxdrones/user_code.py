@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import inspect
 import sys
 import traceback
 import types
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from jaxdrones.checks import hint
 from jaxdrones.errors import UserError
+
+_modules: set[str] = set()  # names of the modules that files of users became
+_OF_TRACING = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 
 
 def is_reference(text: str) -> bool:
@@ -74,6 +80,35 @@ def definition(file: str, text: str, name: str) -> Any:
     return vars(module)[name]
 
 
+def blame(error: BaseException) -> str | None:
+    """Where in a user's file an error arose and what it says, on one line; `None` if it arose in no such file."""
+    frames = [x for x in traceback.walk_tb(error.__traceback__) if x[0].f_globals.get("__name__") in _modules]
+    if not frames:
+        return None
+    frame, line = frames[-1]
+    code = frame.f_code
+    within = "" if code.co_name.startswith("<") else f" ({code.co_name})"
+    said = f": {error}" if isinstance(error, UserError) else f" raises {_said(error)}"
+    return f"{code.co_filename}: line {line}{within}{said}"
+
+
+def place(function: Any) -> str:
+    """The file and line in which a function is defined, such as `my_task.py, line 12`; empty where it has none."""
+    code = getattr(inspect.unwrap(getattr(function, "func", function)), "__code__", None)
+    return "" if code is None else f"{Path(code.co_filename).name}, line {code.co_firstlineno}"
+
+
+def _said(error: BaseException) -> str:
+    """The type and the message of an error, and what to do about those of JAX."""
+    kind = type(error).__name__
+    if isinstance(error, SystemExit):
+        return f"{kind}({error.code!r}); a file of yours must not end the program"
+    message, _, more = str(error).strip().partition("\n")
+    if isinstance(error, _OF_TRACING):
+        return f"{kind}: {message}; JAX compiles this function: use jax.numpy, and jax.numpy.where in place of if"
+    return f"{kind}: {message}{' ...' * bool(more)}" if message else kind
+
+
 @functools.cache
 def _executed(file: str, text: str) -> types.ModuleType:
     """The module that the text of a file is."""
@@ -81,13 +116,15 @@ def _executed(file: str, text: str) -> types.ModuleType:
     module = types.ModuleType(f"{Path(file).stem}_{digest}")
     module.__file__ = file
     sys.modules[module.__name__] = module  # where dataclasses look for the types that they name
+    _modules.add(module.__name__)
     try:
         exec(compile(text, file, "exec", dont_inherit=True), vars(module))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-        line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
-        what = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
         alone = "; a file of yours may import libraries, but no files beside it" * isinstance(error, ImportError)
-        raise UserError(f"{file}: line {line} raises {what}{alone}") from error
+        if isinstance(error, SyntaxError) and error.filename == file:
+            said = f"{file}: line {error.lineno} raises {type(error).__name__}: {error.msg}"
+        else:  # text with a null byte is refused before any line of it
+            said = blame(error) or f"{file}: {_said(error)}"
+        raise UserError(said + alone) from error
     return module

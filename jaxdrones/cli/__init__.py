@@ -3,7 +3,6 @@
 import argparse
 import sys
 
-from jaxdrones.checks import UnexpectedKeyword
 from jaxdrones.cli import (
     bench,
     compare,
@@ -19,7 +18,7 @@ from jaxdrones.cli import (
     train,
     view,
 )
-from jaxdrones.cli.common import INTERRUPTED, Parser, print_error
+from jaxdrones.cli.common import EXIT_CODES, Parser, print_failure
 from jaxdrones.cli.settings import task_first
 
 
@@ -27,25 +26,30 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        The exit code: 0 done, 1 the flight broke or training diverged, 2 a mistake in what was asked, 130 interrupted.
+        The exit code, see `EXIT_CODES`.
     """
     parser = _parser()
     options = parser.parse_args(task_first(sys.argv[1:] if arguments is None else arguments))
     try:
         return options.run(options)
-    except KeyboardInterrupt:
-        return print_error("interrupted", INTERRUPTED)
-    except OSError as error:
-        unwritable = f"{error.filename}: {error.strerror}; choose another --output"
-        return print_error(unwritable if error.filename else str(error))
-    except (ValueError, ImportError, UnexpectedKeyword) as error:
-        return print_error(str(error))
+    except BaseException as error:
+        return print_failure(error, options.debug)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="jaxdrones", description="Simulate teams of quadrotors.", allow_abbrev=False)
+    parser = Parser(
+        prog="jaxdrones",
+        description="Simulate teams of quadrotors.",
+        epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    text = "show the traceback of an error, also of a mistake"
+    parser.add_argument("--debug", action="store_true", help=text)
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
     for command in (fly, train, evaluate, compare, view, fit, score, ros2, explain, names, doctor, bench):
         command.add(commands)
     completion.add(commands, parser)
+    for each in commands.choices.values():  # --debug may stand before the command or after it
+        each.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=text)
     return parser

@@ -7,12 +7,25 @@ import json
 import math
 import os
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
-INTERRUPTED = 130  # exit code
+from jaxdrones import user_code
+from jaxdrones.checks import UnexpectedKeyword
+from jaxdrones.errors import UserError
+from jaxdrones.throughput import machine
+
+DIVERGED, MISTAKE, FAULT, INTERRUPTED = 1, 2, 70, 130
+EXIT_CODES = """exit codes:
+    0  done
+    1  a flight or a training diverged, commands ceased, or `doctor` found something wrong
+    2  a mistake in what was asked, or in a file of yours: one line says what to do
+   70  a fault of jaxdrones, with its traceback: please report it
+  130  interrupted"""
 
 _MAX_MESSAGE = 1000  # characters
+_DEBUG = {"JAX_DEBUG_NANS", "JAX_DEBUG_INFS"}
 
 _COLUMNS = {  # result: (heading, format)
     "drone": ("drone", "{}"),
@@ -45,10 +58,54 @@ class Parser(argparse.ArgumentParser):
         self.exit(print_error(f"{shortened(message)}; see {self.prog} --help"))
 
 
-def print_error(message: str, code: int = 2) -> int:
+def print_error(message: str, code: int = MISTAKE) -> int:
     """Write an error message of one line to stderr; returns the exit code."""
     print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{shortened(message)}", file=sys.stderr)
     return code
+
+
+def print_failure(error: BaseException, debug: bool) -> int:
+    """Write to stderr what ended a command; returns the exit code.
+
+    A user's mistake is one line, and so is an error in a user's file. Whatever else is a fault of this library.
+
+    Args:
+        error: what was raised.
+        debug: whether to write the traceback first, whatever was raised.
+    """
+    if debug:
+        traceback.print_exception(error)
+    if isinstance(error, KeyboardInterrupt):
+        return print_error("interrupted", INTERRUPTED)
+    if blamed := user_code.blame(error):
+        return print_error(blamed + "; --debug shows the traceback" * (not debug))
+    if isinstance(error, SystemExit):  # of the parser, which has printed its message
+        raise error
+    if message := _explained(error):
+        return print_error(message)
+    if not debug:
+        traceback.print_exception(error)
+    what = f"{type(error).__name__}: {error}; this is a fault of jaxdrones, please report it"
+    return print_error(f"{what} with the lines above and what `jaxdrones doctor` prints", FAULT)
+
+
+def _explained(error: BaseException) -> str | None:
+    """What to do about an error that is no fault of this library; `None` if it may be one."""
+    if isinstance(error, UserError | UnexpectedKeyword):
+        return str(error)
+    if isinstance(error, ImportError) and not (error.name or "").startswith("jaxdrones"):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.filename}: {error.strerror}; choose another --output" if error.filename else str(error)
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        return "there is not enough memory; give fewer worlds, drones or episodes"
+    if isinstance(error, FloatingPointError) and _DEBUG.intersection(os.environ):
+        return f"{error}, as {' and '.join(sorted(_DEBUG.intersection(os.environ)))} asked to find"
+    try:
+        machine.devices()
+    except UserError as missing:
+        return str(missing)
+    return None
 
 
 def print_warning(message: str) -> None:

@@ -8,6 +8,7 @@ import time
 from typing import Any
 
 from jaxdrones.cli.common import as_json
+from jaxdrones.errors import UserError
 
 _LEFT_OUT = ("all", "dev", "docs")  # extras that only join others, or are for developers
 _COMPARISONS = {
@@ -138,8 +139,8 @@ def _devices(wrong: list[str]) -> list[str]:
 
     try:
         return machine.devices()
-    except RuntimeError as error:  # of a driver that jax cannot use
-        wrong.append(f"jax finds no device: {error}; JAX_PLATFORMS=cpu leaves accelerators out")
+    except UserError as error:
+        wrong.append(str(error))
         return []
 
 

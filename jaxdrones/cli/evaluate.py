@@ -29,7 +29,7 @@ def add(commands) -> None:
         "policy",
         type=folder,
         metavar="RUN",
-        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name",
+        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed",
     )
     parser.add_argument("--task", metavar="TASK", help="with file.py:name: the task to fly, as for `jaxdrones train`")
     add_realistic(parser, "with file.py:name: ")
@@ -59,7 +59,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     check_at_most("episodes", options.episodes, LARGEST_COUNT)
     check_seed("seed", options.seed)
     check_choice("backend", options.backend, BACKENDS)
-    run = open_policy(options.policy, options.task, options.realistic, asked_settings(options))
+    run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
     about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed, "backend": options.backend}
     if is_user_policy(options.policy):
         recipe, make_policy = run.recipe(), run.policy

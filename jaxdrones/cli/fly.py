@@ -54,7 +54,7 @@ def add(commands) -> None:
         "--policy",
         type=folder,
         metavar="RUN",
-        help="in place of FLIGHT: a folder of `jaxdrones train`, or file.py:name",
+        help="in place of FLIGHT: a folder of `jaxdrones train`, or file.py:name, whose code is executed",
     )
     parser.add_argument("--task", metavar="TASK", help="with --policy file.py:name: the task to fly")
     parser.add_argument(

@@ -1,5 +1,6 @@
 """Policies at the shell: of a run of `jaxdrones train`, or of a user's file."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ def is_user_policy(policy: Path) -> bool:
     return is_reference(str(policy))
 
 
-def open_policy(policy: Path, task: str | None, realistic: bool | str, options: dict[str, Any]) -> Any:
+def open_policy(
+    policy: Path, task: str | None, realistic: bool | str, options: dict[str, Any], last: bool = False
+) -> Any:
     """The run in a folder, or the policy of a user's file, of which the same can be asked.
 
     Args:
@@ -20,6 +23,7 @@ def open_policy(policy: Path, task: str | None, realistic: bool | str, options: 
         task: the task that a policy of a file flies; `None` for a run, which says it itself.
         realistic: that of `jaxdrones.make`; false for a run.
         options: options of `jaxdrones.make`; none for a run.
+        last: whether the newest policy of a run is meant, not the best.
 
     Raises:
         ValueError: the task is missing, or something is given that the run says itself.
@@ -36,4 +40,9 @@ def open_policy(policy: Path, task: str | None, realistic: bool | str, options: 
     for name, x in given.items():
         if x not in (None, False):
             raise UserError(f"{name} is given beside the run {policy}, which says what is flown; leave it out")
-    return open_run(policy)
+    run = open_run(policy)
+    recipe = run.sidecar_entry("last" if last else "best", "recipe")
+    names = recipe.get("files", ()) if isinstance(recipe, dict) else ()
+    if code := " and ".join(name for name in names if is_reference(name)):
+        print(f"jaxdrones: {policy} holds {code}, whose code is executed; open runs you trust alone", file=sys.stderr)
+    return run

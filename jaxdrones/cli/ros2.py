@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import functools
 import math
 import time
 from typing import Any
@@ -28,6 +29,7 @@ from jaxdrones.urdf import load_params
 
 _SPACING = 0.5  # m between drones at the start, along y
 _MAX_HZ = 20_000
+_OF_REPLAY = ("replay", "speed", "real_time", "transport", "json", "run", "debug")
 
 
 def add(commands) -> None:
@@ -53,10 +55,11 @@ def add(commands) -> None:
     parser.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
     parser.add_argument("--replay", type=folder, metavar="BAG", help="publish what a bag holds; nothing is simulated")
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
-    parser.set_defaults(run=_run)
+    parser.set_defaults(run=functools.partial(_run, parser))
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+    _refuse(parser, options)
     with contextlib.closing(open_transport(options.transport)) as transport:
         if options.replay:
             return _replay(options, transport)
@@ -82,6 +85,14 @@ def _run(options: argparse.Namespace) -> int:
         report: dict[str, Any] = vars(node.flown) | {"simulated_s": simulation.ns / 1e9}
         _print(options, report)
     return 0 if lost is None else print_error(lost, 1)
+
+
+def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Raise for options of a flight beside --replay."""
+    for name in vars(options) if options.replay else ():
+        if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
+            option = f"--{name.replace('_', '-')}"
+            raise UserError(f"{option} is given beside --replay, which publishes what the bag holds; leave it out")
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:

@@ -3,12 +3,14 @@
 import argparse
 import ast
 import contextlib
+import inspect
 import itertools
 from typing import Any
 
 from jaxdrones.envs import TASKS
+from jaxdrones.envs.named_tasks import task_function
 from jaxdrones.errors import UserError
-from jaxdrones.user_code import is_reference
+from jaxdrones.user_code import blame, is_reference
 
 # Arguments of `Recipe.of` that are options of the command.
 _NO_SETTINGS = ("cls", "task", "algorithm", "realistic", "library")
@@ -86,15 +88,16 @@ def _value(text: str) -> Any:
 
 @contextlib.contextmanager
 def user_mistakes(changes: dict[str, Any], task: str):
-    """Turn errors that settings of a user cause into errors that name the settings.
+    """Turn errors that options of a task cause into errors that name these options.
 
     Raises:
-        ValueError: in place of an error of Python or JAX.
+        UserError: in place of an error of Python or JAX that did not arise in a user's file.
     """
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
-        if not changes:
+        known = inspect.signature(task_function(task)).parameters
+        given = ", ".join(f"{name}={x}" for name, x in changes.items() if name in known)
+        if not given or blame(error):
             raise
-        given = ", ".join(f"{name}={x}" for name, x in changes.items())
         raise UserError(f"--set {given} does not fit {task}: {error}") from error

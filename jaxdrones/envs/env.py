@@ -17,6 +17,7 @@ from jaxdrones.envs import randomize as draws
 from jaxdrones.envs.action import Action
 from jaxdrones.envs.arguments import check_draws, check_team, check_terms, delay_steps, episode_steps
 from jaxdrones.envs.construction import Constructed, constructed
+from jaxdrones.envs.functions import check_episode
 from jaxdrones.envs.observations import bounds, observe
 from jaxdrones.envs.privileged import PrivilegedObservation, deviations
 from jaxdrones.envs.process import check_process
@@ -104,7 +105,8 @@ class Env(Constructed):
         self.delay = delay_steps(task, delay, dt)  # control steps
         self._history = max(math.ceil(self.delay) + 1, *(term.history for term in terms))
         self._drawn = draws.drawn_leaves(randomize, params)
-        self.observation_bound = bounds(terms, self.term_sizes())
+        self.term_sizes = check_episode(task, params, self.scene, terms, dt, self._first_world)
+        self.observation_bound = bounds(terms, self.term_sizes)
         """(d,) largest magnitude of every entry of the observation."""
         self.observation_size = len(self.observation_bound)
         constructed(self)
@@ -231,10 +233,14 @@ class Env(Constructed):
     def _first_observation(self, key: jax.Array, world: World, rate: State | None) -> tuple[Array, World]:
         """The observation at the start of an episode, and the world with the first readings."""
         if rate is not None:
-            init_key, measure_key = jax.random.split(jax.random.fold_in(key, SENSORS))
-            world = world.replace(sensors=init_sensors(self.sensors, init_key, world.params))
-            world = self._measured(measure_key, world, rate)
+            world = self._measured_first(key, world, rate)
         return self._noisy_observation(key, world), world
+
+    def _measured_first(self, key: jax.Array, world: World, rate: State) -> World:
+        """The world with the first readings of the sensors."""
+        init_key, measure_key = jax.random.split(jax.random.fold_in(key, SENSORS))
+        world = world.replace(sensors=init_sensors(self.sensors, init_key, world.params))
+        return self._measured(measure_key, world, rate)
 
     def _rate(self, world: World, rpm: Array) -> State | None:
         """The time derivative of the state for the sensors, if there are any."""
@@ -288,12 +294,7 @@ class Env(Constructed):
             world = world.replace(drones=self.noise(jax.random.fold_in(key, NOISE), world.drones))
         return observe(self.terms, self.task, world)
 
-    def term_sizes(self) -> list[int]:
-        """How many numbers of a drone each observation term has."""
-
-        def terms(key):
-            world = self._start(key)
-            _, world = self._first_observation(key, world, self._rate(world, world.drones.rpm))
-            return [term.observe(self.task, world) for term in self.terms]
-
-        return [x.shape[-1] for x in jax.eval_shape(terms, jax.random.key(0))]
+    def _first_world(self, key: jax.Array) -> World:
+        """The world at the start of an episode, with the first readings."""
+        rate = self._rate(world := self._start(key), world.drones.rpm)
+        return world if rate is None else self._measured_first(key, world, rate)

@@ -77,7 +77,7 @@ def explain(env: Env) -> Explanation:
 
 def _observed(env: Env, action: tuple[Quantity, ...]) -> Iterable[Entry]:
     bounds = iter(env.observation_bound.tolist())
-    for i, (term, size) in enumerate(zip(env.terms, env.term_sizes(), strict=True)):
+    for i, (term, size) in enumerate(zip(env.terms, env.term_sizes, strict=True)):
         name = term.name or f"term {i}"
         for quantity in _quantities(term, name, size, env.drones, action):
             bound = next(bounds)

@@ -79,6 +79,15 @@ def make_task(task: str | Task | Callable[..., Task], options: dict[str, Any], o
     if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters.values()):
         for option in options:
             check_keyword(f"make({name!r})", option, {*others, *parameters})
+    lacking = [
+        parameter.name
+        for parameter in parameters.values()
+        if parameter.default is parameter.empty and parameter.name not in options
+        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+    ]
+    if lacking:
+        words = ", ".join(lacking)
+        raise UserError(f"{name} takes {words} without a default; give defaults in the file, or values as options")
     made = function(**options)
     if not isinstance(made, Task):
         raise UserError(f"{name} returned {shown(made)}; return a jaxdrones.tasks.Task")

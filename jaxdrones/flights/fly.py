@@ -63,11 +63,14 @@ def fly(
     def plan(params: Params) -> dict[str, jax.Array]:
         t = dt * jnp.arange(1, steps + 1)
         target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
-        target_pos, target_vel = _targets(target, params)
-        return {"t": t, "target_pos": target_pos, "target_vel": target_vel}
+        return {"t": t} | _commanded(target, params)
 
     params, start, memory = prepare(load_params(conditions.vehicle))
     planned, team = jax.device_get((plan(params), params))
+    nothing = np.full(
+        (steps, len(start.pos), 3), np.nan, planned["t"].dtype
+    )  # where positions or velocities are not commanded
+    planned = {"target_pos": nothing, "target_vel": nothing} | planned
 
     def record(trajectory: State, first: int) -> Record:
         rows = slice(first, first + len(trajectory.pos))
@@ -137,9 +140,8 @@ def _report(k: jax.Array, steps: int, progress: Callable[[float], None]) -> None
     jax.lax.cond((k + 1) % every == 0, report, lambda: None)
 
 
-def _targets(target: Setpoint | jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
-    """Commanded positions and velocities over time; the one that is not commanded is NaN."""
+def _commanded(target: Setpoint | jax.Array, params: Params) -> dict[str, jax.Array]:
+    """The positions or the velocities that are commanded over time."""
     if isinstance(target, Setpoint):
-        return target.pos, jnp.full_like(target.pos, jnp.nan)
-    vel = jax.vmap(jax.vmap(velocity.commanded), (None, 0))(params, target)
-    return jnp.full_like(vel, jnp.nan), vel
+        return {"target_pos": target.pos}
+    return {"target_vel": jax.vmap(jax.vmap(velocity.commanded), (None, 0))(params, target)}

@@ -150,11 +150,19 @@ def to_body(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
     return to_world(quat * np.array([-1, -1, -1, 1], quat.dtype), v)
 
 
+class Refused(UserError):
+    """A message that commands nothing; errors of one `kind` differ in the values alone."""
+
+    def __init__(self, field: str, found: str, advice: str):
+        super().__init__(f"its {field} {found}; {advice}")
+        self.kind = field, advice
+
+
 def to_command(name: str, message: Any) -> Command:
     """What a message on the topic `name` of `topics.COMMANDS` commands one drone.
 
     Raises:
-        ValueError: numbers that are not finite, a frame that is not known, a quaternion of no length, or another
+        Refused: numbers that are not finite, a frame that is not known, a quaternion of no length, or another
             number of rotors.
     """
     return _COMMANDS[name](message)
@@ -163,11 +171,11 @@ def to_command(name: str, message: Any) -> Command:
 def _pose_command(message: msg.PoseStamped) -> Command:
     frame = message.header.frame_id
     if frame not in ("", topics.WORLD):
-        raise UserError(f"its frame_id is {frame!r}; give poses in {topics.WORLD!r}")
+        raise Refused("frame_id", f"is {frame!r}", f"give poses in {topics.WORLD!r}")
     x, y, z, w = _finite(numbers(message.pose.orientation), "orientation")
     length = math.hypot(x, y, z, w)
     if not abs(length - 1) < 1e-3:
-        raise UserError(f"its orientation has length {length:g}; give a unit quaternion (x, y, z, w)")
+        raise Refused("orientation", f"has length {length:g}", "give a unit quaternion (x, y, z, w)")
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return Command.zero(Mode.POSITION, pos=_finite(numbers(message.pose.position), "position"), yaw=yaw)
 
@@ -180,13 +188,13 @@ def _velocity_command(message: msg.Twist) -> Command:
 def _rates_command(message: msg.Twist) -> Command:
     acc, omega = (_finite(numbers(v), name) for v, name in ((message.linear, "linear"), (message.angular, "angular")))
     if acc[2] < 0:
-        raise UserError(f"its linear.z, the collective thrust per mass, is {acc[2]:g} m/s^2; give 0 or more")
+        raise Refused("linear.z, the collective thrust per mass,", f"is {acc[2]:g} m/s^2", "give 0 or more")
     return Command.zero(Mode.RATES, omega=omega, thrust=acc[2])
 
 
 def _motor_command(message: msg.Float64MultiArray) -> Command:
     if len(message.data) != 4:
-        raise UserError(f"its data has {len(message.data)} numbers; give 4 rotor speeds, RPM")
+        raise Refused("data", f"has {len(message.data)} numbers", "give 4 rotor speeds, RPM")
     return Command.zero(Mode.MOTORS, rpm=_finite(message.data, "data"))
 
 
@@ -205,5 +213,5 @@ def numbers(vector: Any) -> tuple[float, ...]:
 
 def _finite(values: tuple[float, ...], name: str) -> tuple[float, ...]:
     if not all(map(math.isfinite, values)):
-        raise UserError(f"its {name} is {shown(values)}; give finite numbers")
+        raise Refused(name, f"is {shown(values)}", "give finite numbers")
     return values

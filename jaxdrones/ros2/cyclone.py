@@ -19,7 +19,8 @@ try:
 except ImportError as error:
     raise ImportError('cyclonedds is not installed; pip install "jaxdrones[ros2]", or source a ROS 2') from error
 
-from jaxdrones.checks import check_whole
+from jaxdrones.errors import UserError
+from jaxdrones.limits import check_at_most
 from jaxdrones.ros2 import idl
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2.topics import QoS, Topic
@@ -33,6 +34,7 @@ LOOPBACK = """<CycloneDDS><Domain>
 </Domain></CycloneDDS>"""
 """Configuration with which nothing leaves this computer."""
 
+_LARGEST_DOMAIN = 232  # whose ports are below 65,536
 _MOST = 1000  # messages that are taken at once
 _SERVICE = QoS(depth=10)
 _BLOCK = 0.1  # s for which a writer waits for readers that do not keep up
@@ -58,14 +60,17 @@ class CycloneTransport:
         """Join a domain, that of `ROS_DOMAIN_ID` when left out.
 
         Raises:
-            ValueError: the domain is no whole number of at least 0.
+            ValueError: the domain is no whole number of 0 to 232, or cannot be joined.
         """
         given: Any = os.environ.get("ROS_DOMAIN_ID", "0") if domain is None else domain
         number = int(given) if isinstance(given, str) and given.isdecimal() else given
-        check_whole("ROS_DOMAIN_ID" if domain is None else "domain", number, 0)
+        check_at_most("ROS_DOMAIN_ID" if domain is None else "domain", number, _LARGEST_DOMAIN, 0)
         if _local_only() and number not in _domains:
             _domains[number] = Domain(number, LOOPBACK)
-        self._participant = DomainParticipant(number)
+        try:
+            self._participant = DomainParticipant(number)
+        except DDSException as error:
+            raise UserError(f"domain {number} of ROS 2 cannot be joined: {error}; look at CYCLONEDDS_URI") from error
         self._wake = WaitSet(self._participant)
         self._readers: list[tuple[DataReader, type, Callable[[Any], None]]] = []
         self._services: list[tuple[DataReader, DataWriter, Answer]] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 from jaxdrones.checks import check_number, check_positive
@@ -101,7 +101,7 @@ class Node:
         now = clock()
         self._watches = [Watch(self._failsafe, now) for _ in range(simulation.drones)]
         self._stepper = Watch(self._failsafe, now)
-        self._said: set[str] = set()
+        self._said: set[Hashable] = set()
         self._due = now
 
     def run(self, duration: float | None = None) -> Flown:
@@ -125,7 +125,7 @@ class Node:
                 else:
                     self._await_clock()
                 for text in self._transport.complaints():
-                    self._object(text)
+                    self._object(text, text)
         finally:
             self._transport.flush(_FAREWELL)
         return self.flown
@@ -141,9 +141,9 @@ class Node:
             self._recorder.write(topic, message, self._flight.ns)
         try:
             command = convert.to_command(name, message)
-        except ValueError as error:
+        except convert.Refused as error:
             self.flown.refused += 1
-            self._object(f"a message on /{topic.name} is refused: {error}")
+            self._object(f"a message on /{topic.name} is refused: {error}", (topic.name, error.kind))
             return
         self.flown.received += 1
         self._flight.commands[i] = command
@@ -205,10 +205,10 @@ class Node:
             raise PeerLost(f"{what}; the flight stops, as its failsafe 'stop' asks for")
         self._warn(f"{what}; {then}")
 
-    def _object(self, text: str) -> None:
-        """Say once what is wrong with a peer, or stop because of it."""
-        if text not in self._said:
-            self._said.add(text)
+    def _object(self, text: str, kind: Hashable) -> None:
+        """Say once for each kind what is wrong with a peer, or stop because of it."""
+        if kind not in self._said:
+            self._said.add(kind)
             self._give_up(text, "the flight goes on without it")
 
     def _step(self) -> None:

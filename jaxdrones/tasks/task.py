@@ -13,8 +13,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_choice, check_number, check_positive, check_sequence, check_whole, takes_scene
+from jaxdrones.checks import (
+    check_arguments,
+    check_choice,
+    check_number,
+    check_positive,
+    check_sequence,
+    check_switch,
+    check_whole,
+    shown,
+    takes_scene,
+)
 from jaxdrones.control import Setpoint
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.quantity import Quantity, described
@@ -66,6 +77,8 @@ Entries = tuple[Quantity, ...] | Callable[[int, tuple[Quantity, ...]], tuple[Qua
 """Quantities, or a function (number of drones, quantities of an action) -> quantities."""
 MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 CONTACTS = ("ground", "drones", "obstacles")
+IMAGES = ("rgb", "depth", "segmentation")
+_OF_A_WORLD = ("task", "world")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +97,7 @@ class ObservationTerm:
     """The name by which an environment knows the term; `jaxdrones.make` sets it."""
 
     def __post_init__(self):
+        _check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
             check_number("bound of an observation", bound, above=0, infinite=True)
         check_whole("history of an observation", self.history)
@@ -151,17 +165,50 @@ class Task:
     """Control steps that an episode goes on after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
 
     def __post_init__(self):
+        for name in "name", "summary":
+            if not (isinstance(getattr(self, name), str) and getattr(self, name)):
+                raise UserError(f"{name} of the task is {shown(getattr(self, name))}; give a text")
         check_whole(f"number of drones of {self.name}", self.drones)
         check_positive("duration", self.duration, "s")
         check_positive("control_hz", self.control_hz, "1/s")
         check_whole("substeps", self.substeps)
         check_whole("extra_steps", self.extra_steps, minimum=0)
-        for name, (scale, _) in self.rewards.items():
-            check_number(f"scale of the reward {name!r}", scale)
+        check_switch("obstacles_terminate", self.obstacles_terminate)
+        self._check_functions()
         for contact in check_sequence("contact", self.contact, "'ground'"):
             check_choice("contact", contact, CONTACTS)
         for name in check_sequence("success_terminations", self.success_terminations, "'reached'"):
             check_choice("success termination", name, self.terminations)
+        check_sequence("observation", self.observation, "'position_error'")
+        for image in check_sequence("vision", self.vision, "'depth'"):
+            check_choice("image", image, IMAGES)
+        for name, term in _mapping("observations", self.observations, "an ObservationTerm").items():
+            if not isinstance(term, ObservationTerm):
+                raise UserError(f"observations[{name!r}] is {shown(term)}; give an ObservationTerm")
+        if self.camera is not None and not isinstance(self.camera, Camera):
+            raise UserError(f"camera is {shown(self.camera)}; give a jaxdrones.sensing.Camera")
+
+    def _check_functions(self) -> None:
+        """Raise unless the functions of the task are functions of so many arguments."""
+        _check_function("start", self.start, ("key", "params", "scene")[: 3 if takes_scene(self.start) else 2])
+        _check_function("target", self.target, ("variables", "time"))
+        _check_function("advance", self.advance, _OF_A_WORLD)
+        if self.success is not None:
+            _check_function("success", self.success, ("metrics", "dt"))
+        for name, entry in _mapping("rewards", self.rewards, "(scale, function of (task, world))").items():
+            if not (isinstance(entry, tuple | list) and len(entry) == 2):
+                raise UserError(f"rewards[{name!r}] is {shown(entry)}; give (scale, function of (task, world))")
+            check_number(f"scale of the reward {name!r}", entry[0])
+            _check_function(f"rewards[{name!r}]", entry[1], _OF_A_WORLD)
+        if not self.rewards:
+            raise UserError("rewards is empty; give at least one, name: (scale, function of (task, world))")
+        for field in "terminations", "truncations", "metrics":
+            for name, function in _mapping(field, getattr(self, field), "a function of (task, world)").items():
+                _check_function(f"{field}[{name!r}]", function, _OF_A_WORLD)
+        for function in check_sequence("randomize", self.randomize, "scaled('mass', 0.9, 1.1)"):
+            _check_function("randomize", function, ("key", "params"))
+        if not isinstance(self.scene, Scene):
+            _check_function("scene", self.scene, ("key",))
 
     def begin(self, key: jax.Array, params: Params, scene: Scene) -> tuple[State, Any]:
         """The team at the start of an episode in a scene, and the task's variables."""
@@ -187,6 +234,20 @@ class Task:
     def target_now(self, world: World) -> Setpoint:
         """Where every drone should be at this moment."""
         return self.target(world.variables, world.time)
+
+
+def _mapping(field: str, value: Any, example: str) -> Mapping[str, Any]:
+    """A mapping by name, or an error that says what to give."""
+    if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
+        raise UserError(f"{field} is {shown(value)}; give a dictionary of names, {{'name': {example}}}")
+    return value
+
+
+def _check_function(field: str, value: Any, arguments: tuple[str, ...]) -> None:
+    """Raise unless a field holds a function that can be called with so many arguments."""
+    if not callable(value) or isinstance(value, type):
+        raise UserError(f"{field} is {shown(value)}; give a function of ({', '.join(arguments)})")
+    check_arguments(field, value, arguments)
 
 
 Term = Callable[[Task, World], Float[Array, " n"]]

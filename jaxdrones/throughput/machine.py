@@ -9,6 +9,8 @@ from pathlib import Path
 
 import jax
 
+from jaxdrones.errors import UserError
+
 LIBRARIES = ("jaxdrones", "jax", "jaxlib", "flax", "numpy", "gymnasium")
 NOT_INSTALLED = "not installed"
 
@@ -35,8 +37,17 @@ def processor() -> str:
 
 
 def devices() -> list[str]:
-    """The devices that JAX computes on, such as `gpu: NVIDIA H200`."""
-    return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+    """The devices that JAX computes on, such as `gpu: NVIDIA H200`.
+
+    Raises:
+        UserError: JAX finds none, for example none of the platforms that `JAX_PLATFORMS` names.
+    """
+    try:
+        return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+    except (AssertionError, RuntimeError) as error:  # an assertion, where the only platform asked for has no driver
+        platforms = os.environ.get("JAX_PLATFORMS", "")
+        why = str(error) or f"JAX_PLATFORMS is {platforms!r}"
+        raise UserError(f"jax finds no device: {why}; JAX_PLATFORMS=cpu leaves accelerators out") from error
 
 
 def cores() -> int:

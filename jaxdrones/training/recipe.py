@@ -7,6 +7,7 @@ import inspect
 from collections.abc import Callable, Collection
 from typing import Any
 
+from jaxdrones import user_code
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.named_tasks import task_function
@@ -134,6 +135,8 @@ def checked_preset(
     try:
         return preset(task, algorithm, realistic, **options)
     except TypeError as error:
+        if user_code.blame(error):
+            raise
         name = task if isinstance(task, str) else task.__name__
         raise UserError(f"options {options} do not fit {name}: {error}") from None
 

@@ -1,6 +1,7 @@
 """Trainings by Stable-Baselines3: recipes, models as policies, and their folders. Needs the extra `sb3`.
 
-The folder of such a run holds models as .zip files, which Stable-Baselines3 itself loads too.
+The folder of such a run holds models as .zip files, which Stable-Baselines3 itself loads too. Here only their weights
+are read, so that no code of the file is executed.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import io
+import zipfile
+from collections.abc import Mapping
 from typing import Any
 
 import flax.struct
@@ -168,16 +171,24 @@ class SB3Policy(PyTreeNode):
     """Whether outputs pass through tanh, as those of sac do; otherwise they are clipped to [-1, 1]."""
 
     @classmethod
-    def of(cls, model: BaseAlgorithm) -> SB3Policy:
-        """The function that `model.predict(obs, deterministic=True)` computes."""
-        policy, squashed = model.policy, isinstance(model, _class("sac"))
-        modules = (
-            (*policy.actor.latent_pi, policy.actor.mu)
-            if squashed
-            else (*policy.mlp_extractor.policy_net, policy.action_net)
-        )
-        linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
-        return cls(tuple((_array(layer.weight), _array(layer.bias)) for layer in linear), squashed)
+    def of(cls, weights: Mapping[str, torch.Tensor], algorithm: str) -> SB3Policy:
+        """The function that `model.predict(obs, deterministic=True)` computes.
+
+        Args:
+            weights: those of `model.policy.state_dict()`.
+            algorithm: name of the algorithm that trained the model.
+
+        Raises:
+            UserError: they are not those of a network that `SB3Recipe.model` makes.
+        """
+        squashed = algorithm == "sac"
+        hidden, last = ("actor.latent_pi.", "actor.mu") if squashed else ("mlp_extractor.policy_net.", "action_net")
+        names = [name.removesuffix(".weight") for name in weights if name.startswith(hidden) and ".weight" in name]
+        try:
+            layers = [[weights[f"{name}.{part}"] for part in ("weight", "bias")] for name in (*names, last)]
+        except KeyError as error:
+            raise UserError(f"the model has no {error.args[0]}; its algorithm is not {algorithm}, train anew") from None
+        return cls(tuple((_array(weight), _array(bias)) for weight, bias in layers), squashed)
 
     def __call__(self, obs: Float[Array, "n d"]) -> Float[Array, "n a"]:
         """Actions of the team, in [-1, 1]; for Stable-Baselines3 a team is one agent."""
@@ -206,30 +217,34 @@ class SB3Run(Run):
     def policy(self, name: str = "best", env: Env | None = None) -> Any:
         """The policy `best` or `last`; raises as `load` does, and if it does not fit `env`."""
         self.check_identity(name)
-        policy = SB3Policy.of(self.load(name))
+        policy = SB3Policy.of(self.weights(name), self.recipe(name).algorithm)
         if env is not None:
             sizes = (policy.layers[0][0].shape[1], policy.layers[-1][0].shape[0])
             expected = (env.drones * env.observation_size, env.drones * env.action_size)
             self.check_sizes(name, env, sizes, expected)
         return policy
 
-    def load(self, name: str = "best") -> BaseAlgorithm:
-        """The model `best` or `last`.
+    def weights(self, name: str = "best") -> Mapping[str, torch.Tensor]:
+        """The weights of the model `best` or `last`.
+
+        Stable-Baselines3's own `load` also unpickles what else is in the file, which can execute any code; this reads
+        tensors alone.
 
         Raises:
             FileNotFoundError: there is no such model.
-            ValueError: it is damaged, or has numbers that are not finite.
+            UserError: it is damaged, or has numbers that are not finite.
         """
         file = self.folder / f"{name}.zip"
-        algorithm = _class(self.recipe(name).algorithm)
         content = files.load_bytes(file, self.sidecar(name))
         try:
-            model = algorithm.load(io.BytesIO(content), device="cpu")
-        except Exception as error:  # zip, pickle and torch raise errors of several types
+            with zipfile.ZipFile(io.BytesIO(content)) as parts:
+                weights = torch.load(io.BytesIO(parts.read("policy.pth")), map_location="cpu", weights_only=True)
+            finite = all(torch.isfinite(x).all() for x in weights.values())
+        except Exception as error:  # zip and torch raise errors of several types
             raise UserError(f"{file} cannot be loaded: {files.one_line(error)}; {files.ADVICE}") from error
-        if not all(torch.isfinite(x).all() for x in model.policy.parameters()):
+        if not finite:
             raise UserError(f"{file} holds numbers that are not finite; {files.ADVICE}")
-        return model
+        return weights
 
     def save_model(self, name: str, model: BaseAlgorithm, **about: Any) -> None:
         """Write `best` or `last`, with entries of its description."""

@@ -144,7 +144,8 @@ class _Callback(BaseCallback):
         """Evaluate the model, always in the same episodes; save it if its return is the best, as in the paper."""
         self.evaluated = self.update
         metrics = self._metrics()
-        report = self._evaluate(SB3Policy.of(self.model), self.selection_key)
+        policy = SB3Policy.of(self.model.policy.state_dict(), self.trainer.recipe.algorithm)
+        report = self._evaluate(policy, self.selection_key)
         stop_at = self.trainer.recipe.stop_at
         self.reached = self.reached + 1 if stop_at is not None and report.success_lower_bound >= stop_at else 0
         score = report.mean_return if math.isfinite(report.mean_return) else -math.inf

@@ -5,8 +5,12 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
+
 from jaxdrones import user_code
+from jaxdrones.checks import check_arguments
 from jaxdrones.envs import Env, make
+from jaxdrones.envs.functions import check_policy
 from jaxdrones.errors import UserError
 from jaxdrones.learning.recurrence import AnyPolicy, RecurrentPolicy
 
@@ -47,9 +51,18 @@ class UserPolicy:
             ValueError: the file cannot be read or executed, or the name is not that of a policy.
         """
         policy = user_code.load(self.reference)
-        if not (callable(policy) or isinstance(policy, RecurrentPolicy)):
+        sizes = (env.drones, env.observation_size), (env.drones, env.action_size)
+        recurrent = isinstance(policy, RecurrentPolicy)
+        if isinstance(policy, type) or not (callable(policy) or recurrent):
             raise UserError(
-                f"{self.reference} is {policy!r:.60}; give a function from observations ({env.drones}, "
-                f"{env.observation_size}) to actions ({env.drones}, {env.action_size}), or a policy with a memory"
+                f"{self.reference} is {policy!r:.60}; give a function from observations {sizes[0]} to actions "
+                f"{sizes[1]}, or a policy with a memory"
             )
+        if recurrent:
+            check_arguments(f"{self.reference}.initial_memory", policy.initial_memory, ("batch",))
+            check_arguments(f"{self.reference}.act", policy.act, ("memory", "obs"))
+        else:
+            check_arguments(self.reference, policy, ("obs",))
+        obs, _ = jax.eval_shape(env.reset, jax.random.key(0))
+        check_policy(self.reference, policy, obs, sizes[1])
         return policy

@@ -1,5 +1,8 @@
 """The node in one process: what it publishes, flies and does when nobody speaks to it."""
 
+import functools
+import math
+
 import jax
 import numpy as np
 import pytest
@@ -158,15 +161,29 @@ def test_a_wrong_type_is_said_and_the_flight_goes_on_or_stops(action):
         assert node.run(0.1).steps == 10 and len(warnings) == 1 and "goes on without it" in warnings[0]
 
 
-def test_a_refused_message_is_said_once_and_changes_nothing():
+def test_refused_messages_of_a_kind_are_said_once_whatever_their_numbers():
     wire = Wire()
     node, warnings = make_node(wire, n=1)
     peer = Peer(InProcess(wire), 1)
-    bad = msg.Float64MultiArray(data=(1.0,))
-    wire.script = [(0.01 * k, lambda: peer.send(0, "cmd_motors", bad)) for k in range(5)]
+    bad = {  # of each kind, k-th message -> message
+        "cmd_motors": [
+            lambda k: msg.Float64MultiArray(data=(1.0,) * (k + 5)),
+            lambda k: msg.Float64MultiArray(data=(float(k), math.nan, 0.0, 0.0)),
+        ],
+        "cmd_rates": [lambda k: msg.Twist(linear=msg.Vector3(0.0, 0.0, -1.0 - k))],
+        "cmd_vel": [lambda k: msg.Twist(linear=msg.Vector3(math.inf, float(k), 0.0))],
+        "cmd_pose": [
+            lambda k: msg.PoseStamped(header=msg.Header(frame_id=f"odom{k}")),
+            lambda k: msg.PoseStamped(pose=msg.Pose(orientation=msg.Quaternion(0.0, 0.0, 0.0, 2.0 + k))),
+        ],
+    }
+    kinds = [(name, make) for name, makers in bad.items() for make in makers]
+    wire.script = [
+        (0.01 * k, functools.partial(peer.send, 0, name, make(k))) for k in range(20) for name, make in kinds
+    ]
     flown = node.run(0.3)
-    assert flown.refused == 5 and flown.received == 0 and len(warnings) == 1
-    assert "a message on /drone_0/cmd_motors is refused: its data has 1 numbers" in warnings[0]
+    assert flown.refused == 20 * len(kinds) and flown.received == 0 and len(warnings) == len(kinds)
+    assert "a message on /drone_0/cmd_motors is refused: its data has 5 numbers; give 4 rotor speeds" in warnings[0]
     assert peer.state().pos[0, 2] == pytest.approx(1.0, abs=0.05)
 
 

@@ -14,8 +14,10 @@ from jaxdrones.cli import live as live_option
 from jaxdrones.cli import main
 from jaxdrones.flights.fly import fly
 from jaxdrones.visualization.viewer import live as module
-from jaxdrones.visualization.viewer.live import HOST, Live
+from jaxdrones.visualization.viewer import server
+from jaxdrones.visualization.viewer.live import Live
 from jaxdrones.visualization.viewer.payload import decode
+from jaxdrones.visualization.viewer.server import HOST
 
 ARRAYS = ("t", "pos", "quat", "vel", "omega", "rpm")
 
@@ -158,21 +160,54 @@ def test_another_flight_begins_anew_and_a_whole_one_is_shown_with_its_learning_c
     np.testing.assert_allclose(viewer.header["worlds"][0]["pos"], record.pos, rtol=0, atol=1e-4)
 
 
-def test_only_this_machine_is_served():
+def status(live, path, **headers):
+    """The status with which a request is answered; {} in a header is the port."""
+    port = int(live.url.split(":")[2].split("/")[0])
+    headers = {"Host": "127.0.0.1:{}"} | {name.replace("_", "-"): x for name, x in headers.items()}
+    lines = [f"GET {path} HTTP/1.0", *(f"{name}: {x.format(port)}" for name, x in headers.items()), "", ""]
+    with socket.create_connection((HOST, port), timeout=20) as connection:
+        connection.sendall("\r\n".join(lines).encode())
+        return int(connection.recv(4096).split()[1])
+
+
+def test_the_page_is_for_this_machine_and_for_those_who_know_its_address():
     with Live() as live:
-        assert live.url.startswith(f"http://{HOST}:") and HOST == "127.0.0.1"
-        with urllib.request.urlopen(live.url) as page:
-            assert b"live:/events" in page.read()
-        for path, host, code in (
-            ("", "example.org", 403),
-            ("events", "example.org:80", 403),
-            ("etc/passwd", HOST, 404),
-        ):
-            request = urllib.request.Request(live.url + path, headers={"Host": host})
-            with pytest.raises(urllib.error.HTTPError) as error:
-                urllib.request.urlopen(request)
-            assert error.value.code == code
-            error.value.close()
+        secret = live.url.split("/")[3]
+        assert live.url.startswith(f"http://{HOST}:") and HOST == "127.0.0.1" and len(secret) >= 20
+        page, stream = f"/{secret}/", f"/{secret}/events"
+        with urllib.request.urlopen(live.url) as opened:
+            assert f"live:{stream}".encode() in opened.read()
+        for path in (page, stream):
+            for own in ({}, {"Origin": "http://127.0.0.1:{}"}, {"Host": "localhost:9", "Origin": "http://localhost:9"}):
+                assert status(live, path, **own) == 200, own
+            for host in ("example.org", "example.org:{}", "127.0.0.1.example.org:{}", ""):
+                assert status(live, path, Host=host) == 403, host
+            for origin in ("http://example.org", "null", "http://127.0.0.1:1", "https://127.0.0.1:{}"):
+                assert status(live, path, Origin=origin) == 403, origin
+        for site in ("cross-site", "same-site"):
+            assert status(live, stream, Sec_Fetch_Site=site) == 403
+        for path in ("/", "/events", f"/{secret[:-1]}/events", f"/{secret}x/events", f"/{'a' * len(secret)}/events"):
+            assert status(live, path) == 403, path
+        assert status(live, f"{page}etc/passwd") == 404
+
+
+def test_silent_connections_neither_pile_up_nor_keep_a_viewer_out(record, monkeypatch):
+    monkeypatch.setattr(server, "_SILENT", 0.5)
+    with Live(wait=0.0) as live:
+        play(live, record)
+        before, port = threading.active_count(), int(live.url.split(":")[2].split("/")[0])
+        silent = [socket.create_connection((HOST, port)) for _ in range(2 * server.CONNECTIONS)]
+        silent[-1].sendall(b"GET / HTTP/1.1\r\nHost: ")  # and never a second line
+        viewer = Viewer(live, events=1)
+        viewer.join(10)
+        assert viewer.heard[0][0] == "begin"
+        assert threading.active_count() - before <= server.CONNECTIONS + 1
+        end = time.monotonic() + 10
+        while threading.active_count() > before and time.monotonic() < end:
+            time.sleep(0.05)
+        assert threading.active_count() <= before
+        for connection in silent:
+            connection.close()
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(capsys):
@@ -201,6 +236,19 @@ def test_a_flight_that_is_interrupted_ends_the_stream_and_the_server(record, cap
 def test_more_than_a_browser_plays_is_refused(record):
     with Live(wait=0.0) as live, pytest.raises(ValueError, match="more than a page plays"):
         live.add(next(parts(record)), 1e5)
+
+
+@pytest.mark.parametrize("when", ["open http", "waiting"])
+def test_ctrl_c_ends_a_program_that_waits_for_a_viewer(when, tmp_path, monkeypatch, capsys):
+    def interrupted(line, **to):
+        if line.startswith(when):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(live_option, "print", interrupted, raising=False)
+    start = time.monotonic()
+    assert main(["fly", "circle", "--duration", "0.5", "--live", "--no-figure", "--output", str(tmp_path)]) == 130
+    assert time.monotonic() - start < live_option.WAIT
+    assert capsys.readouterr().err == "jaxdrones: interrupted\n"
 
 
 @pytest.mark.slow

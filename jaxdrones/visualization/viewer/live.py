@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import http.server
 import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from http import HTTPStatus
 from typing import Any
 
 import numpy as np
@@ -16,15 +14,10 @@ import numpy as np
 from jaxdrones.errors import UserError
 from jaxdrones.flights.record import Record
 from jaxdrones.limits import check_at_most
-from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.payload import encode, encode_rows
+from jaxdrones.visualization.viewer.server import Server
 from jaxdrones.visualization.viewer.show import LAYOUTS, check_size, looks, records_of
 
-HOST = "127.0.0.1"
-"""The only address that is served: that by which a machine reaches itself."""
-STREAM = "/events"
-"""Path of the stream of server-sent events: `begin` (a payload), `rows` (further rows), `end`."""
-_LOCAL_NAMES = ("127.0.0.1", "localhost")  # that a browser may ask for; others may be names of a foreign site
 _RELOADING = 2.0  # s, for which a viewer that left is awaited
 _ALIVE = 0.5  # s between signs of life, by which it is noticed that a viewer left
 _FLUSHING = 5.0  # s, for which viewers may take what is left at the end
@@ -34,7 +27,8 @@ _ROWS = ("t", "pos", "quat", "vel", "omega", "rpm", "target_pos", "target_vel") 
 class Live:
     """A server that shows flights while they are flown, to any number of viewers; a context, which ends them.
 
-    Only programs on this machine reach it. A viewer that comes late sees the flight from its start.
+    Only programs on this machine reach it, and only those that know `url`, which holds a secret. A viewer that comes
+    late sees the flight from its start.
 
     Args:
         port: port of the server; 0 takes a free one.
@@ -55,14 +49,13 @@ class Live:
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
         check_at_most("port", port, 65535, 0)
-        self.page = Page("jaxdrones", f"live:{STREAM}").html
         try:
-            self._server = _Server((HOST, port), self)
+            self._server = Server(port, "jaxdrones", self._stream)
         except OSError as error:
             raise UserError(
                 f"port {port} cannot be used: {error.strerror}; give another, or 0 for a free one"
             ) from None
-        self.url = f"http://{HOST}:{self._server.server_port}/"
+        self.url = self._server.url
         self._title, self._wait, self._say = title, wait, say
         self._changed = threading.Condition()
         self._parts: list[Record] = []  # of the flight that is shown
@@ -170,8 +163,11 @@ class Live:
         """Wait until there is something that a viewer who has this does not have, but not for long."""
         self._changed.wait_for(lambda: self._closed or self._news != had, _ALIVE)
 
-    def stream(self, send: Callable[[str, str], None]) -> None:
-        """Tell one viewer everything, by a function that sends an event and its data; returns at the end."""
+    def _stream(self, send: Callable[[str, str], None]) -> None:
+        """Tell one viewer everything, by a function that sends an event and its data; returns at the end.
+
+        The events are `begin` (a payload), `rows` (further rows) and `end`.
+        """
         with self._changed:
             self._viewers += 1
             self._changed.notify_all()
@@ -203,48 +199,3 @@ def _joined(parts: Sequence[Record]) -> Record:
     """Successive parts of a flight as one."""
     rows: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ROWS}
     return dataclasses.replace(parts[0], **rows | {"images": {}})
-
-
-class _Server(http.server.ThreadingHTTPServer):
-    """A thread for each viewer; none keeps the program from ending."""
-
-    def __init__(self, address: tuple[str, int], live: Live) -> None:
-        super().__init__(address, _Handler)
-        self.live = live
-
-
-class _Handler(http.server.BaseHTTPRequestHandler):
-    """Answers a viewer's requests: the page, and its stream."""
-
-    server: _Server
-    server_version = "jaxdrones"
-    sys_version = ""
-
-    def do_GET(self) -> None:
-        name = self.headers.get("Host", "").partition(":")[0]
-        if name not in _LOCAL_NAMES:
-            return self.send_error(HTTPStatus.FORBIDDEN, "this page is for this machine alone")
-        if self.path == "/":
-            self._begin("text/html; charset=utf-8")
-            self.wfile.write(self.server.live.page.encode())
-        elif self.path == STREAM:
-            self._begin("text/event-stream")
-            self.server.live.stream(self._send)
-        elif self.path == "/favicon.ico":
-            self.send_response(HTTPStatus.NO_CONTENT)
-            self.end_headers()
-        else:
-            self.send_error(HTTPStatus.NOT_FOUND)
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
-
-    def _begin(self, kind: str) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", kind)
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-
-    def _send(self, event: str, data: str) -> None:
-        self.wfile.write(f"event: {event}\ndata: {data}\n\n".encode())
-        self.wfile.flush()

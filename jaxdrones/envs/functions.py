@@ -1,0 +1,228 @@
+"""Checks of what the functions of a user return: those of a task, before an episode is compiled, and a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.checks import shown
+from jaxdrones.control import Setpoint
+from jaxdrones.errors import UserError
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.state import State
+from jaxdrones.tasks.task import ObservationTerm, Task, World
+from jaxdrones.user_code import place
+
+_NUMBERS = "biuf"  # kinds of dtypes
+
+
+def _is_own(function: Any) -> bool:
+    """Whether a function belongs to this library, whose tests check it."""
+    return str(getattr(getattr(function, "func", function), "__module__", "")).startswith("jaxdrones.")
+
+
+def check_episode(
+    task: Task,
+    params: Params,
+    scene: Any,
+    terms: Sequence[ObservationTerm],
+    dt: float,
+    first_world: Callable[[jax.Array], World],
+) -> list[int]:
+    """Raise unless the functions of a task return what they should; traces them, and computes nothing.
+
+    Args:
+        task: the task.
+        params: nominal parameters of the team.
+        scene: the scene of all episodes, or the function that draws it.
+        terms: observation terms.
+        dt: control period, s.
+        first_world: (key) -> the world at the start of an episode, with the first readings of the sensors.
+
+    Returns:
+        How many numbers of a drone each observation term has.
+
+    Raises:
+        UserError: a function returns something else; names it and its file.
+    """
+
+    def sizes(key: jax.Array) -> list[Any]:
+        _check_randomizations(task, params)
+        _check_start(task, params, scene, key)
+        world = first_world(key)
+        _check_functions(task, world, dt)
+        _check_terms(task, terms, world)
+        return [term.observe(task, world) for term in terms]
+
+    return [x.shape[-1] for x in jax.eval_shape(sizes, jax.random.key(0))]
+
+
+def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None:
+    """Raise unless the start of a task returns the state of the team and the task's variables."""
+    if _is_own(task.start):
+        return
+    where, n = _where("start", task.start), task.drones
+    returned = task.begin(key, params, scene if isinstance(scene, Scene) else scene(key))
+    if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[0], State)):
+        raise UserError(f"{where} returns {_kind(returned)}; return a State of the team and the task's variables")
+    _check_like(where, "a state", returned[0], State.at_rest(jnp.zeros((n, 3))))
+    _check_arrays(f"{where} returns variables", returned[1])
+
+
+def _check_randomizations(task: Task, params: Params) -> None:
+    """Raise unless each randomization of a task returns the parameters of one drone."""
+    one = jax.tree.map(lambda x: x[0], params)
+    for function in task.randomize:
+        if not _is_own(function):
+            where = _where("a randomization", function)
+            returned = function(jax.random.key(0), one)
+            if not isinstance(returned, Params):
+                raise UserError(f"{where} returns {_kind(returned)}; return params.replace(...)")
+            _check_like(where, "parameters", returned, one)
+
+
+def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> None:
+    """Raise unless each observation term returns a row of numbers for every drone."""
+    n = task.drones
+    for term in terms:
+        if _is_own(term.observe):
+            continue
+        where = _where(f"observation {term.name!r}", term.observe)
+        x = term.observe(task, world)
+        shape = _shape(x)
+        if shape is None or len(shape) != 2 or shape[0] != n or shape[1] == 0:
+            raise UserError(f"{where} returns {_kind(x)}; return an array ({n}, d), one row for every drone")
+        for name, given in ("bound", term.bound), ("entries", term.entries):
+            if isinstance(given, tuple) and given and len(given) != shape[1]:
+                raise UserError(f"{where} returns {shape[1]} numbers and has {len(given)} in {name}; give one for each")
+
+
+def _check_functions(task: Task, world: World, dt: float) -> None:
+    """Raise unless target, rewards, conditions, metrics, `advance` and `success` return what a `Task` needs.
+
+    Args:
+        task: the task.
+        world: a world at the start of an episode, traced.
+        dt: control period, s.
+    """
+    n = task.drones
+    if not _is_own(task.target):
+        where, target = _where("target", task.target), task.target(world.variables, world.time)
+        if not isinstance(target, Setpoint):
+            raise UserError(f"{where} returns {_kind(target)}; return Setpoint.at(pos), pos of shape ({n}, 3)")
+        _check_like(where, "a target", target, Setpoint.at(jnp.zeros((n, 3))))
+    if not _is_own(task.advance):
+        where = _where("advance", task.advance)
+        _check_kept(where, "variables", world.variables, task.advance(task, world))
+    for name, (_, term) in task.rewards.items():
+        _check_one_each(f"reward {name!r}", term, n, (task, world))
+    for kind, conditions in ("termination", task.terminations), ("truncation", task.truncations):
+        for name, condition in conditions.items():
+            _check_one_each(f"{kind} {name!r}", condition, n, (task, world), "b")
+    for name, metric in task.metrics.items():
+        _check_one_each(f"metric {name!r}", metric, n, (task, world))
+    if task.success is not None:
+        metrics = {name: jnp.stack([x] * _ROWS) for name, x in task.measure(world).items()}
+        _check_one_each("success", task.success, n, (metrics, dt), "b")
+
+
+def check_policy(name: str, policy: Any, obs: Any, shape: tuple[int, int]) -> None:
+    """Raise unless a policy returns actions for an observation.
+
+    Args:
+        name: of the policy.
+        policy: function of observations, or a policy with a memory.
+        obs: observations of the team, or their shapes.
+        shape: that of the actions.
+    """
+
+    def act(obs):
+        memory, action = None, None
+        if hasattr(policy, "initial_memory"):
+            memory = policy.initial_memory((shape[0],))
+            _check_arrays(f"{name}: initial_memory returns a memory", memory)
+            returned = policy.act(memory, obs)
+            if not (isinstance(returned, tuple) and len(returned) == 2):
+                raise UserError(f"{name}: act returns {_kind(returned)}; return the memory and the actions")
+            _check_kept(f"{name}: act", "memory", memory, returned[0])
+            action = returned[1]
+        else:
+            action = policy(obs)
+        if _shape(action) != shape:
+            what = f"return actions of shape {shape}, one row for every drone"
+            raise UserError(f"{name} returns {_kind(action)}; {what}")
+        if jnp.result_type(action).kind not in "iuf":
+            raise UserError(f"{name} returns {_kind(action)}; return real numbers")
+        return 0
+
+    jax.eval_shape(act, obs)
+
+
+_ROWS = 100  # of the metrics that `success` is tried with
+
+
+def _check_one_each(what: str, function: Callable, n: int, arguments: tuple, kinds: str = _NUMBERS) -> None:
+    """Raise unless a function returns one number, or one boolean, for each of n drones."""
+    if _is_own(function):
+        return
+    x = function(*arguments)
+    wanted = "boolean" if kinds == "b" else "number"
+    if _shape(x) != (n,) or jnp.result_type(x).kind not in kinds:
+        where = _where(what, function)
+        raise UserError(f"{where} returns {_kind(x)}; return one {wanted} for every drone, an array ({n},)")
+
+
+def _check_like(where: str, what: str, given: Any, wanted: Any) -> None:
+    """Raise unless the fields of a pytree have the shapes of another one's."""
+    for field, like in vars(wanted).items():
+        if field == "aux" or like is None:
+            continue
+        x = getattr(given, field)
+        if _shape(x) != np.shape(like) or jnp.result_type(x).kind not in "iuf":
+            raise UserError(f"{where} returns {what} whose {field} is {_kind(x)}; give an array {np.shape(like)}")
+
+
+def _check_kept(where: str, what: str, before: Any, after: Any) -> None:
+    """Raise unless a tree keeps its structure, its shapes and its types from step to step."""
+    _check_arrays(f"{where} returns {what}", after)
+    leaves, structure = jax.tree.flatten(before)
+    others, other = jax.tree.flatten(after)
+    if str(structure) != str(other):
+        raise UserError(f"{where} returns {what} {other}, which were {structure}; return the same kind of tree")
+    for x, y in zip(leaves, others, strict=True):
+        same = jnp.result_type(x) == jnp.result_type(y) or getattr(x, "weak_type", not hasattr(x, "dtype"))
+        if np.shape(x) != np.shape(y) or not same:
+            raise UserError(f"{where} returns {what} with {_kind(y)}, which was {_kind(x)}; keep its shape and type")
+
+
+def _check_arrays(what: str, tree: Any) -> None:
+    """Raise unless all leaves of a tree are arrays or numbers."""
+    for leaf in jax.tree.leaves(tree):
+        if _shape(leaf) is None:
+            raise UserError(f"{what} that hold {shown(leaf)}; give arrays and numbers")
+
+
+def _shape(x: Any) -> tuple[int, ...] | None:
+    """The shape of an array or a number; `None` of anything else."""
+    if isinstance(x, jax.Array | np.ndarray | np.generic | bool | int | float | complex):
+        return np.shape(x)
+    return None
+
+
+def _kind(x: Any) -> str:
+    """What something is, for an error."""
+    shape = _shape(x)
+    if isinstance(x, jax.Array | np.ndarray) and shape is not None:
+        return f"an array {shape} of {x.dtype}"
+    return shown(x)
+
+
+def _where(what: str, function: Any) -> str:
+    """What a function is of a task, and where it is defined."""
+    where = place(function)
+    return f"{where}: {what}" if where else what

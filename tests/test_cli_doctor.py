@@ -74,13 +74,27 @@ def test_a_library_of_a_wrong_version_is_wrong(name, found, said, no_flight, mon
     assert said in wrong and f'pip install "{name}' in wrong
 
 
-def test_a_device_that_does_not_work_is_wrong(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("error", "why"),
+    [
+        (RuntimeError("Unable to initialize backend 'cuda'"), "Unable to initialize backend 'cuda'"),
+        (AssertionError(), "JAX_PLATFORMS is 'cuda'"),  # of JAX_PLATFORMS=cuda without a driver
+    ],
+)
+def test_a_device_that_does_not_work_is_one_line(error, why, monkeypatch, capsys):
     def devices():
-        raise RuntimeError("Unable to initialize backend 'cuda'")
+        raise error
 
-    monkeypatch.setattr(machine, "devices", devices)
+    def broken(*_, **__):
+        raise error
+
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    monkeypatch.setattr(machine.jax, "devices", devices)
     assert main(["doctor"]) == 1
-    assert "wrong      jax finds no device: Unable to initialize backend 'cuda'" in capsys.readouterr().out
+    assert f"wrong      jax finds no device: {why}" in capsys.readouterr().out
+    monkeypatch.setattr("jaxdrones.cli.explain.explain", broken)
+    assert main(["explain", "hover"]) == 2
+    assert capsys.readouterr().err.startswith(f"jaxdrones: error: jax finds no device: {why}; JAX_PLATFORMS=cpu")
 
 
 def test_doctor_understands_every_requirement_of_the_project():

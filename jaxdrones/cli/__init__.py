@@ -18,7 +18,7 @@ from jaxdrones.cli import (
     train,
     view,
 )
-from jaxdrones.cli.common import EXIT_CODES, Parser, print_failure
+from jaxdrones.cli.common import EXIT_CODES, Parser, lasting_interrupts, print_failure
 from jaxdrones.cli.settings import task_first
 
 
@@ -31,7 +31,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(task_first(sys.argv[1:] if arguments is None else arguments))
     try:
-        return options.run(options)
+        with lasting_interrupts():
+            return options.run(options)
     except BaseException as error:
         return print_failure(error, options.debug)
 

@@ -6,10 +6,14 @@ import errno
 import json
 import math
 import os
+import signal
 import sys
+import threading
 import traceback
 from pathlib import Path
 from typing import Any
+
+import jax
 
 from jaxdrones import user_code
 from jaxdrones.checks import UnexpectedKeyword
@@ -24,6 +28,7 @@ EXIT_CODES = """exit codes:
    70  a fault of jaxdrones, with its traceback: please report it
   130  interrupted"""
 
+_AGAIN = 0.05  # s after which a lost Ctrl-C is repeated
 _MAX_MESSAGE = 1000  # characters
 _DEBUG = {"JAX_DEBUG_NANS", "JAX_DEBUG_INFS"}
 
@@ -64,6 +69,27 @@ def print_error(message: str, code: int = MISTAKE) -> int:
     return code
 
 
+@contextlib.contextmanager
+def lasting_interrupts():
+    """A context in which no Ctrl-C is lost: one that Python had to drop, as in a callback of its garbage collector."""
+    before, timers = sys.unraisablehook, []
+
+    def interrupt_again(dropped):
+        if dropped.exc_type is not KeyboardInterrupt:
+            return before(dropped)
+        main = threading.main_thread().ident, signal.SIGINT
+        timers.append(threading.Timer(_AGAIN, signal.pthread_kill, main))  # which also ends the wait for a lock
+        timers[-1].start()
+
+    sys.unraisablehook = interrupt_again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+        for timer in timers:
+            timer.cancel()
+
+
 def print_failure(error: BaseException, debug: bool) -> int:
     """Write to stderr what ended a command; returns the exit code.
 
@@ -75,7 +101,8 @@ def print_failure(error: BaseException, debug: bool) -> int:
     """
     if debug:
         traceback.print_exception(error)
-    if isinstance(error, KeyboardInterrupt):
+    in_callback = isinstance(error, jax.errors.JaxRuntimeError) and "KeyboardInterrupt" in str(error)
+    if isinstance(error, KeyboardInterrupt) or in_callback:
         return print_error("interrupted", INTERRUPTED)
     if blamed := user_code.blame(error):
         return print_error(blamed + "; --debug shows the traceback" * (not debug))

@@ -12,6 +12,7 @@ import pytest
 
 from jaxdrones.cli import live as live_option
 from jaxdrones.cli import main
+from jaxdrones.cli.common import lasting_interrupts
 from jaxdrones.flights.fly import fly
 from jaxdrones.visualization.viewer import live as module
 from jaxdrones.visualization.viewer import server
@@ -238,16 +239,20 @@ def test_more_than_a_browser_plays_is_refused(record):
         live.add(next(parts(record)), 1e5)
 
 
-@pytest.mark.parametrize("when", ["open http", "waiting"])
-def test_ctrl_c_ends_a_program_that_waits_for_a_viewer(when, tmp_path, monkeypatch, capsys):
-    def interrupted(line, **to):
-        if line.startswith(when):
-            raise KeyboardInterrupt
+class Dropped:
+    """Its deletion is interrupted, which Python cannot raise: as in a callback of the garbage collector."""
 
-    monkeypatch.setattr(live_option, "print", interrupted, raising=False)
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_ends_a_wait_for_a_viewer_also_where_python_drops_it(record, tmp_path, monkeypatch, capsys):
     start = time.monotonic()
-    assert main(["fly", "circle", "--duration", "0.5", "--live", "--no-figure", "--output", str(tmp_path)]) == 130
+    with pytest.raises(KeyboardInterrupt), lasting_interrupts(), Live(say=lambda line: Dropped() and None) as live:
+        play(live, record)
     assert time.monotonic() - start < live_option.WAIT
+    monkeypatch.setattr(live_option, "print", lambda *line, **to: Dropped() and None, raising=False)
+    assert main(["fly", "circle", "--duration", "0.5", "--live", "--no-figure", "--output", str(tmp_path)]) == 130
     assert capsys.readouterr().err == "jaxdrones: interrupted\n"
 
 

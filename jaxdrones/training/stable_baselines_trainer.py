@@ -53,7 +53,8 @@ class SB3Trainer:
         self.worlds.reset()
         self.worlds.step(np.zeros((self.worlds.num_envs, *self.worlds.action_space.shape), np.float32))
         self.worlds.seed(seed)
-        self.evaluate = compile_evaluation(self.env, SB3Policy.of(self.model), episodes)
+        policy = SB3Policy.of(self.model.policy.state_dict(), recipe.algorithm)
+        self.evaluate = compile_evaluation(self.env, policy, episodes)
         self.compile_seconds = time.perf_counter() - start
 
     def prepare(self, run: SB3Run) -> None:

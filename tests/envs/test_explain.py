@@ -145,7 +145,7 @@ def test_a_term_of_a_user_is_shown_even_if_it_says_nothing_and_refused_if_it_say
     told = explain(make("hover", observation=(silent, "omega"))).observation
     assert [(entry.term, entry.quantity.unit) for entry in told[:3]] == [("term 0", "?")] * 3
     short = ObservationTerm(lambda task, world: world.drones.pos, 5.0, entries=(Quantity("height", "m"),))
-    with pytest.raises(ValueError, match="line .* returns 3 numbers and has 1 in entries"):
+    with pytest.raises(ValueError, match=r"line .* returns 3 numbers and has 1 in entries"):
         make("hover", observation=(short,))
     still = Action(2, lambda params, memory, state, action, setpoint, dt: (memory, params.hover_rpm * jnp.ones(4)))
     assert [entry.quantity.name for entry in explain(make("hover", action=still)).action] == ["number 0", "number 1"]

@@ -165,9 +165,9 @@ class Task:
     """Control steps that an episode goes on after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
 
     def __post_init__(self):
-        for name in "name", "summary":
-            if not (isinstance(getattr(self, name), str) and getattr(self, name)):
-                raise UserError(f"{name} of the task is {shown(getattr(self, name))}; give a text")
+        for name, kind in ("name", str), ("summary", str), ("camera", Camera | None):
+            if not isinstance(x := getattr(self, name), kind) or x == "":
+                raise UserError(f"{name} of the task is {shown(x)}; give {'a text' if kind is str else 'a Camera'}")
         check_whole(f"number of drones of {self.name}", self.drones)
         check_positive("duration", self.duration, "s")
         check_positive("control_hz", self.control_hz, "1/s")
@@ -185,16 +185,13 @@ class Task:
         for name, term in _mapping("observations", self.observations, "an ObservationTerm").items():
             if not isinstance(term, ObservationTerm):
                 raise UserError(f"observations[{name!r}] is {shown(term)}; give an ObservationTerm")
-        if self.camera is not None and not isinstance(self.camera, Camera):
-            raise UserError(f"camera is {shown(self.camera)}; give a jaxdrones.sensing.Camera")
 
     def _check_functions(self) -> None:
         """Raise unless the functions of the task are functions of so many arguments."""
         _check_function("start", self.start, ("key", "params", "scene")[: 3 if takes_scene(self.start) else 2])
         _check_function("target", self.target, ("variables", "time"))
         _check_function("advance", self.advance, _OF_A_WORLD)
-        if self.success is not None:
-            _check_function("success", self.success, ("metrics", "dt"))
+        _check_function("success", self.success or (lambda metrics, dt: None), ("metrics", "dt"))
         for name, entry in _mapping("rewards", self.rewards, "(scale, function of (task, world))").items():
             if not (isinstance(entry, tuple | list) and len(entry) == 2):
                 raise UserError(f"rewards[{name!r}] is {shown(entry)}; give (scale, function of (task, world))")

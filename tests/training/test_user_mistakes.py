@@ -84,7 +84,7 @@ MISTAKES = [  # (what stands in the file, what a user wrote in its place, what i
     ("duration=1.0", "duration=1.0, vision=('colour',)", "unknown image 'colour'"),
     ("duration=1.0", "duration=1.0, action='fly'", "unknown action 'fly'"),
     ("duration=1.0", "duration=1.0, obstacles_terminate=1", "obstacles_terminate is 1; give True or False"),
-    ("camera=None", "camera=3", "camera is 3; give a jaxdrones.sensing.Camera"),
+    ("camera=None", "camera=3", "camera of the task is 3; give a Camera"),
     ("contact=()", "contact=('water',)", "unknown contact 'water'"),
     ("contact=()", "contact=3", "contact is 3; give a sequence"),
     ("start=start", "start=None", r"start is None; give a function of \(key, params\)"),

@@ -191,7 +191,7 @@ class Task:
         _check_function("start", self.start, ("key", "params", "scene")[: 3 if takes_scene(self.start) else 2])
         _check_function("target", self.target, ("variables", "time"))
         _check_function("advance", self.advance, _OF_A_WORLD)
-        _check_function("success", self.success or (lambda metrics, dt: None), ("metrics", "dt"))
+        _check_function("success", self.advance if self.success is None else self.success, ("metrics", "dt"))
         for name, entry in _mapping("rewards", self.rewards, "(scale, function of (task, world))").items():
             if not (isinstance(entry, tuple | list) and len(entry) == 2):
                 raise UserError(f"rewards[{name!r}] is {shown(entry)}; give (scale, function of (task, world))")

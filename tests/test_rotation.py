@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import jaxdrones as jd
 from jaxdrones import rotation, vector
 
 ROUND_OFF = 1e-14  # a dozen float64 operations on numbers of order one
@@ -110,6 +111,87 @@ def test_conversions_agree_with_recorded_ones(name):
     difference = each(rotation.to_rpy, recorded["quat"]) - recorded["rpy"]
     # asin(s) loses half the digits as s nears 0.99999: 1e-16 / sqrt(1 - s^2) = 2e-14.
     np.testing.assert_allclose((difference + np.pi) % (2 * np.pi) - np.pi, 0, atol=1e-12)
+
+
+def attitudes(count, near):
+    """Single-precision quaternions: random ones, some near the poles, and `near` about every multiple of 7.5 degrees.
+
+    Each of roll, pitch and yaw goes through all its multiples, while the other two are random multiples.
+    """
+    rng = np.random.default_rng(4)
+    steps = np.array([24, 12, 24])
+    multiples = [rng.integers(-steps, steps + 1, (near * (2 * n + 1), 3)) for n in steps]
+    for axis, (n, some) in enumerate(zip(steps, multiples, strict=True)):
+        some[:, axis] = np.repeat(np.arange(-n, n + 1), near)
+    rpy = np.radians(7.5 * np.concatenate(multiples))
+    quat = Rotation.from_euler("xyz", rpy + rng.uniform(-1e-6, 1e-6, rpy.shape)).as_quat()
+    half = (np.pi / 2 - rng.uniform(-0.008, 0.008, count // 100)) * rng.choice([-1, 1], count // 100)
+    polar = np.column_stack([rng.uniform(-3, 3, len(half)), half, rng.uniform(-3, 3, len(half))])
+    polar = Rotation.from_euler("xyz", polar).as_quat()
+    quats = np.concatenate([Rotation.random(count, rng=5).as_quat(), quat, polar])
+    return (quats * rng.choice([-1, 1], (len(quats), 1))).astype(np.float32)
+
+
+def check_angles(quats, rpy):
+    """Away from the poles the angles are those of the matrix. At the poles roll is zero and the attitude is right."""
+    x, y, z, w = np.asarray(quats, float).T
+    rpy = np.asarray(rpy, float)
+    up, down = np.maximum(abs(w - y), abs(x + z)), np.maximum(abs(w + y), abs(x - z))
+    pole = np.minimum(up, down) <= 3 / 1024
+    roll, yaw = np.arctan2(y * z + w * x, 0.5 - x * x - y * y), np.arctan2(x * y + w * z, 0.5 - y * y - z * z)
+    exact = np.column_stack([roll, np.arcsin(np.clip(2 * (w * y - x * z), -1, 1)), yaw])
+    difference = (rpy - exact)[~pole]
+    assert np.max(np.abs((difference + np.pi) % (2 * np.pi) - np.pi)) < 2e-3
+    assert np.all(rpy[pole, 0] == 0)
+    turned = Rotation.from_euler("xyz", rpy[pole]).inv() * Rotation.from_quat(np.asarray(quats, float)[pole])
+    assert np.all(turned.magnitude() <= 3 / 512 * np.sqrt(2) + 1e-6)  # rad, at the corners of what counts as a pole
+
+
+def in_worlds(quats):
+    def in_a_loop(quat):
+        return jax.lax.scan(lambda quat, _: (quat, rotation.to_rpy(quat)), quat, length=2)[1]
+
+    return jd.over_worlds(in_a_loop)(quats)[:, 1]
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize(
+    ("count", "near"), [(100_000, 100), pytest.param(1_000_000, 10_000, marks=pytest.mark.slow)], ids=["quick", "slow"]
+)
+def test_angles_in_single_precision_are_right_however_they_are_compiled(count, near):
+    quats = attitudes(count, near)
+    check_angles(quats, in_worlds(quats))
+    check_angles(quats, jax.jit(jax.vmap(rotation.to_rpy))(quats))
+    check_angles(quats, jax.vmap(rotation.to_rpy)(quats))  # eager
+    check_angles(quats[-5:], [jax.jit(rotation.to_rpy)(quat) for quat in quats[-5:]])
+
+
+@pytest.mark.float32
+@pytest.mark.needs("pybullet")
+def test_angles_of_states_of_both_backends_are_right():
+    quats = attitudes(100, 1)
+    n = len(quats)
+    params = jd.repeat(jd.load_params("cf2x"), n)
+    start = jd.State.at_rest(np.arange(3 * n).reshape(n, 3)).replace(quat=jnp.asarray(quats))
+    flown = jax.jit(lambda state: jax.vmap(rotation.to_rpy)(state.quat))
+    from jaxdrones.engine import bullet
+
+    with bullet.make_step() as in_bullet:
+        for step in jd.make_step(), in_bullet:
+            state = step(params, start, jnp.zeros((n, 4)))
+            check_angles(state.quat, flown(state))
+
+
+@pytest.mark.needs("casadi")
+def test_angles_of_the_symbolic_twin_are_right():
+    import casadi
+
+    from jaxdrones.symbolic.interpreter import on_symbols
+
+    (q,), rpy = on_symbols(rotation.to_rpy, q=jnp.zeros(4))
+    quats = attitudes(10_000, 100)
+    twin = casadi.Function("rpy", [q], [rpy]).map(len(quats))
+    check_angles(quats, np.asarray(twin(quats.T.astype(float))).T)
 
 
 def test_roll_pitch_yaw_have_finite_gradients_also_at_the_poles():

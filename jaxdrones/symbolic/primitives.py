@@ -5,19 +5,12 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 try:
     import casadi
 except ImportError as error:
     raise ImportError('jaxdrones.symbolic: casadi is not installed; pip install "jaxdrones[casadi]"') from error
-
-
-class _Bits(NamedTuple):
-    """The bits of a number, of which only the sign is ever asked."""
-
-    number: Any
-    width: int
 
 
 def select(which: Any, *cases: Any) -> Any:
@@ -40,17 +33,6 @@ def _round(x: Any, **_: Any) -> Any:
     return casadi.floor(x + 0.5)
 
 
-def _bits(x: Any, new_dtype: Any) -> _Bits:
-    return _Bits(x, 8 * new_dtype.itemsize)
-
-
-def _sign_of_bits(bits: Any, shift: Any) -> Any:
-    """The sign bit, as `jnp.copysign` asks for it; a negative zero counts as positive."""
-    if not isinstance(bits, _Bits) or int(shift) != bits.width - 1:
-        raise NotImplementedError("a shift of bits has no counterpart in CasADi; write the effect without it")
-    return casadi.SX(bits.number) < 0
-
-
 def _of_two(function: Callable) -> Callable:
     return lambda x, y, **_: function(x, y)
 
@@ -71,7 +53,6 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "atan": _of_one(casadi.atan),
     "atan2": _of_two(casadi.atan2),
     "atanh": _of_one(casadi.atanh),
-    "bitcast_convert_type": _bits,
     "cbrt": _of_one(lambda x: casadi.sign(x) * casadi.fabs(x) ** (1 / 3)),
     "ceil": _of_one(casadi.ceil),
     "clamp": lambda low, x, high, **_: casadi.fmin(casadi.fmax(x, low), high),
@@ -103,8 +84,6 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "pow": _of_two(operator.pow),
     "round": _round,
     "rsqrt": _of_one(lambda x: 1 / casadi.sqrt(x)),
-    "shift_right_arithmetic": _of_two(_sign_of_bits),
-    "shift_right_logical": _of_two(_sign_of_bits),
     "sign": _of_one(casadi.sign),
     "sin": _of_one(casadi.sin),
     "sinh": _of_one(casadi.sinh),

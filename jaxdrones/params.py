@@ -13,6 +13,11 @@ from jaxtyping import Array
 from jaxdrones.checks import check_params, check_shape, check_whole, shown
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
+from jaxdrones.vector import safe_sqrt
+
+AIR_DENSITY = 1.225
+"""Density of the air at which the coefficients of rotors hold, kg/m^3: standard atmosphere at sea level. Their sources
+do not state it; in a laboratory it is within a few percent."""
 
 
 class Params(PyTreeNode):
@@ -30,9 +35,9 @@ class Params(PyTreeNode):
     rotor_spin: Array
     """(4,) +1 or -1: sign of the reaction torque on the body about its z axis."""
     kf: Array
-    """() thrust coefficient, N/RPM^2."""
+    """() thrust coefficient in air of `AIR_DENSITY`, N/RPM^2."""
     km: Array
-    """() torque coefficient, N m/RPM^2."""
+    """() torque coefficient in air of `AIR_DENSITY`, N m/RPM^2."""
     max_rpm: Array
     """() highest rotor speed, RPM; does not follow the mass. Infinity stands for motors without a limit."""
     rotor_rise_time: Array
@@ -44,13 +49,13 @@ class Params(PyTreeNode):
     gravity: Array
     """() acceleration towards -z, m/s^2."""
     air_density: Array
-    """() kg/m^3."""
+    """() kg/m^3; thrust, torque and drag of the rotors are proportional to it, and zero in a vacuum."""
     wind: Array
     """(3,) velocity of the air, m/s, world."""
     external_force: Array
     """(3,) force on the center of mass, N, world; acts through the effect `external_force`."""
     drag_coeff: Array
-    """(3,) rotor drag per axis, N per m/s of air speed and rad/s of summed rotor speed."""
+    """(3,) rotor drag per axis in air of `AIR_DENSITY`, N per m/s of air speed and rad/s of summed rotor speed."""
     flapping_coeff: Array
     """(2,) moment of rotors that move along body x and y, N m per m/s of air speed and rad/s of summed rotor speed."""
     flapping_climb: Array
@@ -64,7 +69,7 @@ class Params(PyTreeNode):
     downwash_coeff: Array
     """(3,) k_D1 (N), k_D2, k_D3 (m) of equation 6 of the paper."""
     inflow_loss: Array
-    """() share of a rotor's thrust lost per m/s of downwash through it, s/m."""
+    """() share of a rotor's thrust lost per m/s of downwash through it, s/m; below one half of the thrust."""
     prop_radius: Array
     """() m."""
     max_speed: Array
@@ -89,9 +94,19 @@ class Params(PyTreeNode):
         return jnp.mean(jnp.sqrt(jnp.sum(self.rotor_pos[..., :2] ** 2, axis=-1)), axis=-1)
 
     @property
+    def relative_density(self) -> Array:
+        """() density of the air over that at which the coefficients hold."""
+        return self.air_density / AIR_DENSITY
+
+    @property
     def hover_rpm(self) -> Array:
-        """() rotor speed at which four rotors carry the weight, RPM."""
-        return jnp.sqrt(self.weight / (4 * self.kf))
+        """() rotor speed at which four rotors carry the weight, RPM.
+
+        This and the following limits are those in air of `AIR_DENSITY`. Like the controllers they do not follow
+        `air_density`, which a vehicle does not know; in other air it hovers at this speed over the square root of
+        `relative_density`.
+        """
+        return safe_sqrt(self.weight / (4 * self.kf))
 
     @property
     def max_thrust(self) -> Array:

@@ -18,10 +18,9 @@ import numpy as np
 from jaxdrones import assets
 from jaxdrones.checks import check_choice, shown
 from jaxdrones.errors import UserError
-from jaxdrones.params import Params
+from jaxdrones.params import AIR_DENSITY, Params
 
 GRAVITY = 9.8  # m/s^2, as in gym-pybullet-drones
-AIR_DENSITY = 1.225  # kg/m^3, standard atmosphere at sea level
 
 _ANY = (-np.inf, np.inf)
 _SIGN = (-1, 1)

@@ -29,8 +29,8 @@ from jaxtyping import Array
 
 from jaxdrones.checks import check_number
 from jaxdrones.errors import UserError
-from jaxdrones.params import Params
-from jaxdrones.urdf import AIR_DENSITY, GRAVITY
+from jaxdrones.params import AIR_DENSITY, Params
+from jaxdrones.urdf import GRAVITY
 
 LIGHTEST, HEAVIEST = 0.02, 3.0  # kg
 _RADIANS_PER_SECOND = 2 * np.pi / 60  # per RPM

@@ -43,7 +43,8 @@ def test_constants_are_the_recorded_ones(name):
         "collision_z_offset": params.collision_offset,
     }
     if vehicle != "hb":  # gym-pybullet-drones gives its hb propellers no size
-        pairs["prop_radius"] = params.prop_radius
+        # Of the racer the diameter is recorded as the radius.
+        pairs["prop_radius"] = params.prop_radius * (2 if vehicle == "racer" else 1)
     for key, value in pairs.items():
         np.testing.assert_allclose(value, recorded[key], rtol=RTOL, err_msg=key)
 

@@ -131,3 +131,9 @@ def test_every_vehicle_stands_on_the_ground():
     np.testing.assert_allclose(end.pos[:, 2], team.collision_height / 2 - team.collision_offset, atol=2e-3)
     np.testing.assert_allclose(end.pos[:, :2], start.pos[:, :2], atol=1e-3)
     assert np.all(np.abs(end.vel) < 1e-3) and np.all(np.abs(end.omega) < 1e-2)
+
+
+def test_the_aspect_of_a_drawn_vehicle_is_the_distance_of_its_rotors_along_y_over_that_along_x(monkeypatch):
+    monkeypatch.setitem(jd.vehicles.LAWS, "aspect", jd.vehicles.Law(1.1, 0.1, 1.09, 1.11))
+    x, y, _ = jnp.abs(jd.vehicles.median(jd.load_params("cf2x")).rotor_pos).T
+    np.testing.assert_allclose(y / x, 1.1, rtol=1e-6)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
 from jaxdrones.dynamics.model import constants
-from jaxdrones.dynamics.rotors import summed_speed, thrust
+from jaxdrones.dynamics.rotors import drag_speed, thrust
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
@@ -22,7 +22,7 @@ _FLOOR = 1.63  # propeller radii; below this height ground effect levels off, as
 def drag(params: Params, state: State) -> Wrench:
     """Rotor drag, -k_D sum(rotor speed) v with v the velocity relative to the air and k_D along the body axes."""
     air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
-    return Wrench.of_force(-params.drag_coeff * summed_speed(state) * air_velocity)
+    return Wrench.of_force(-params.drag_coeff * drag_speed(params, state) * air_velocity)
 
 
 def quadratic_drag(params: Params, state: State) -> Wrench:
@@ -39,7 +39,7 @@ def quadratic_drag(params: Params, state: State) -> Wrench:
 
 def drag_world_axes(params: Params, state: State) -> Wrench:
     """Rotor drag as in gym-pybullet-drones, with the coefficients along the world axes."""
-    force = -params.drag_coeff * summed_speed(state) * (state.vel - params.wind)
+    force = -params.drag_coeff * drag_speed(params, state) * (state.vel - params.wind)
     return Wrench.of_force(rotation.rotate_inverse(state.quat, force))
 
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from jaxdrones import rotation
-from jaxdrones.dynamics.rotors import summed_speed
+from jaxdrones.dynamics.rotors import drag_speed
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import components, safe_sqrt
@@ -25,12 +25,12 @@ def flapping_moment(params: Params, state: State) -> Wrench:
     c_x, c_y = components(params.flapping_coeff)
     about_x = c_y * v * (1 - loss_y * climb + gain * climb**2)
     about_y = -c_x * u * (1 - loss_x * climb + gain * climb**2)
-    return Wrench.of_torque(summed_speed(state) * jnp.stack([about_x, about_y, jnp.zeros_like(u)]))
+    return Wrench.of_torque(drag_speed(params, state) * jnp.stack([about_x, about_y, jnp.zeros_like(u)]))
 
 
 def rate_damping(params: Params, state: State) -> Wrench:
     """Torque against the angular velocity: a descending rotor gains thrust, a rising one loses thrust."""
-    return Wrench.of_torque(-params.rate_damping * state.omega)
+    return Wrench.of_torque(-params.relative_density * params.rate_damping * state.omega)
 
 
 def trim_torque(params: Params, state: State) -> Wrench:

@@ -5,12 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.dynamics.rotors import induced_speed, lost_share, thrust
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import components, cross
 from jaxdrones.wrench import Wrench
 
 _NEWTON_STEPS = 3
+_STOPPED = 1.0  # RPM; a slower rotor has no thrust to lose
 _STILL = 1e-6  # (m/s)^2; makes the inflow of a rotor that neither turns nor moves differentiable
 
 
@@ -19,25 +21,25 @@ def inflow_thrust(params: Params, state: State) -> Wrench:
 
     With U the air speed through a moving rotor, and v_h that in hover,
 
-        dF = -2 b F (U - v_h),  b = inflow_loss hover_rpm / P.
+        dF = -s(2 b (U - v_h)) F,  b = inflow_loss hover_rpm / P.
 
     A blade element loses lift in proportion to the flow through the disc. In a slow climb the induced velocity falls by
-    half the climb speed, hence the factor 2: in a climb at w the fraction b w is lost. Forward flight lowers the
-    induced velocity, which is translational lift. The lift that advancing blades gain is not modeled. Sources:
+    half the climb speed, hence the factor 2: in a climb at w the fraction b w is lost. Beyond one half of the thrust
+    the limit s (`lost_share`) keeps thrust positive, and at most doubles it in a fast descent. Forward flight lowers
+    the induced velocity, which is translational lift. The lift that advancing blades gain is not modeled. Sources:
     Leishman, Principles of Helicopter Aerodynamics, 2006, chapters 2 and 3; Glauert 1926.
 
     The z component of `drag_coeff` is the same loss, measured on the Crazyflie: set it to zero if you also use `drag`.
     """
     air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
-    area = jnp.pi * params.prop_radius**2
 
-    def change(rotor: Float[Array, "3"], rpm: Float[Array, ""]) -> Float[Array, ""]:
+    def share(rotor: Float[Array, "3"], rpm: Float[Array, ""]) -> Float[Array, ""]:
         x, y, climb = components(air_velocity + cross(state.omega, rotor))
-        in_hover = rpm * jnp.sqrt(params.kf / (2 * params.air_density * area))
-        loss_per_speed = 2 * params.inflow_loss * params.hover_rpm * params.kf * rpm
-        return -loss_per_speed * (flow_through(climb, x**2 + y**2, in_hover) - in_hover)
+        in_hover = induced_speed(params, rpm)
+        loss_per_speed = 2 * params.inflow_loss * params.hover_rpm / jnp.maximum(rpm, _STOPPED)
+        return lost_share(loss_per_speed * (flow_through(climb, x**2 + y**2, in_hover) - in_hover))
 
-    return Wrench.of_thrusts(params.rotor_pos, jax.vmap(change)(params.rotor_pos, state.rpm))
+    return Wrench.of_thrusts(params.rotor_pos, -thrust(params, state) * jax.vmap(share)(params.rotor_pos, state.rpm))
 
 
 def flow_through(

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.dynamics.rotors import induced_speed, lost_share, thrust
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
@@ -26,15 +27,16 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     U(z, r) = U_0 10.11 / (z/l + 5.817) / (1 + (sqrt(2) - 1) (r/w)^2)^2, w = 0.07668 (z + 5.817 l),
     l the distance of neighboring motors; it sets in smoothly within one l below the other drone.
     A rotor loses the share `inflow_loss` of its thrust per m/s that blows down its own axis, so that a drone
-    that is half in the jet tilts. The law is valid from 2.5 l on (Bauersfeld et al. 2024); nearer it is an assumption.
+    that is half in the jet tilts; beyond one half of the thrust the loss levels off (`lost_share`). The law is valid
+    from 2.5 l on (Bauersfeld et al. 2024); nearer it is an assumption.
     """
     length = jnp.sqrt(2.0) * other.arm
     axis = rotation.z_axis(other_state.quat)
     to_other = other_state.pos - state.pos
-    speed = _JET_SPEED * _induced_speed(other, other_state)
-    loss = params.inflow_loss * params.kf * vector.dot(axis, rotation.z_axis(state.quat))
+    speed = _JET_SPEED * vector.total(induced_speed(other, jnp.abs(other_state.rpm))) / 4
+    loss = params.inflow_loss * vector.dot(axis, rotation.z_axis(state.quat))
 
-    def thrust_change(rotor: Float[Array, "3"], rpm: Float[Array, ""]) -> Float[Array, ""]:
+    def share(rotor: Float[Array, "3"]) -> Float[Array, ""]:
         above = to_other - rotation.rotate(state.quat, rotor)
         along = vector.dot(axis, above)
         off_axis = vector.dot(above, above) - along**2
@@ -43,10 +45,10 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
         width = (_JET_WIDTH * depth * length) ** 2
         spread = width + (jnp.sqrt(2.0) - 1) * off_axis
         onset = jnp.clip(z, 0, 1)
-        return -speed * width**2 * onset**2 * (3 - 2 * onset) * loss * rpm**2 / (depth * spread**2)
+        return lost_share(speed * width**2 * onset**2 * (3 - 2 * onset) * loss / (depth * spread**2))
 
-    rotors = zip(vector.components(params.rotor_pos), vector.components(state.rpm), strict=True)
-    return Wrench.of_thrusts(params.rotor_pos, jnp.stack([thrust_change(*rotor) for rotor in rotors]))
+    shares = jnp.stack([share(rotor) for rotor in vector.components(params.rotor_pos)])
+    return Wrench.of_thrusts(params.rotor_pos, -thrust(params, state) * shares)
 
 
 def downwash_2021(params: Params, state: State, other: Params, other_state: State) -> Wrench:
@@ -63,9 +65,3 @@ def downwash_2021(params: Params, state: State, other: Params, other_state: Stat
     strength = k1 * (other.prop_radius / (4 * height)) ** 2 * jnp.exp(-off_axis / width / 2)
     strength = jnp.where((dz > 0) & (off_axis < _CUTOFF**2), strength, 0)
     return Wrench.of_force(vector.along_z(-strength))
-
-
-def _induced_speed(params: Params, state: State) -> Float[Array, ""]:
-    """Air speed through the rotor discs in hover by momentum theory, m/s: the mean of sqrt(F_i / (2 rho A))."""
-    area = jnp.pi * params.prop_radius**2
-    return vector.total(jnp.abs(state.rpm)) / 4 * jnp.sqrt(params.kf / (2 * params.air_density * area))

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_number
 from jaxdrones.dynamics.model import Model, constants
+from jaxdrones.dynamics.rotors import induced_speed, thrust
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -103,9 +104,8 @@ def battery_power(params: Params, state: State) -> Float[Array, ""]:
     is this power over the electrical power; it includes the losses of rotor, motor and driver.
     """
     cell = _constants(params)
-    area = jnp.pi * params.prop_radius**2
-    per_cube = params.kf * jnp.sqrt(params.kf / (2 * params.air_density * area))
-    return cell.idle_power + per_cube / cell.efficiency * total(jnp.abs(state.rpm) ** 3)
+    ideal = total(thrust(params, state) * induced_speed(params, jnp.abs(state.rpm)))
+    return cell.idle_power + ideal / cell.efficiency
 
 
 def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
@@ -123,14 +123,9 @@ def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
 
 
 def battery_current(params: Params, state: State) -> Float[Array, ""]:
-    """Current out of the battery, A: power over voltage, or U / R at the maximum power."""
-    power, resistance, voltage = (
-        battery_power(params, state),
-        _constants(params).resistance,
-        battery_voltage(params, state),
-    )
-    enough = 4 * resistance * power <= _source(params, state) ** 2
-    return jnp.where(enough, power, voltage) / jnp.where(enough, voltage, resistance)
+    """Current out of the battery, A: power over voltage, and at most U / R, which it is at the maximum power."""
+    power, voltage = battery_power(params, state), battery_voltage(params, state)
+    return power / jnp.maximum(voltage, _constants(params).resistance * power / voltage)
 
 
 def open_circuit_voltage(battery: Battery, charge: Float[Array, ""]) -> Float[Array, ""]:

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.params import Params
+from jaxdrones.params import AIR_DENSITY, Params
 from jaxdrones.state import State
 from jaxdrones.vector import along_z, components, dot, total
 from jaxdrones.wrench import Wrench
@@ -40,18 +40,37 @@ def lagging_rotors(
 
 
 def thrust(params: Params, state: State) -> Float[Array, "4"]:
-    """Thrust of each rotor, N along body z: F_i = k_F P_i^2."""
-    return params.kf * state.rpm**2
+    """Thrust of each rotor, N along body z: F_i = k_F P_i^2, times the relative density of the air."""
+    return params.relative_density * params.kf * state.rpm**2
 
 
-def summed_speed(state: State) -> Float[Array, ""]:
-    """Sum of the four rotor speeds, rad/s."""
-    return _RADIANS_PER_SECOND * total(state.rpm)
+def drag_speed(params: Params, state: State) -> Float[Array, ""]:
+    """Sum of the four rotor speeds, rad/s, times the relative density of the air; rotor drag is proportional to it."""
+    return params.relative_density * _RADIANS_PER_SECOND * total(state.rpm)
+
+
+def induced_speed(params: Params, rpm: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Speed of the air through a rotor in hover by momentum theory, sqrt(F / (2 rho A)), m/s.
+
+    It does not depend on the density of the air, to which thrust is proportional.
+    """
+    area = jnp.pi * params.prop_radius**2
+    return rpm * jnp.sqrt(params.kf / (2 * AIR_DENSITY * area))
+
+
+def lost_share(loss: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Share of the thrust that a rotor loses, from the linear law of blade elements; negative for a gain.
+
+    Up to one half it is the linear law's. Beyond, where blades stall, it tends smoothly to one: thrust stays positive,
+    and does not grow to more than twice its value. The form of this limit is an assumption.
+    """
+    beyond = jnp.exp(-jnp.maximum(-2 * loss - 1, 0)) - jnp.exp(-jnp.maximum(2 * loss - 1, 0))
+    return jnp.clip(loss, -0.5, 0.5) + beyond / 2
 
 
 def rotor_wrench(params: Params, state: State) -> Wrench:
     """Aerodynamic wrench of the rotors: their thrusts and drag torques, T = sum of spin_i k_T P_i^2 about body z."""
-    drag_torque = params.km * dot(params.rotor_spin, state.rpm**2)
+    drag_torque = params.relative_density * params.km * dot(params.rotor_spin, state.rpm**2)
     return Wrench.of_thrusts(params.rotor_pos, thrust(params, state)) + Wrench.of_torque(along_z(drag_torque))
 
 

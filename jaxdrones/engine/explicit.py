@@ -13,7 +13,7 @@ from jaxdrones.accelerate.shared import materialize_shared
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.integrators import Integrator
-from jaxdrones.dynamics.rotors import limited, with_rotor_speed
+from jaxdrones.dynamics.rotors import limited
 from jaxdrones.engine.clearance import FreeBalls
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Physics, Rotors, check_functions
@@ -150,10 +150,8 @@ class ExplicitStep(Step):
         derivative = _derivative_of(physics)
 
         def substep(params: Params, state: State, command: jax.Array, scene: Scene, free: FreeBalls | None) -> State:
-            speed, _ = physics.rotor_speed(params, state, command)
-            if speed is not state.rpm:  # rotors with a lag do not jump
-                state = jax.vmap(with_rotor_speed)(params, state, speed)
-            return integrator(lambda s: derivative(params, s, command, scene, free), state, dt)
+            start = physics.at_speed(params, state, command)
+            return integrator(lambda s: derivative(params, s, command, scene, free), start, dt)
 
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
             command = check_command(params, state, rpm)
@@ -169,7 +167,8 @@ class ExplicitStep(Step):
             return advance(state, None)[0] if substeps == 1 else jax.lax.scan(advance, state, length=substeps)[0]
 
         def rate(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
-            return derivative(params, state, check_command(params, state, rpm), scene)
+            command = check_command(params, state, rpm)
+            return derivative(params, physics.at_speed(params, state, command), command, scene)
 
         self._step, self._rate = jax.jit(step, inline=True), jax.jit(rate, inline=True)
         self._params: Params | None = None  # what was looked at last, and the attitude that was flown to
@@ -185,7 +184,7 @@ class ExplicitStep(Step):
         return state
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """The derivative that is integrated; see `make_derivative`."""
+        """The derivative that is integrated, once rotors without a lag have their speed; see `make_derivative`."""
         return self._rate(params, state, rpm, self._given(scene))
 
     def __repr__(self) -> str:

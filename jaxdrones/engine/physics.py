@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_arguments, check_sequence, takes_scene
 from jaxdrones.dynamics import Model, drone_contact, instant_rotors, obstacle_contact
-from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench
+from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench, with_rotor_speed
 from jaxdrones.engine.clearance import FreeBalls, contact_of_team
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
@@ -138,6 +138,11 @@ class Physics:
                     f"state.aux lacks {model.name!r}, the state of a model; start from step.init(params, state)"
                 )
         return jax.vmap(self.rotors)(params, state, command)
+
+    def at_speed(self, params: Params, state: State, command: Float[Array, "n 4"]) -> State:
+        """The state of a team after rotors without a lag have taken the speed of a command."""
+        speed, _ = self.rotor_speed(params, state, command)
+        return state if speed is state.rpm else jax.vmap(with_rotor_speed)(params, state, speed)
 
     def wrench(self, params: Params, state: State, scene: Scene, free: FreeBalls | None = None) -> Wrench:
         """The sum of the rotors' aerodynamic wrench and of all effects, one row per drone."""

@@ -10,6 +10,7 @@ import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.control import rates
 from jaxdrones.control.setpoint import Setpoint
+from jaxdrones.dynamics import newton_euler, rotor_wrench
 
 INPUTS = ("pos", "quat", "vel", "target_pos", "target_vel")
 
@@ -99,3 +100,14 @@ def test_body_rates_of_a_team_are_refused():
 
 def hold_rates(gains, params, memory, state, omega, *, dt):
     return memory, rates.follow(gains, params, state, params.gravity, omega)
+
+
+def test_the_inner_loop_compensates_the_gyroscopic_torque():
+    """Without rotor lag the body takes exactly the angular acceleration of the gains, also in a fast tumble."""
+    params, gains = jaxdrones.load_params("cf2x"), rates.gains()
+    params = params.replace(inertia=jnp.array([1.4e-5, 1.8e-5, 2.17e-5]))
+    omega, commanded = jnp.array([6.0, -5.0, 2.0]), jnp.array([6.5, -5.5, 2.2])
+    state = State(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3), omega, jnp.zeros(4))
+    rpm = rates.follow(gains, params, state, params.gravity, commanded)
+    _, turning = newton_euler(params, state, rotor_wrench(params, state.replace(rpm=rpm)))
+    np.testing.assert_allclose(turning, gains.rate * (commanded - omega), rtol=1e-9)

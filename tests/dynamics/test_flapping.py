@@ -37,8 +37,13 @@ def test_only_the_velocity_through_the_air_flaps():
 
 
 def test_a_climb_takes_some_of_the_moment():
-    still, climbing = (abs(flapping_moment(params, level([1.0, 0, w])).torque[1]) for w in (0.0, 0.5))
-    np.testing.assert_allclose(climbing / still, 1 - 0.3 * 0.493 + 0.2 * 0.493**2, rtol=1e-3)  # 0.5/sqrt(1 + (0.5/3)^2)
+    for axis, loss in enumerate((0.3, 0.1)):  # of motion along x and along y
+        vel = np.eye(3)[axis]
+        still, climbing = (
+            abs(flapping_moment(params, level(vel + np.array([0, 0, w]))).torque[1 - axis]) for w in (0.0, 0.5)
+        )
+        expected = 1 - loss * 0.493 + 0.2 * 0.493**2  # 0.493 = 0.5/sqrt(1 + (0.5/3)^2)
+        np.testing.assert_allclose(climbing / still, expected, rtol=1e-3)
 
 
 def test_damping_takes_energy_from_every_rotation():

@@ -176,3 +176,17 @@ def test_downwash_differs_between_vehicles():
     assert below_racer < on_lower(hovering((0, 0, 0.5))).force[2] < 0
     numb = params.replace(inflow_loss=jnp.zeros(()))
     assert on_lower(upper, params=numb, other=racer).force[2] == 0
+
+
+def test_the_loss_is_a_share_of_the_own_thrust_and_the_jet_that_of_the_other():
+    """Four times the thrust coefficient: four times the own loss, twice the speed of the other's jet."""
+    loss = float(downwash(params, lower, params, hovering((0, 0, 1.5))).force[2])
+    stronger = params.replace(kf=4 * params.kf)
+    np.testing.assert_allclose(downwash(stronger, lower, params, hovering((0, 0, 1.5))).force[2], 4 * loss, rtol=1e-12)
+    np.testing.assert_allclose(downwash(params, lower, stronger, hovering((0, 0, 1.5))).force[2], 2 * loss, rtol=1e-12)
+
+
+def test_no_jet_takes_more_than_the_thrust():
+    racer = jaxdrones.load_params("racer")
+    force = downwash(params, lower, racer, hovering((0, 0, 0.4), rpm=racer.max_rpm)).force[2]
+    assert -params.weight < force < -0.6 * params.weight

@@ -59,7 +59,11 @@ def test_voltage_times_current_is_the_power():
 def test_a_slow_drop_comes_to_the_slow_resistance_times_the_current():
     end = flown(equipped(slow_resistance=0.05, slow_time=0.1), 4e4, 480)
     current = jax.vmap(jd.battery_current)(TEAM, end)
-    np.testing.assert_allclose(end.aux["battery"]["slow_drop"], 0.05 * current, rtol=1e-3)
+    battery, slow_drop = TEAM.aux["battery"], end.aux["battery"]["slow_drop"]
+    np.testing.assert_allclose(slow_drop, 0.05 * current, rtol=1e-3)
+    at_rest = jax.vmap(open_circuit_voltage)(battery, end.aux["battery"]["charge"])
+    voltage = jax.vmap(jd.battery_voltage)(TEAM, end)
+    np.testing.assert_allclose(voltage, at_rest - slow_drop - battery.resistance * current, rtol=1e-12)
 
 
 def test_a_weaker_battery_lifts_less():

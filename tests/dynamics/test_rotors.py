@@ -9,6 +9,7 @@ from helpers import VEHICLES, assert_finite, name_of
 import jaxdrones
 from jaxdrones import State, instant_rotors, lagging_rotors
 from jaxdrones.dynamics import rotor_wrench
+from jaxdrones.dynamics.rotors import lost_share, rotor_reaction
 
 level = State(*(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3), jnp.zeros(3)), rpm=jnp.zeros(4))
 
@@ -141,3 +142,25 @@ def test_a_tumbling_drone_with_spinning_rotors_keeps_its_angular_momentum():
     np.testing.assert_allclose(total_angular_momentum(team, after), before, atol=1e-9 * float(jnp.linalg.norm(before)))
     without = step(team.replace(rotor_inertia=jnp.zeros(1)), start, jnp.full((1, 4), 1e4))
     assert np.abs(step(team, start, jnp.full((1, 4), 1e4)).omega - without.omega).max() > 0.01
+
+
+def test_turning_the_spinning_rotors_takes_the_torque_that_angular_momentum_demands():
+    """The torque on the body is minus the rate of h in the world, -(h' + omega x h), with h of all rotors along z."""
+    params = jaxdrones.load_params("cf2x").replace(rotor_inertia=jnp.array(3e-8))
+    omega, rpm, rate = np.array([1.0, -2, 3]), np.array([1e4, 2e4, 3e4, 5e4]), np.array([1e3, -2e3, 5e3, 7e3])
+    state = State(*(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3)), jnp.array(omega), jnp.array(rpm))
+    h, h_rate = (-3e-8 * 2 * np.pi / 60 * np.sum(np.asarray(params.rotor_spin) * x) for x in (rpm, rate))
+    expected = -np.array([0, 0, h_rate]) - np.cross(omega, [0, 0, h])
+    torque = rotor_reaction(params, state, jnp.array(rate)).torque
+    np.testing.assert_allclose(torque, expected, rtol=1e-12)
+
+
+def test_the_lost_share_is_linear_up_to_one_half_and_never_reaches_one():
+    """Its slope is one where the limit sets in, from both sides; in single precision far losses round to one."""
+    small = np.linspace(-0.5, 0.5, 11)
+    np.testing.assert_array_equal(lost_share(jnp.array(small)), small)
+    far = lost_share(jnp.array([0.75, 1.5, 10.0]))
+    np.testing.assert_allclose(far, 1 - np.exp([-0.5, -2, -19]) / 2, rtol=1e-12)
+    np.testing.assert_array_equal(lost_share(-jnp.array([0.75, 1.5, 10.0])), -far)
+    slopes = jax.vmap(jax.grad(lost_share))(jnp.array([-1e9, -0.5, 0.0, 0.5, 0.5 + 1e-12, 1e9]))
+    np.testing.assert_allclose(slopes, [0, 1, 1, 1, 1, 0], rtol=1e-9)

@@ -7,6 +7,7 @@ import pytest
 from helpers import assert_close, assert_finite, flying, make_step
 
 import jaxdrones as jd
+from jaxdrones.dynamics import battery_power, flapping_moment, rate_damping
 from jaxdrones.dynamics.inflow import flow_through
 
 AREA = {"drag_area": jnp.array([2e-3, 3e-3, 6e-3])}
@@ -129,3 +130,61 @@ def test_mistakes_are_named():
         jd.in_wind(lambda pos, time: pos, jd.drag)(CF2X, HOVER)
     with pytest.raises(ValueError, match=r"params.aux lacks 'drag_area'; found nothing"):
         jd.quadratic_drag(CF2X.replace(aux={}), HOVER)
+
+
+def test_rotors_never_pull_down_and_a_descent_at_most_doubles_their_thrust():
+    """All vehicles, from standing rotors to the fastest, at up to 100 m/s in all directions; with finite gradients."""
+    team = jax.tree.map(lambda *x: jnp.stack(x), *(jd.load_params(name) for name in sorted(jd.assets.vehicles())))
+    grid = np.meshgrid(np.linspace(-100, 100, 81), [0.0, 5.0, 100.0], np.linspace(0, 1, 6))
+    climb, edgewise, speed = (jnp.array(x.ravel()) for x in grid)
+
+    def change(climb, edgewise, speed, params):
+        rpm = jnp.full(4, speed * params.max_rpm)
+        vel = jnp.stack([edgewise, jnp.zeros(()), climb])
+        return jd.inflow_thrust(params, HOVER.replace(vel=vel, rpm=rpm)).force[2]
+
+    on_grid = jax.vmap(jax.value_and_grad(change, argnums=(0, 1, 2, 3)), (0, 0, 0, None))
+    changes, slopes = jax.jit(jax.vmap(on_grid, (None, None, None, 0)))(climb, edgewise, speed, team)
+    full = 4 * team.kf[:, None] * (speed[None] * team.max_rpm[:, None]) ** 2
+    assert np.all(full + changes >= 0) and np.all(changes <= full)
+    assert_finite(slopes)
+
+
+def test_the_loss_of_every_vehicle_scales_with_the_speed_of_its_blade_tips():
+    """A blade element loses its angle of attack by the flow through the disc over the speed of the blade."""
+
+    def tip_speed(params):
+        return params.hover_rpm * 2 * np.pi / 60 * params.prop_radius
+
+    vehicles = {name: jd.load_params(name) for name in jd.assets.vehicles()}
+    for name, params in vehicles.items():
+        assert 30 < tip_speed(params) < 154, name
+        expected = CF2X.inflow_loss * tip_speed(CF2X) / tip_speed(params)
+        np.testing.assert_allclose(params.inflow_loss, expected, rtol=0.01, err_msg=name)
+    drawn = jd.vehicles.median(CF2X)
+    np.testing.assert_allclose(drawn.inflow_loss, CF2X.inflow_loss * tip_speed(CF2X) / tip_speed(drawn), rtol=0.01)
+
+
+def test_what_the_air_does_is_proportional_to_its_density_and_nothing_in_a_vacuum():
+    """All effects, on two drones one above the other; no gradient is infinite, in a vacuum or without gravity."""
+    air = (jd.drag, jd.inflow_thrust, flapping_moment, rate_damping, jd.ground_effect, jd.quadratic_drag)
+    derivative = jd.make_derivative(air, (jd.downwash,), models=(jd.battery(),))
+    aux = AREA | {"battery": jd.lithium_polymer()}
+    flapping = {"flapping_coeff": jnp.full(2, 1e-7), "rate_damping": jnp.full(3, 1e-5), "aux": aux}
+    team = jd.repeat(CF2X.replace(**flapping), 2)
+    state = flying(team).replace(pos=jnp.array([[0.0, 0, 0.1], [0.02, 0, 0.8]]))
+    state = state.replace(aux={"battery": jax.vmap(jd.battery().init)(team)})
+
+    def felt(density, gravity, state):
+        params = team.replace(air_density=jnp.full(2, density), gravity=jnp.full(2, gravity))
+        rate = derivative(params, state, state.rpm)
+        power = jax.vmap(battery_power)(params, state) - 0.5
+        return jnp.concatenate([rate.vel + gravity * jnp.array([[0.0, 0, 1]]), rate.omega, power[:, None]], axis=1)
+
+    both = jax.jit(jax.vmap(lambda *x: (felt(*x), jax.jacrev(felt, (0, 1, 2))(*x)), (0, 0, None)))
+    (vacuum, half, full, weightless), slopes = both(
+        jnp.array([0, 0.6125, 1.225, 1.225]), jnp.array([9.8, 9.8, 9.8, 0]), state
+    )
+    np.testing.assert_allclose(half - vacuum, (full - vacuum) / 2, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(vacuum[:, [0, 1, 2, 6]], 0, atol=1e-12)
+    assert_finite((weightless, slopes))

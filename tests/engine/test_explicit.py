@@ -119,6 +119,13 @@ def test_whole_numbers_and_lists_are_rotor_speeds_too():
     assert_close(single_step(team, start, [[15000] * 4]), expected, atol=0)
 
 
+def test_a_call_lasts_as_many_physics_steps_as_it_has_substeps():
+    fallen = jaxdrones.make_step(dt=0.01, substeps=3)(
+        jaxdrones.repeat(cf2x, 1), State.at_rest([[0.0, 0, 1]]), jnp.zeros((1, 4))
+    )
+    np.testing.assert_allclose(fallen.vel[0, 2], -3 * 0.01 * cf2x.gravity, rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_substeps_equal_repeated_steps():
     team = jaxdrones.repeat(cf2x, 2)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
-from jaxdrones.dynamics.rotors import limited, with_rotor_speed
+from jaxdrones.dynamics.rotors import limited
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.team import Layout, pack
 from jaxdrones.params import Params
@@ -40,19 +40,28 @@ def bodies_of(params: Params) -> jax.Array:
     return jnp.concatenate([jnp.stack(shape, axis=-1), rotor_pos, params.mass[:, None], params.inertia], axis=-1)
 
 
+def make_start(physics: Physics) -> Callable[[Params, State, jax.Array], State]:
+    """Build the function of the state at the start of a physics step, with the rotor speeds that act in it."""
+
+    def start(params: Params, state: State, command: jax.Array) -> State:
+        return physics.at_speed(params, state.replace(rpm=jax.vmap(limited)(params, state.rpm)), command)
+
+    return start
+
+
 def make_loads(physics: Physics, dt: float) -> Callable[..., jax.Array]:
     """Build `loads(layout, aux, flat_params, team, scene)`, compiled: what acts on drones, what follows, (n, 13 + k).
 
     The layouts are those of the parameters and of the states of models, which the arrays were packed by.
     """
+    start = make_start(physics)
 
     def loads(layout: Layout, aux: Layout, flat_params: jax.Array, team: jax.Array, scene: Scene) -> jax.Array:
         params: Params = layout.unpack(flat_params)
         state = State(**{name: team[:, columns] for name, columns in COLUMNS.items()}, aux=aux.unpack(team[:, AUX]))
         omega = jax.vmap(rotation.rotate_inverse)(state.quat, state.omega)
-        state = state.replace(omega=omega, rpm=jax.vmap(limited)(params, state.rpm))
         command = team[:, COMMAND]
-        state = jax.vmap(with_rotor_speed)(params, state, physics.rotor_speed(params, state, command)[0])
+        state = start(params, state.replace(omega=omega), command)
         acting = physics.loads(params, state, command, scene)
 
         in_world = jax.vmap(rotation.rotate)

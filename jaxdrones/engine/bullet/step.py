@@ -41,6 +41,7 @@ class BulletStep(HostStep):
         self.client, self.physics, self.substeps, self.dt, self._scene = client, physics, substeps, dt, scene
         client.set_scene(scene)
         self._loads = arrays.make_loads(physics, dt)
+        self._at_speed = jax.jit(arrays.make_start(physics))
         # What the last call with values was checked for and what was made of it, kept as long as it stays the same:
         self._params: Params | None = None
         self._shapes: list[tuple[int, ...]] = []
@@ -72,8 +73,12 @@ class BulletStep(HostStep):
         return self._flown(params, state, rpm, scene, self.substeps)
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """The mean time derivative over the physics step that follows `state`, contacts included."""
+        """The mean time derivative over the physics step that follows `state`, contacts included.
+
+        Rotors without a lag have their speed at the start of the step, so that their rate is zero.
+        """
         after = self._flown(params, state, rpm, scene, substeps=1)
+        state = self._at_speed(params, state, jnp.asarray(rpm))
         same_sign = jnp.sign(jnp.sum(after.quat * state.quat, axis=-1, keepdims=True))
         after = after.replace(quat=same_sign * after.quat)
         return jax.tree.map(lambda b, a: (b - a) / self.dt, after, state)

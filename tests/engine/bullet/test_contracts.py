@@ -37,6 +37,21 @@ def test_the_rate_is_that_of_the_explicit_backend_in_free_flight(step):
     assert_close(jax.jit(step.rate)(TEAM, state, HOVER), rate, 1e-12)
 
 
+def test_rotors_that_take_their_speed_at_once_have_no_rate_on_either_backend():
+    """Nor do they turn the body by a jump of their speed, whatever speed the state has."""
+    team = TEAM.replace(rotor_inertia=jnp.full(2, 5e-8))
+    state, command = (
+        HIGH.replace(omega=jnp.full((2, 3), 0.1), rpm=0.5 * HOVER),
+        HOVER * jnp.array([[1.0, 1.1, 0.9, 1.2]]),
+    )
+    explicit = jd.make_step().rate(team, state, command)
+    with bullet.make_step() as step:
+        for rate in step.rate(team, state, command), jax.jit(step.rate)(team, state, command):
+            np.testing.assert_array_equal(rate.rpm, 0)
+            np.testing.assert_array_equal(rate.rpm, explicit.rpm)
+            assert_close((rate.vel, rate.omega), (explicit.vel, explicit.omega), 1e-9)
+
+
 def test_the_rate_of_a_drone_at_rest_on_the_ground_is_zero(step):
     """Gravity and the ground's push together, which the sum of wrenches does not know."""
     state, still = jd.State.at_rest([[0.0, 0, 0.05], [1, 0, 0.05]]), np.zeros((2, 4))

@@ -89,6 +89,31 @@ class Cue:
         return world.replace(images={"depth": depth} if self.vision else {})
 
 
+class Clock:
+    """A team that observes the time of its episode, which fails after one step half of the time, or lasts `steps`.
+
+    Drone i is rewarded 1 + i in every step.
+    """
+
+    action_size, observation_size, dt, constant_fields, vision = 1, 1, 0.1, (), None
+
+    def __init__(self, steps: int = 10, drones: int = 1):
+        self.steps, self.drones = steps, drones
+
+    def reset(self, key):
+        fails = jnp.broadcast_to(jax.random.bernoulli(key), (self.drones, 1)).astype(float)
+        return jnp.zeros((self.drones, 1)), PointWorld(Point(fails), jnp.zeros((), jnp.int32))
+
+    begin = reset
+
+    def step(self, key, world, action):
+        world = world.replace(step=world.step + 1)
+        reward = 1 + jnp.arange(self.drones, dtype=action.dtype) + 0 * action[:, 0]
+        obs = jnp.full((self.drones, 1), world.step, action.dtype)
+        info = {"metrics": {"error": reward}}
+        return obs, world, reward, world.drones.pos[0, 0] > 0, world.step >= self.steps, info
+
+
 def dynamics():
     dt = DoubleIntegrator.dt
     return np.array([[1, dt], [0, 1]]), np.array([[dt**2 / 2], [dt]])

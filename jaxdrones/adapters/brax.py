@@ -22,6 +22,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxdrones import envs
+from jaxdrones.adapters.session import rewarding
 from jaxdrones.checks import check_whole
 from jaxdrones.errors import UserError
 
@@ -35,13 +36,23 @@ _COLORED = 4  # axes of the images of a team that have colors
 _NEXT = np.uint32(2**32 - 1)  # what the key is folded with for the next episode: no episode has that many steps
 
 
-def wrap(env: envs.Env) -> BraxEnv:
-    """An environment for brax's trainers."""
-    return BraxEnv(env)
+def wrap(env: envs.Env, team_reward: str = "sum") -> BraxEnv:
+    """An environment for brax's trainers.
+
+    Args:
+        env: environment.
+        team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
+
+    Raises:
+        ValueError: another `team_reward`.
+    """
+    return BraxEnv(env, team_reward)
 
 
 class BraxEnv(base.Env):
-    """One world with one agent: actions and observations of the drones are concatenated, the reward is their mean.
+    """One world with one agent: actions and observations of the drones are concatenated.
+
+    `metrics` has the terms of the reward, as the reward counts them, and means over the drones of the task's metrics.
 
     As in all of brax's environments, the time limit is the trainer's `episode_length`; take `env.steps`.
     `info["time_out"]` is 1 where the task truncated the episode. With images, observations are dictionaries, as brax's
@@ -49,9 +60,9 @@ class BraxEnv(base.Env):
     where the images of all drones are channels of one image.
     """
 
-    def __init__(self, env: envs.Env):
-        """Wrap an environment."""
-        self.env = env
+    def __init__(self, env: envs.Env, team_reward: str = "sum"):
+        """Wrap an environment; the arguments are those of `wrap`."""
+        self.env, self._rewarding = env, rewarding(team_reward)
 
     @property
     def observation_size(self) -> Any:
@@ -78,7 +89,7 @@ class BraxEnv(base.Env):
         obs, world = self.env.reset(start)
         zero = jnp.zeros((), jnp.float32)
         shapes = jax.eval_shape(self.env.step, key, world, jnp.zeros((self.env.drones, self.env.action_size)))
-        metrics = jax.tree.map(lambda _: zero, self._metrics(shapes[-1], lambda x: x))
+        metrics = jax.tree.map(lambda _: zero, jax.eval_shape(self._metrics, shapes[-1]))
         return base.State((world, key), self._flat(obs), zero, zero, metrics, {"time_out": zero})
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
@@ -90,9 +101,9 @@ class BraxEnv(base.Env):
         return state.replace(
             pipeline_state=(world, key),
             obs=self._flat(obs),
-            reward=_mean(reward),
+            reward=_float(self._rewarding(reward)),
             done=_float(terminated | cut),
-            metrics=state.metrics | self._metrics(info, _mean),
+            metrics=state.metrics | self._metrics(info),
             info=state.info | {"time_out": _float(cut & ~terminated)},
         )
 
@@ -102,9 +113,9 @@ class BraxEnv(base.Env):
         images = {f"pixels/{name}": _channels(x) for name, x in obs.items() if name != "state"}
         return {"state": self._flat(obs["state"])} | images
 
-    def _metrics(self, info: dict[str, Any], mean) -> dict[str, jax.Array]:
-        rewards = {f"reward_{name}": mean(x) for name, x in info["rewards"].items()}
-        return rewards | {name: mean(x) for name, x in info["metrics"].items()}
+    def _metrics(self, info: dict[str, Any]) -> dict[str, jax.Array]:
+        rewards = {f"reward_{name}": _float(self._rewarding(x)) for name, x in info["rewards"].items()}
+        return rewards | {name: _float(jnp.mean(x)) for name, x in info["metrics"].items()}
 
 
 class _Training(base.Wrapper):
@@ -212,10 +223,6 @@ def _channels(image: jax.Array) -> jax.Array:
     """Images (n, h, w) or (n, h, w, c) of a team as one, (h, w, n c)."""
     image = image if image.ndim == _COLORED else image[..., None]
     return jnp.moveaxis(image, 0, -2).reshape(*image.shape[1:3], -1).astype(jnp.float32)
-
-
-def _mean(x: jax.Array) -> jax.Array:
-    return jnp.mean(x).astype(jnp.float32)
 
 
 def _float(x: jax.Array) -> jax.Array:

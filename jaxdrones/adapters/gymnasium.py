@@ -18,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 
 from jaxdrones import envs
 from jaxdrones.adapters import pictures
-from jaxdrones.adapters.session import SEEDS, Session, as_env, flat
+from jaxdrones.adapters.session import SEEDS, Session, as_env, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
 from jaxdrones.checks import check_choice, check_whole, shown
@@ -29,7 +29,7 @@ NAMESPACE = "jaxdrones"
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One world. A team's reward is the sum over its drones.
+    """One world.
 
     `info` has the terms of the reward of every drone, `reward_position`, ..., and likewise `metric_...`, of the drones,
     and `termination_...` and `truncation_...`, of the team.
@@ -38,7 +38,13 @@ class GymnasiumEnv(gymnasium.Env):
     metadata = {"render_modes": pictures.MODES, "render_fps": 100}  # noqa: RUF012
 
     def __init__(
-        self, task: str | Task | envs.Env, *, dict_spaces: bool = False, render_mode: str | None = None, **options: Any
+        self,
+        task: str | Task | envs.Env,
+        *,
+        dict_spaces: bool = False,
+        team_reward: str = "sum",
+        render_mode: str | None = None,
+        **options: Any,
     ):
         """Wrap an environment.
 
@@ -46,6 +52,7 @@ class GymnasiumEnv(gymnasium.Env):
             task: a name, a task, or an environment.
             dict_spaces: observations and actions are dicts by drone, "0", "1", ..., as in gym-pybullet-drones (2021);
                 else a team has Box spaces (n, d) and (n, a), and a single drone (d,) and (a,).
+            team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
             render_mode: `rgb_array` or nothing.
             **options: options of `jaxdrones.make`.
 
@@ -55,7 +62,7 @@ class GymnasiumEnv(gymnasium.Env):
         pictures.check_mode(render_mode)
         self.env, self.render_mode = as_env(task, options), render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / self.env.dt)}
-        self._layout = _layout(self.env, dict_spaces)
+        self._layout, self._rewarding = _layout(self.env, dict_spaces), rewarding(team_reward)
         self.observation_space, self.action_space = self._layout.observation, self._layout.action
         self._session = Session(self.env)
 
@@ -79,7 +86,7 @@ class GymnasiumEnv(gymnasium.Env):
         info = flat(info)
         if self.env.drones == 1:
             info = {name: x if isinstance(x, bool) else x.item() for name, x in info.items()}
-        return self._layout.arrange(obs), float(reward.sum()), terminated, truncated, info
+        return self._layout.arrange(obs), float(self._rewarding(reward)), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """A picture (height, width, 3) of the team from the side, if made with `render_mode="rgb_array"`.
@@ -116,6 +123,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         num_envs: int = 1,
         *,
         dict_spaces: bool = False,
+        team_reward: str = "sum",
         numpy: bool = True,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
@@ -128,6 +136,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             task: a name, a task, or an environment.
             num_envs: number of worlds.
             dict_spaces: as for `GymnasiumEnv`.
+            team_reward: as for `GymnasiumEnv`.
             numpy: return new NumPy arrays; else JAX arrays, not copied and not waited for, with `final_obs` and
                 `final_info` in every step.
             max_episode_steps: truncate episodes after so many steps, not after the task's duration.
@@ -157,7 +166,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = self._layout.observation, self._layout.action
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._worlds = Worlds(self.env, self._layout, self.autoreset_mode)
+        self._worlds = Worlds(self.env, self._layout, self.autoreset_mode, team_reward)
         self._over = np.zeros(num_envs, bool)  # worlds that have to be reset, in NumPy with autoreset disabled
 
     def reset(

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from jaxdrones import envs
 from jaxdrones.adapters import jax_spaces
 from jaxdrones.adapters.jax_spaces import Spaces, action_table, of_gymnasium
+from jaxdrones.adapters.session import rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs.autoreset import Episode
 from jaxdrones.envs.env import RESET
@@ -47,6 +48,7 @@ def wrap(
     separate_truncation: bool = False,
     discrete_actions: ArrayLike | None = None,
     spaces: Spaces = jax_spaces,
+    team_reward: str = "sum",
 ) -> GymnaxEnv:
     """An environment with the interface of gymnax.
 
@@ -57,22 +59,30 @@ def wrap(
             continuous when left out.
         spaces: module whose classes the spaces are of, for loops that ask for the class of a space, such as
             `gymnax.environments.spaces`.
+        team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
 
     Raises:
         ValueError: a table of actions of another shape, or with numbers that are not finite.
     """
-    return GymnaxEnv(env, separate_truncation, discrete_actions, spaces)
+    return GymnaxEnv(env, separate_truncation, discrete_actions, spaces, team_reward)
 
 
 class GymnaxEnv:
     """One world with one agent; where an episode ends, the next one begins in the same step.
 
-    Observations and actions of the drones are concatenated, and the reward is their sum. With images, observations are
+    Observations and actions of the drones are concatenated. With images, observations are
     dictionaries of `state` and of the images, which have a drone axis if there are several drones.
     """
 
-    def __init__(self, env: envs.Env, separate_truncation: bool, discrete_actions: ArrayLike | None, spaces: Spaces):
-        self.env = env
+    def __init__(
+        self,
+        env: envs.Env,
+        separate_truncation: bool,
+        discrete_actions: ArrayLike | None,
+        spaces: Spaces,
+        team_reward: str,
+    ):
+        self.env, self._rewarding = env, rewarding(team_reward)
         self._separate_truncation = separate_truncation
         self._layout = Layout(env, None)
         size = env.drones * env.action_size
@@ -131,7 +141,7 @@ class GymnaxEnv:
             else _step_and_reset(self._with(params), key, state, action)
         )
         obs, state, reward, terminated, truncated, info = outcome
-        obs, reward = self._arranged(obs), reward.sum()
+        obs, reward = self._arranged(obs), self._rewarding(reward)
         if self._separate_truncation:
             final = self._arranged(info["final_obs"])
             info = {"terminated": terminated, "truncated": truncated, "final_observation": final}
@@ -148,7 +158,7 @@ class GymnaxEnv:
         """
         outcome = self._episodes(params).step_without_reset(key, state, self._gathered(action))
         obs, state, reward, terminated, truncated, _ = outcome
-        obs, reward = self._arranged(obs), reward.sum()
+        obs, reward = self._arranged(obs), self._rewarding(reward)
         if self._separate_truncation:
             return obs, state, reward, terminated, {"truncated": truncated}
         return obs, state, reward, terminated | truncated, {"discount": _discount(terminated, reward)}

@@ -40,7 +40,7 @@ class VecEnv(vec_env.VecEnv):
             num_envs: number of worlds.
             seed: seed of the first reset; SB3's algorithms set it too.
             render_mode: `rgb_array` or nothing.
-            **options: options of `jaxdrones.make`.
+            **options: options of `jaxdrones.make`, and `team_reward`, `sum` or `mean` of the rewards of the drones.
 
         Raises:
             ValueError: an argument that `jaxdrones.make` refuses.

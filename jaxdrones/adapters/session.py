@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdrones.adapters import pictures
-from jaxdrones.checks import UnexpectedKeyword
+from jaxdrones.checks import UnexpectedKeyword, check_choice
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.tasks.task import Task, World
@@ -80,6 +80,20 @@ def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
             "jaxdrones.make"
         )
     return task
+
+
+def rewarding(team_reward: str) -> Callable[[Any], Any]:
+    """The function from the rewards (*batch, n) of the drones to that (*batch) of their team.
+
+    Args:
+        team_reward: `sum`, as in gym-pybullet-drones' `MultiHoverAviary`, or `mean`, which is of one scale for teams of
+            any size.
+
+    Raises:
+        ValueError: another name.
+    """
+    check_choice("team_reward", team_reward, ("sum", "mean"))
+    return lambda rewards: getattr(rewards, team_reward)(-1)
 
 
 def flat(info: dict[str, Any]) -> dict[str, Any]:

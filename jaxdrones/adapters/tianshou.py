@@ -30,13 +30,22 @@ class VectorEnv(BaseVectorEnv):
     Observations and actions have the shapes of `jaxdrones.adapters.gymnasium.VectorEnv`. Infos are empty.
     """
 
-    def __init__(self, task: str | Task | Env, num_envs: int, *, seed: int | None = None, **options: Any):
+    def __init__(
+        self,
+        task: str | Task | Env,
+        num_envs: int,
+        *,
+        seed: int | None = None,
+        team_reward: str = "sum",
+        **options: Any,
+    ):
         """Make the worlds.
 
         Args:
             task: a name, a task, or an environment.
             num_envs: number of worlds.
             seed: seed of the first reset of all worlds.
+            team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
             **options: options of `jaxdrones.make`.
 
         Raises:
@@ -46,7 +55,7 @@ class VectorEnv(BaseVectorEnv):
         self.env, self.env_num = as_env(task, options), num_envs
         self.is_async = self.is_closed = False
         self._layout = Layout(self.env, None)
-        self._worlds = Worlds(self.env, self._layout, AutoresetMode.DISABLED)
+        self._worlds = Worlds(self.env, self._layout, AutoresetMode.DISABLED, team_reward)
         self.seed(seed)
 
     def get_env_attr(self, key: str, id: Any = None) -> list[Any]:

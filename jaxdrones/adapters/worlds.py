@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from jaxdrones.adapters.session import begin, flat
+from jaxdrones.adapters.session import begin, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import AutoReset, Env
 from jaxdrones.envs.process import check_process
@@ -19,8 +19,8 @@ from jaxdrones.envs.process import check_process
 class Worlds:
     """Worlds that stay on the device; results are JAX arrays with a leading axis over worlds, in a layout."""
 
-    def __init__(self, env: Env, layout: Layout, mode: AutoresetMode):
-        self.env, self.layout, self.mode = env, layout, mode
+    def __init__(self, env: Env, layout: Layout, mode: AutoresetMode, team_reward: str):
+        self.env, self.layout, self.mode, self._rewarding = env, layout, mode, rewarding(team_reward)
         self.started = False
         self._episodes = AutoReset(env)
         self._compiled_reset = jax.jit(self._reset)
@@ -85,13 +85,13 @@ class Worlds:
         if self.mode is AutoresetMode.SAME_STEP:
             ended = terminated | truncated
             result["goes_on"] = ~ended
-            result["episode"] = {"r": info["episode"]["return"].sum(-1), "l": info["episode"]["length"]}
+            result["episode"] = {"r": self._rewarding(info["episode"]["return"]), "l": info["episode"]["length"]}
             result["final_obs"] = self.layout.arrange(info["final_obs"], 1)
         elif self.mode is AutoresetMode.NEXT_STEP:
             ended = terminated | truncated
         else:
             ended = ended | terminated | truncated
-        outcome = self.layout.arrange(obs, 1), reward.sum(-1), terminated, truncated, result
+        outcome = self.layout.arrange(obs, 1), self._rewarding(reward), terminated, truncated, result
         return (count + 1, episodes, ended), outcome
 
     def _step_some(self, kept: tuple, worlds: tuple, actions: jax.Array, mask: jax.Array):

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -94,7 +95,15 @@ class ProgressDisplay(contextlib.ExitStack):
                 self._bar.write(line, file=sys.stderr if self._print_line is quiet else sys.stdout)
         if self._bar is not None:
             self._bar.update(count - self._bar.n)
-            self._bar.set_postfix_str(", ".join(filter(None, (self._evaluated, f"reward {now['reward']:.3f}", speed))))
+            newest = (self._evaluated, _training_return(now), f"reward {now['reward']:.3f}", speed)
+            self._bar.set_postfix_str(", ".join(filter(None, newest)))
+
+
+def _training_return(now: dict[str, float]) -> str:
+    """The mean return in training, where it is measured."""
+    if "return" not in now:
+        return ""
+    return "no episode ended yet" if math.isnan(now["return"]) else f"in training {now['return']:.1f}"
 
 
 def _speed(steps_per_s: float) -> str:

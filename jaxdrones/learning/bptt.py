@@ -14,7 +14,6 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import collect
 from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.normalize import state_vector
 from jaxdrones.learning.result import Result, cosine_adam, count_nonfinite, run_training
 from jaxdrones.learning.returns import discounted_rewards
 from jaxdrones.learning.settings import (
@@ -125,11 +124,12 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     step, opt_state = _optimizer(config).update(gradient, state.opt_state)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
-        obs_stats=collect.update_obs_stats(state.policy.obs_stats, state_vector(trajectory.obs), config, state.step),
+        obs_stats=collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step),
     )
     norm = optax.tree.norm(gradient)
     metrics = {"gradient_norm": norm, "nonfinite_gradients": count_nonfinite(norm)}
-    metrics |= collect.trajectory_metrics(trajectory)
+    worlds, measured = collect.measure(env, config, state.step, worlds, trajectory)
+    metrics |= measured
     return TrainState(state.step + 1, key, policy, opt_state, worlds), metrics
 
 

@@ -16,7 +16,7 @@ from jaxdrones.envs.env import Obs
 from jaxdrones.envs.privileged import PrivilegedObservation
 from jaxdrones.learning import sharding
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.normalize import RunningStatistics
+from jaxdrones.learning.normalize import RunningStatistics, state_vector
 from jaxdrones.learning.settings import Scalar
 from jaxdrones.pytree import PyTreeNode
 
@@ -33,6 +33,10 @@ class Worlds(PyTreeNode):
     """(w, n, d) current observations; here and below, with cameras, a dictionary of such an array and of images."""
     done: Array
     """(w,) whether the episode has ended and a new one has to be started."""
+    last_return: Array
+    """(w,) return of the last episode that ended, mean of the drones; 0 before the first."""
+    last_weight: Array
+    """(w,) weight of that episode in the mean return; 0 before the first. See `mean_return`."""
     memory: Array | None = None
     """(w, n, m) memory of the policy before the observations, zero at the start of an episode; `None` without one."""
 
@@ -56,6 +60,8 @@ class Trajectory(PyTreeNode):
     """(t, w, n, d) observations after the step, before a new episode starts."""
     episode_return: Array
     """(t, w, n) sum of the rewards of the episode so far."""
+    length: Array
+    """(t, w) control steps of the episode so far."""
     error: Array
     """(t, w, n) distance from the target, m."""
     privileged: PrivilegedObservation | None
@@ -78,7 +84,8 @@ def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
     obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), count))
     episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
     memory = None if policy is None else policy.initial_memory((count, env.drones))
-    return Worlds(episodes, obs, jnp.ones(count, bool), memory)
+    none = jnp.zeros(count, episodes.episode_return.dtype)
+    return Worlds(episodes, obs, jnp.ones(count, bool), none, none, memory)
 
 
 def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) -> Worlds:
@@ -96,7 +103,8 @@ def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) ->
     chosen = worlds.done | jax.random.bernoulli(choice_key, fraction, (count,))
     obs, episodes = jax.vmap(AutoReset(env).reset)(jax.random.split(start_key, count))
     memory = jax.tree.map(jnp.zeros_like, worlds.memory)
-    return _select(chosen, Worlds(episodes, obs, jnp.zeros_like(chosen), memory), worlds)
+    fresh = worlds.replace(episodes=episodes, obs=obs, done=jnp.zeros_like(chosen), memory=memory)
+    return _select(chosen, fresh, worlds)
 
 
 def collect(
@@ -140,6 +148,7 @@ def collect(
             truncated=truncated & ~terminated,
             final_obs=info["final_obs"],
             episode_return=info["episode"]["return"],
+            length=info["episode"]["length"],
             error=info["metrics"]["error"],
             privileged=privileged_of(worlds.episodes.world),
             final_privileged=privileged_of(info["final_world"]),
@@ -149,8 +158,8 @@ def collect(
         ended = terminated | truncated
         if reset:
             memory = jax.tree.map(lambda x: jnp.where(ended[:, None, None], 0, x), memory)
-            return Worlds(episodes, obs, worlds.done, memory), recorded
-        after = Worlds(episodes, obs, worlds.done | ended, memory)
+            return worlds.replace(episodes=episodes, obs=obs, memory=memory), recorded
+        after = worlds.replace(episodes=episodes, obs=obs, done=worlds.done | ended, memory=memory)
         return _select(worlds.done, worlds, after), recorded  # without this, a lost drone would fly on to infinity
 
     def control_steps(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Trajectory]:
@@ -181,36 +190,83 @@ class _NoReset(AutoReset):
         return obs, episode, reward, terminated, truncated, info
 
 
-def trajectory_metrics(trajectory: Trajectory) -> dict[str, Array]:
-    """Metrics over the steps that count.
+def measure(
+    env: Env, config: Any, step: Array, worlds: Worlds, trajectory: Trajectory
+) -> tuple[Worlds, dict[str, Array]]:
+    """The worlds with the returns of the episodes that ended in a trajectory, and the metrics of an update.
 
-    These are the mean reward of a step, the mean error (m), the fraction of steps that terminated an episode, and the
-    mean return of the episodes that ended.
+    The metrics are the mean reward and the mean error (m) of the steps that count, the fraction of them that terminated
+    an episode, and the mean return. The latter is NaN until a whole episode could have been flown, as only those that
+    failed have ended before: in the first `env.steps` steps of a training, and always if every trajectory is shorter
+    and starts new episodes in all worlds.
+
+    Args:
+        env: environment.
+        config: settings of a learner, of which `horizon` and `restart_fraction` count.
+        step: () updates made before this one.
+        worlds: worlds after the trajectory.
+        trajectory: trajectory.
     """
     counts = ~trajectory.was_done
-    done = trajectory.done & counts
-    return {
+    worlds = with_returns(worlds, trajectory, config.restart_fraction)
+    episodes_fit = config.horizon >= env.steps
+    could_end = (config.restart_fraction < 1) & ((step + 1) * config.horizon >= env.steps) | episodes_fit
+    return worlds, {
         "reward": jnp.mean(trajectory.reward, where=counts[..., None]),
         "error": jnp.mean(trajectory.error, where=counts[..., None]),
         "termination_rate": jnp.mean(trajectory.terminated.astype(trajectory.reward.dtype), where=counts),
-        "return": jnp.sum(trajectory.episode_return, where=done[..., None])
-        / jnp.maximum(jnp.sum(done), 1)
-        / trajectory.reward.shape[2],
+        "return": jnp.where(could_end, mean_return(worlds), jnp.nan),
     }
 
 
-def update_obs_stats(
-    statistics: RunningStatistics, obs: Float[Array, "t w n d"], config: Any, step: Array
-) -> RunningStatistics:
-    """The statistics with the observations of a trajectory added, until they are frozen.
+def with_returns(worlds: Worlds, trajectory: Trajectory, restart_fraction: Scalar) -> Worlds:
+    """The worlds with the return and the weight of the last episode that ended in each.
+
+    An episode that passed k updates was not cut by `restart` with a probability of (1 - restart_fraction)^k. Long ones
+    end more rarely than they begin, and its inverse is the weight that makes up for it (Horvitz and Thompson 1952).
+
+    Args:
+        worlds: worlds after the trajectory.
+        trajectory: trajectory.
+        restart_fraction: probability of being cut before an update.
+    """
+    ended = trajectory.done & ~trajectory.was_done
+    t = jnp.arange(len(ended))[:, None]
+    last = jnp.max(jnp.where(ended, t, -1), axis=0)
+    chosen = t == last[None]  # not an index, with which devices would exchange worlds
+    length = jnp.sum(jnp.where(chosen, trajectory.length, 0), axis=0)
+    passed = -((last + 1 - length) // len(ended))  # updates that began after its first step
+    weight = (1 - jnp.asarray(restart_fraction, trajectory.reward.dtype)) ** -passed
+    returns = jnp.mean(jnp.sum(jnp.where(chosen[..., None], trajectory.episode_return, 0), axis=0), axis=-1)
+    return worlds.replace(
+        last_return=jnp.where(last >= 0, returns, worlds.last_return),
+        last_weight=jnp.where(last >= 0, weight, worlds.last_weight),
+    )
+
+
+def mean_return(worlds: Worlds) -> Float[Array, ""]:
+    """Mean return of the last episode that ended in each world, and of its drones; NaN before there is one.
+
+    Of the episodes that end while some are under way, more are short than long. Of the last ones of all worlds not:
+    every world counts once, however often its episodes end.
+    """
+    weight = jnp.sum(worlds.last_weight)
+    mean = jnp.sum(worlds.last_weight * worlds.last_return) / jnp.where(weight > 0, weight, 1)
+    return jnp.where(weight > 0, mean, jnp.nan)
+
+
+def update_obs_stats(statistics: RunningStatistics, trajectory: Trajectory, config: Any, step: Array):
+    """The statistics with the observations of the steps that count in a trajectory, until they are frozen.
 
     Args:
         statistics: statistics so far.
-        obs: observations of the trajectory.
+        trajectory: trajectory.
         config: settings of a learner, of which `obs_stats_window`, `obs_stats_freeze` and `updates` count.
         step: () updates made.
     """
-    new = statistics.update(obs, window=config.obs_stats_window * obs[..., 0].size)
+    obs = state_vector(trajectory.obs)
+    counts = jnp.broadcast_to(~trajectory.was_done[..., None], obs.shape[:-1])
+    new = statistics.update(obs, window=config.obs_stats_window * obs[..., 0].size, where=counts)
     frozen = step >= config.obs_stats_freeze * config.updates
     return jax.tree.map(lambda new, old: jnp.where(frozen, old, new), new, statistics)
 

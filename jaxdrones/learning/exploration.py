@@ -30,10 +30,13 @@ def explore(
         The memory after the observations, the actions (w, n, a), and the logarithm of their density (w, n).
     """
     memory, mean = policy.act(memory, obs)
-    std = jnp.broadcast_to(jnp.exp(log_std), mean.shape)
-    noise = jax.vmap(lambda key: jax.random.normal(key, mean.shape[1:], mean.dtype))(keys)
-    action = mean + std * noise
+    action = jax.vmap(sample, (0, 0, None))(keys, mean, log_std)
     return memory, action, log_prob(action, mean, log_std)
+
+
+def sample(key: jax.Array, mean: Float[Array, "*batch n a"], log_std: Array) -> Float[Array, "*batch n a"]:
+    """Actions that are normally distributed about their mean."""
+    return mean + jnp.broadcast_to(jnp.exp(log_std), mean.shape) * jax.random.normal(key, mean.shape, mean.dtype)
 
 
 def log_prob(action: Float[Array, "*batch n a"], mean: Array, log_std: Array) -> Float[Array, "*batch n"]:

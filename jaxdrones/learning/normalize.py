@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning.settings import Scalar
@@ -31,26 +31,31 @@ class RunningStatistics(PyTreeNode):
         return cls(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
 
     @classmethod
-    def of(cls, obs: Float[Array, "*batch d"]) -> RunningStatistics:
-        """Statistics of the vectors along the last axis."""
+    def of(cls, obs: Float[Array, "*batch d"], where: Bool[Array, "*batch"] | None = None) -> RunningStatistics:
+        """Statistics of the vectors along the last axis, of those where a mask is true if one is given."""
         batch_axes = tuple(range(obs.ndim - 1))
-        mean = jnp.mean(obs, axis=batch_axes, keepdims=True)
-        var = jnp.mean((obs - mean) ** 2, axis=batch_axes)
-        return cls(mean.reshape(-1), var, jnp.asarray(obs.size // obs.shape[-1], obs.dtype))
+        counts = jnp.ones((1,) * obs.ndim, bool) if where is None else where[..., None]
+        count = jnp.sum(jnp.broadcast_to(counts, (*obs.shape[:-1], 1)), dtype=obs.dtype)
+        mean = jnp.sum(obs, axis=batch_axes, keepdims=True, where=counts) / jnp.maximum(count, 1)
+        var = jnp.sum((obs - mean) ** 2, axis=batch_axes, where=counts) / jnp.maximum(count, 1)
+        return cls(mean.reshape(-1), var, count)
 
-    def update(self, obs: Float[Array, "*batch d"], window: Scalar = jnp.inf) -> RunningStatistics:
+    def update(
+        self, obs: Float[Array, "*batch d"], window: Scalar = jnp.inf, where: Bool[Array, "*batch"] | None = None
+    ) -> RunningStatistics:
         """Statistics of the old and the new vectors together (Chan et al. 1983).
 
         Args:
             obs: new vectors along the last axis.
             window: the old vectors weigh at most as much as this number of vectors, so that early ones are forgotten.
+            where: which of the new vectors count; all when left out.
         """
-        new = RunningStatistics.of(obs)
+        new = RunningStatistics.of(obs, where)
         old_count = jnp.minimum(self.count, window)
-        count = old_count + new.count
+        count = jnp.maximum(old_count + new.count, 1)
         shift = new.mean - self.mean
         var = (old_count * self.var + new.count * new.var) / count + shift**2 * (old_count * new.count / count**2)
-        return RunningStatistics(self.mean + shift * (new.count / count), var, count)
+        return RunningStatistics(self.mean + shift * (new.count / count), var, old_count + new.count)
 
     def normalize(self, obs: Float[Array, "*batch d"]) -> Array:
         """Observations in standard deviations from the mean, clipped at ten."""

@@ -14,12 +14,10 @@ from jaxdrones.checks import check_key, check_keywords, check_number, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
-from jaxdrones.learning import collect
+from jaxdrones.learning import collect, result
 from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
-from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob
+from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob, sample
 from jaxdrones.learning.networks import Policy, init_params
-from jaxdrones.learning.normalize import state_vector
-from jaxdrones.learning.result import Result, clip_gradient, count_nonfinite, run_training
 from jaxdrones.learning.returns import trajectory_advantages
 from jaxdrones.learning.settings import (
     BelowOne,
@@ -30,7 +28,6 @@ from jaxdrones.learning.settings import (
     NotNegative,
     Positive,
     PositiveOrInfinite,
-    Scalar,
     Switch,
     TracedCount,
     check_config,
@@ -38,7 +35,6 @@ from jaxdrones.learning.settings import (
 )
 from jaxdrones.pytree import PyTreeNode
 
-_RATE_FACTOR = 1.2  # by which the learning rate is raised or lowered
 _MAX_LOG_RATIO = 10.0  # far beyond what is rewarded; its exponential is finite
 
 
@@ -72,8 +68,9 @@ class Config:
     learning_rate: Positive = 2e-3
     """Learning rate at the start; it then adapts to `target_kl`."""
     target_kl: Positive = 0.02
-    """Divergence of the updated policy from the one that acted. The learning rate falls when the divergence is above
-    twice this value and rises when it is below half of it, between `min_learning_rate` and `max_learning_rate`."""
+    """Kullback-Leibler divergence of the updated policy from the one that acted. After an update the learning rate
+    falls if the divergence was above twice this value and rises if it was below half of it, between
+    `min_learning_rate` and `max_learning_rate`."""
     min_learning_rate: Positive = 1e-5
     max_learning_rate: Positive = 5e-3
     anneal_fraction: Fraction = 0.3
@@ -171,56 +168,76 @@ def init(key: jax.Array, env: Env, config: Config) -> TrainState:
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Collect a trajectory of all worlds, then make some epochs of gradient steps on it."""
     check_config(config, Config)
-    key, restart_key, collect_key, optimize_key = jax.random.split(state.key, 4)
+    key, restart_key, collect_key, critic_key, optimize_key = jax.random.split(state.key, 5)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
 
     act = jax.tree_util.Partial(explore, state.policy, state.log_std)
     after, trajectory = collect.collect(
         collect_key, env, act, worlds, config.horizon, privileged=config.privileged_critic
     )
-    batch = _batch(config, state, worlds.memory, trajectory)
-    (params, log_std, critic), opt_state, learning_rate, metrics = _optimize(optimize_key, config, state, batch)
-    max_std = _annealed(config, state.step, config.init_std, config.final_std)
+    batch = batch_of(critic_key, config, state, worlds.memory, trajectory)
+    (params, log_std, critic), opt_state, metrics = _optimize(optimize_key, config, state, batch)
+    learning_rate = result.adapted_learning_rate(config, state.step + 1, state.learning_rate, metrics["kl"])
+    max_std = result.annealed(config, state.step, config.init_std, config.final_std)
     log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.min_std, max_std)), jnp.log(max_std))
-    obs_stats = collect.update_obs_stats(state.policy.obs_stats, state_vector(trajectory.obs), config, state.step)
+    obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
     policy = state.policy.replace(params=params, obs_stats=obs_stats)
-    metrics |= collect.trajectory_metrics(trajectory)
+    after, measured = collect.measure(env, config, state.step, after, trajectory)
+    metrics |= measured
     metrics |= {"action_std": jnp.mean(jnp.exp(log_std)), "learning_rate": learning_rate}
     return TrainState(state.step + 1, key, policy, log_std, critic, opt_state, learning_rate, after), metrics
 
 
-def train(key: jax.Array, env: Env, config: Config) -> Result:
+def train(key: jax.Array, env: Env, config: Config) -> result.Result:
     """Make all updates in one compiled program; see `learning.result.run_training`."""
     check_key("key", key)
     check_config(config, Config)
-    return run_training(init, update, key, env, config)
+    return result.run_training(init, update, key, env, config)
 
 
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
     """The clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy."""
-    mean = policy.replay(jax.tree.map(lambda x: x[0], batch.memory), batch.obs, batch.starts)
-    log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob
-    ratio = jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
+    ratio, _ = _probability_ratio(policy, log_std, batch)
     clipped = jnp.clip(ratio, 1 - config.clip_epsilon, 1 + config.clip_epsilon)
     surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     value_error = (1 - config.gamma) * (_value(config, critic, batch.critic_obs) - batch.value_target)
     value_loss = jnp.mean(value_error**2)
     entropy = jnp.mean(jnp.sum(log_std + 0.5 + HALF_LOG_2_PI, axis=-1))
     total = -surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
-    kl = jnp.mean(ratio - 1 - log_ratio)
-    return total, {"value_loss": value_loss, "kl": kl}
+    return total, {"value_loss": value_loss}
 
 
-def _batch(config: Config, state: TrainState, memory: Array | None, trajectory: collect.Trajectory) -> Batch:
+def divergence(policy: Policy, log_std: Array, batch: Batch) -> Array:
+    """Estimate of the Kullback-Leibler divergence of a policy from the one that acted, never negative."""
+    ratio, log_ratio = _probability_ratio(policy, log_std, batch)
+    return jnp.mean(ratio - 1 - log_ratio)
+
+
+def _probability_ratio(policy: Policy, log_std: Array, batch: Batch) -> tuple[Array, Array]:
+    """How much more probable the actions are than when they were chosen, and its logarithm."""
+    mean = policy.replay(jax.tree.map(lambda x: x[0], batch.memory), batch.obs, batch.starts)
+    log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob
+    return jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)), log_ratio
+
+
+def batch_of(
+    key: jax.Array, config: Config, state: TrainState, memory: Array | None, trajectory: collect.Trajectory
+) -> Batch:
     """The transitions of a trajectory with their advantages, normalized, and the targets of their values.
 
-    `memory` (w, n, m) is that of the policy before the trajectory, or `None`.
+    `memory` (w, n, m) is that of the policy before the trajectory, or `None`. The key draws what a centralized critic
+    takes after the last steps of episodes and of the trajectory: actions with exploration, like those before.
     """
     policy = state.policy
-    final_memory, final_action = policy.act(trajectory.memory, trajectory.final_obs)
-    actions = (trajectory.action, final_action) if config.centralized_critic else (None, None)
-    critic_obs = critic_observation(policy, trajectory.obs, trajectory.memory, trajectory.privileged, actions[0])
-    final_obs = critic_observation(policy, trajectory.final_obs, final_memory, trajectory.final_privileged, actions[1])
+    final_memory, final_mean = policy.act(trajectory.memory, trajectory.final_obs)
+    action = final_action = None
+    if config.centralized_critic:
+        action, last = trajectory.action, trajectory.done.at[-1].set(True)[..., None, None]
+        final_action = jnp.where(last, sample(key, final_mean, state.log_std), jnp.roll(action, -1, axis=0))
+    critic_obs = critic_observation(policy, trajectory.obs, trajectory.memory, trajectory.privileged, action)
+    final_obs = critic_observation(
+        policy, trajectory.final_obs, final_memory, trajectory.final_privileged, final_action
+    )
     value = _value(config, state.critic, critic_obs)
     next_value = _value(config, state.critic, final_obs)
     advantage = trajectory_advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
@@ -237,45 +254,42 @@ def _batch(config: Config, state: TrainState, memory: Array | None, trajectory: 
 
 
 def _optimize(key: jax.Array, config: Config, state: TrainState, batch: Batch):
-    """Some epochs of gradient steps: (policy parameters, log_std, critic), optimizer state, learning rate, metrics."""
+    """Some epochs of gradient steps: (policy parameters, log_std, critic), optimizer state, metrics."""
     w = batch.advantage.shape[1]
+    *epoch_keys, last_key = jax.random.split(key, config.epochs + 1)
+
+    def minibatches(key):
+        # The worlds are cut into groups of neighbors, and each minibatch takes one world of every group: on several
+        # devices, whose shares are neighbors too, no device needs the worlds of another.
+        order = jnp.argsort(jax.random.uniform(key, (w // config.minibatches, config.minibatches)), axis=1)
+
+        def cut(x):
+            x = x.reshape(len(x), *order.shape, *x.shape[2:])
+            return jax.vmap(lambda group, order: group[:, order], (1, 0), 2)(x, order).swapaxes(0, 1)
+
+        return jax.tree.map(cut, batch)
 
     def cost(variables, minibatch):
         params, log_std, critic = variables
         return loss(config, state.policy.replace(params=params), log_std, critic, minibatch)
 
-    max_learning_rate = _annealed(config, state.step, config.max_learning_rate, config.min_learning_rate)
-
     def step(carry, minibatch):
-        variables, opt_state, learning_rate = carry
+        variables, opt_state = carry
         (_, metrics), gradient = jax.value_and_grad(cost, has_aux=True)(variables, minibatch)
         step, opt_state = _optimizer(config).update(gradient, opt_state)
-        lower, raise_ = metrics["kl"] > 2 * config.target_kl, metrics["kl"] < config.target_kl / 2
-        factor = jnp.where(lower, 1 / _RATE_FACTOR, jnp.where(raise_, _RATE_FACTOR, 1))
-        learning_rate = jnp.clip(learning_rate * factor, config.min_learning_rate, max_learning_rate)
-        variables = jax.tree.map(lambda x, s: x - (learning_rate * s).astype(x.dtype), variables, step)
-        return (variables, opt_state, learning_rate), (metrics, optax.tree.norm(gradient))
+        variables = jax.tree.map(lambda x, s: x - (state.learning_rate * s).astype(x.dtype), variables, step)
+        return (variables, opt_state), (metrics, optax.tree.norm(gradient))
 
     def epoch(carry, key):
-        # The worlds are cut into groups of neighbors, and each minibatch takes one world of every group: on several
-        # devices, whose shares are neighbors too, no device needs the worlds of another.
-        order = jnp.argsort(jax.random.uniform(key, (w // config.minibatches, config.minibatches)), axis=1)
+        return jax.lax.scan(step, carry, minibatches(key))
 
-        def minibatches(x):
-            x = x.reshape(len(x), *order.shape, *x.shape[2:])
-            return jax.vmap(lambda group, order: group[:, order], (1, 0), 2)(x, order).swapaxes(0, 1)
-
-        return jax.lax.scan(step, carry, jax.tree.map(minibatches, batch))
-
-    carry = ((state.policy.params, state.log_std, state.critic), state.opt_state, state.learning_rate)
-    carry, (metrics, norms) = jax.lax.scan(epoch, carry, jax.random.split(key, config.epochs))
-    return *carry, jax.tree.map(jnp.mean, metrics) | {"nonfinite_gradients": count_nonfinite(norms)}
-
-
-def _annealed(config: Config, step: Array, high: Scalar, low: Scalar) -> Array:
-    """`high` until the last updates, in which it falls to `low` by the same factor in each."""
-    remaining = jnp.clip((1 - step / config.updates) / config.anneal_fraction, 0, 1)
-    return low * (high / low) ** remaining
+    carry = (state.policy.params, state.log_std, state.critic), state.opt_state
+    carry, (metrics, norms) = jax.lax.scan(epoch, carry, jnp.stack(epoch_keys))
+    params, log_std, _ = carry[0]
+    policy = state.policy.replace(params=params)
+    kl = jax.lax.map(lambda minibatch: divergence(policy, log_std, minibatch), minibatches(last_key))
+    metrics = jax.tree.map(jnp.mean, metrics | {"kl": kl})
+    return *carry, metrics | {"nonfinite_gradients": result.count_nonfinite(norms)}
 
 
 def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
@@ -283,4 +297,4 @@ def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
 
 
 def _optimizer(config: Config) -> optax.GradientTransformation:
-    return optax.flatten(optax.chain(clip_gradient(config.max_grad_norm), optax.scale_by_adam()))
+    return optax.flatten(optax.chain(result.clip_gradient(config.max_grad_norm), optax.scale_by_adam()))

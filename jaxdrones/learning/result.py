@@ -22,6 +22,8 @@ from jaxdrones.pytree import PyTreeNode
 PATIENCE = 10
 """Training has diverged when gradients were not finite in so many updates in a row, or in all of fewer updates."""
 
+_RATE_FACTOR = 1.2  # by which the learning rate is raised or lowered
+
 
 class Diverged(RuntimeError):
     """Training has diverged: its numbers or its gradients are not finite."""
@@ -131,6 +133,27 @@ def cosine_adam(
         return learning_rate * (0.5 * (1 + jnp.cos(jnp.pi * jnp.minimum(step, steps) / steps)))
 
     return optax.flatten(optax.chain(clip_gradient(max_grad_norm), optax.adam(schedule, b2=adam_b2)))
+
+
+def adapted_learning_rate(config: Any, updates: Scalar, learning_rate: Scalar, kl: Scalar) -> Array:
+    """The learning rate after an update, with PPO's adaptation to the divergence from the policy that acted.
+
+    Args:
+        config: settings, of which `target_kl` and those of the learning rate count.
+        updates: updates made, this one included.
+        learning_rate: learning rate of this update.
+        kl: divergence of the updated policy from the one that acted in this update.
+    """
+    raised = jnp.where(kl < config.target_kl / 2, _RATE_FACTOR, 1)
+    factor = jnp.where(kl > 2 * config.target_kl, 1 / _RATE_FACTOR, raised)
+    high = annealed(config, updates, config.max_learning_rate, config.min_learning_rate)
+    return jnp.clip(learning_rate * factor, config.min_learning_rate, high)
+
+
+def annealed(config: Any, updates: Scalar, high: Scalar, low: Scalar) -> Array:
+    """`high` until the last updates, in which it falls to `low` by the same factor in each."""
+    remaining = jnp.clip((1 - updates / config.updates) / jnp.maximum(config.anneal_fraction, 1e-6), 0, 1)
+    return low * (high / low) ** remaining
 
 
 def clip_gradient(max_grad_norm: Scalar) -> optax.GradientTransformation:

@@ -17,7 +17,6 @@ from jaxdrones.learning import collect
 from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
 from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
 from jaxdrones.learning.networks import Policy, init_params
-from jaxdrones.learning.normalize import state_vector
 from jaxdrones.learning.result import Result, cosine_adam, count_nonfinite, run_training
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
 from jaxdrones.learning.settings import (
@@ -169,7 +168,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     target_critic = optax.incremental_update(critic, state.target_critic, config.target_update_rate)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
-        obs_stats=collect.update_obs_stats(state.policy.obs_stats, state_vector(trajectory.obs), config, state.step),
+        obs_stats=collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step),
     )
     norm = optax.tree.norm(gradient)
     metrics = {
@@ -177,7 +176,8 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         "critic_loss": critic_metrics["loss"],
         "nonfinite_gradients": count_nonfinite(norm) + critic_metrics["nonfinite_gradients"],
     }
-    metrics |= collect.trajectory_metrics(trajectory)
+    worlds, measured = collect.measure(env, config, state.step, worlds, trajectory)
+    metrics |= measured
     state = TrainState(state.step + 1, key, policy, opt_state, critic, target_critic, critic_opt_state, worlds)
     return state, metrics
 

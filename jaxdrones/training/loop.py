@@ -153,7 +153,8 @@ class _Loop:
         start = time.perf_counter()
         state, metrics = self.trainer.advance(self.state, length)
         seconds = distributed.from_first_host(time.perf_counter() - start)
-        nonfinite = metrics["nonfinite_gradients"] + np.any([~np.isfinite(x) for x in metrics.values()], axis=0)
+        bad = [~np.isfinite(x) for name, x in metrics.items() if name != "return"]  # NaN until an episode has ended
+        nonfinite = metrics["nonfinite_gradients"] + np.any(bad, axis=0)
         self.nonfinite_streak = check_gradients(nonfinite, min(PATIENCE, self.updates), self.nonfinite_streak)
         if not _is_finite(state):
             raise _diverged("parameters are not finite", self.update + length)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 from collections.abc import Sequence
 from typing import IO
@@ -29,7 +30,8 @@ class Progress:
             events.unlink()
 
     def add(self, rows: list[dict[str, float]]) -> None:
-        """Write rows, each with at least `update`."""
+        """Write rows, each with at least `update`; a number that is NaN was not measured and stays empty."""
+        rows = [{name: x for name, x in row.items() if not math.isnan(x)} for row in rows]
         self._write(self._file, rows)
         self._file.flush()
         self._add_events(rows)

@@ -35,6 +35,24 @@ def test_a_step_returns_what_it_was_given_as_the_trainers_scan_over_it(task, env
     assert all(x.shape == (3,) and x.dtype == jnp.float32 for x in (after.reward, after.done))
 
 
+def test_the_reward_of_a_team_is_the_sum_of_its_drones_unless_the_mean_is_asked_for(env_of):
+    plain = env_of("hover", drones=2, duration=0.02)
+
+    @jax.jit
+    def step(key):
+        state = brax.wrap(plain).reset(key)
+        world, step_key = state.pipeline_state
+        rewards = plain.step(jax.random.fold_in(step_key, world.step), world, jnp.full((2, 4), 0.1))[2]
+        action = jnp.full(8, 0.1)
+        return rewards, brax.wrap(plain).step(state, action), brax.wrap(plain, team_reward="mean").step(state, action)
+
+    rewards, *states = step(jax.random.key(0))
+    for state, expected in zip(states, (rewards.sum(), rewards.mean()), strict=True):
+        np.testing.assert_allclose(state.reward, expected, rtol=1e-6)
+        terms = sum(x for name, x in state.metrics.items() if name.startswith("reward_"))
+        np.testing.assert_allclose(terms, expected, rtol=1e-5)
+
+
 @functools.cache
 def two_ends():
     """Above 2.2 m the episode is terminated, below 1.8 m it is cut."""

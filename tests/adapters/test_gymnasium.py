@@ -63,13 +63,25 @@ def test_dict_spaces_by_drone_pass_and_show_what_the_boxes_show(env_of):
     assert reward == reward_by_drone
 
 
-@pytest.mark.slow
-def test_a_teams_reward_is_the_sum_over_drones_and_terms(env_of):
-    env = GymnasiumEnv(env_of("leader-follower"))
-    env.reset(seed=0)
-    _, reward, *_, info = env.step(env.action_space.sample())
-    assert type(reward) is float
-    assert reward == pytest.approx(sum(x.sum() for name, x in info.items() if name.startswith("reward_")), rel=1e-6)
+@pytest.mark.parametrize("rule, share", [("sum", 1.0), ("mean", 0.5)])
+def test_a_teams_reward_is_the_sum_or_the_mean_over_drones_of_all_terms(env_of, rule, share):
+    """Also for many worlds, as Stable-Baselines3 and Tianshou see them; the sum where nothing is said."""
+    env = env_of("hover", drones=2, duration=0.02)
+    one = GymnasiumEnv(env) if rule == "sum" else GymnasiumEnv(env, team_reward=rule)
+    many = VectorEnv(env, 1) if rule == "sum" else VectorEnv(env, 1, team_reward=rule)
+    one.reset(seed=0), many.reset(seed=0)
+    rewards = []
+    for _ in range(2):
+        _, reward, *_, info = one.step(np.full((2, 4), 0.1))
+        assert type(reward) is float
+        terms = sum(x.sum() for name, x in info.items() if name.startswith("reward_"))
+        assert reward == pytest.approx(share * terms, rel=1e-5)
+        _, of_worlds, *_, infos = many.step(np.full((1, 2, 4), 0.1))
+        np.testing.assert_allclose(of_worlds, reward, rtol=1e-5)
+        rewards.append(reward)
+    np.testing.assert_allclose(infos["final_info"]["episode"]["r"], sum(rewards), rtol=1e-5)
+    with pytest.raises(ValueError, match="team_reward"):
+        GymnasiumEnv(env, team_reward="max")
 
 
 def test_a_seed_fixes_the_episode_and_those_that_follow(env_of):

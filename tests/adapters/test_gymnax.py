@@ -36,10 +36,13 @@ def test_it_is_the_environment_with_autoreset(env_of):
     for k in range(3):
         key = jax.random.fold_in(KEY, k)
         action = env.action_space().sample(key)
+        before = state
         obs, state, reward, done, info = env.step(key, state, action)
         expected, episode, rewards, *_ = jax.jit(episodes.step)(key, episode, action.reshape(2, 4))
         np.testing.assert_allclose(obs, expected.ravel(), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(reward, rewards.sum(), rtol=1e-5)
+        halved = gymnax.wrap(plain, team_reward="mean").step_env(key, before, action)[2]
+        np.testing.assert_allclose(halved, rewards.mean(), rtol=1e-5)
         assert done == (k == 1)
         discounts.append(float(info["discount"]))
     assert discounts == [1, 1, 1]  # truncated, not terminated

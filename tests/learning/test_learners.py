@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from double_integrator import SMALL, DoubleIntegrator, Point, PointWorld, dynamics
+from double_integrator import SMALL, Clock, DoubleIntegrator, Point, PointWorld, dynamics
 
 from jaxdrones import envs
 from jaxdrones.envs.randomize import scaled
@@ -95,6 +95,87 @@ def test_learning_rates_can_be_mapped():
 
     small, large = jax.jit(jax.vmap(change))(jnp.array([1e-3, 1e-2]))
     np.testing.assert_allclose(large, 10 * small, rtol=1e-2)
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("reset", [True, False])
+def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_one_could_end(reset):
+    """Half of the episodes fail after one step, the others last for 10, unless they are cut."""
+    env, horizon, fraction = Clock(steps=10, drones=2), 4, 0.3
+    config = ppo.Config(horizon=horizon, restart_fraction=fraction)
+
+    def update(worlds, step):
+        start_key, key = jax.random.split(jax.random.fold_in(jax.random.key(0), step))
+        worlds = collect.restart(start_key, env, worlds, fraction)
+        worlds, flown = collect.collect(key, env, lambda k, m, obs: (m, 0 * obs, None), worlds, horizon, reset)
+        worlds, metrics = collect.measure(env, config, step, worlds, flown)
+        return worlds, metrics["return"]
+
+    worlds = collect.empty_worlds(env, 1000)
+    returns = np.asarray(jax.jit(lambda w: jax.lax.scan(update, w, jnp.arange(120)))(worlds)[1])
+    assert np.all(np.isnan(returns[:2])) and np.all(np.isfinite(returns[2:]))
+    mean, episodes = 1.5 * (1 + 10) / 2, 1000 * 80 / 20  # 20 updates until the last episodes of all worlds are others
+    np.testing.assert_allclose(np.mean(returns[40:]), mean, atol=4 * 1.5 * 4.5 * 2 / np.sqrt(episodes))
+
+
+@pytest.mark.float32
+@LEARNERS
+def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learner):
+    """An episode observes 0, 1, 2; where nothing is reset, five more steps of the trajectory observe 3."""
+    env = Clock(steps=3)
+    config = dataclasses.replace(SMALL[learner], horizon=8, worlds=16)
+    state = learner.init(jax.random.key(0), env, config)
+    after, metrics = jax.jit(lambda state: learner.update(env, config, state))(state)
+    mean, count = float(after.policy.obs_stats.mean[0]), float(after.policy.obs_stats.count)
+    if learner is ppo:
+        assert count == 8 * 16
+    else:  # of episodes that fail only 0 is observed
+        lasting = (count - 16) / 2
+        np.testing.assert_allclose(mean, 3 * lasting / count, rtol=1e-6)
+        np.testing.assert_allclose(metrics["return"], (3 * lasting + (16 - lasting)) / 16, rtol=1e-6)
+
+
+@pytest.mark.float32
+def test_a_centralized_critic_is_bootstrapped_with_the_actions_that_follow():
+    """With lambda 0 a target is the reward and the value of what the critic takes in the next step."""
+    env = Clock(steps=5, drones=2)
+    config = dataclasses.replace(SMALL[ppo], horizon=12, gae_lambda=0.0, gamma=0.9, centralized_critic=True)
+    state = ppo.init(jax.random.key(0), env, config)
+    state = state.replace(critic=jax.tree.map(lambda x: x + 0.3, state.critic))
+
+    @jax.jit
+    def batch_of(key):
+        worlds = collect.restart(jax.random.key(1), env, state.worlds)
+        act = jax.tree_util.Partial(ppo.explore, state.policy, state.log_std)
+        _, flown = collect.collect(jax.random.key(2), env, act, worlds, config.horizon)
+        return flown.terminated, flown.done, ppo.batch_of(key, config, state, None, flown)
+
+    terminated, done, batch = batch_of(jax.random.key(3))
+    value = np.asarray(ppo.discounted_value(state.critic, batch.critic_obs, (8,), config.gamma))
+    within = np.asarray(~done)[:-1]
+    reward = np.array([1.0, 2.0])
+    np.testing.assert_allclose(batch.value_target[:-1][within], (reward + 0.9 * value[1:])[within], rtol=1e-5)
+    np.testing.assert_allclose(batch.value_target[terminated], np.tile(reward, (int(terminated.sum()), 1)), rtol=1e-5)
+    other = batch_of(jax.random.key(4))[2].value_target
+    drawn = np.array(done & ~terminated)
+    drawn[-1] |= ~np.asarray(done)[-1]
+    np.testing.assert_array_equal(np.any(other != batch.value_target, axis=-1), drawn)
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("epochs, minibatches", [(1, 1), (3, 2)])
+def test_the_learning_rate_of_ppo_moves_once_an_update_by_the_divergence_after_it(epochs, minibatches):
+    env = DoubleIntegrator()
+    config = dataclasses.replace(SMALL[ppo], epochs=epochs, minibatches=minibatches, max_learning_rate=10.0)
+    rates = jnp.array([1e-4, 3.0])
+
+    def update(rate):
+        state = ppo.init(jax.random.key(0), env, dataclasses.replace(config, learning_rate=rate))
+        return ppo.update(env, config, state)[1]
+
+    metrics = jax.jit(jax.vmap(update))(rates)
+    assert 0 < metrics["kl"][0] < config.target_kl / 2 and metrics["kl"][1] > 2 * config.target_kl
+    np.testing.assert_allclose(metrics["learning_rate"], rates * jnp.array([1.2, 1 / 1.2]), rtol=1e-6)
 
 
 def optax_norm(tree):

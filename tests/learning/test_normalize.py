@@ -30,3 +30,14 @@ def test_normal_observations_have_zero_mean_and_unit_variance_and_outliers_are_c
 def test_an_entry_that_never_changes_stays_finite():
     constant = jnp.ones((10, 2))
     assert jnp.all(RunningStatistics.of(constant).normalize(constant) == 0)
+
+
+def test_vectors_that_do_not_count_change_nothing():
+    rng = np.random.default_rng(0)
+    x, counts = jnp.asarray(rng.normal(3.0, 2.0, size=(20, 5, 4))), rng.random((20, 5)) < 0.4
+    expected = RunningStatistics.empty(4).update(x[counts])
+    masked = RunningStatistics.empty(4).update(jnp.where(counts[..., None], x, 1e6), where=jnp.asarray(counts))
+    none = masked.update(x + 1e6, where=jnp.zeros((20, 5), bool))
+    for one in masked, none:
+        for name in ("mean", "var", "count"):
+            np.testing.assert_allclose(getattr(one, name), getattr(expected, name), rtol=1e-12)

@@ -10,7 +10,7 @@ from double_integrator import SMALL, DoubleIntegrator
 
 from jaxdrones import envs, learning
 from jaxdrones.learning import Diverged, Policy, bptt, evaluate, ppo, shac
-from jaxdrones.learning.result import PATIENCE, check_gradients, clip_gradient, count_nonfinite
+from jaxdrones.learning.result import PATIENCE, adapted_learning_rate, check_gradients, clip_gradient, count_nonfinite
 
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
 KEY = jax.random.key(0)
@@ -74,6 +74,21 @@ def test_a_gradient_that_is_not_finite_is_replaced_by_zero_and_counted():
         clipped, _ = transformation.update({"a": jnp.array([1.0, bad]), "b": jnp.array(2.0)}, None)
         assert all(jnp.all(x == 0) for x in jax.tree.leaves(clipped))
     np.testing.assert_array_equal(count_nonfinite(jnp.array([[1.0, jnp.nan], [jnp.inf, 0.0]])), 2)
+
+
+def test_the_learning_rate_follows_the_divergence_within_bounds_that_are_annealed():
+    config = ppo.Config(updates=100, target_kl=0.02, max_learning_rate=6e-3, anneal_fraction=0.4)
+
+    def adapted(*numbers, config=config):
+        return float(adapted_learning_rate(config, *numbers))
+
+    assert adapted(0, 1e-3, 0.009) == pytest.approx(1.2e-3) and adapted(0, 1e-3, 0.041) == pytest.approx(1e-3 / 1.2)
+    assert adapted(0, 1e-3, 0.011) == adapted(0, 1e-3, 0.039) == pytest.approx(1e-3)
+    assert adapted(60, 6e-3, 0.0) == pytest.approx(6e-3)
+    assert adapted(80, 6e-3, 0.0) == pytest.approx((6e-3 * 1e-5) ** 0.5)
+    assert adapted(100, 6e-3, 0.0) == adapted(0, 1e-5, 1.0) == pytest.approx(1e-5)
+    never = dataclasses.replace(config, anneal_fraction=0.0)
+    assert adapted(99, 6e-3, 0.0, config=never) == pytest.approx(6e-3) and adapted(100, 6e-3, 0.0, config=never) > 0
 
 
 def test_nobody_is_asked_about_compilers():

@@ -121,14 +121,18 @@ def test_exploration_stays_within_bounds_that_are_annealed(env):
     made.stop()
 
 
-def test_the_learning_rate_follows_the_divergence_within_bounds_that_are_annealed():
-    settings = Config(updates=100, target_kl=0.02, min_learning_rate=1e-5, max_learning_rate=6e-3, anneal_fraction=0.4)
-    assert settings.adapted_learning_rate(0, 1e-3, kl=0.001) == pytest.approx(1.2e-3)
-    assert settings.adapted_learning_rate(0, 1e-3, kl=0.02) == 1e-3
-    assert settings.adapted_learning_rate(0, 1e-3, kl=0.05) == pytest.approx(1e-3 / 1.2)
-    assert settings.adapted_learning_rate(60, 6e-3, kl=0.0) == 6e-3
-    assert settings.adapted_learning_rate(80, 6e-3, kl=0.0) == pytest.approx((6e-3 * 1e-5) ** 0.5)
-    assert settings.adapted_learning_rate(100, 6e-3, kl=0.0) == settings.adapted_learning_rate(0, 1e-5, 1.0) == 1e-5
+def test_a_gradient_that_is_not_finite_is_counted_and_replaced_by_zero(env):
+    recipe = Recipe.of("leader-follower", "ppo", library="rllib", worlds=4, horizon=8, hidden_sizes=(8,), minibatches=2)
+    trainer = RLlibTrainer(recipe, episodes=2)
+    state = trainer.start(jax.random.key(0))
+    _, metrics = trainer.advance(state, 1)
+    assert metrics["nonfinite_gradients"] == [0]
+    with torch.no_grad():
+        for module in trainer._modules()[:1]:
+            module.critic[-1].bias.fill_(1e30)  # the square of its error overflows
+    _, metrics = trainer.advance(state, 1)
+    assert metrics["nonfinite_gradients"][0] > recipe.config.epochs
+    assert all(torch.isfinite(x).all() for module in trainer._modules() for x in module.parameters())
 
 
 def test_a_seed_repeats_a_training_and_another_does_not():

@@ -6,6 +6,7 @@ import dataclasses
 
 from jaxdrones.checks import check_keywords
 from jaxdrones.errors import UserError
+from jaxdrones.learning.result import annealed
 from jaxdrones.learning.settings import (
     BelowOne,
     Count,
@@ -15,12 +16,8 @@ from jaxdrones.learning.settings import (
     Positive,
     PositiveFraction,
     PositiveOrInfinite,
-    Scalar,
     check_settings,
 )
-
-RATE_FACTOR = 1.2
-"""Factor by which the learning rate is raised or lowered."""
 
 
 @check_keywords
@@ -45,8 +42,9 @@ class Config:
     learning_rate: Positive = 1e-3
     """Learning rate (`lr`) at the start; that of each drone then adapts to `target_kl`."""
     target_kl: Positive = 0.02
-    """Divergence of the updated policy from the one that acted. The learning rate falls when the divergence is above
-    twice this value and rises when it is below half of it, between `min_learning_rate` and `max_learning_rate`."""
+    """Kullback-Leibler divergence of the updated policy from the one that acted, in the last minibatch. After an update
+    the learning rate falls if the divergence was above twice this value and rises if it was below half of it, between
+    `min_learning_rate` and `max_learning_rate`."""
     min_learning_rate: Positive = 1e-5
     max_learning_rate: Positive = 6e-3
     anneal_fraction: PositiveFraction = 0.4
@@ -78,18 +76,7 @@ class Config:
         if self.worlds * self.horizon < self.minibatches:
             raise UserError(f"minibatches is {self.minibatches}; give at most worlds * horizon")
 
-    def std_bounds(self, update: float) -> tuple[float, float]:
-        """Bounds of the standard deviation of actions after an update."""
-        high = self._annealed(update, self.init_std, self.final_std)
+    def std_bounds(self, updates: float) -> tuple[float, float]:
+        """Bounds of the standard deviation of actions after so many updates."""
+        high = float(annealed(self, updates, self.init_std, self.final_std))
         return min(float(self.min_std), high), high
-
-    def adapted_learning_rate(self, update: float, learning_rate: float, kl: float) -> float:
-        """The learning rate after an update that moved the policy by this divergence."""
-        high = self._annealed(update, self.max_learning_rate, self.min_learning_rate)
-        factor = 1 / RATE_FACTOR if kl > 2 * self.target_kl else RATE_FACTOR if kl < self.target_kl / 2 else 1.0
-        return min(max(learning_rate * factor, float(self.min_learning_rate)), high)
-
-    def _annealed(self, update: float, high: Scalar, low: Scalar) -> float:
-        """`high` until the last updates, in which it falls to `low` by the same factor in each."""
-        remaining = min(1.0, max(0.0, (1 - update / self.updates) / self.anneal_fraction))
-        return float(low * (high / low) ** remaining)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from jaxdrones.learning.result import adapted_learning_rate
 from jaxdrones.training.rllib.config import Config
 from jaxdrones.training.rllib.module import CentralizedCriticModule
 
 # isort: split
+import torch
 from ray.rllib.algorithms.ppo.ppo import LEARNER_RESULTS_KL_KEY
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
@@ -21,6 +23,17 @@ class AdaptiveLearner(PPOTorchLearner):
     `learner_config_dict` holds `settings`, the `Config`.
     """
 
+    nonfinite_gradients = 0
+    """Number of gradients of a module whose norm was not finite; they were replaced by zero."""
+
+    def postprocess_gradients_for_module(self, *, module_gradients_dict: dict[Any, Any], **kwargs: Any) -> dict:
+        """Count a gradient that is not finite and replace it by zero, as our own learners do; clip the others."""
+        norm = torch.stack([gradient.norm() for gradient in module_gradients_dict.values()]).norm()
+        if not torch.isfinite(norm):
+            self.nonfinite_gradients += 1
+            module_gradients_dict = {name: torch.zeros_like(x) for name, x in module_gradients_dict.items()}
+        return super().postprocess_gradients_for_module(module_gradients_dict=module_gradients_dict, **kwargs)
+
     def after_gradient_based_update(self, *, timesteps: dict[str, Any]) -> None:
         """Adapt the learning rates, and move the standard deviations into the bounds of this update."""
         settings: Config = self.config.learner_config_dict["settings"]
@@ -33,7 +46,7 @@ class AdaptiveLearner(PPOTorchLearner):
             module.limit_std(*settings.std_bounds(update))
             kl = float(convert_to_numpy(self.metrics.peek((name, LEARNER_RESULTS_KL_KEY))))
             for group in self.get_optimizer(name).param_groups:
-                group["lr"] = settings.adapted_learning_rate(update, rate, kl)
+                group["lr"] = float(adapted_learning_rate(settings, update, rate, kl))
 
     def learning_rate(self, name: str) -> float:
         """The learning rate of a module."""

@@ -16,7 +16,7 @@ from jaxdrones.adapters.rllib import MultiAgentEnv
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect, compilation
 from jaxdrones.learning.critic import critic_observation
-from jaxdrones.learning.exploration import explore
+from jaxdrones.learning.exploration import explore, sample
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
 from jaxdrones.pytree import PyTreeNode
@@ -150,11 +150,11 @@ def _simulate(
     update: Array,
 ) -> tuple[collect.Worlds, RunningStatistics, Steps, dict[str, Array]]:
     """The worlds after some control steps, the statistics of observations, these steps, and their metrics."""
-    restart_key, collect_key = jax.random.split(key)
+    restart_key, collect_key, final_key = jax.random.split(key, 3)
     worlds = collect.restart(restart_key, env, worlds, settings.restart_fraction)
     act = jax.tree_util.Partial(explore, policy, log_std)
     worlds, trajectory = collect.collect(collect_key, env, act, worlds, settings.horizon)
-    mean, final_action = policy(trajectory.obs), policy(trajectory.final_obs)
+    mean, final_action = policy(trajectory.obs), sample(final_key, policy(trajectory.final_obs), log_std)
     columns = {
         "obs": critic_observation(policy, trajectory.obs, None, action=trajectory.action),
         "final_obs": critic_observation(policy, trajectory.final_obs, None, action=final_action),
@@ -163,9 +163,10 @@ def _simulate(
         "log_prob": trajectory.extras,
         "reward": trajectory.reward,
     }
-    obs_stats = collect.update_obs_stats(policy.obs_stats, trajectory.obs, settings, update)
+    obs_stats = collect.update_obs_stats(policy.obs_stats, trajectory, settings, update)
+    worlds, metrics = collect.measure(env, settings, update, worlds, trajectory)
     steps = Steps(columns, trajectory.terminated, trajectory.truncated)
-    return worlds, obs_stats, steps, collect.trajectory_metrics(trajectory)
+    return worlds, obs_stats, steps, metrics
 
 
 def _parts(done: np.ndarray) -> Iterator[tuple[int, int, int]]:

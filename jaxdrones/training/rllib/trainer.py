@@ -111,5 +111,5 @@ class RLlibTrainer(BaseTrainer):
         metrics |= {name: float(np.mean([x[key] for x in learned])) for name, key in _LEARNED.items()}
         metrics["learning_rate"] = float(np.mean([self._learner.learning_rate(agent) for agent in self._agents]))
         log_std = [module.log_std.detach().numpy() for module in self._modules()]
-        # What is not finite shows in the other metrics: RLlib counts no gradients.
-        return metrics | {"action_std": float(np.mean(np.exp(log_std))), "nonfinite_gradients": 0.0}
+        nonfinite, self._learner.nonfinite_gradients = float(self._learner.nonfinite_gradients), 0
+        return metrics | {"action_std": float(np.mean(np.exp(log_std))), "nonfinite_gradients": nonfinite}

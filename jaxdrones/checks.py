@@ -24,6 +24,7 @@ POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_
 """Constants of a vehicle without which nothing flies."""
 _NOT_NEGATIVE = ("km", "gravity", "air_density")
 _MAY_BE_INFINITE = ("max_rpm",)
+_BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 _NO_ARRAYS = (list, tuple, dict, str, type(None))
 _UNKNOWN = (jax.core.Tracer, jax.ShapeDtypeStruct)
 
@@ -187,12 +188,18 @@ def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], h
 
 
 def takes_scene(function: Callable) -> bool:
-    """Whether a function has three arguments, the third of which is called `scene`."""
+    """Whether a function has a parameter named `scene`, with or without a default, that is not bound by `partial`."""
     try:
-        parameters = list(inspect.signature(function).parameters.values())
+        parameter = inspect.signature(function).parameters.get("scene")
     except (TypeError, ValueError):
         return False
-    return len(parameters) == 3 and parameters[2].name == "scene"
+    is_bound = isinstance(function, functools.partial) and "scene" in function.keywords
+    return parameter is not None and parameter.kind in _BY_NAME and not is_bound
+
+
+def with_scene(function: Callable, scene: Any) -> Callable:
+    """The function with its parameter `scene` bound; the function itself if it takes no scene."""
+    return functools.partial(function, scene=scene) if takes_scene(function) else function
 
 
 def check_keywords(function: Function) -> Function:

@@ -4,12 +4,15 @@
 gym-pybullet-drones (2021), for its figures and its recorded data.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
 from jaxdrones.dynamics.model import constants
+from jaxdrones.dynamics.needs import Needs, declare
 from jaxdrones.dynamics.rotors import drag_speed, thrust
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -43,12 +46,16 @@ def drag_world_axes(params: Params, state: State) -> Wrench:
     return Wrench.of_force(rotation.rotate_inverse(state.quat, force))
 
 
-def ground_effect(params: Params, state: State) -> Wrench:
+@declare(Needs(ground_only=True))
+def ground_effect(params: Params, state: State, scene: Any = None) -> Wrench:
     """Extra thrust near the ground, smooth and bounded.
 
     Each rotor gains k_G (r_P / 4)^2 / sqrt(h^4 + h_0^4) of its thrust: equation 5 far above
     h_0 = 1.63 propeller radii, level below. The gain fades with the squared cosine of the tilt and is zero upside down.
+    A `scene` without a ground has no ground effect.
     """
+    if scene is not None and not scene.ground:
+        return Wrench.of_force(jnp.zeros_like(state.pos))
     height = _rotor_heights(params, state)
     floor = _FLOOR * params.prop_radius
     gain = params.ground_effect_coeff * (params.prop_radius / 4) ** 2 / jnp.sqrt(height**4 + floor**4)
@@ -56,8 +63,14 @@ def ground_effect(params: Params, state: State) -> Wrench:
     return Wrench.of_thrusts(params.rotor_pos, upright * gain * thrust(params, state))
 
 
-def ground_effect_2021(params: Params, state: State) -> Wrench:
-    """Equation 5 with the height limited from below, and no effect beyond 90 degrees of roll or pitch."""
+@declare(Needs(ground_only=True))
+def ground_effect_2021(params: Params, state: State, scene: Any = None) -> Wrench:
+    """Equation 5 with the height limited from below, and no effect beyond 90 degrees of roll or pitch.
+
+    A `scene` without a ground has no ground effect.
+    """
+    if scene is not None and not scene.ground:
+        return Wrench.of_force(jnp.zeros_like(state.pos))
     clip = params.prop_radius / 4 * safe_sqrt(15 / 4 * params.ground_effect_coeff)
     height = jnp.maximum(_rotor_heights(params, state), clip)
     above = height > 0  # below the ground there is no clip where the coefficient is zero

@@ -12,9 +12,10 @@ jumps at touchdown, and a drone that leaves is not held back. Deeper inside the 
 integration is unstable with more. Friction is Coulomb's, and viscous at low slip speed. All forces are in proportion to
 a mass, so that one set of coefficients serves every vehicle.
 
-The coefficients suit `semi_implicit_euler` with steps of up to 1/240 s: a velocity that is damped at a rate above 1/dt
-overshoots, and at a rate above 2/dt it gains energy. The price of such soft contact is depth: a drone that lands at
-1 m/s sinks in 8 mm, at 5 m/s 3 cm.
+A velocity that is damped at a rate above 1/dt overshoots in explicit integration, and at a rate above 2/dt it gains
+energy. The coefficients are chosen by vehicle such that no rate of heave, tilt or slip is above 408 1/s. So one largest
+step, `LARGEST_STEP`, holds for every vehicle, and `make_step` refuses longer ones. The price of such soft contact is
+depth: a drone that lands on the ground at 1 m/s sinks in 8 mm, at 5 m/s 3 cm.
 """
 
 from typing import Any, NamedTuple
@@ -22,9 +23,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.dynamics.needs import Needs, declare
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import along_z, components, cross, dot, safe_sqrt, total
@@ -35,9 +38,12 @@ _ANGLES = 2 * np.pi / _SPHERES * np.arange(_SPHERES)
 
 _ONSET_DEPTH = 2.5e-3  # m, d: depth of half the damping; a drone at rest is 1.5 mm deep; 1 mm makes gradients noisier
 _PRELOAD = 20.0  # m/s^2, a: about twice gravity, so that a drone rests near the surface
-_DAMPING = 120.0  # 1/s, a b: half of 1/dt for a drone that heaves; a level hb tilts at 3.3 times that rate
+_DAMPING = 120.0  # 1/s, a b: half of 1/dt for a drone that heaves
+_MAX_TILTING = 3.4  # tilt of a level drone is damped at most at so many times that rate, 1.7/dt; an hb's at 3.3 times
 _STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; the damping is just above critical, so that drones hardly bounce
 _FRICTION_RATE = 400.0  # 1/s: the highest rate at which friction on the ground slows a point of the rim
+LARGEST_STEP = 1 / 240
+"""Longest physics step, s, with which contact is stable, whatever the vehicle: 1.7 over the highest rate."""
 _FRICTION_RATE_ON_DRONE = 15.0  # 1/s: the same between drones at each of 16 points; more shakes a drone that is carried
 _MAX_SHARE_ON_DRONE = 4.0  # normal force at one point over that of its lever; three loaded points then stay below 2/dt
 _STICTION_SPEED = 0.01  # m/s: friction is viscous below; with the weight of a cf2x below 0.05 m/s
@@ -46,11 +52,19 @@ _DRONE_FRICTION = 0.25  # coefficient: 0.5 times 0.5
 _ROUNDING = 1e-4  # m: rounds off the distance of two points that coincide
 
 
-def ground_contact(params: Params, state: State) -> Wrench:
+@declare(Needs(contact="ground", ground_only=True))
+def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
     """Normal force and friction of the ground, the plane z = 0, on a drone that touches it. The ground never pulls.
 
     Not for the Bullet backend, which has a ground of its own.
+
+    Args:
+        params: of the drone.
+        state: of the drone.
+        scene: a `jaxdrones.Scene`; one without a ground does not push. There is a ground when left out.
     """
+    if scene is not None and not scene.ground:
+        return Wrench(jnp.zeros_like(state.pos), jnp.zeros_like(state.pos))
     radius, ring = _rim(params)
     x_axis, y_axis, z_axis = rotation.axes(state.quat)
     omega = rotation.rotate(state.quat, state.omega)
@@ -75,6 +89,7 @@ def ground_contact(params: Params, state: State) -> Wrench:
     return Wrench(rotation.rotate_inverse(state.quat, force), rotation.rotate_inverse(state.quat, torque))
 
 
+@declare(Needs(contact="obstacles"))
 def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     """Normal force and friction of the obstacles of a scene on a drone that touches them, by the law of the ground.
 
@@ -116,6 +131,7 @@ def contact_radius(params: Params) -> Float[Array, ""]:
     return safe_sqrt(ring**2 + params.collision_offset**2) + radius
 
 
+@declare(Needs(contact="drones"))
 def drone_contact(params: Params, state: State, other: Params, other_state: State) -> Wrench:
     """Normal force and friction of another drone on a drone that it touches; the other one gets the opposite.
 
@@ -207,14 +223,17 @@ def _contacts(spheres: _Body, disc: _Body) -> _Contact:
     return jax.vmap(of_sphere)(cos, sin)
 
 
-def _normal_force_per_mass(depth: Array, depth_rate: Array) -> Array:
+def _normal_force_per_mass(depth: Array, depth_rate: Array, damping: ArrayLike = _DAMPING) -> Array:
     """Normal force per mass at a penetration depth (m) that grows at a rate (m/s): N/kg, never negative."""
-    return jnp.maximum(_onset(depth) * (_PRELOAD + _DAMPING * depth_rate) + _STIFFNESS * jnp.maximum(depth, 0), 0)
+    return jnp.maximum(_onset(depth) * (_PRELOAD + damping * depth_rate) + _STIFFNESS * jnp.maximum(depth, 0), 0)
 
 
 def _load(params: Params, depth: Array, depth_rate: Array, slip_squared: Array) -> tuple[Array, Array]:
     """Normal force (N) and friction over slip velocity (N s/m) at one sphere on what does not move."""
-    normal_force = params.mass / _SPHERES * _normal_force_per_mass(depth, depth_rate)
+    ix, iy, _ = components(params.inertia)
+    tilting = params.mass * _rim(params)[1] ** 2 / 2 / jnp.minimum(ix, iy)  # rate of damped tilt over that of heave
+    damping = _DAMPING / jnp.maximum(1, tilting / _MAX_TILTING)
+    normal_force = params.mass / _SPHERES * _normal_force_per_mass(depth, depth_rate, damping)
     max_viscosity = _FRICTION_RATE * _sliding_mass(params) / _SPHERES
     return normal_force, _friction_per_slip(_GROUND_FRICTION * normal_force, slip_squared, max_viscosity)
 

@@ -3,6 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -44,13 +45,13 @@ def in_wind(field: WindField, effect: Effect) -> Effect:
     check_arguments("effect", effect, ("params", "state"))
 
     @functools.wraps(effect)
-    def blown(params: Params, state: State) -> Wrench:
+    def blown(params: Params, state: State, **scene: Any) -> Wrench:
         if len(arguments) == 2 and "clock" not in state.aux:
             raise UserError(
                 "the wind field depends on time and state.aux lacks 'clock'; give models=(jaxdrones.clock(),)"
             )
         wind = field(state.pos, state.aux["clock"]) if len(arguments) == 2 else field(state.pos)
-        return effect(params.replace(wind=params.wind + wind), state)
+        return effect(params.replace(wind=params.wind + wind), state, **scene)
 
     return blown
 

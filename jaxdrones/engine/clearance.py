@@ -6,6 +6,7 @@ control step tells in all its physics steps which drones cannot touch anything, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones.accelerate.where_needed import where_needed
-from jaxdrones.dynamics import obstacle_contact
+from jaxdrones.checks import with_scene
 from jaxdrones.dynamics.contact import contact_radius
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -49,10 +50,11 @@ class FreeBalls(NamedTuple):
         return jax.vmap(is_inside)(*self, params, state)
 
 
-def contact_of_team(params: Params, state: State, scene: Scene, free: FreeBalls | None) -> Wrench:
-    """`obstacle_contact` on every drone of a team.
+def contact_of_team(contact: Callable, params: Params, state: State, scene: Scene, free: FreeBalls | None) -> Wrench:
+    """Contact with obstacles of every drone of a team.
 
     Args:
+        contact: effect that declares it, such as `obstacle_contact`.
         params: of a team of n drones.
         state: of the team.
         scene: obstacles.
@@ -60,10 +62,10 @@ def contact_of_team(params: Params, state: State, scene: Scene, free: FreeBalls 
             all, if left out.
     """
 
-    def contact(params: Params, state: State, scene: Scene) -> Wrench:
-        return jax.vmap(obstacle_contact, (0, 0, None))(params, state, scene)
+    def on_all(params: Params, state: State, scene: Scene) -> Wrench:
+        return jax.vmap(with_scene(contact, scene))(params, state)
 
     if free is None:
-        return contact(params, state, scene)
+        return on_all(params, state, scene)
     still = jax.lax.stop_gradient((params, state))
-    return where_needed(contact, _ONE_IN)(~jnp.all(free.hold(*still)), params, state, scene)
+    return where_needed(on_all, _ONE_IN)(~jnp.all(free.hold(*still)), params, state, scene)

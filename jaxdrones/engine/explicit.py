@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import jax
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 from jaxdrones.accelerate.shared import materialize_shared
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, semi_implicit_euler
+from jaxdrones.dynamics.contact import LARGEST_STEP
 from jaxdrones.dynamics.integrators import Integrator
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.engine.clearance import FreeBalls
@@ -107,7 +109,7 @@ def make_step(
 
     Args:
         effects: wrenches on a drone by itself, `(params, state) -> Wrench`: `drag`, `ground_effect`, your own. One
-            that has a third argument called `scene` is given what stands around: `obstacle_contact`.
+            with a parameter named `scene` is given the scene: `obstacle_contact`, `ground_contact`.
         pairs: wrenches on a drone because of another, `(params, state, other, other_state) -> Wrench`: `downwash`.
         rotors: `instant_rotors`, `lagging_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
         integrator: `semi_implicit_euler`, `euler`, `rk4` or `implicit_midpoint`.
@@ -128,13 +130,21 @@ def make_step(
         attitude.
 
     Raises:
-        ValueError: `dt` or `substeps` not positive, an argument that should be a function or a model and is not, or a
-            scene with obstacles and no effect that takes it.
+        ValueError: `dt` or `substeps` not positive, an argument that should be a function or a model and is not, a
+            scene with obstacles and no effect that takes it, or contact with `dt` above 1/240 s, with which it would
+            gain energy.
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
     check_functions("integrator", [integrator])
+    contacts = physics.contacts("ground", "obstacles", "drones")
+    if contacts and dt > LARGEST_STEP * (1 + 1e-6):
+        times = math.ceil(dt / LARGEST_STEP - 1e-6)
+        raise UserError(
+            f"dt is {dt:.4g} s and {describe(contacts)} is stable up to 1/240 s; give dt={dt / times:.4g} and "
+            f"substeps={times * substeps}"
+        )
     return ExplicitStep(physics, integrator, dt, substeps, scene)
 
 
@@ -190,13 +200,13 @@ class ExplicitStep(Step):
     def __repr__(self) -> str:
         return f"<step: {self._text}>"
 
-    def _given(self, scene: Scene | None) -> Scene | None:
-        """The scene of a call; `None` where no effect depends on it."""
+    def _given(self, scene: Scene | None) -> Scene:
+        """What effects depend on of the scene of a call."""
         if scene is None:
             scene = self._scene
         else:
             self._check_scene(scene)
-        return scene if self.physics.takes_scene else None
+        return self.physics.seen(scene)
 
     def _check_scene(self, scene: Scene) -> None:
         if not isinstance(scene, Scene):

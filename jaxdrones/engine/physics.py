@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arguments, check_sequence, takes_scene
-from jaxdrones.dynamics import Model, drone_contact, instant_rotors, obstacle_contact
+from jaxdrones.checks import check_arguments, check_sequence, takes_scene, with_scene
+from jaxdrones.dynamics import Model, instant_rotors
+from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench, with_rotor_speed
 from jaxdrones.engine.clearance import FreeBalls, contact_of_team
 from jaxdrones.engine.neighbors import NeighborGrid
@@ -89,16 +90,20 @@ class Physics:
 
     @functools.cached_property
     def takes_scene(self) -> bool:
-        """Whether an effect depends on what stands around."""
-        return any(takes_scene(effect) for effect in self.effects)
+        """Whether an effect depends on obstacles."""
+        return any(takes_scene(effect) and not needs_of(effect).ground_only for effect in self.effects)
 
-    def touches(self, scene: Scene | None) -> bool:
+    def seen(self, scene: Scene) -> Scene:
+        """The part of a scene on which effects depend."""
+        return scene if self.takes_scene else Scene(ground=scene.ground)
+
+    def contacts(self, *touched: str) -> list[Callable]:
+        """The effects and pairs that are contact with something: `ground`, `obstacles`, `drones`."""
+        return [f for f in (*self.effects, *self.pairs) if needs_of(f).contact in touched]
+
+    def touches(self, scene: Scene) -> bool:
         """Whether drones touch the obstacles of a scene."""
-        return scene is not None and scene.has_obstacles and obstacle_contact in self.effects
-
-    def contains(self, function: Callable) -> bool:
-        """Whether a function is among the effects or pairs, also with arguments bound by `functools.partial`."""
-        return any(_unbound(f) is function for f in (*self.effects, *self.pairs))
+        return scene.has_obstacles and bool(self.contacts("obstacles"))
 
     def init(self, params: Params, state: State) -> State:
         """The state of a team with the states of its models, which start anew unless they are there."""
@@ -146,21 +151,19 @@ class Physics:
 
     def wrench(self, params: Params, state: State, scene: Scene, free: FreeBalls | None = None) -> Wrench:
         """The sum of the rotors' aerodynamic wrench and of all effects, one row per drone."""
-        effects = [effect for effect in self.effects if effect is not obstacle_contact]
+        contacts = self.contacts("obstacles")
+        effects = [effect for effect in self.effects if effect not in contacts]
 
         def alone(params: Params, state: State) -> Wrench:
-            def acting(effect):
-                return effect(params, state, scene) if takes_scene(effect) else effect(params, state)
-
-            own = (check_wrench("effects", effect, acting(effect)) for effect in effects)
+            own = (check_wrench("effects", f, with_scene(f, scene)(params, state)) for f in effects)
             return sum(own, rotor_wrench(params, state))
 
         wrench = jax.vmap(alone)(params, state)
-        if self.touches(scene):
-            wrench += contact_of_team(params, state, scene, free)
+        for contact in contacts if scene.has_obstacles else ():
+            wrench += contact_of_team(contact, params, state, scene, free)
         of_team = (check_wrench("team_effects", f, f(params, state), len(state.pos)) for f in self.team_effects)
         wrench = sum(of_team, wrench)
-        state = side_by_side(state) if self.contains(drone_contact) else state
+        state = side_by_side(state) if self.contacts("drones") else state
         return sum((from_others(pair, params, state, self.neighbors) for pair in self.pairs), wrench)
 
 
@@ -177,12 +180,11 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
     for function in functions:
         if not callable(function):
             raise UserError(f"{name}: {function!r} is not a function; give for example {example}")
-        if not (name == "effects" and takes_scene(function)):
-            check_arguments(name, function, _ARGUMENTS[name], _ELSEWHERE.get(name, ""))
+        given = with_scene(function, None) if name == "effects" else function
+        check_arguments(name, given, _ARGUMENTS[name], _ELSEWHERE.get(name, ""))
+        if needs_of(function).contact == "obstacles" and not takes_scene(function):
+            raise UserError(
+                f"{name}: {describe([function])} has a scene of its own; give that to make_step(scene=...), and the "
+                "effect without it"
+            )
     return functions
-
-
-def _unbound(function: Callable) -> Callable:
-    while isinstance(function, functools.partial):
-        function = function.func
-    return function

@@ -1,5 +1,6 @@
 """Wrenches between the drones of a team, and what a function that computes wrenches must return."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -17,7 +18,7 @@ from jaxdrones.vector import components
 from jaxdrones.wrench import Wrench
 
 Effect = Callable[[Params, State], Wrench] | Callable[[Params, State, Scene], Wrench]
-"""`(params, state)` or `(params, state, scene)` of one drone -> wrench on it."""
+"""`(params, state)` of one drone -> wrench on it; a parameter named `scene` is given the scene."""
 Pair = Callable[[Params, State, Params, State], Wrench]
 """`(params, state, other, other_state)` of two drones -> wrench on the first."""
 TeamEffect = Callable[[Params, State], Wrench]
@@ -30,7 +31,13 @@ _SHORT = 32  # terms
 
 def describe(functions: Sequence[Callable]) -> str:
     """Names of functions, for people."""
-    return ", ".join(getattr(function, "__name__", type(function).__name__) for function in functions) or "none"
+    return ", ".join(_name(function) for function in functions) or "none"
+
+
+def _name(function: Callable) -> str:
+    while isinstance(function, functools.partial):
+        function = function.func
+    return getattr(function, "__name__", type(function).__name__)
 
 
 def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | None = None) -> Wrench:

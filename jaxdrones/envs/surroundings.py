@@ -62,5 +62,6 @@ def scene_for_step(step: Step, scene: Scene | DrawScene, world: World) -> Scene 
         scene: of the environment.
         world: an episode of it.
     """
-    needed = not isinstance(scene, Scene) if isinstance(step, HostStep) else step.physics.takes_scene
-    return world.scene if needed else None
+    if isinstance(step, HostStep):
+        return None if isinstance(scene, Scene) else world.scene
+    return step.physics.seen(world.scene)

@@ -22,7 +22,7 @@ from jaxdrones.checks import (
     check_switch,
     check_whole,
     shown,
-    takes_scene,
+    with_scene,
 )
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
@@ -188,7 +188,7 @@ class Task:
 
     def _check_functions(self) -> None:
         """Raise unless the functions of the task are functions of so many arguments."""
-        _check_function("start", self.start, ("key", "params", "scene")[: 3 if takes_scene(self.start) else 2])
+        _check_function("start", with_scene(self.start, None), ("key", "params"))
         _check_function("target", self.target, ("variables", "time"))
         _check_function("advance", self.advance, _OF_A_WORLD)
         _check_function("success", self.advance if self.success is None else self.success, ("metrics", "dt"))
@@ -209,7 +209,7 @@ class Task:
 
     def begin(self, key: jax.Array, params: Params, scene: Scene) -> tuple[State, Any]:
         """The team at the start of an episode in a scene, and the task's variables."""
-        return self.start(key, params, scene) if takes_scene(self.start) else self.start(key, params)
+        return with_scene(self.start, scene)(key, params)
 
     def measure(self, world: World) -> dict[str, Float[Array, " n"]]:
         """All metrics by name; the task's own metrics replace standard ones of the same name."""

@@ -37,8 +37,8 @@ def test_obstacles_are_solid_unless_the_task_ends_where_they_are_touched():
     touches = dataclasses.replace(ends, contact=("obstacles",))
     expected = [("hover", BALL, True), ("hover", random_ball, True), ("hover", Scene(ground=False), False)]
     for task, scene, solid in (*expected, (ends, None, False), (touches, None, True)):
-        assert make(task, scene=scene).physics.physics.contains(jd.obstacle_contact) == solid
-    assert not make("hover", scene=BALL, effects=(repelled,)).physics.physics.contains(jd.obstacle_contact)
+        assert bool(make(task, scene=scene).physics.physics.contacts("obstacles")) == solid
+    assert not make("hover", scene=BALL, effects=(repelled,)).physics.physics.contacts("obstacles")
     with pytest.raises(ValueError, match=r"the scene has obstacles .*obstacle_contact, .*obstacles_terminate"):
         check_scene(BALL, jd.make_step(), TASKS["hover"]())
 

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import jax
 
 from jaxdrones.checks import check_number, check_positive, check_whole
-from jaxdrones.dynamics import Model, drone_contact, ground_contact, instant_rotors, obstacle_contact
+from jaxdrones.dynamics import Model, instant_rotors
 from jaxdrones.engine.bullet.client import BALLS, TINY, Client
 from jaxdrones.engine.bullet.step import BulletStep
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Physics, Rotors
 from jaxdrones.engine.step import is_traced
-from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
+from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
 from jaxdrones.errors import UserError
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.scene import check_scene
@@ -66,12 +66,12 @@ def make_step(
     check_whole("substeps", substeps)
     check_number("damping", damping, "1/s", at_least=0)
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
-    for contact in ground_contact, obstacle_contact, drone_contact:
-        if physics.contains(contact):
-            raise UserError(
-                f"{contact.__name__} is given and Bullet resolves contacts by itself, so drones would touch twice; "
-                "leave it out"
-            )
+    contacts = physics.contacts("ground", "obstacles", "drones")
+    if contacts:
+        raise UserError(
+            f"{describe(contacts)} is given and Bullet resolves contacts by itself, so drones would touch twice; "
+            "leave it out"
+        )
     scene = Scene() if scene is None else scene
     check_scene(scene, files=True)
     if is_traced(scene):

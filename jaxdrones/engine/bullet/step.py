@@ -27,7 +27,6 @@ from jaxdrones.sensing.camera import check_camera
 from jaxdrones.sensing.scene import check_scene
 from jaxdrones.state import State
 
-_BARE = Scene()
 _DEFAULT_CAMERA = Camera()
 _FILM_CAMERA = Camera(resolution=(640, 480), near=0.1)
 
@@ -165,7 +164,7 @@ class BulletStep(HostStep):
         return self._acting(scene)
 
     def _acting(self, scene: Scene) -> Scene:
-        return scene if self.physics.takes_scene else _BARE
+        return self.physics.seen(scene)
 
     def _place(self, params: Params, state: State) -> np.ndarray:
         team = self._pack(params, state, state.rpm)

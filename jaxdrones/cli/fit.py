@@ -98,12 +98,12 @@ def add_consistency(parser: argparse.ArgumentParser) -> None:
 
 def load_logs(files: Sequence[Path], allow_inconsistent: bool) -> list:
     """The flight logs of files, with different names; warns of contradictions that are allowed."""
-    from jaxdrones.identification import FlightLog, inconsistencies
+    from jaxdrones.identification import FlightLog
     from jaxdrones.identification.log import named_apart
 
     logs = named_apart([FlightLog.load(file, allow_inconsistent) for file in files])
     for log in logs if allow_inconsistent else ():
-        for found in inconsistencies(log):
+        for found in log.inconsistencies():
             print_warning(f"{log.name}: {found}")
     return logs
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from jaxdrones.errors import UserError
 
-if TYPE_CHECKING:
-    from jaxdrones.flights.record import Record
 
-
-def check_arrays_of_flight(record: Record, name: str) -> None:
+def check_arrays_of_flight(record: Any, name: str) -> None:
     """Raise unless the arrays of a record belong together and can be shown.
+
+    Args:
+        record: a `Record`.
+        name: of the record, for the error.
 
     Raises:
         ValueError: names the array that has another shape, is no number, or runs backwards.

@@ -1,7 +1,6 @@
 """System identification: compares a vehicle with recorded flights, and estimates its parameters from them."""
 
 from jaxdrones.identification.closed_loop import ClosedLoopResult, simulate_closed_loop
-from jaxdrones.identification.consistency import inconsistencies
 from jaxdrones.identification.fit import Estimate, Report, fit
 from jaxdrones.identification.instruments import Instruments
 from jaxdrones.identification.log import FlightLog
@@ -21,7 +20,6 @@ __all__ = [
     "Vehicle",
     "fit",
     "hold_errors",
-    "inconsistencies",
     "open_loop_errors",
     "simulate_closed_loop",
 ]

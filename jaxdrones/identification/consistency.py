@@ -9,15 +9,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxdrones.identification import quaternions
 from jaxdrones.identification.motor_effects import motor_effects
-
-if TYPE_CHECKING:
-    from jaxdrones.identification.log import FlightLog
 
 _PERIOD = 0.01  # s
 _GRAVITY = 9.81  # m/s^2
@@ -45,7 +42,9 @@ _NAMES = ("front right", "back right", "back left", "front left")
 Change = tuple[str, Callable[[np.ndarray], np.ndarray]]
 
 
-class _Columns(NamedTuple):
+class Columns(NamedTuple):
+    """The motion that a log has, see `FlightLog`."""
+
     pos: np.ndarray
     quat: np.ndarray
     vel: np.ndarray
@@ -83,23 +82,19 @@ _READINGS: dict[str, tuple[Change, ...]] = {
 _ALL_NED = "all columns look like NED axes (z down in world and body)"
 
 
-def inconsistencies(log: FlightLog) -> list[str]:
-    """Contradictions within a log, a sentence each with the likely cause; none for a sound log."""
-    logged = _Columns(log.pos, log.quat, log.vel, log.omega)
-    rows = _flying_rows(log)
-    logged = _Columns(*(x[rows] for x in logged))
-    found, columns = _check_axes(logged)
-    found = found or _check_scales(logged)
-    motors = log.rpm if log.rpm is not None else log.pwm
-    if motors is not None:
-        found += _check_motors(motors[rows] ** (2 if log.rpm is not None else 1), columns)
-    return found + _check_battery(log)
+def contradictions(columns: Columns, thrusts: np.ndarray, sag: float) -> list[str]:
+    """Contradictions within a flight, a sentence each with the likely cause; none for a sound one.
 
-
-def _flying_rows(log: FlightLog) -> slice:
-    """The rows from the first to the last in which all motors run."""
-    flying = np.flatnonzero(log.in_flight)
-    return slice(int(flying[0]), int(flying[-1]) + 1) if len(flying) else slice(0)
+    Args:
+        columns: pos, quat, vel and omega of T rows in which the motors run.
+        thrusts: (T, 4) relative thrusts of the motors.
+        sag: of the battery at take-off, V.
+    """
+    found, read = _check_axes(columns)
+    found = (found or _check_scales(columns)) + _check_motors(thrusts, read)
+    if sag < -_MAX_RISE:
+        found.append(f"vbat rises by {-sag:.2f} V when the motors start: the load of the battery has the wrong sign")
+    return found
 
 
 def _starts(rows: int, length: int) -> np.ndarray:
@@ -177,7 +172,7 @@ def force_test(vel: np.ndarray, quat: np.ndarray) -> _Test:
     return _Test(has, implied, _MIN_ACC, _MAX_FORCE_MISFIT, _MAX_FORCE_ERROR)
 
 
-def _failures(columns: _Columns) -> list[str]:
+def _failures(columns: Columns) -> list[str]:
     pos, quat, vel, omega = columns
     found = []
     if not (test := shift_test(pos, vel)).passes:
@@ -195,7 +190,7 @@ def _failures(columns: _Columns) -> list[str]:
     return found
 
 
-def _check_axes(logged: _Columns) -> tuple[list[str], _Columns]:
+def _check_axes(logged: Columns) -> tuple[list[str], Columns]:
     """What does not fit, with the simplest reading of the columns that explains it, and the columns so read."""
     failures = _failures(logged)
     if not failures:
@@ -207,11 +202,11 @@ def _check_axes(logged: _Columns) -> tuple[list[str], _Columns]:
     return ["; ".join(failures) + hint], logged
 
 
-def _readings(logged: _Columns):
+def _readings(logged: Columns):
     """Other readings of the columns, those with the fewest changes first: their causes, and the columns so read."""
     every = [(name, cause, change) for name, changes in _READINGS.items() for cause, change in changes]
     yield ["vel looks like body axes"], logged._replace(vel=quaternions.rotate(logged.quat, logged.vel))
-    yield [_ALL_NED], _Columns(_flipped(logged.pos), _turned(logged.quat), _flipped(logged.vel), _flipped(logged.omega))
+    yield [_ALL_NED], Columns(_flipped(logged.pos), _turned(logged.quat), _flipped(logged.vel), _flipped(logged.omega))
     for count in (1, 2):
         for changes in itertools.combinations(every, count):
             if len({name for name, _, _ in changes}) == count:
@@ -230,7 +225,7 @@ def _ratio(test: _Test, axes: slice) -> float | None:
     return float(ratio) if unlike < 2 * _MAX_CLOCK_MISFIT else None
 
 
-def _check_scales(columns: _Columns) -> list[str]:
+def _check_scales(columns: Columns) -> list[str]:
     """Whether distances and turns are as large as the velocities and rates imply; a wrong clock scales both."""
     pos, quat, vel, omega = columns
     shifts = shift_test(pos, vel)
@@ -256,7 +251,7 @@ def _check_scales(columns: _Columns) -> list[str]:
     return [f"{'; '.join(off)} instead of 1: {cause}"]
 
 
-def _check_motors(squares: np.ndarray, columns: _Columns) -> list[str]:
+def _check_motors(squares: np.ndarray, columns: Columns) -> list[str]:
     """Whether roll and pitch accelerate as the documented order of the motors implies."""
     effect = motor_effects(squares, columns.quat, columns.vel, columns.omega)
     if effect is None:
@@ -273,9 +268,3 @@ def _check_motors(squares: np.ndarray, columns: _Columns) -> list[str]:
 
 def _likeness(effect: np.ndarray, pattern: np.ndarray) -> float:
     return float(np.mean(np.sum(effect * pattern, axis=1)))
-
-
-def _check_battery(log: FlightLog) -> list[str]:
-    if log.sag < -_MAX_RISE:
-        return [f"vbat rises by {-log.sag:.2f} V when the motors start: the load of the battery has the wrong sign"]
-    return []

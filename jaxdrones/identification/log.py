@@ -13,7 +13,7 @@ from jaxdrones import assets
 from jaxdrones.checks import shown
 from jaxdrones.errors import UserError
 from jaxdrones.identification import quaternions
-from jaxdrones.identification.consistency import inconsistencies
+from jaxdrones.identification.consistency import Columns, contradictions
 from jaxdrones.npz import read_arrays
 
 PERIOD = 0.01  # s, time between the rows of a log
@@ -84,7 +84,7 @@ class FlightLog:
 
         Args:
             file: the file, or the name of a bundled log.
-            allow_inconsistent: whether to load a log whose columns contradict each other, see `inconsistencies`.
+            allow_inconsistent: whether to load a log whose columns contradict each other, see `inconsistencies()`.
 
         Raises:
             ValueError: the file is not a log, lacks a column, or has invalid data: NaN, times that run backwards, a
@@ -96,13 +96,21 @@ class FlightLog:
             columns["omega"] = columns["gyro"]
         columns.pop("gyro", None)
         log = cls(path.name, **_resampled(_checked(path.name, columns)), file=path)
-        found = [] if allow_inconsistent else inconsistencies(log)
+        found = [] if allow_inconsistent else log.inconsistencies()
         if found:
             raise UserError(
                 f"{path.name}: {'; '.join(found)}; repair the log, or pass allow_inconsistent=True "
                 "(--allow-inconsistent) to take it as it is"
             )
         return log
+
+    def inconsistencies(self) -> list[str]:
+        """Contradictions between the columns, a sentence each with the likely cause; none for a sound log."""
+        flying = np.flatnonzero(self.in_flight)
+        rows = slice(int(flying[0]), int(flying[-1]) + 1) if len(flying) else slice(0)
+        motion = Columns(self.pos[rows], self.quat[rows], self.vel[rows], self.omega[rows])
+        thrusts = self.rpm**2 if self.rpm is not None else self.pwm if self.pwm is not None else np.zeros((0, 4))
+        return contradictions(motion, thrusts[rows], self.sag)
 
     @property
     def has_rotor_speeds(self) -> bool:

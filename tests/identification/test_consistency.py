@@ -7,7 +7,7 @@ import pytest
 
 from jaxdrones import assets
 from jaxdrones.cli import main
-from jaxdrones.identification import FlightLog, inconsistencies, quaternions
+from jaxdrones.identification import FlightLog, quaternions
 
 NED = np.array([1, -1, -1])
 SIGNS = np.array([1, -1, -1, 1])
@@ -60,7 +60,7 @@ def load(folder, columns, **options):
 
 def test_sound_flights_have_no_contradiction(flown):
     for log in (flown[1], *map(FlightLog.load, assets.flights())):
-        assert inconsistencies(log) == []
+        assert log.inconsistencies() == []
 
 
 @pytest.mark.parametrize("damage", DAMAGE)

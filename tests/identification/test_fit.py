@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import jaxdrones
+from jaxdrones import State, rotation
 from jaxdrones.cli import main
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import crazyflie_motors
@@ -19,6 +20,7 @@ from jaxdrones.identification import FlightLog, Vehicle, fit, hold_errors, open_
 from jaxdrones.identification.files import load_vehicle, write_vehicle
 from jaxdrones.identification.fit import _estimate
 from jaxdrones.identification.log import named_apart
+from jaxdrones.identification.open_loop import residuals
 from jaxdrones.urdf import parse_params
 from jaxdrones.urdf_writer import to_urdf
 
@@ -86,6 +88,15 @@ def test_a_fit_finds_the_thrust_whatever_the_validation_flight(flown, fits):
 def test_standard_errors_fall_with_the_root_of_the_number_of_flights(fits):
     one, two, _ = fits
     assert two.std_error / one.std_error == pytest.approx(2**-0.5, rel=0.05)
+
+
+def test_residuals_are_predictions_minus_log():
+    """A prediction that is ahead and turned about an axis of the body has positive residuals along them."""
+    quat = rotation.from_rpy(jnp.array([0.3, -0.2, 1.0]))
+    logged = State(jnp.ones(3), quat, jnp.ones(3), jnp.ones(3), jnp.zeros(4))
+    pos, vel, turn, omega = 1e-3 * (1 + jnp.arange(12.0).reshape(4, 3))
+    predicted = State(1 + pos, rotation.multiply(quat, rotation.exp(turn)), 1 + vel, 1 + omega, jnp.zeros(4))
+    np.testing.assert_allclose(residuals(predicted, logged), [pos, vel, turn, omega], rtol=1e-4)
 
 
 @pytest.mark.parametrize(

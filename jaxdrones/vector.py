@@ -92,7 +92,7 @@ def atan2(y: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     In single precision, where the library's function keeps a loop from using the vector unit of a CPU, a minimax
     polynomial of the arctangent on [0, 1] is used; its relative error is 2e-8. Its branches compare x and y alone, and
     the angle is continuous from one to the next, except for the whole turn between -pi and pi: an angle is right also
-    where a compiler computes x and y twice and rounds them differently.
+    where a compiled program computes x and y twice and rounds them differently.
     """
     if _is_double(x) or _is_double(y):
         return jnp.arctan2(y, x)

@@ -7,6 +7,7 @@ compiled step; the options are those of `jaxdrones.make`.
 from __future__ import annotations
 
 import copy
+import string
 from collections.abc import Sequence
 from typing import Any
 
@@ -158,10 +159,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             self.env.steps = max_episode_steps
         pictures.check_mode(render_mode)
         self.autoreset_mode, self.render_mode = _autoreset_mode(autoreset_mode), render_mode
-        self.metadata = self.metadata | {
-            "autoreset_mode": self.autoreset_mode,
-            "render_fps": round(1 / self.env.dt),
-        }
+        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode, "render_fps": round(1 / self.env.dt)}
         self._layout = _layout(self.env, dict_spaces)
         self.single_observation_space, self.single_action_space = self._layout.observation, self._layout.action
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -272,11 +270,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
 def ids() -> dict[str, str]:
     """Id of every task, by its name."""
-    return {task: f"{NAMESPACE}/{_camel_case(task)}-v0" for task in envs.TASKS}
-
-
-def _camel_case(name: str) -> str:
-    return "".join(word.capitalize() for word in name.split("-"))
+    return {task: f"{NAMESPACE}/{string.capwords(task, '-').replace('-', '')}-v0" for task in envs.TASKS}
 
 
 def _layout(env: envs.Env, by_drone: bool) -> Layout:

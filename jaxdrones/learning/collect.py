@@ -255,7 +255,9 @@ def mean_return(worlds: Worlds) -> Float[Array, ""]:
     return jnp.where(weight > 0, mean, jnp.nan)
 
 
-def update_obs_stats(statistics: RunningStatistics, trajectory: Trajectory, config: Any, step: Array):
+def update_obs_stats(
+    statistics: RunningStatistics, trajectory: Trajectory, config: Any, step: Array
+) -> RunningStatistics:
     """The statistics with the observations of the steps that count in a trajectory, until they are frozen.
 
     Args:

@@ -260,8 +260,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def _infos(self, info: dict[str, Any], ended: Any) -> dict[str, Any]:
         """The infos with gymnasium's masks: `_name` says of which worlds `name` is valid."""
-        last, goes_on = info["last"], info["goes_on"]
-        infos = _masked(last, goes_on)
+        last, infos = info["last"], _masked(info["last"], info["goes_on"])
         if "final_obs" in info and (not self._numpy or ended.any()):
             final = _masked(last | {"episode": _masked(info["episode"], ended)}, ended)
             infos |= _masked({"final_obs": info["final_obs"], "final_info": final}, ended)
@@ -278,8 +277,7 @@ def _layout(env: envs.Env, by_drone: bool) -> Layout:
 
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    if not isinstance(mode, AutoresetMode):
-        check_choice("autoreset_mode", mode, [known.value for known in AutoresetMode])
+    check_choice("autoreset_mode", getattr(mode, "value", mode), [known.value for known in AutoresetMode])
     return AutoresetMode(mode)
 
 

@@ -1,12 +1,9 @@
-"""Action types: functions from a few numbers in [-1, 1] to rotor speeds.
-
-All are scaled with the nominal parameters of the vehicle, so that an action of 0 hovers, whatever the mass.
-"""
+"""Action types, from numbers in [-1, 1] to rotor speeds, scaled by the vehicle so that 0 hovers whatever the mass."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -67,10 +64,25 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
         return memory, jnp.minimum(rpm, params.max_rpm)
 
     def entries(params: Params) -> Entries:
-        torques = zip("xyz", map(float, limits(params)), strict=True)
-        return _thrust(0.0, params.weight, 2 * params.weight) + tuple(
-            Quantity(f"{axis} of the torque", "N m", "body", (-limit, 0.0, limit)) for axis, limit in torques
-        )
+        return _thrust(0.0, params.weight, 2 * params.weight) + _about_axes("torque", "N m", limits(params))
+
+    return Action(4, command, entries=entries)
+
+
+def angular_acceleration(largest: tuple[float, float, float] = (100.0, 100.0, 10.0)) -> Action:
+    """A speed of all rotors (-1 standstill, 0 hover, 1 full), and angular accelerations up to `largest` in hover."""
+    _check_about_axes("largest", largest, "rad/s^2")
+
+    def command(params, memory, state, action, setpoint, dt):
+        x, y, _ = params.rotor_pos.T
+        torque = jnp.stack([y, -x, params.rotor_spin * params.km / params.kf])  # of 1 N of each rotor
+        share = torque / jnp.sum(torque**2, axis=1, keepdims=True)  # rows are orthogonal at corners of a rectangle
+        difference = (params.inertia * jnp.array(largest) * action[1:]) @ share / (2 * params.kf * params.hover_rpm)
+        return memory, jnp.clip(_rotor_speed(params, action[0], None) + difference, 0, params.max_rpm)
+
+    def entries(params: Params) -> Entries:
+        speed = Quantity("speed of all rotors", "RPM", values=_speeds(params, None))
+        return speed, *_about_axes("angular acceleration", "rad/s^2", largest)
 
     return Action(4, command, entries=entries)
 
@@ -158,8 +170,8 @@ def pid_gains() -> Action:
         return pid.control(scaled, params, memory, state, setpoint, dt=dt)
 
     def entries(params: Params) -> Entries:
-        names = [field.name for field in dataclasses.fields(pid.Gains)]
-        return tuple(Quantity(f"factor of the gain {name}", values=(0.0, 1.0, 2.0)) for name in names)
+        gains = dataclasses.fields(pid.Gains)
+        return tuple(Quantity(f"factor of the gain {gain.name}", values=(0.0, 1.0, 2.0)) for gain in gains)
 
     def for_vehicle(params):
         if pid.fits(params):
@@ -174,19 +186,14 @@ def pid_gains() -> Action:
 
 def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
     """Collective thrust (-1 none, 0 the weight, 1 the largest) and body rates up to `max_rate` (rad/s)."""
-    check_shape("max_rate", max_rate, (3,), "about x, y and z, rad/s")
-    for rate in max_rate:
-        check_number("an entry of max_rate", rate, "rad/s", above=0)
+    _check_about_axes("max_rate", max_rate, "rad/s")
 
     def command(params, memory, state, action, setpoint, dt):
         omega = jnp.array(max_rate, action.dtype) * action[1:]
         return memory, rates.follow(rates.gains(), params, state, _collective(params, action[0]), omega)
 
     def entries(params: Params) -> Entries:
-        turning = zip("xyz", map(float, max_rate), strict=True)
-        return _thrust(0.0, params.weight, params.max_thrust) + tuple(
-            Quantity(f"{axis} of the body rates", "rad/s", "body", (-rate, 0.0, rate)) for axis, rate in turning
-        )
+        return _thrust(0.0, params.weight, params.max_thrust) + _about_axes("body rates", "rad/s", max_rate)
 
     return Action(4, command, entries=entries)
 
@@ -236,6 +243,18 @@ def _check_share(name: str, share: float | None) -> None:
         check_number(name, share, above=0, at_most=1)
 
 
+def _check_about_axes(name: str, values: tuple[float, float, float], unit: str) -> None:
+    check_shape(name, values, (3,), f"about x, y and z, {unit}")
+    for value in values:
+        check_number(f"an entry of {name}", value, unit, above=0)
+
+
+def _about_axes(name: str, unit: str, largest: Iterable) -> Entries:
+    """Three numbers about the axes of the body, of which an action of 1 is the largest."""
+    axes = zip("xyz", map(float, largest), strict=True)
+    return tuple(Quantity(f"{axis} of the {name}", unit, "body", (-value, 0.0, value)) for axis, value in axes)
+
+
 def _speeds(params: Params, near_hover: float | None) -> tuple[float, float, float]:
     """Rotor speeds at -1, 0 and 1, RPM."""
     low, hover, high = (float(_rotor_speed(params, jnp.asarray(x), near_hover)) for x in (-1.0, 0.0, 1.0))
@@ -267,6 +286,7 @@ ACTIONS: dict[str, Callable[..., Action]] = {
     "rpm": rpm,
     "one_d_rpm": one_d_rpm,
     "thrust_and_torques": thrust_and_torques,
+    "angular_acceleration": angular_acceleration,
     "one_d_thrust": one_d_thrust,
     "velocity": velocity_input,
     "one_d_velocity": one_d_velocity,

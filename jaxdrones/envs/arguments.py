@@ -19,6 +19,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.tasks.task import ObservationTerm, Task
 
+_BOUNDS = 2  # of a drawn delay
 _MAX_STEPS = 1e9  # control steps of an episode, which are counted by an integer of 32 bits
 
 
@@ -64,15 +65,26 @@ def check_draws(
     return check_randomizations(randomize)
 
 
-def delay_steps(task: Task, delay: float, dt: float) -> float:
-    """A delay in control steps; 0.02 s at 100 Hz are two, whatever the rounding.
+def delay_steps(task: Task, delay: float | tuple[float, float], dt: float) -> tuple[float, float]:
+    """The shortest and the longest delay in control steps; 0.02 s at 100 Hz are two, whatever the rounding.
 
     Raises:
-        ValueError: a negative delay, or one that is longer than an episode.
+        ValueError: a negative delay, one that is longer than an episode, or bounds in the wrong order.
     """
-    check_number("delay", delay, "s, less than an episode", at_least=0, below=task.duration)
-    steps = delay / dt
-    return float(round(steps)) if math.isclose(steps, round(steps), abs_tol=1e-6) else steps
+    drawn = isinstance(delay, tuple | list)
+    bounds = check_sequence("delay", delay, "(0.0, 0.04)") if drawn else (delay, delay)
+    if len(bounds) != _BOUNDS:
+        raise UserError(f"delay is {shown(delay)}; give a number, or the shortest and the longest of an episode")
+    for bound in bounds:
+        check_number("delay", bound, "s, less than an episode", at_least=0, below=task.duration)
+    if bounds[0] > bounds[1]:
+        raise UserError(f"delay is {shown(delay)}; give the shortest first")
+
+    def steps(bound: float) -> float:
+        steps = bound / dt
+        return float(round(steps)) if math.isclose(steps, round(steps), abs_tol=1e-6) else steps
+
+    return steps(bounds[0]), steps(bounds[1])
 
 
 def episode_steps(task: Task, dt: float) -> int:

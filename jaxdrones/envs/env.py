@@ -58,7 +58,7 @@ class Env(Constructed):
         randomize: Sequence[draws.Randomization] = (),
         noise: draws.Noise | None = None,
         disturbance: draws.Disturbance | None = None,
-        delay: float = 0.0,
+        delay: float | tuple[float, float] = 0.0,
         vision: Vision | None = None,
         sensors: Sequence[Sensor] = (),
         scene: Scene | DrawScene | None = None,
@@ -76,7 +76,7 @@ class Env(Constructed):
             randomize: randomizations that draw the parameters of every episode from the nominal ones.
             noise: noise of the observed state.
             disturbance: sets the surroundings before every control step, for example `random_pushes`.
-            delay: delay between action and command, s.
+            delay: delay between action and command, s; or the shortest and the longest of all drones and episodes.
             vision: cameras, as `jaxdrones.envs.vision.make_vision` returns them for the same step and scene.
             sensors: sensors of every drone, which measure after `reset` and after every control step.
             scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's
@@ -89,7 +89,8 @@ class Env(Constructed):
         check_process()
         check_team(task, params, action, dt)
         terms, randomize = check_terms(observation), check_draws(randomize, noise, disturbance)
-        params, randomize = draws.prepared(disturbance, params, randomize)
+        self.delay = delay_steps(task, delay, dt)  # shortest and longest, control steps
+        params, randomize = draws.prepared(disturbance, self.delay, params, randomize)
         self.scene = task.scene if scene is None else scene
         """Obstacles and ground, or the function that draws them."""
         obstacles = check_scene(self.scene, step, task)
@@ -102,8 +103,7 @@ class Env(Constructed):
         """Number of control steps after which an episode is truncated."""
         self.sensors = check_sensors(sensors, dt)
         self.terms, self.randomize, self.noise, self.disturbance = terms, randomize, noise, disturbance
-        self.delay = delay_steps(task, delay, dt)  # control steps
-        self._history = max(math.ceil(self.delay) + 1, *(term.history for term in terms))
+        self._history = max(math.ceil(self.delay[1]) + 1, *(term.history for term in terms))
         self._drawn = draws.drawn_leaves(randomize, params)
         self.term_sizes = check_episode(task, params, self.scene, terms, dt, self._first_world)
         self.observation_bound = bounds(terms, self.term_sizes)
@@ -266,7 +266,7 @@ class Env(Constructed):
         def of_drone(params, memory, state, action, setpoint):
             return self.action.rpm(params, memory, state, action, setpoint, self.dt)
 
-        flown = draws.delayed(actions, self.delay), self.task.target_now(world)
+        flown = draws.delayed(actions, draws.delay_of(params, self.delay)), self.task.target_now(world)
         known = draws.scaling_params(self.randomize, params, self.params)
         memory, rpm = jax.vmap(of_drone)(known, world.memory, world.drones, *flown)
         return world.replace(memory=memory), rpm

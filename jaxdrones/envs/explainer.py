@@ -123,7 +123,7 @@ def _physics(env: Env) -> dict[str, str]:
         "scene": _scene(env.scene),
         "sensors": ", ".join(sensor.name for sensor in env.sensors) or "none",
         "cameras": str(env.vision) if env.vision else "none",
-        "delay": f"{env.delay * env.dt:.4g} s between action and command",
+        "delay": " to ".join(f"{x * env.dt:.4g}" for x in sorted({*env.delay})) + " s between action and command",
         "noise": _said(env.noise, "none"),
         "disturbance": _said(env.disturbance, "none"),
         "drawn per episode": "; ".join(_said(one, "a randomization of its own") for one in env.randomize) or "nothing",

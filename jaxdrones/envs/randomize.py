@@ -17,6 +17,9 @@ from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
 
+DELAY = "delay"
+"""Key of `Params.aux`: the delay of an episode, control steps, where it is drawn."""
+
 Randomization = Callable[[jax.Array, Params], Params]
 """(key, params) of one drone -> its parameters in this episode."""
 Noise = Callable[[jax.Array, State], State]
@@ -116,13 +119,20 @@ def constant_wind(speed: float) -> Randomization:
 
 
 def prepared(
-    disturbance: Disturbance | None, params: Params, randomize: Sequence[Randomization]
+    disturbance: Disturbance | None, delay: tuple[float, float], params: Params, randomize: Sequence[Randomization]
 ) -> tuple[Params, tuple[Randomization, ...]]:
-    """Nominal parameters of a team and randomizations, with the memory of a disturbance that has one."""
+    """Nominal parameters of a team and randomizations, with the memory of a disturbance and the delay that is drawn.
+
+    `delay` is the shortest and the longest, control steps; if they differ, the nominal one is their mean.
+    """
+    randomize = tuple(randomize)
     if isinstance(disturbance, DisturbanceWithMemory):
         start = described(f"start of: {disturbance.text}", functools.partial(disturbance.start))
-        return disturbance.nominal(params), (*randomize, start)
-    return params, tuple(randomize)
+        params, randomize = disturbance.nominal(params), (*randomize, start)
+    if delay[0] < delay[1]:
+        mean = jnp.full_like(params.mass, sum(delay) / 2)
+        params, randomize = params.replace(aux=params.aux | {DELAY: mean}), (*randomize, drawn_delay(*delay))
+    return params, randomize
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,15 +244,32 @@ def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) ->
     )
 
 
-def delayed(actions: Array, steps: float) -> Array:
+def drawn_delay(shortest: float, longest: float) -> Randomization:
+    """Delay between action and command U(shortest, longest), control steps, constant in an episode: `params.aux`."""
+
+    def randomize(key: jax.Array, params: Params) -> Params:
+        delay = jax.random.uniform(key, (), params.mass.dtype, shortest, longest)
+        return params.replace(aux=params.aux | {DELAY: delay})
+
+    return described(f"delay U({shortest:g}, {longest:g}) control steps between action and command", randomize)
+
+
+def delay_of(params: Params, bounds: tuple[float, float]) -> float | Array:
+    """The delay of an episode, control steps: of each drone (n,) if it is drawn between bounds, else a number."""
+    return params.aux[DELAY] if bounds[0] < bounds[1] else bounds[1]
+
+
+def delayed(actions: Array, steps: float | Array) -> Array:
     """The action (n, a) that is in force `steps` control steps after it was given, out of the last h actions (n, h, a).
 
-    For a fraction it is the mean over the control step, in which one action is followed by the next.
+    For a fraction it is the mean over the control step, in which one action is followed by the next. `steps` is a
+    number, or (n,) of every drone.
     """
-    whole = int(steps)
-    share = steps - whole
-    newest = actions[:, -1 - whole]
-    return newest if share == 0 else (1 - share) * newest + share * actions[:, -2 - whole]
+    if isinstance(steps, float) and steps == int(steps):
+        return actions[:, -1 - int(steps)]
+    age = jnp.arange(actions.shape[1], dtype=actions.dtype)[None, ::-1]
+    share = jnp.maximum(1 - jnp.abs(age - jnp.reshape(jnp.asarray(steps, actions.dtype), (-1, 1))), 0)
+    return jnp.sum(share[..., None] * actions, axis=1)
 
 
 REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
@@ -260,4 +287,4 @@ REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
 Some find a fifth of our torque coefficient; some find that rotors slow down as fast as they speed up, others five times
 as slowly.
 """
-REALISTIC_DELAY = 0.02  # s
+REALISTIC_DELAY = 0.0, 0.04  # s, drawn: radio links and autopilots differ, and so do their loads

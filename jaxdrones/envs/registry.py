@@ -86,7 +86,7 @@ def make(
     randomize: Sequence[Randomization] | None = None,
     noise: Noise | None = None,
     disturbance: Disturbance | None = None,
-    delay: float | None = None,
+    delay: float | tuple[float, float] | None = None,
     sensors: Sequence[Sensor] = (),
     scene: Scene | DrawScene | None = None,
     **options: Any,
@@ -103,7 +103,7 @@ def make(
         vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, as images of a camera on every
             drone; the task's own when left out.
         camera: that camera, with its rate, latency and noise; the task's own when left out, or else a `Camera()`.
-        realistic: lagging rotors, drag, 20 ms of delay, sensor noise and random parameters, where not given here;
+        realistic: lagging rotors, drag, a random delay, sensor noise and random parameters, where not given here;
             `any` draws another vehicle of 20 g to 3 kg for every episode in place of random parameters.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
@@ -116,7 +116,7 @@ def make(
         randomize: randomizations that draw each episode's parameters from the nominal ones.
         noise: noise of the observed state.
         disturbance: sets the surroundings before every control step, for example `random_pushes`.
-        delay: delay between action and command, s.
+        delay: delay between action and command, s; or the shortest and the longest, between which every episode draws.
         sensors: sensors of every drone; their names are observations too.
         scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's own
             when left out. On the explicit backend `obstacle_contact` makes obstacles solid, unless another effect

@@ -17,9 +17,12 @@ _DELAYED_OBSERVATION = (
     "velocity_error",
     "omega",
     "rotor_speed",
-    last_actions(3),
+    last_actions(5),
 )
-"""With delay and rotor lag, rotor speeds and recent actions are part of the state."""
+"""With rotor lag and a delay of up to four control steps, rotor speeds and recent actions are part of the state."""
+
+_ANY_VEHICLE = {"action": "angular_acceleration"}
+"""The same rotor speeds turn the largest vehicles up to 30 times more slowly than the smallest ones."""
 
 _ONE_D = {
     "worlds": 64,
@@ -113,7 +116,8 @@ def preset(
             and the learner has its own.
         algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
         realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters, or `any` with another
-            vehicle in every episode; the policy then also observes rotor speeds and its last three actions.
+            vehicle in every episode, which then commands angular accelerations; the policy also observes rotor speeds
+            and its last five actions.
         practice: whether to make the environment to train in, which may have easier starts than the one to fly in.
         **options: options of `jaxdrones.make`.
 
@@ -122,7 +126,7 @@ def preset(
     """
     config = learner(algorithm).Config()
     if realistic and task in ("hover", "recovery", "landing"):
-        options = {"observation": _DELAYED_OBSERVATION} | options
+        options = {"observation": _DELAYED_OBSERVATION} | (_ANY_VEHICLE if realistic == "any" else {}) | options
     if practice and isinstance(task, str):
         options = _PRACTICE_OPTIONS.get(task, {}) | options
     env = make(task, realistic=realistic, **options)

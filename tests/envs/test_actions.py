@@ -7,8 +7,9 @@ import pytest
 from helpers import VEHICLES, make_step
 
 import jaxdrones
-from jaxdrones import State, assets
+from jaxdrones import State, assets, vehicles
 from jaxdrones.control import for_team, pid, velocity
+from jaxdrones.dynamics.rotors import rotor_wrench
 from jaxdrones.envs import ACTIONS, make
 
 HZ, SECONDS = 100, 6
@@ -133,3 +134,21 @@ def test_failing_rotors_lag_as_those_that_they_wrap():
     for rotors in jaxdrones.lagging_rotors, jaxdrones.failing(jaxdrones.lagging_rotors):
         with pytest.raises(ValueError, match=r"'pid_gains' .* which lag, have 0\.15 s"):
             make("hover", vehicle=params, action="pid_gains", rotors=rotors)
+
+
+def test_an_angular_acceleration_is_the_same_for_all_sizes_and_turns_about_one_axis():
+    """By the derivative of the wrench in hover, which does not change the thrust."""
+    command = ACTIONS["angular_acceleration"]().rpm
+
+    def response(params):
+        def acceleration(action):
+            _, speeds = command(params, None, None, action, None, 0.01)
+            state = jax.tree.map(lambda x: x[0], State.at_rest(START[None])).replace(rpm=speeds)
+            wrench = rotor_wrench(params, state)
+            return jnp.append(wrench.torque / params.inertia, wrench.force[2] / params.weight)
+
+        return jax.jacobian(acceleration)(jnp.full(4, 1e-9))[:, 1:]
+
+    drawn = jax.vmap(lambda key: vehicles.draw(key, CRAZYFLIE))(jax.random.split(jax.random.key(0), 20))
+    expected = jnp.zeros((4, 3)).at[jnp.arange(3), jnp.arange(3)].set(jnp.array([100.0, 100.0, 10.0]))
+    np.testing.assert_allclose(jax.vmap(response)(drawn), np.tile(expected, (20, 1, 1)), atol=1e-5)

@@ -7,7 +7,7 @@ import pytest
 from helpers import assert_close
 
 import jaxdrones as jd
-from jaxdrones.envs import make
+from jaxdrones.envs import Env, make
 from jaxdrones.envs.randomize import (
     constant_wind,
     delayed,
@@ -81,6 +81,33 @@ def test_noise_is_seen_and_does_not_move_the_drone():
 def test_a_delay_takes_an_older_action_or_mixes_two(steps, expected):
     actions = jnp.arange(6.0)[None, :, None]
     np.testing.assert_allclose(delayed(actions, steps), expected)
+
+
+def test_every_episode_draws_a_delay_of_its_own_and_flies_with_it():
+    """The share of the newest action says how late it is: 1 without delay, 0.25 of 0.75 control steps."""
+    env = make("hover", drones=2, delay=(0.0, 0.01))
+    assert env.privileged_size == 1
+
+    @jax.jit
+    @jax.vmap
+    def first_speeds(key):
+        _, world = env.reset(key)
+        _, rpm = Env._command(env, None, world, jnp.full((2, 4), 0.5))
+        return world.params.aux["delay"], rpm[:, 0]
+
+    delay, speed = first_speeds(jax.random.split(KEY, 200))
+    hover = env.params.hover_rpm[None]
+    full = hover + 0.5 * (env.params.max_rpm[None] - hover)
+    np.testing.assert_allclose((speed - hover) / (full - hover), 1 - delay, rtol=1e-9)
+    assert 0 <= delay.min() < 0.05 and 0.95 < delay.max() <= 1 and abs(delay.mean() - 0.5) < 0.05
+    assert not np.any(delay[:, 0] == delay[:, 1])
+
+
+def test_bounds_of_a_delay_are_checked():
+    for delay in (0.02, 0.01), (0.0, 5.0), (-0.01, 0.01), (0.01,), (0.0, np.nan):
+        with pytest.raises(ValueError, match="delay"):
+            make("hover", delay=delay)
+    assert make("hover", delay=(0.02, 0.02)).privileged_size == 0
 
 
 @pytest.mark.slow

@@ -150,7 +150,7 @@ def _train_runs(options: argparse.Namespace, runs: dict, output: Path, trainer: 
     from jaxdrones.training.run import Run
 
     recipe, print_line = trainer.recipe, quiet if options.json else print
-    known = recipe.realistic != "any" and settings_known(recipe.task, recipe.algorithm, recipe.library)
+    known = settings_known(recipe.task, recipe.algorithm, recipe.library, recipe.realistic == "any")
     if not options.resume and not known:
         warn_of_unknown_settings(recipe)
     print_line(f"{_headline(recipe)}; compiling")

@@ -87,6 +87,7 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ),
     ("hover", "ppo"): dict(updates=750, critic_hidden_sizes=(64, 64), privileged_critic=True, target_kl=0.01),
 }
+_ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {("hover", "bptt"): dict(updates=1200)}
 
 _UNFINISHED = {("room", "bptt")}
 """Settings that are the best found, and with which about half of the episodes succeed."""
@@ -140,8 +141,10 @@ def realism(realistic: bool | str) -> str:
     return f", realistic{', any vehicle' if realistic == 'any' else ''}" if realistic else ""
 
 
-def settings_known(task: str, algorithm: str, library: str = "jaxdrones") -> bool:
+def settings_known(task: str, algorithm: str, library: str = "jaxdrones", any_vehicle: bool = False) -> bool:
     """Whether settings are known with which a learner of a library masters a task, that of its default options."""
+    if any_vehicle:
+        return library == "jaxdrones" and (task, algorithm) in _ANY_VEHICLE_CONFIGS
     if library == "rllib":
         return task == "leader-follower"
     found = (task, algorithm) in _CONFIGS or algorithm in _BY_DEFAULT.get(task, ())
@@ -151,4 +154,5 @@ def settings_known(task: str, algorithm: str, library: str = "jaxdrones") -> boo
 def _settings(task: str, algorithm: str, realistic: bool | str) -> dict[str, Any]:
     """The settings of a learner that differ from its defaults."""
     known = _CONFIGS.get((task, algorithm), {})
-    return known | (_REALISTIC_CONFIGS.get((task, algorithm), {}) if realistic else {})
+    known = known | (_REALISTIC_CONFIGS.get((task, algorithm), {}) if realistic else {})
+    return known | (_ANY_VEHICLE_CONFIGS.get((task, algorithm), {}) if realistic == "any" else {})

@@ -69,5 +69,5 @@ class Deadlines:
         if self.seconds is not None and spent > _TOLERANCE * budget + 1:
             print_warning(
                 f"everything took {spent:.0f} s, more than {budget:.0f} s by --budget {self._text}: compiling, one "
-                "update and two evaluations are the least; give a longer --budget, fewer --episodes or fewer worlds"
+                "update and three evaluations are the least; give a longer --budget or fewer --episodes"
             )

@@ -12,6 +12,8 @@ import jaxdrones
 from jaxdrones import Camera, Scene, State, render, rotation
 from jaxdrones.sensing import Box, Capsule, Cylinder, Mesh, Sphere
 from jaxdrones.sensing.images import drone_solids, view_of
+from jaxdrones.sensing.shading import SUN, shade
+from jaxdrones.sensing.visibility import depth
 
 CRAZYFLIE = jaxdrones.load_params("cf2x")
 CAMERA = Camera(resolution=(32, 24), field_of_view=70, far=30.0)
@@ -212,13 +214,54 @@ def test_colors_are_those_of_what_is_seen():
     assert tiles.max() - tiles.min() > 30
 
 
-@pytest.mark.slow
-def test_light_falls_from_above():
-    ball = Sphere(pos=(3.0, 0.0, 1.5), radius=1.0, color=(1.0, 1.0, 1.0, 1.0))
-    images = render(Scene.of(ball, ground=False), *team(([0, 0, 1.5], [0, 0, 0])), CAMERA)
-    rows = np.nonzero(np.asarray(images.segmentation[0, :, 16]) == 2)[0]
-    light = np.asarray(images.rgb[0, :, 16, 0], int)[rows]
-    assert light[1] > light[-2] + 50
+BALL = Sphere(pos=(1.3, 0.5, 1.2), radius=0.7, color=(1.0, 1.0, 1.0, 1.0))
+
+
+@functools.cache
+def ball_from_a_tilted_camera():
+    """Of the pixels that see it: (1, u, v), rays, normals, depths and their derivatives by eye and axes, redness."""
+    camera = Camera(resolution=(8, 6), field_of_view=70, far=30.0)
+    view = view_of(camera, *jax.tree.map(lambda x: x[0], team(([0, 0, 1.0], [0.2, -0.1, 0.3]))))
+    solids, active = Scene.of(BALL).shapes(float), [jnp.ones(1, bool)]
+
+    @jax.jit
+    def look(eye, axes):
+        def and_itself(eye, axes):
+            found = depth(view.replace(eye=eye, axes=axes), solids, active)
+            return found, found
+
+        slopes, found = jax.jacfwd(and_itself, (0, 1), has_aux=True)(eye, axes)
+        index = (found == view.far).astype(int)
+        return found, slopes, shade(view, solids, jnp.ones((1, 3)), None, index, found)[..., 0]
+
+    found, (by_eye, by_axes), red = jax.tree.map(np.asarray, look(view.eye, view.axes))
+    view = jax.tree.map(np.asarray, view)
+    pixels = np.stack(np.broadcast_arrays(1.0, view.u, view.v), axis=-1)
+    rays = pixels @ view.axes
+    normals = (view.eye + found[..., None] * rays - np.asarray(BALL.pos)) / float(BALL.radius)
+    hit = found < view.far
+    assert 10 < hit.sum() < 40
+    return [x[hit] for x in (pixels, rays, normals, found, by_eye, by_axes, red)]
+
+
+def test_a_pixel_stays_on_the_surface_where_the_eye_moves_and_the_camera_turns():
+    """The tangent plane at eye + depth * ray gives the derivatives; a step along a ray makes its depth as much less."""
+    pixels, rays, normals, depths, by_eye, by_axes, _ = ball_from_a_tilted_camera()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-9)
+    np.testing.assert_allclose(np.sum(rays * by_eye, axis=1), -1, rtol=1e-9)
+    expected = -normals / np.sum(rays * normals, axis=1, keepdims=True)
+    np.testing.assert_allclose(by_eye, expected, rtol=1e-7)
+    turned = depths[:, None, None] * pixels[:, :, None] * expected[:, None, :]
+    np.testing.assert_allclose(by_axes, turned, rtol=1e-7, atol=1e-9)
+
+
+def test_what_is_turned_towards_the_sun_is_bright_by_lamberts_law_and_the_rest_in_shadow():
+    _, _, normals, *_, red = ball_from_a_tilted_camera()
+    cosine = normals @ np.array(SUN)
+    assert np.sum(cosine > 0.2) > 3 and np.sum(cosine < -0.04) > 3
+    shadow = int(red[cosine.argmin()])
+    assert 0 < shadow < 200
+    np.testing.assert_allclose(red, shadow + (255 - shadow) * np.maximum(cosine, 0), atol=1)
 
 
 @pytest.mark.parametrize(

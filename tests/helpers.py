@@ -1,6 +1,7 @@
 """Teams in flight, and comparisons that say which array differs."""
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import lru_cache, partial
 
@@ -90,3 +91,20 @@ def assert_finite(tree) -> None:
 def mostly_slow(names: Iterable[str], quick: Sequence[str]) -> list:
     """Parameters of a test: the `quick` ones run every time, the others only with the slow tests."""
     return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+class Keys:
+    """The random keys, as bytes, that were drawn from, of which others were made, and that were made."""
+
+    draws = ("uniform", "normal", "bernoulli", "randint")
+
+    def __init__(self):
+        self.drawn, self.parents, self.derived = Counter(), set(), Counter()
+
+    def check(self, least):
+        jax.effects_barrier()
+        assert sum(self.drawn.values()) >= least
+        assert max(self.drawn.values()) == 1, "a key is drawn from twice"
+        assert max(self.derived.values()) == 1, "two keys that were made of others are the same"
+        both = self.drawn.keys() & self.parents
+        assert not both, "a key is drawn from, and others are made of it"

@@ -1,24 +1,23 @@
 """No two draws share a random key: every key is either drawn from, once, or made others of, which all differ."""
 
 import dataclasses
-from collections import Counter
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import mostly_slow
+from helpers import Keys, mostly_slow
 
 import jaxdrones as jd
 from jaxdrones.envs import AutoReset, make
+from jaxdrones.envs import env as environment
 from jaxdrones.envs.randomize import random_pushes, scaled, sensor_noise, shifted
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
 from jaxdrones.sensing import Scene, Sensor, Sphere
 from jaxdrones.training import selection
 
-DRAWS = ("uniform", "normal", "bernoulli", "randint")
 KEY = jax.random.key(3)
 EVERYTHING = dict(
     randomize=(scaled("mass", 0.9, 1.1), scaled("kf", 0.9, 1.1), shifted("wind", -1, 1)),
@@ -41,21 +40,6 @@ LEARNERS = {
     "shac": (shac, shac.Config(**SMALL, **CRITIC, critic_steps=2)),
     "ppo": (ppo, ppo.Config(**SMALL, **CRITIC, epochs=2, minibatches=3)),
 }
-
-
-class Keys:
-    """What the functions of `jax.random` were given and gave, also in compiled programs."""
-
-    def __init__(self):
-        self.drawn, self.parents, self.derived = Counter(), set(), Counter()
-
-    def check(self, least):
-        jax.effects_barrier()
-        assert sum(self.drawn.values()) >= least
-        assert max(self.drawn.values()) == 1, "a key is drawn from twice"
-        assert max(self.derived.values()) == 1, "two keys that were made of others are the same"
-        both = self.drawn.keys() & self.parents
-        assert not both, "a key is drawn from, and others are made of it"
 
 
 @pytest.fixture
@@ -88,7 +72,7 @@ def keys(monkeypatch):
 
         return make
 
-    for name in DRAWS:
+    for name in Keys.draws:
         monkeypatch.setattr(jax.random, name, drawing(getattr(jax.random, name)))
     for name in ("split", "fold_in"):
         monkeypatch.setattr(jax.random, name, making(getattr(jax.random, name)))
@@ -104,6 +88,12 @@ def test_the_draws_of_an_episode_have_keys_of_their_own(keys, task):
     episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
     AutoReset(env).step(KEY, episode, jnp.zeros((env.drones, 4)))
     keys.check(least=2 * 8 + 3)
+
+
+def test_the_streams_of_an_environment_have_numbers_of_their_own():
+    streams = {name: number for name, number in vars(environment).items() if name.isupper() and type(number) is int}
+    assert {"DISTURBANCE", "NOISE", "START", "RANDOMIZE", "RESET", "SENSORS", "SCENE", "VISION"} <= set(streams)
+    assert len(set(streams.values())) == len(streams)
 
 
 @pytest.mark.slow

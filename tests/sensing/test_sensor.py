@@ -4,12 +4,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import Keys
 
 import jaxdrones as jd
-from jaxdrones.sensing import Scene
+from jaxdrones.sensing import (
+    DepthNoise,
+    MotionCaptureSystem,
+    Scene,
+    barometer,
+    forest,
+    imu,
+    magnetometer,
+    motion_capture,
+    optical_flow,
+    range_finder,
+    room,
+    state_estimate,
+)
 from jaxdrones.sensing.sensor import check_sensors, init_sensors, measure_sensors
 
-KEY = jax.random.key(0)
+BEFORE, KEY = jax.random.key(1), jax.random.key(0)
 PARAMS = jd.stack([jd.load_params("cf2x"), jd.load_params("racer")])
 STATE = jd.State.at_rest([[0.0, 0.0, 1.0], [1.0, 2.0, 3.0]])
 
@@ -110,3 +124,62 @@ def test_what_is_no_memory_and_reading_is_refused(result, message):
 def test_a_wrong_sensor_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.fixture
+def keys(monkeypatch):
+    """Notes the random keys that a function uses while it is traced; they stay values, so that nothing is compiled."""
+    keys = Keys()
+
+    def name(key):
+        return np.asarray(jax.random.key_data(key)).tobytes()
+
+    def drawing(function):
+        def draw(key, *args, **kwargs):
+            with jax.ensure_compile_time_eval():
+                keys.drawn[name(key)] += 1
+            return function(key, *args, **kwargs)
+
+        return draw
+
+    def split(key, num=2, split=jax.random.split):
+        with jax.ensure_compile_time_eval():
+            children = list(split(key, num))
+            keys.parents.add(name(key))
+            keys.derived.update(map(name, children))
+        return children
+
+    for draw in Keys.draws:
+        monkeypatch.setattr(jax.random, draw, drawing(getattr(jax.random, draw)))
+    monkeypatch.setattr(jax.random, "split", split)
+    return keys
+
+
+def begun(sensor):
+    """A measurement of one drone after the start of its episode."""
+    params, state = (jax.tree.map(lambda x: x[0], tree) for tree in (PARAMS, STATE))
+    memory = None if sensor.init is None else sensor.init(BEFORE, params)
+    return sensor.measure(KEY, params, state, state, Scene(), memory)
+
+
+SYSTEM = MotionCaptureSystem(dropout=0.1, pos_noise=0.1, angle_noise=0.1)
+
+
+@pytest.mark.parametrize(
+    ("draw", "draws"),
+    [
+        (lambda: begun(range_finder("rays", np.eye(3), max_range=1.0, noise=0.1, dropout=0.1)), 2),
+        (lambda: begun(optical_flow(noise=0.1, dropout=0.1)), 2),
+        (lambda: begun(imu()), 2 * 3 + 2 * 3),
+        (lambda: begun(barometer()), 3 + 3),
+        (lambda: begun(magnetometer()), 3 + 3),
+        (lambda: begun(motion_capture(SYSTEM)), 3),
+        (lambda: begun(state_estimate(system=SYSTEM)), 6 + 1 + 6 + 2 + 1),
+        (lambda: DepthNoise(spread=0.1, dropout=0.1).apply(KEY, jnp.ones((1, 2, 2)), jd.Camera(resolution=(2, 2))), 2),
+        (lambda: forest(KEY, density=(0.1, 0.2), tilt=9.0, spheres=2, boxes=2), 1 + 4 + 2 + 3),
+        (lambda: room(key=KEY, pillars=2, spheres=2, boxes=2), 4 + 2 + 3),
+    ],
+)
+def test_no_two_draws_of_a_device_or_scene_share_a_key(keys, draw, draws):
+    jax.eval_shape(draw)
+    keys.check(least=draws)

@@ -41,12 +41,12 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
     assert run.recipe().config.worlds == 4 and run.recipe().options == {"duration": 0.2}
     rows = run.history()
     assert [row["update"] for row in rows] == [1, 2, 3, 4]
-    assert rows[-1]["steps"] == 4 * 4 * 4 and rows[-1]["success"] == 0 and rows[-1]["seconds"] > 0
+    assert rows[-1]["steps"] == 4 * 4 * 4 and "evaluated_return" in rows[-1] and rows[-1]["seconds"] > 0
     assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
     assert len(list(folder.glob("events.out.tfevents.*"))) == 1
     (report,) = printed["seeds"]
     assert report == json.loads((folder / "report.json").read_text())
-    assert report["evaluation"]["episodes"] == 8 and len(report["evaluation"]["success_interval"]) == 2
+    assert report["evaluation"]["episodes"] == 8 and report["evaluation"]["success"] is None  # too short to succeed
     assert report["seconds"]["training"] > 0 and report["seconds"]["compiling"] > 0
 
 
@@ -275,7 +275,7 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
         (["train", "hover", "--seeds", "2", "--seed", str(2**31 - 1)], "the last seed is 2147483648"),
         (["train", "hover", "--seeds", "1000000000"], "seeds is 1000000000; give at most 1000"),
         (["train", "hover", "--episodes", "1000000000000"], "episodes is 1000000000000; give at most"),
-        (["train", "hover", "--episodes", "2000000000"], "2,000,000,000 episodes needs about 128 GB of memory"),
+        (["train", "hover", "--episodes", "2000000000"], "2,000,000,000 episodes needs about 256 GB of memory"),
         (["train", "hover", "--set", "worlds=1000000000000"], "worlds is 1000000000000; give at most"),
         (
             ["train", "hover", "--set", "worlds=2000000000"],
@@ -357,7 +357,7 @@ def test_eval_prints_one_object(trained, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["evaluation"]["episodes"] == 8 and printed["recipe"]["task"] == "hover"
     assert printed["backend"] == "explicit"
-    assert printed["evaluation"]["successes"] == 0
+    assert printed["evaluation"]["successes"] is None
     assert set(printed["evaluation"]["final_error_percentiles"]) == {"50", "95", "99"}
 
 

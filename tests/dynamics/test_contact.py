@@ -260,7 +260,7 @@ def crash(params, speed, towards, n=30):
 @pytest.mark.parametrize("vehicle", mostly_slow(VEHICLES, ["cf2x"]))
 @pytest.mark.slow
 def test_drones_that_crash_stop_each_other_and_gain_nothing(vehicle, speed, towards):
-    """They rebound by no more than 0.4 of their speed (0.2 typical; Bullet's below 0.05) and stay on their own sides.
+    """They rebound by no more than 0.4 of their speed (0.2 typical; Bullet's at most 0.2) and stay on their own sides.
 
     But for the thin ones that meet rim to rim at 3 m/s: 26 of 30 slip past each other, in Bullet 1 of 30.
     """

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.sensing import BEAMS, forest, gate, room, track
+from jaxdrones import rotation
+from jaxdrones.sensing import BEAMS, Scene, clutter, forest, gate, room, track
 
 KEYS = jax.random.split(jax.random.key(0), 4096)
 ENDS = jnp.array([[0.0, 0.0, 1.5], [20.0, 0.0, 1.5]])
@@ -40,13 +41,21 @@ def test_trees_are_as_many_as_the_density_says_but_for_those_left_out():
     assert jnp.all((trees.radius >= 0.1) & (trees.radius <= 0.3))
 
 
-@pytest.mark.slow
-def test_trunks_stand_on_the_ground_and_tilt_as_far_as_they_may():
-    trunks = mixed_forests(KEYS)[0].cylinders
-    x, y, *_ = jnp.moveaxis(trunks.quat, -1, 0)
-    cosine = 1 - 2 * (x**2 + y**2)
-    assert jnp.min(cosine) >= np.cos(np.radians(20)) - 1e-9 and jnp.min(cosine) < np.cos(np.radians(19))
-    np.testing.assert_allclose(trunks.pos[..., 2], 2.5 * cosine, atol=1e-9)
+def test_trunks_stand_with_their_foot_in_the_strip_and_tilt_to_all_sides_as_far_as_they_may():
+    corners = np.array([[0, -3, 0], [20, 3, 5.0]])
+
+    @jax.jit
+    def drawn(key):
+        trunks = clutter.trunks(key, 500, jnp.array(corners), (0.1, 0.3), tilt=20.0)
+        return trunks.pos, jax.vmap(rotation.z_axis)(trunks.quat), trunks.radius
+
+    pos, axes, radius = map(np.asarray, drawn(KEYS[0]))
+    foot = pos - 2.5 * axes
+    np.testing.assert_allclose(foot[:, 2], 0, atol=1e-12)
+    assert np.all((foot >= corners[0] - 1e-9) & (foot <= corners[1]))
+    tilt = np.degrees(np.arccos(axes[:, 2]))
+    assert tilt.max() <= 20 + 1e-9 and np.all(np.histogram(tilt, 4, (0, 20))[0] > 90)  # of 125
+    assert np.abs(axes[:, :2].mean(axis=0)).max() < 0.02 and np.all((radius >= 0.1) & (radius <= 0.3))
 
 
 @pytest.mark.slow
@@ -61,6 +70,34 @@ def test_a_room_is_closed_and_its_pillars_keep_away_from_places():
 
     active, clear, beyond = distances(jax.random.key(1))
     assert 0 < jnp.sum(active) < 20 and jnp.all(clear >= 0.7) and jnp.all(beyond < 0)
+
+
+distances = jax.jit(jax.vmap(Scene.distance, (None, 0)))
+
+
+def test_a_room_is_as_large_as_it_says_and_its_walls_are_as_thick():
+    """1 cm from the middle of walls, floor and ceiling, inside, and outside but for the floor."""
+    half, wall = np.array([3.0, 2.0, 1.5]), 0.2
+    middle, sides = np.array([0, 0, 1.5]), np.concatenate([np.eye(3), -np.eye(3)])
+    scene = room(tuple(2 * half), wall=wall)
+    np.testing.assert_allclose(distances(scene, middle + (half - 0.01) * sides), 0.01, atol=1e-12)
+    np.testing.assert_allclose(distances(scene, middle + (half + wall + 0.01) * sides[:5]), 0.01, atol=1e-12)
+
+
+def test_the_opening_of_a_gate_is_a_square_of_the_size_that_was_asked_for_in_a_square_frame():
+    """Along the two lines through the middle: free half the opening away, solid over the frame, and free again."""
+    opening, frame, depth, yaw, center = 0.4, 0.16, 0.05, 0.7, np.array([1.0, 2, 3])
+    scene = Scene.of(gate(center, yaw, opening, frame, depth), ground=False)
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
+    ways = np.stack([left, -left, [0, 0, 1], [0, 0, -1]])
+    inner, outer = opening / 2, opening / 2 + frame
+    for along, expected in (0, inner), (inner - 0.01, 0.01), (inner + 0.01, -0.01), (outer + 0.01, 0.01):
+        np.testing.assert_allclose(distances(scene, center + along * ways), expected, atol=1e-12)
+    corners = np.array([a + b for a in ways[:2] for b in ways[2:]])
+    np.testing.assert_allclose(distances(scene, center + (inner - 0.01) * corners), 0.01, atol=1e-12)
+    np.testing.assert_allclose(distances(scene, center + (outer - 0.01) * corners), -0.01, atol=1e-12)
+    thick = center + (inner + frame / 2) * ways + (depth / 2 + 0.01) * ahead
+    np.testing.assert_allclose(distances(scene, thick), 0.01, atol=1e-12)
 
 
 def test_a_track_is_its_gates_in_their_order():

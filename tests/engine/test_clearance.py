@@ -1,5 +1,7 @@
 """Contact that is computed only where an obstacle is near equals contact that is computed everywhere."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -79,6 +81,25 @@ def test_what_stays_in_its_free_ball_has_no_contact():
     size = contact_radius(jd.load_params("cf2x"))
     away = np.linalg.norm(towards[:, 0], axis=1)
     np.testing.assert_array_equal(inside, away + size + 1e-3 < radius)
+
+
+def test_the_ball_that_holds_a_drone_is_the_smallest_one():
+    """At its radius above the ground no attitude touches, and slightly lower one does; hb's shape is off its center."""
+    params = jd.stack([jd.load_params(name) for name in ("cf2x", "hb", "racer")])
+
+    @partial(jax.vmap, in_axes=(None, None, 0))
+    def force(params, height, roll):
+        state = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.array([[0, 0, 1.0]]) * height))
+        state = state.replace(quat=jd.rotation.from_rpy(jnp.array([1.0, 0, 0]) * roll))
+        return jnp.max(jnp.abs(jd.ground_contact(params, state).force))
+
+    @jax.jit
+    @partial(jax.vmap, in_axes=(0, None))
+    def largest(params, share):
+        return jnp.max(force(params, share * contact_radius(params), jnp.linspace(-np.pi, np.pi, 721)))
+
+    np.testing.assert_array_equal(largest(params, 1.0001), 0)
+    assert np.all(largest(params, 0.999) > 0)
 
 
 def height(effect, vel, shift, state):

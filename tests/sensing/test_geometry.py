@@ -97,6 +97,19 @@ def test_the_nearest_point_of_the_surface_is_a_distance_down_the_gradient(solid)
 surfaces = jax.jit(jax.vmap(Scene.nearest, (None, 0)))
 
 
+def test_what_a_camera_takes_for_the_normal_is_outward_where_a_point_is_on_the_surface():
+    """From points inside those that have edges, at which a point outside sees neither face."""
+    reach = np.array([(1, 2, 0.5), (1, 1, 1), (0.35, 0.35, 1), (1, 1, 2)])
+
+    def cosine(solid, point):
+        outward = solid.outward(point)
+        normal = jnp.stack(solid.normals(list(point - solid.distance(point) * outward)))
+        return outward @ normal / jnp.linalg.norm(normal)
+
+    found = jax.jit(jax.vmap(lambda points: [cosine(*pair) for pair in zip(SOLIDS, points, strict=True)]))
+    np.testing.assert_allclose(found(RNG.uniform(-1, 1, (100, 4, 3)) * reach), 1, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_the_nearest_surface_is_a_distance_away_along_its_normal():
     """Inside and outside; the normal is the gradient of the distance."""

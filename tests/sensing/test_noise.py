@@ -10,6 +10,7 @@ import pytest
 from jaxdrones.sensing import BMI088, MPU9250, Noise, allan_deviation
 
 KEY = jax.random.key(0)
+WHITE, WALK, DRIFT = Noise(density=0.02), Noise(random_walk=0.3), Noise(instability=0.5, correlation=0.05)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3))
@@ -27,8 +28,8 @@ def readings(noise, dt, length, channels=3):
 @pytest.mark.parametrize(
     ("noise", "samples"),
     [
-        (Noise(density=0.02), [1, 10, 100]),
-        (Noise(random_walk=0.3), [10, 100]),
+        (WHITE, [1, 10, 100]),
+        (WALK, [10, 100]),
         (Noise(instability=0.5, correlation=1.0), [30, 100, 189, 400]),
         (Noise(density=0.02, instability=0.05, correlation=2.0, random_walk=0.01), [1, 10, 100, 400]),
     ],
@@ -67,6 +68,21 @@ def test_bias_and_scale_are_drawn_and_a_channel_saturates():
     np.testing.assert_allclose([np.std(errors.bias), np.std(errors.scale)], [2, 0.1], rtol=0.05)
     for true in 1e3, -1e3:
         np.testing.assert_array_equal(noise.measure(KEY, errors, jnp.full(4000, true), 0.01)[1], np.sign(true) * 50)
+
+
+def test_white_noise_shrinks_and_the_walk_of_the_bias_grows_with_the_root_of_the_time_between_measurements():
+    zero = jnp.zeros(4000)
+    for dt in 0.0025, 0.09:
+        errors, read = WHITE.measure(KEY, WHITE.init(KEY, (4000,), float), zero, dt)
+        np.testing.assert_allclose(np.std(read), 0.02 / np.sqrt(dt), rtol=0.05)
+        np.testing.assert_array_equal(errors.bias, 0)
+        errors, read = WALK.measure(KEY, WALK.init(KEY, (4000,), float), zero, dt)
+        np.testing.assert_allclose(np.std(read), 0.3 * np.sqrt(dt), rtol=0.05)
+        np.testing.assert_array_equal(errors.bias, read)
+        again = WALK.measure(jax.random.key(1), errors, zero, dt)[1]
+        np.testing.assert_allclose(np.std(again), 0.3 * np.sqrt(2 * dt), rtol=0.05)
+        errors, read = DRIFT.measure(KEY, DRIFT.init(jax.random.key(1), (4000,), float), zero, dt)
+        np.testing.assert_allclose(np.std(read), DRIFT.drift, rtol=0.05)
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,15 @@ def first_call(function, *arguments) -> float:
     return timing.first_call(function, *arguments)
 
 
+def success_rate(success: float | None, interval: tuple[float, float] | None) -> str:
+    """A success rate with its interval, or why there is none."""
+    if success is None:
+        return "no criterion"
+    if interval is None:
+        return f"{success:.4f} [1 distinct episode]"
+    return f"{success:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]"
+
+
 def report(result: dict, as_json: bool, lines: list[str]) -> None:
     """Print one JSON object, or the lines for people."""
     print(json.dumps(result) if as_json else "\n".join(lines))

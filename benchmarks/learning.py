@@ -8,7 +8,7 @@ import argparse
 import time
 
 import jax
-from common import about, report
+from common import about, report, success_rate
 
 from jaxdrones.cli.settings import parse_settings
 from jaxdrones.learning import evaluate
@@ -41,20 +41,11 @@ def main() -> None:
     lines.append("seed |     steps | run s (CPU s) | success [95 % interval] |  error cm p50   p99 | rms cm | others")
     lines += [
         f"{row['seed']:4} | {row['steps']:9} | {row['run']:5.1f} ({row['run CPU']:5.1f}) |"
-        f" {_success(row)} |"
+        f" {success_rate(row['success'], row['interval'])} |"
         f"  {100 * row['error p50']:8.2f} {100 * row['error p99']:8.2f} | {100 * row['rms']:6.2f} | {row['metrics']}"
         for row in rows
     ]
     report({"settings": recipe.as_dict(), "about": about(), "spent": spent, "rows": rows}, options.json, lines)
-
-
-def _success(row: dict) -> str:
-    """The success rate with its interval, or why there is none."""
-    if row["success"] is None:
-        return "no criterion"
-    if row["interval"] is None:
-        return f"{row['success']:.4f} [1 distinct episode]"
-    return f"{row['success']:.4f} [{row['interval'][0]:.4f}, {row['interval'][1]:.4f}]"
 
 
 def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:

@@ -27,7 +27,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import rivals_venv
-from common import about, report
+from common import about, report, success_rate
 
 import jaxdrones as jd
 from jaxdrones.checks import check_choice
@@ -76,7 +76,7 @@ def main() -> None:
     lines.append("plant                | policy       | episodes | success [95 % interval]  | error cm p50    p99")
     lines += [
         f"{row['plant']:20} | {row['policy']:12} | {row['episodes']:8} |"
-        f" {row['success']:.4f} [{row['interval'][0]:.4f}, {row['interval'][1]:.4f}] |"
+        f" {success_rate(row['success'], row['interval']):24} |"
         f" {100 * row['error p50']:12.2f} {100 * row['error p99']:6.2f}"
         for row in result["rows"]
     ]

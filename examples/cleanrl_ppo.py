@@ -169,10 +169,8 @@ def train(
             returns.append(torch.cat(episode_returns).mean().item())
         if update % 20 == 19 or update == updates - 1:
             speed = (update + 1) * num_envs * horizon / (time.perf_counter() - start)
-            print(
-                f"update {update + 1}/{updates}: return {returns[-1]:.1f}, kl {kl:.3f}, {speed:,.0f} steps/s",
-                flush=True,
-            )
+            mean_return = f"{returns[-1]:.1f}" if returns else "of no episode yet"
+            print(f"update {update + 1}/{updates}: return {mean_return}, kl {kl:.3f}, {speed:,.0f} steps/s", flush=True)
     envs.close()
     return agent, returns
 
@@ -203,8 +201,8 @@ def main() -> None:
     agent, _ = train(arguments.steps, seed=arguments.seed)
     seconds = time.perf_counter() - start
     report = evaluate(jd.make("hover"), jax_policy(agent), jax.random.key(arguments.seed), arguments.episodes)
-    low, high = report.success_interval
-    print(f"{seconds:.0f} s; success {report.success:.1%} ({low:.1%} to {high:.1%}) of {arguments.episodes} episodes")
+    interval = "({:.1%} to {:.1%})".format(*report.success_interval) if report.success_interval else "(no interval)"
+    print(f"{seconds:.0f} s; success {report.success:.1%} {interval} of {arguments.episodes} episodes")
 
 
 if __name__ == "__main__":

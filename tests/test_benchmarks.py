@@ -169,6 +169,14 @@ def test_accelerator_stops_what_takes_longer_than_its_share(tmp_path):
     assert result["rows"] == [] and set(result["stopped"]) == {"plant", "learning"}
 
 
+def test_a_success_rate_is_reported_with_its_interval_if_there_is_one(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from common import success_rate
+
+    assert success_rate(0.5, (0.25, 0.75)) == "0.5000 [0.2500, 0.7500]"
+    assert success_rate(1.0, None) == "1.0000 [1 distinct episode]" and success_rate(None, None) == "no criterion"
+
+
 @pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from helpers import mostly_slow
@@ -80,6 +81,13 @@ def test_a_flight_that_diverges_is_logged_and_reported(flight, tmp_path, capsys)
 def test_a_flight_that_goes_well_diverged_nowhere(tmp_path, capsys):
     assert main(["fly", "circle", *SHORT, "--json", "--no-figure", "--output", str(tmp_path)]) == 0
     assert json.loads(capsys.readouterr().out)["diverged"] == {}
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+def test_no_flight_computes_what_is_not_a_number(tmp_path):
+    with jax.debug_nans(True):
+        assert main(["fly", "circle", *SHORT, "--json", "--no-figure", "--output", str(tmp_path)]) == 0
 
 
 @pytest.mark.parametrize(

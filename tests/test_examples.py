@@ -46,6 +46,13 @@ def test_the_policy_that_is_evaluated_is_the_one_that_was_trained():
 
 
 @pytest.mark.needs("torch")
+def test_one_episode_is_reported_without_an_interval(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["cleanrl_ppo.py", "--steps", "0", "--episodes", "1"])
+    example("cleanrl_ppo").main()
+    assert "(no interval) of 1 episodes" in capsys.readouterr().out
+
+
+@pytest.mark.needs("torch")
 def test_cleanrls_style_of_ppo_learns():
     _, returns = example("cleanrl_ppo").train(2_000_000)
     assert returns[-1] > returns[0] + 600, returns

@@ -62,7 +62,7 @@ class CycloneTransport:
         Raises:
             ValueError: the domain is no whole number of 0 to 232, or cannot be joined.
         """
-        given: Any = os.environ.get("ROS_DOMAIN_ID", "0") if domain is None else domain
+        given: Any = (os.environ.get("ROS_DOMAIN_ID") or "0") if domain is None else domain
         number = int(given) if isinstance(given, str) and given.isdecimal() else given
         check_at_most("ROS_DOMAIN_ID" if domain is None else "domain", number, _LARGEST_DOMAIN, 0)
         if _local_only() and number not in _domains:

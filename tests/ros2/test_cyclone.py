@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from ros2_team import make_simulation
 
+from jaxdrones.errors import UserError
 from jaxdrones.ros2 import Peer, QoS, Topic, convert, topics
 from jaxdrones.ros2 import messages as msg
 
@@ -124,11 +125,15 @@ def test_commands_to_nobody_are_an_error_in_time(join):
         Peer(join(), 1).send(0, "cmd_vel", msg.Twist(), timeout=0.1)
 
 
-def test_a_domain_that_is_no_number_is_refused(domain, monkeypatch):
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [("ten", "'ten'; give a whole number"), ("-1", "'-1'; give a whole number"), ("233", "233; give at most 232")],
+)
+def test_a_domain_that_there_is_not_is_refused(given, message, domain, monkeypatch):
     from jaxdrones.ros2.cyclone import CycloneTransport
 
-    monkeypatch.setenv("ROS_DOMAIN_ID", "ten")
-    with pytest.raises(ValueError, match="ROS_DOMAIN_ID is 'ten'; give a whole number"):
+    monkeypatch.setenv("ROS_DOMAIN_ID", given)
+    with pytest.raises(UserError, match=f"^ROS_DOMAIN_ID is {message}"):
         CycloneTransport()
 
 

@@ -65,7 +65,7 @@ def lift(starts=(0.0,), drones=1, noise=None, **changes):
 
     task = Task(
         name="lift",
-        summary="",
+        summary="lifted by its rotors",
         drones=drones,
         duration=1.0,
         start=start,
@@ -107,6 +107,27 @@ def test_an_episode_is_what_it_was_at_its_end_whatever_comes_after(before, succe
     errors = np.abs(climb) * np.arange(1, steps + 1)
     np.testing.assert_allclose(report.final_error, errors[-1], atol=1e-6)
     np.testing.assert_allclose(report.rms_error, np.sqrt(np.mean(errors[steps // 5 :] ** 2)), atol=1e-6)
+
+
+class YawTorque(PyTreeNode):
+    """A yaw torque for some steps, then none."""
+
+    steps: jax.Array
+
+    def initial_memory(self, batch):
+        return jnp.zeros(())
+
+    def act(self, memory, obs):
+        return memory + 1, jnp.where(memory < self.steps, 1.0, 0.0) * jnp.array([[0.0, 0, 0, 1]])
+
+
+@pytest.mark.slow
+def test_a_drone_that_spins_at_its_goal_fails_whether_it_is_turned_on_or_coasts_after_the_end():
+    torques = ACTIONS["thrust_and_torques"](torque_share=0.6)
+    env = envs.make("hover", reach=0, speed=0, omega=0, tilt=0, action=torques)
+    report = evaluate(env, YawTorque(jnp.array(jnp.inf)), KEY, 3)
+    assert report.success == 0 and report.end_rates == {"lost": 0, "spinning": 1} and report.final_error < 0.01
+    assert report == evaluate(env, YawTorque(jnp.array(report.mean_length / env.dt)), KEY, 3)
 
 
 def test_a_failure_counts_where_the_goal_is_reached_in_the_same_step_and_any_other_end_is_one():

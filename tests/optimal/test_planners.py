@@ -124,8 +124,9 @@ def _control(module):
     return settings, jax.jit(functools.partial(module.control, settings, dt=DT))
 
 
+@pytest.mark.slow
 @pytest.mark.float32
-@pytest.mark.parametrize("module", [mppi, pytest.param(ilqr, marks=pytest.mark.slow)], ids=["mppi", "ilqr"])
+@pytest.mark.parametrize("module", [mppi, ilqr], ids=["mppi", "ilqr"])
 def test_after_a_state_that_is_not_finite_or_cannot_be_planned_for_the_next_one_is_planned_as_if_it_were_the_first(
     module,
 ):

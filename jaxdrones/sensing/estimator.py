@@ -141,9 +141,8 @@ def state_estimate(
         numbers = memory.count - late + jnp.arange(late + 1)  # of the samples; negative where there was none yet
         since = jax.tree.map(lambda x: x[1:], (numbers, samples))
         now = jax.lax.scan(forward, estimate, since)[0]
-        omega = state.omega + (read["gyro"] - true["gyro"]) - now.gyro_bias
         after = Memory(estimate, errors, samples, state.quat, state.vel, memory.count + 1)
-        return after, State(now.pos, now.quat, now.vel, omega, state.rpm)
+        return after, seen(now, state, read, true)
 
     def begin(key: jax.Array, state: State) -> kalman.Estimate:
         """The first estimate: the truth with errors."""
@@ -170,6 +169,19 @@ def state_estimate(
         *quantities("rotors", "RPM", parts=("speed of rotor 0", "1", "2", "3")),
     )
     return Sensor(name, measure, init, rate=rate, entries=entries, clocked=True)
+
+
+def seen(now: kalman.Estimate, state: State, read: dict[str, Array], true: dict[str, Array]) -> State:
+    """The state as the filter knows it; body rates are those of the gyroscope, less the bias that it is taken to have.
+
+    Args:
+        now: estimate of the present.
+        state: the true one.
+        read: what the IMU reads; its error, of a mean over the period, is taken for that at the instant.
+        true: what a unit without errors reads.
+    """
+    omega = state.omega + (read["gyro"] - true["gyro"]) - now.gyro_bias
+    return State(now.pos, now.quat, now.vel, omega, state.rpm)
 
 
 def _chosen(condition: Array, a: Any, b: Any) -> Any:

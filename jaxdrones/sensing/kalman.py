@@ -90,7 +90,7 @@ def predict(
     tilt = -middle @ _skew(acc - estimate.acc_bias) @ rotation.to_matrix(half_turn).T  # acceleration per angle
     transition = jnp.block(
         [
-            [eye, dt * eye, dt**2 / 2 * tilt, -(dt**3) / 6 * tilt, -(dt**2) / 2 * middle],
+            [eye, dt * eye, dt**2 / 2 * tilt, -(dt**3) / 4 * tilt, -(dt**2) / 2 * middle],
             [zero, eye, dt * tilt, -(dt**2) / 2 * tilt, -dt * middle],
             [zero, zero, back, -dt * eye, zero],
             [zero, zero, zero, eye, zero],

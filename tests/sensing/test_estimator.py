@@ -30,7 +30,7 @@ from jaxdrones.sensing import (
     motion_capture,
     state_estimate,
 )
-from jaxdrones.sensing.estimator import imu_noise
+from jaxdrones.sensing.estimator import imu_noise, seen
 
 KEY = jax.random.key(5)
 N = 100
@@ -119,64 +119,120 @@ def test_a_controller_flies_on_the_estimate():
     assert 0 < np.abs(pos - seen).max() < 0.05
 
 
-@pytest.mark.slow
-def test_the_barometer_and_the_magnetic_field_correct_height_and_heading():
-    quat = jd.rotation.from_rpy(jnp.array([0.1, -0.2, 0.3]))
-    wrong = jd.rotation.multiply(quat, jd.rotation.exp(jnp.array([0.02, 0.03, -0.05])))
-    estimate = kalman.init(jnp.array([0, 0, 1.0]), jnp.zeros(3), wrong, jnp.repeat(jnp.array([0.5] * 5), 3))
-    field = jnp.array(EUROPE)
-    after = kalman.update_height(estimate, jnp.array(1.3), 1e-3)
-    np.testing.assert_allclose(after.pos, [0, 0, 1.3], atol=1e-4)
-    for _ in range(3):
-        after = kalman.update_direction(after, jd.rotation.rotate_inverse(quat, field), field, 0.01)
-        after = kalman.update_direction(after, jd.rotation.rotate_inverse(quat, field[::-1]), field[::-1], 0.01)
-    np.testing.assert_allclose(kalman.angle(after.quat, quat), 0, atol=1e-3)  # half the square of 0.06 rad
-    assert np.all(np.linalg.eigvalsh(after.cov) > 0)
+def tilted(deviation=0.1):
+    """An estimate of a drone in flight."""
+    pos, vel = jnp.array([1.0, -2, 3]), jnp.array([2.0, 1, -1])
+    return kalman.init(pos, vel, jd.rotation.from_rpy(jnp.array([0.4, -0.7, 1.0])), jnp.full(15, deviation))
 
 
-@pytest.mark.slow
-def test_a_point_away_from_the_imu_is_measured_where_it_is():
-    """The estimate is at the truth already, and a measurement of the point leaves it there."""
-    quat = jd.rotation.from_rpy(jnp.array([0.4, -0.2, 0.3]))
-    estimate = kalman.init(jnp.zeros(3), jnp.zeros(3), quat, jnp.full(15, 0.1))
-    offset = jnp.array([0.01, 0.02, 0.05])
-    after = kalman.update_position(estimate, jd.rotation.rotate(quat, offset), 0.01, offset)
-    np.testing.assert_allclose(after.pos, 0, atol=1e-12)
-    tipped = estimate.replace(quat=jd.rotation.multiply(quat, jd.rotation.exp(jnp.array([1e-6, 2e-6, 0.0]))))
-    found = kalman.update_position(tipped, jd.rotation.rotate(quat, offset), 0.01, offset)
-    linear = kalman.error(tipped, jnp.zeros(3), jnp.zeros(3), quat, jnp.zeros(3), jnp.zeros(3))
-    seen = -jd.rotation.to_matrix(quat) @ jnp.cross(offset, linear[kalman.ANGLE])
-    np.testing.assert_allclose(
-        jd.rotation.rotate(quat, offset) - jd.rotation.rotate(tipped.quat, offset), seen, atol=1e-12
+def shifted(estimate, error):
+    """The estimate if it had this error less."""
+    return estimate.replace(
+        pos=estimate.pos + error[kalman.POS],
+        vel=estimate.vel + error[kalman.VEL],
+        quat=jd.rotation.multiply(estimate.quat, jd.rotation.exp(error[kalman.ANGLE])),
+        gyro_bias=estimate.gyro_bias + error[kalman.GYRO_BIAS],
+        acc_bias=estimate.acc_bias + error[kalman.ACC_BIAS],
     )
-    assert np.abs(found.pos).max() < 1e-6
 
 
-@pytest.mark.slow
-def test_prediction_has_the_jacobian_of_its_own_motion():
-    """The covariance is moved by the derivative of the motion with respect to the error."""
+def difference(a, b):
+    return kalman.error(a, b.pos, b.vel, b.quat, b.gyro_bias, b.acc_bias)
+
+
+PARTS = kalman.POS, kalman.VEL, kalman.ANGLE, kalman.GYRO_BIAS, kalman.ACC_BIAS
+
+
+def test_prediction_has_the_jacobian_of_its_own_motion_in_every_block():
+    """The covariance is moved by the derivative of the motion; of a certain error alone, by one of its columns."""
+    start, dt = tilted(), 1e-3
+    gyro, acc, gravity = jnp.array([3.0, -2, 1]), jnp.array([4.0, 5, 9]), jnp.array(9.8)
+
+    @jax.jit
+    def both(start):
+        end = kalman.move(start, gyro, acc, gravity, dt)
+        exact = jax.jacfwd(lambda e: difference(end, kalman.move(shifted(start, e), gyro, acc, gravity, dt)))
+        units = jax.vmap(lambda e: start.replace(cov=jnp.outer(e, e)))(jnp.eye(15))
+        covs = jax.vmap(lambda one: kalman.predict(imu_noise(PERFECT), one, gyro, acc, gravity, dt).cov)(units)
+        return exact(jnp.zeros(15)), covs
+
+    exact, covs = map(np.asarray, both(start))
+    diagonal = np.einsum("kkk->k", covs)
+    assert np.all(diagonal > 0.9)
+    found = np.einsum("kik->ik", covs) / np.sqrt(diagonal)  # each column times its own entry of the diagonal
+    half_turn = dt * np.linalg.norm(gyro) / 2  # what the column of the gyroscope's bias neglects; the others are exact
+    for row in PARTS:
+        for column in PARTS:
+            block, share = exact[row, column], half_turn if column == kalman.GYRO_BIAS else 1e-9
+            np.testing.assert_allclose(found[row, column], block, rtol=0, atol=share * np.abs(block).max() + 1e-15)
+
+
+def test_a_measurement_leaves_the_covariance_of_bayes_about_the_corrected_attitude():
+    """The inverse covariances add, in the old body axes; the correction of 0.2 rad turns the axes of the new angle."""
     rng = np.random.default_rng(0)
-    pos, vel, gyro, acc = (jnp.array(rng.normal(size=3)) * scale for scale in (1, 2, 3, 9))
-    quat = jd.rotation.from_rpy(jnp.array([0.4, -0.7, 1.0]))
-    gravity, dt = jnp.array(9.8), 0.01
-    silent = imu_noise(PERFECT)
-    start = kalman.init(pos, vel, quat, jnp.ones(15))
+    root, jacobian = rng.normal(size=(15, 15)), rng.normal(size=(4, 15))
+    prior, noise = root @ root.T / 15, np.diag([0.1, 0.2, 0.3, 0.4])
+    posterior = np.linalg.inv(np.linalg.inv(prior) + jacobian.T @ np.linalg.inv(noise) @ jacobian)
+    gain = posterior @ jacobian.T @ np.linalg.inv(noise)
+    residual = np.array([0.3, -0.2, 0.1, 0.2])
+    residual *= 0.2 / np.linalg.norm((gain @ residual)[kalman.ANGLE])
+    error = jnp.array(gain @ residual)
 
-    def ends(error):
-        begun = start.replace(
-            pos=pos + error[kalman.POS],
-            vel=vel + error[kalman.VEL],
-            quat=jd.rotation.multiply(quat, jd.rotation.exp(error[kalman.ANGLE])),
-            gyro_bias=error[kalman.GYRO_BIAS],
-            acc_bias=error[kalman.ACC_BIAS],
-        )
-        end = kalman.move(begun, gyro, acc, gravity, dt)
-        ref = kalman.move(start, gyro, acc, gravity, dt)
-        return kalman.error(ref, end.pos, end.vel, end.quat, end.gyro_bias, end.acc_bias)
+    @jax.jit
+    def both(estimate):
+        after = kalman.update(estimate, jnp.array(residual), jnp.array(jacobian), jnp.array(noise))
+        mean = shifted(estimate, error)
+        return after, mean, jax.jacfwd(lambda e: difference(mean, shifted(estimate, error + e)))(jnp.zeros(15))
 
-    jacobian = jax.jit(jax.jacfwd(ends))(jnp.zeros(15))
-    moved = jax.jit(kalman.predict)(silent, start, gyro, acc, gravity, dt)
-    np.testing.assert_allclose(moved.cov, jacobian @ jacobian.T, atol=2e-4)  # series to the second order of dt w
+    after, mean, turn = both(tilted().replace(cov=jnp.array(prior)))
+    np.testing.assert_allclose(difference(mean, after), 0, atol=1e-9)
+    np.testing.assert_allclose(after.cov, turn @ posterior @ turn.T, atol=0.2**2 / 3 * np.abs(posterior).max())
+    assert np.linalg.norm(turn[kalman.ANGLE, kalman.ANGLE] - np.eye(3)) > 0.1
+
+
+def test_a_bias_that_is_known_is_taken_out_of_the_body_rates_and_one_that_is_not_stays_in():
+    bias, omega = jnp.array([0.1, -0.2, 0.3]), jnp.array([1.0, 2, -1])
+    state = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.zeros((1, 3)))).replace(omega=omega)
+    for known in bias, 0 * bias:
+        now = tilted().replace(gyro_bias=known)
+        read = seen(now, state, {"gyro": 0.9 * omega + bias}, {"gyro": 0.9 * omega})  # means over the period
+        np.testing.assert_allclose(read.omega, omega + bias - known, rtol=1e-12)
+        np.testing.assert_array_equal([*read.pos, *read.quat, *read.vel], [*now.pos, *now.quat, *now.vel])
+
+
+POINT, FIELD = jnp.array([0.1, 0.2, -0.3]), jnp.array(EUROPE) / 20
+MEASUREMENTS = {
+    "position": lambda e, at, d: kalman.update_position(e, at.pos, d),
+    "point": lambda e, at, d: kalman.update_position(e, at.pos + jd.rotation.rotate(at.quat, POINT), d, POINT),
+    "attitude": lambda e, at, d: kalman.update_attitude(e, at.quat, d),
+    "height": lambda e, at, d: kalman.update_height(e, at.pos[2], d),
+    "direction": lambda e, at, d: kalman.update_direction(e, jd.rotation.rotate_inverse(at.quat, FIELD), FIELD, d),
+}
+
+
+def test_an_exact_measurement_of_any_kind_is_fulfilled_after_it():
+    """Position and height move the position; the others, of a drone whose position is known, turn the attitude."""
+    error = jnp.array([0.01, -0.02, 0.03, 0, 0, 0, 0.02, 0.03, -0.01, *[0.0] * 6])
+
+    @jax.jit
+    def corrected(estimate):
+        known = estimate.replace(cov=jnp.diag(jnp.full(15, 1e-16).at[kalman.ANGLE].set(0.01)))
+        turned = jnp.zeros(15).at[kalman.ANGLE].set(error[kalman.ANGLE])
+        found = {}
+        for name, measure in MEASUREMENTS.items():
+            start, off = (estimate, error) if name in ("position", "height") else (known, turned)
+            truth = shifted(start, off)
+            found[name] = difference(measure(start, truth, 1e-6), truth)
+        return found
+
+    left = corrected(tilted())
+    np.testing.assert_allclose(left["position"][kalman.POS], 0, atol=1e-9)
+    np.testing.assert_allclose(left["height"][2], 0, atol=1e-9)
+    np.testing.assert_allclose(left["attitude"][kalman.ANGLE], 0, atol=1e-6)
+    for name, axis in ("point", POINT), ("direction", jd.rotation.rotate_inverse(tilted().quat, FIELD)):
+        seen = np.cross(axis, left[name][kalman.ANGLE]) / np.linalg.norm(axis)  # a turn about the vector is not seen
+        np.testing.assert_allclose(seen, 0, atol=1e-3)
+        assert np.linalg.norm(np.cross(axis, error[kalman.ANGLE])) / np.linalg.norm(axis) > 0.01
 
 
 @pytest.mark.slow

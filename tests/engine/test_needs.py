@@ -103,6 +103,7 @@ def test_without_a_ground_nothing_pushes_a_drone_up():
     assert step(TEAM, start, rpm).pos[0, 2] > 0
 
 
+@pytest.mark.slow
 def test_no_vehicle_gains_energy_by_contact_at_the_longest_step():
     """Bundled and sampled vehicles, dropped level, tilted and on edge; 0.1 % for the explicit gyroscopic term."""
     bundled = [jd.load_params(str(path)) for path in assets.vehicles().values()]

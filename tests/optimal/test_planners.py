@@ -52,7 +52,6 @@ def _candidates(hessian, gradient, low, high):
             yield x
 
 
-@pytest.mark.slow
 def test_importance_prefers_what_costs_less_and_leaves_out_what_is_not_finite():
     weights = importance(jnp.array([3.0, 1.0, jnp.inf, 2.0, jnp.nan]), jnp.array(0.5))
     assert weights[1] > weights[3] > weights[0] > 0 and weights[2] == weights[4] == 0

@@ -1,5 +1,7 @@
 """Model predictive control by CasADi tracks a curve in the simulator."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,10 +18,17 @@ pytestmark = pytest.mark.needs("casadi")
 DT = 1 / 40
 
 
-def controller(horizon=20, solver="ipopt", **options):
-    from jaxdrones.symbolic import Mpc, casadi_model
+@functools.cache
+def model(**options):
+    from jaxdrones.symbolic import casadi_model
 
-    return Mpc(casadi_model("cf2x", [jd.drag], **options), DT, horizon=horizon, solver=solver)
+    return casadi_model("cf2x", [jd.drag], **options)
+
+
+def controller(horizon=20, solver="ipopt", **options):
+    from jaxdrones.symbolic import Mpc
+
+    return Mpc(model(**options), DT, horizon=horizon, solver=solver)
 
 
 @pytest.mark.slow
@@ -34,6 +43,7 @@ def test_at_the_target_the_plan_is_hover_and_far_off_it_keeps_to_the_limits():
     assert np.all(rpm <= params.max_rpm) and np.all(rpm > 1.2 * params.hover_rpm)
 
 
+@pytest.mark.slow
 def test_constants_that_are_symbols_are_given_at_each_call():
     """Twice the mass needs more thrust at once, though the model was made for the light drone."""
     mpc, team = controller(horizon=4, parameters=("mass",)), team_of("cf2x")
@@ -64,6 +74,7 @@ def test_a_state_that_is_not_finite_or_a_plan_that_does_not_converge_gives_the_l
         assert mpc.status == Status.OK and mpc.message == "Solve_Succeeded"
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_refused():
     from jaxdrones.symbolic import Mpc, casadi_model
 

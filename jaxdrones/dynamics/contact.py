@@ -65,7 +65,7 @@ def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
     """
     if scene is not None and not scene.ground:
         return Wrench(jnp.zeros_like(state.pos), jnp.zeros_like(state.pos))
-    radius, ring = _rim(params)
+    radius, ring = rim(params)
     x_axis, y_axis, z_axis = rotation.axes(state.quat)
     omega = rotation.rotate(state.quat, state.omega)
     # Everything below is in the world frame. The lowest point of the sphere at angle t is p + x cos t + y sin t from
@@ -105,7 +105,7 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     if not scene.has_obstacles:
         zero = jnp.zeros_like(state.pos)
         return Wrench(zero, zero)
-    radius, ring = _rim(params)
+    radius, ring = rim(params)
     x_axis, y_axis, z_axis = rotation.axes(state.quat)
     omega = rotation.rotate(state.quat, state.omega)
     cos, sin = (jnp.asarray(f(_ANGLES), radius.dtype)[:, None] for f in (np.cos, np.sin))
@@ -125,9 +125,27 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     return jax.tree.map(lambda v: rotation.rotate_inverse(state.quat, v), wrench)
 
 
+def stop_at(state: State, normals: Float[Array, "planes 3"], heights: Float[Array, " planes"]) -> State:
+    """The state of a drone that does not cross planes n . pos = h: moved back to them, its velocity along them.
+
+    The impact is inelastic and gives no spin, so that no energy is gained; compliant contact does the rest.
+
+    Args:
+        state: of one drone.
+        normals: unit vectors n, world; zero for no plane.
+        heights: h, m.
+    """
+    pos, vel = state.pos, state.vel
+    for normal, height in zip(normals, heights, strict=True):
+        behind = height - dot(normal, pos)
+        pos += jnp.maximum(behind, 0) * normal
+        vel -= jnp.where(behind > 0, jnp.minimum(dot(vel, normal), 0), 0) * normal
+    return state.replace(pos=pos, vel=vel)
+
+
 def contact_radius(params: Params) -> Float[Array, ""]:
     """Radius of the ball about the center of mass that holds all of a drone that can touch anything, m."""
-    radius, ring = _rim(params)
+    radius, ring = rim(params)
     return safe_sqrt(ring**2 + params.collision_offset**2) + radius
 
 
@@ -196,7 +214,7 @@ class _Contact(NamedTuple):
 def _body(params: Params, state: State, pos: Float[Array, "3"]) -> _Body:
     axes = rotation.axes(state.quat)
     center = pos + params.collision_offset * axes[2]
-    return _Body(pos, state.vel, rotation.rotate(state.quat, state.omega), center, axes, *_rim(params))
+    return _Body(pos, state.vel, rotation.rotate(state.quat, state.omega), center, axes, *rim(params))
 
 
 def _velocity(body: _Body, point: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -231,7 +249,7 @@ def _normal_force_per_mass(depth: Array, depth_rate: Array, damping: ArrayLike =
 def _load(params: Params, depth: Array, depth_rate: Array, slip_squared: Array) -> tuple[Array, Array]:
     """Normal force (N) and friction over slip velocity (N s/m) at one sphere on what does not move."""
     ix, iy, _ = components(params.inertia)
-    tilting = params.mass * _rim(params)[1] ** 2 / 2 / jnp.minimum(ix, iy)  # rate of damped tilt over that of heave
+    tilting = params.mass * rim(params)[1] ** 2 / 2 / jnp.minimum(ix, iy)  # rate of damped tilt over that of heave
     damping = _DAMPING / jnp.maximum(1, tilting / _MAX_TILTING)
     normal_force = params.mass / _SPHERES * _normal_force_per_mass(depth, depth_rate, damping)
     max_viscosity = _FRICTION_RATE * _sliding_mass(params) / _SPHERES
@@ -249,7 +267,7 @@ def _friction_per_slip(max_friction: Array, slip_squared: Array, max_viscosity: 
     return max_friction / jnp.sqrt(slip_squared + _STICTION_SPEED**2 + (max_friction / max_viscosity) ** 2)
 
 
-def _rim(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def rim(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Radius of the spheres and of the circle of their centers, m; as in Bullet."""
     radius = jnp.minimum(params.collision_height, params.collision_radius) / 2
     return radius, params.collision_radius - radius
@@ -257,7 +275,7 @@ def _rim(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
 
 def _sliding_mass(params: Params) -> Float[Array, ""]:
     """Effective mass of a point of the rim that is pushed sideways, so that the drone slides, tilts and turns, kg."""
-    radius, ring = _rim(params)
+    radius, ring = rim(params)
     low = jnp.abs(params.collision_offset) + radius
     ix, _, iz = components(params.inertia)
     return 1 / (1 / params.mass + low**2 / ix + ring**2 / iz)
@@ -266,7 +284,7 @@ def _sliding_mass(params: Params) -> Float[Array, ""]:
 def _tilting_mass(params: Params) -> Float[Array, ""]:
     """Effective mass of a sphere that is pushed along the thrust axis, times a constant; at most the mass, kg."""
     ix, _, _ = components(params.inertia)
-    return jnp.minimum(params.mass, _MAX_SHARE_ON_DRONE / (1 / params.mass + _rim(params)[1] ** 2 / ix))
+    return jnp.minimum(params.mass, _MAX_SHARE_ON_DRONE / (1 / params.mass + rim(params)[1] ** 2 / ix))
 
 
 def _series_mass(a: Array, b: Array) -> Array:

@@ -16,7 +16,7 @@ from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, s
 from jaxdrones.dynamics.contact import LARGEST_STEP
 from jaxdrones.dynamics.integrators import Integrator
 from jaxdrones.dynamics.rotors import limited
-from jaxdrones.engine.clearance import FreeBalls
+from jaxdrones.engine.clearance import FreeBalls, stopped_by_obstacles
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Physics, Rotors, check_functions
 from jaxdrones.engine.step import Step, is_traced
@@ -161,7 +161,8 @@ class ExplicitStep(Step):
 
         def substep(params: Params, state: State, command: jax.Array, scene: Scene, free: FreeBalls | None) -> State:
             start = physics.at_speed(params, state, command)
-            return integrator(lambda s: derivative(params, s, command, scene, free), start, dt)
+            end = integrator(lambda s: derivative(params, s, command, scene, free), start, dt)
+            return end if free is None else stopped_by_obstacles(params, start, end, scene, free)
 
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
             command = check_command(params, state, rpm)

@@ -204,7 +204,7 @@ def forest(
 def _advance(task: Task, world: World) -> dict[str, Array]:
     variables, pos = world.variables, world.drones.pos
     goal = variables["goal"]
-    found = touches(world)
+    found = touches(world, variables["pos"])
     return variables | {
         "pos": pos,
         "progress": norm(variables["pos"] - goal) - norm(pos - goal),

@@ -184,7 +184,7 @@ def _advance(task: Task, world: World) -> dict[str, Array]:
     return variables | {
         "index": index + (racing & passes),
         "before": index,
-        "hit": touches(world, world.scene.replace(ground=False)).scene,
+        "hit": touches(world, variables["pos"], world.scene.replace(ground=False)).scene,
         "pos": pos,
         "progress": racing * (norm(variables["pos"] - target) - norm(pos - target)),
         "lap_time": jnp.where(racing, world.time, variables["lap_time"]),

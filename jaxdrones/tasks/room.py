@@ -71,6 +71,7 @@ def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float =
         goal = -places + jnp.array([[0, 0, 2 * HEIGHT]], goal.dtype) if drones == 1 else goal
         return state, {
             "goal": goal,
+            "pos": state.pos,
             "clearance": jnp.full(drones, _CLEARANCE, goal.dtype),
             "touched": goal[:, 0] < -jnp.inf,
         }
@@ -130,8 +131,9 @@ def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float =
 
 def _advance(task: Task, world: World) -> dict[str, Array]:
     variables = world.variables
-    found = touches(world)
+    found = touches(world, variables["pos"])
     return variables | {
+        "pos": world.drones.pos,
         "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
         "touched": variables["touched"] | found.ground | found.drones | found.scene,
     }

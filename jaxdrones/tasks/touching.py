@@ -2,11 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jaxdrones.accelerate.where_needed import where_needed
+from jaxdrones.dynamics.contact import rim
 from jaxdrones.params import Params
 from jaxdrones.sensing import Collisions, Scene, collisions
+from jaxdrones.sensing.sweep import Disc, meets
 from jaxdrones.state import State
 from jaxdrones.tasks.task import World, norm
 from jaxdrones.vector import safe_sqrt
@@ -15,31 +17,42 @@ _MARGIN = 1e-3  # m: gap that still counts as touching
 _ONE_IN = 8  # worlds: in forests and rooms something is mostly near in fewer
 
 
-def touches(world: World, scene: Scene | None = None) -> Collisions:
-    """The collision flags of a world, by `jaxdrones.sensing.collisions`.
+def touches(world: World, before: Float[Array, "n 3"], scene: Scene | None = None) -> Collisions:
+    """The collision flags of a world, by `jaxdrones.sensing.collisions`, and obstacles on the way since the last step.
 
     Of many worlds, only those are computed in which something is so near that it may be touched.
 
     Args:
         world: of which only the poses matter.
+        before: positions at the last control step, m, world; the way from there is swept along a straight line.
         scene: what may be touched; that of the world when left out.
     """
     scene = world.scene if scene is None else scene
-    params, drones, scene = jax.lax.stop_gradient((world.params, world.drones, scene))
-    found = where_needed(_found, one_in=_ONE_IN)(jnp.any(_near(params, drones, scene)), params, drones, scene)
-    return Collisions(*found)
+    args = jax.lax.stop_gradient((world.params, world.drones, before, scene))
+    return Collisions(*where_needed(_found, one_in=_ONE_IN)(jnp.any(_near(*args)), *args))
 
 
-def _found(params: Params, drones: State, scene: Scene) -> tuple[Array, Array, Array]:
+def _found(params: Params, drones: State, before: Array, scene: Scene) -> tuple[Array, Array, Array]:
     found = collisions(params, drones, scene, _MARGIN)
-    return found.ground, found.drones, found.scene
+    if not scene.has_obstacles:
+        return found.ground, found.drones, found.scene
+    kinds = scene.shapes(before.dtype)
+
+    def meets_obstacle(params: Params, drone: State, before: Array) -> Array:
+        radius, ring = rim(params)
+        start, end = (
+            Disc.of(pos, drone.quat, params.collision_offset, ring, radius + _MARGIN) for pos in (before, drone.pos)
+        )
+        return meets(kinds, start, end)
+
+    return found.ground, found.drones, found.scene | jax.vmap(meets_obstacle)(params, drones, before)
 
 
-def _near(params: Params, drones: State, scene: Scene) -> Bool[Array, " n"]:
+def _near(params: Params, drones: State, before: Array, scene: Scene) -> Bool[Array, " n"]:
     """Whether an obstacle, the ground or another drone is within the ball about each drone."""
     half = params.collision_height / 2
     ball = jnp.abs(params.collision_offset) + safe_sqrt(params.collision_radius**2 + half**2) + _MARGIN
-    near = jax.vmap(scene.distance)(drones.pos) <= ball
+    near = jax.vmap(scene.distance)(drones.pos) <= ball + norm(drones.pos - before)
     for k in range(1, len(ball)):
         near |= norm(jnp.roll(drones.pos, k, axis=0) - drones.pos) <= jnp.roll(ball, k) + ball
     return near

@@ -1,0 +1,153 @@
+"""The way of a body past obstacles: what it meets, and the planes that it does not cross.
+
+A body is a disc that is rounded by a ball. It moves along a straight line, advanced by steps in which it provably
+touches nothing: where the gap to a convex obstacle is g along the normal n, and the way leads w = -way . n against it,
+nothing is touched on a further share g/w of the way (conservative advancement; Mirtich, 1996). Then it turns.
+No function here has a gradient.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxdrones import rotation
+from jaxdrones.sensing.distances import fold_near
+from jaxdrones.sensing.geometry import Number, Point, length
+from jaxdrones.sensing.shapes import Obstacle
+from jaxdrones.vector import dot, safe_sqrt
+
+_ADVANCES = 6
+_PROJECTIONS = 4  # alternating projections on disc and obstacle in each advance; they begin where the last ones ended
+_PLANES = 3  # of a body: a corner has three faces
+
+
+class Disc(NamedTuple):
+    """A disc that is rounded by a ball."""
+
+    center: Point
+    """m, world."""
+    axis: Point
+    """Unit normal, world."""
+    ring: Number
+    """Radius of the disc without its rounding, m."""
+    rounding: Number
+    """Radius of the ball, m."""
+
+    @classmethod
+    def of(cls, pos: Point, quat: Float[Array, "4"], offset: Number, ring: Number, rounding: Number) -> Disc:
+        """The disc of a drone at a pose, whose center is `offset` (m) above the center of mass."""
+        axis = rotation.z_axis(quat)
+        return cls(pos + offset * axis, axis, ring, rounding)
+
+    def nearest(self, point: Point) -> Point:
+        """The point of the disc, without its rounding, that is nearest to another one."""
+        offset = point - self.center
+        radial = offset - dot(offset, self.axis) * self.axis
+        return self.center + radial * jnp.minimum(1, self.ring / jnp.maximum(length(radial), 1e-9))
+
+
+class Approach(NamedTuple):
+    """How a moving disc approaches an obstacle."""
+
+    touches: Bool[Array, ""]
+    """Whether it touches the obstacle on its way or at its end."""
+    normal: Point
+    """Unit normal of a plane between both before they touch, away from the obstacle, world."""
+    height: Number
+    """Of the plane over the origin, m."""
+
+
+class Planes(NamedTuple):
+    """Planes between a disc and what it would move into."""
+
+    normals: Float[Array, "planes 3"]
+    """Unit normals away from the obstacles, world; zero for no plane."""
+    heights: Float[Array, " planes"]
+    """Least heights of the disc's center along the normals, m."""
+
+
+def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
+    """The planes that a disc would cross on its way, one of each obstacle, for up to three obstacles, nearest first.
+
+    Args:
+        kinds: obstacles, each kind with a leading axis.
+        start: the disc at the start of its way.
+        end: the disc at the end, if nothing is in the way.
+    """
+
+    def look(found: tuple[Planes, Point, Number], obstacle: Obstacle, _: Any) -> tuple[Planes, Point, Number]:
+        known, center, count = found
+        approach = _approach(obstacle, start, end)
+        normal = approach.normal
+        extent = end.ring * safe_sqrt(1 - dot(normal, end.axis) ** 2) + end.rounding  # of the disc to the obstacle
+        height = approach.height + extent
+        behind = jnp.where(approach.touches, jnp.maximum(height - dot(normal, center), 0), 0)
+        here = (jnp.arange(_PLANES) == count) & (behind > 0)
+        after = Planes(jnp.where(here[:, None], normal[None], known.normals), jnp.where(here, height, known.heights))
+        return after, center + behind * normal, count + (behind > 0)
+
+    none = Planes(jnp.zeros((_PLANES, 3), end.center.dtype), jnp.zeros(_PLANES, end.center.dtype))
+    found = none, end.center, jnp.zeros((), jnp.int32)
+    for kind in kinds:
+        found = fold_near(kind, *_reach(start, end), look, found)
+    return found[0]
+
+
+def meets(kinds: list[Any], start: Disc, end: Disc) -> Bool[Array, ""]:
+    """Whether a disc touches any obstacle on its way; arguments are those of `planes`."""
+
+    def look(touches: Array, obstacle: Obstacle, _: Any) -> Array:
+        return touches | _approach(obstacle, start, end).touches
+
+    found = jnp.zeros((), bool)
+    for kind in kinds:
+        found = fold_near(kind, *_reach(start, end), look, found)
+    return found
+
+
+def _reach(start: Disc, end: Disc) -> tuple[Point, Number]:
+    """A ball that holds the disc on all of its way: center and radius, m."""
+    return (start.center + end.center) / 2, length(end.center - start.center) / 2 + end.ring + end.rounding
+
+
+def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> Approach:
+    """The approach to one obstacle, in whose axes it is computed: with the attitude of the start, then that of the end.
+
+    The plane is the last one with the attitude of the start, because a thin obstacle has its other side nearer as soon
+    as the disc is more than half through.
+    """
+    start, end = _in_axes(obstacle, start), _in_axes(obstacle, end)
+    way = end.center - start.center
+
+    def nearest(disc: Disc, on_obstacle: Point) -> tuple[Point, Point, Number]:
+        on_obstacle = jax.lax.fori_loop(
+            0, _PROJECTIONS, lambda _, point: obstacle.nearest(disc.nearest(point)), on_obstacle
+        )
+        on_disc = disc.nearest(on_obstacle)
+        return on_obstacle, on_disc, obstacle.distance(on_disc) - disc.rounding
+
+    def advance(_, carry: tuple) -> tuple:
+        share, on_obstacle, _, _ = carry
+        now = start._replace(center=start.center + share * way)
+        on_obstacle, on_disc, gap = nearest(now, on_obstacle)
+        normal = obstacle.outward(on_disc)
+        closing = -dot(way, normal)
+        passes = closing <= 0
+        more = jnp.where(passes, 1, jnp.maximum(gap, 0) / jnp.where(passes, 1, closing))
+        return jnp.minimum(share + more, 1), on_obstacle, normal, dot(on_disc, normal) - gap - start.rounding
+
+    zero = jnp.zeros_like(start.rounding)
+    begin = zero, obstacle.nearest(start.center), jnp.zeros_like(way), zero
+    share, on_obstacle, normal, height = jax.lax.fori_loop(0, _ADVANCES, advance, begin)
+    touches = (share < 1) | (nearest(end, on_obstacle)[2] < 0)
+    normal = rotation.rotate(obstacle.quat, normal)
+    return Approach(touches, normal, height + dot(obstacle.pos, normal))
+
+
+def _in_axes(obstacle: Obstacle, disc: Disc) -> Disc:
+    axis = rotation.rotate_inverse(obstacle.quat, disc.axis)
+    return disc._replace(center=obstacle.to_local(disc.center), axis=axis)

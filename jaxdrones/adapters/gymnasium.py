@@ -277,8 +277,9 @@ def _layout(env: envs.Env, by_drone: bool) -> Layout:
 
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    check_choice("autoreset_mode", getattr(mode, "value", mode), [known.value for known in AutoresetMode])
-    return AutoresetMode(mode)
+    value = mode.value if isinstance(mode, AutoresetMode) else mode
+    check_choice("autoreset_mode", value, [known.value for known in AutoresetMode])
+    return AutoresetMode(value)
 
 
 def _refuse(options: dict[str, Any] | None) -> None:

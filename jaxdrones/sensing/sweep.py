@@ -20,7 +20,7 @@ from jaxdrones.sensing.geometry import Number, Point, length
 from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import dot, safe_sqrt
 
-_ADVANCES = 6
+_ADVANCES = 8
 _PROJECTIONS = 4  # alternating projections on disc and obstacle in each advance; they begin where the last ones ended
 _PLANES = 3  # of a body: a corner has three faces
 
@@ -48,6 +48,11 @@ class Disc(NamedTuple):
         offset = point - self.center
         radial = offset - dot(offset, self.axis) * self.axis
         return self.center + radial * jnp.minimum(1, self.ring / jnp.maximum(length(radial), 1e-9))
+
+    def lowest(self, normal: Point) -> Number:
+        """Height of the lowest point along a unit vector, m."""
+        extent = self.ring * safe_sqrt(1 - dot(normal, self.axis) ** 2) + self.rounding
+        return dot(normal, self.center) - extent
 
 
 class Approach(NamedTuple):
@@ -79,12 +84,11 @@ def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
         end: the disc at the end, if nothing is in the way.
     """
 
-    def look(found: tuple[Planes, Point, Number], obstacle: Obstacle, _: Any) -> tuple[Planes, Point, Number]:
+    def look(found: tuple[Planes, Point, Array], obstacle: Obstacle, _: Any) -> tuple[Planes, Point, Array]:
         known, center, count = found
         approach = _approach(obstacle, start, end)
         normal = approach.normal
-        extent = end.ring * safe_sqrt(1 - dot(normal, end.axis) ** 2) + end.rounding  # of the disc to the obstacle
-        height = approach.height + extent
+        height = approach.height + dot(normal, end.center) - end.lowest(normal)  # of the center, where they touch
         behind = jnp.where(approach.touches, jnp.maximum(height - dot(normal, center), 0), 0)
         here = (jnp.arange(_PLANES) == count) & (behind > 0)
         after = Planes(jnp.where(here[:, None], normal[None], known.normals), jnp.where(here, height, known.heights))
@@ -135,10 +139,11 @@ def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> Approach:
         now = start._replace(center=start.center + share * way)
         on_obstacle, on_disc, gap = nearest(now, on_obstacle)
         normal = obstacle.outward(on_disc)
+        height = dot(on_disc, normal) - gap - start.rounding  # of the obstacle; all of it is below
         closing = -dot(way, normal)
         passes = closing <= 0
-        more = jnp.where(passes, 1, jnp.maximum(gap, 0) / jnp.where(passes, 1, closing))
-        return jnp.minimum(share + more, 1), on_obstacle, normal, dot(on_disc, normal) - gap - start.rounding
+        more = jnp.where(passes, 1, jnp.maximum(now.lowest(normal) - height, 0) / jnp.where(passes, 1, closing))
+        return jnp.minimum(share + more, 1), on_obstacle, normal, height
 
     zero = jnp.zeros_like(start.rounding)
     begin = zero, obstacle.nearest(start.center), jnp.zeros_like(way), zero

@@ -9,7 +9,7 @@ import pytest
 from helpers import assert_close, assert_finite
 
 import jaxdrones as jd
-from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
+from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere, gate
 
 VEHICLES = {name: jd.load_params(name) for name in ("cf2x", "hb", "racer")}
 CRAZYFLIE = VEHICLES["cf2x"]
@@ -54,6 +54,94 @@ def fly(params, starts, scene, rpm, length):
 @jax.jit
 def wrenches(scene, states):
     return jax.vmap(jd.obstacle_contact, (None, 0, None))(CRAZYFLIE, states, scene)
+
+
+def solid(kind, thickness):
+    """One solid about the origin, or a gate, that is as thick as asked for."""
+    long, half = jnp.full_like(thickness, 9.0), thickness / 2
+    if kind == "gate":
+        return Scene.of(gate((0, 0, 0.0), depth=0.02, frame=0.05), ground=False)
+    boxes = {"wall": (thickness, long, long), "beam": (thickness, thickness, long), "bar": (thickness, long, thickness)}
+    if kind in boxes:
+        return Scene.of(Box(pos=(0, 0, 0), size=jnp.stack(boxes[kind])), ground=False)
+    round_ones = {"sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule}
+    height = {} if kind == "sphere" else {"height": long}
+    return Scene.of(round_ones[kind](pos=(0, 0, 0), radius=half, **height), ground=False)
+
+
+def deepest(params, states, scene):
+    """How deep the disc of a drone, without its rounding, is in solids at and between the states of a flight, m."""
+    rounding = jnp.minimum(params.collision_height, params.collision_radius) / 2
+    angle = jnp.linspace(0, 2 * jnp.pi, 16, endpoint=False)
+    around = jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=1)
+    disc = jnp.concatenate([r * (params.collision_radius - rounding) * around for r in (0.0, 0.4, 0.7, 1.0)])
+    disc += jnp.stack([0.0, 0.0, params.collision_offset])[None]
+
+    def depth(pos, quat):
+        points = pos[None] + jax.vmap(jd.rotation.rotate, (None, 0))(quat, disc)
+        return -jnp.min(jax.vmap(scene.distance)(points))
+
+    between = (states.pos[:-1] + share * jnp.diff(states.pos, axis=0) for share in (0.25, 0.5, 0.75, 1.0))
+    return jnp.max(jnp.stack([jax.vmap(depth)(pos, states.quat[1:]) for pos in between]))
+
+
+def flights_at(kind, vehicle, n, seed=0):
+    """Depths, gains of energy and trajectories of n drones without weight that fly at a solid at 1 to 20 m/s."""
+    rng = np.random.default_rng(seed)
+    params = jd.load_params(vehicle).replace(gravity=jnp.zeros(()))
+    quat = rng.normal(size=(n, 4))
+    quat[::2] = 0, 0, 0, 1
+    speed, radius = np.linspace(1, 20, n), float(params.collision_radius)
+    vel = speed[:, None] * np.stack([np.ones(n), *rng.uniform(-0.2, 0.2, (2, n))], axis=1)
+    aim = np.array([-radius - 0.3, 0, 0]) * np.ones((n, 1))
+    aim[:, 1:] = rng.uniform(-0.5, 0.5, (n, 2)) * radius + (kind == "gate") * np.array([[0.225, 0]])
+    starts = jax.vmap(jd.State.at_rest)(jnp.zeros((n, 1, 3))).replace(
+        pos=jnp.array(aim - vel * ((radius + 0.3) / speed)[:, None] + [radius + 0.3, 0, 0])[:, None],
+        vel=jnp.array(vel)[:, None],
+        quat=jnp.array(quat / np.linalg.norm(quat, axis=1, keepdims=True))[:, None],
+    )
+    thickness = jnp.array([0.02, 0.05, 0.2])[np.arange(n) % 3]
+    scenes = jax.vmap(lambda t: solid(kind, t))(thickness)
+    team = jd.repeat(params, 1)
+
+    @jax.jit
+    @jax.vmap
+    def flown(start, scene):
+        def advance(state, _):
+            return (after := step(team, state, jnp.zeros((1, 4)), scene)), after
+
+        states = jax.tree.map(lambda x: x[:, 0], jax.lax.scan(advance, start, length=96)[1])
+        energy = params.mass * jnp.sum(states.vel**2, axis=1) + states.omega**2 @ params.inertia
+        first = params.mass * jnp.sum(start.vel**2)
+        return deepest(params, states, scene), jnp.max(energy) / first, states
+
+    return flown(starts, scenes)
+
+
+def test_a_thin_wall_stops_drones_at_any_speed():
+    speed = np.linspace(1, 20, 16)
+    starts = random_states(16).replace(
+        pos=jnp.array(np.stack([np.full(16, 0.5), np.zeros(16), np.zeros(16)], axis=1)),
+        vel=jnp.array(speed[:, None] * [1, 0.1, 0]),
+    )
+    thin = Scene.of(Box(pos=(1.01, 0, 0), size=(0.02, 100, 100)), ground=False)
+    states = fly(CRAZYFLIE.replace(gravity=jnp.zeros(())), starts, thin, 0.0, length=150)
+    assert states.pos[..., 0].max() < 1
+    assert (np.abs(states.vel[:, -1, 0]) < 1).all()
+
+
+@pytest.mark.float32
+@pytest.mark.slow
+@pytest.mark.parametrize("vehicle", ["cf2x", "hb", "racer", "x500"])
+@pytest.mark.parametrize("kind", ["wall", "beam", "bar", "sphere", "cylinder", "capsule", "gate"])
+def test_nothing_flies_into_a_solid_however_thin_it_is_and_no_energy_is_gained(kind, vehicle):
+    """The disc of a drone, which its rounding surrounds, stays out; rim first it may get in by a few millimeters."""
+    depths, gains, states = flights_at(kind, vehicle, n=24)
+    assert_finite(states)
+    assert depths.max() < 0.01
+    assert gains.max() < 1.001
+    if kind == "wall":
+        assert (states.vel[:, -1, 0] < 0.1).all() and (states.pos[:, -1, 0] < 0.1).all()
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES)
@@ -164,3 +252,28 @@ def test_gradients_are_finite_wherever_a_drone_is():
         return sum(jnp.sum(x) for x in jax.tree.leaves(jd.obstacle_contact(params, state, scene)))
 
     assert_finite(jax.jit(jax.vmap(jax.grad(push, (0, 1)), (None, 0)))(scene, states))
+
+
+@pytest.mark.slow
+def test_a_fast_drone_stops_where_the_wall_is_whatever_its_speed_and_goes_with_the_wall_of_its_own_way_along_it():
+    """At 20 m/s: what is left of its velocity is that along the wall, and its place depends on its start along it."""
+
+    def end(y, speed):
+        start = jd.State.at_rest([[0.2, 0.0, 0.0]]).replace(
+            pos=jnp.stack([jnp.full_like(y, 0.2), y, jnp.zeros_like(y)])[None],
+            vel=jnp.stack([speed, speed / 10, 0 * speed])[None],
+        )
+        weightless = jd.repeat(CRAZYFLIE.replace(gravity=jnp.zeros(())), 1)
+
+        def hold(params, memory, state, k):
+            return memory, jnp.zeros((1, 4))
+
+        return jd.rollout(partial(step, scene=WALL), hold, weightless, start, None, length=16)[0]
+
+    y, speed = jnp.zeros(()), jnp.full((), 20.0)
+    final = jax.jit(end)(y, speed)
+    assert abs(final.pos[0, 0] - (1 - CRAZYFLIE.collision_radius)) < 0.02 and abs(final.vel[0, 0]) < 0.7
+    assert final.pos[0, 1] > 0.1
+    slopes = jax.jit(jax.jacfwd(lambda y, speed: end(y, speed).pos[0, :2], argnums=(0, 1)))(y, speed)
+    assert_finite(slopes)
+    assert abs(slopes[0][1] - 1) < 1e-6 and abs(slopes[0][0]) < 1e-6

@@ -1,0 +1,77 @@
+"""The way of a disc past solids."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones import rotation
+from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
+from jaxdrones.sensing.sweep import Disc, meets, planes
+
+SOLIDS = {
+    "box": Box(pos=(0, 0, 0), size=(0.3, 0.05, 0.2)),
+    "sphere": Sphere(pos=(0, 0, 0), radius=0.1),
+    "cylinder": Cylinder(pos=(0, 0, 0), radius=0.02, height=0.4),
+    "capsule": Capsule(pos=(0, 0, 0), radius=0.03, height=0.3),
+}
+RING, ROUNDING = 0.05, 0.0125
+
+
+def random_ways(n, seed=0):
+    """Starts and ends of a disc, 0.2 m from each other, that begins outside and comes near the origin."""
+    rng = np.random.default_rng(seed)
+    quat = rng.normal(size=(n, 4))
+    axis = jax.vmap(rotation.z_axis)(jnp.array(quat / np.linalg.norm(quat, axis=1, keepdims=True)))
+    start = rng.normal(size=(n, 3))
+    start *= rng.uniform(0.28, 0.4, (n, 1)) / np.linalg.norm(start, axis=1, keepdims=True)
+    way = rng.uniform(-0.15, 0.15, (n, 3)) - start
+    return jnp.array(start), jnp.array(start + 0.3 * way / np.linalg.norm(way, axis=1, keepdims=True)), axis
+
+
+def gap_on_the_way(scene, start, end, axis):
+    """The smallest gap between a solid and a disc, from many points of the disc on many places of its way, m."""
+    angle = jnp.linspace(0, 2 * jnp.pi, 20, endpoint=False)
+    across = jnp.linalg.svd(axis[None])[2][1:]
+    rim = jnp.cos(angle)[:, None] * across[:1] + jnp.sin(angle)[:, None] * across[1:]
+    disc = jnp.concatenate([r * RING * rim for r in jnp.linspace(0.25, 1, 4)])
+    places = start[None] + jnp.linspace(0, 1, 40)[:, None] * (end - start)[None]
+    points = (places[:, None] + disc[None]).reshape(-1, 3)
+    return jnp.min(jax.vmap(scene.distance)(points)) - ROUNDING
+
+
+@pytest.mark.parametrize(
+    "solid", ["box", *(pytest.param(name, marks=pytest.mark.slow) for name in SOLIDS if name != "box")]
+)
+def test_a_disc_meets_what_is_on_its_way_and_nothing_else(solid):
+    scene = Scene.of(SOLIDS[solid], ground=False)
+    kinds = scene.shapes(jnp.float64)
+    start, end, axis = random_ways(100)
+
+    @jax.jit
+    @jax.vmap
+    def found(start, end, axis):
+        discs = (Disc(center, axis, jnp.asarray(RING), jnp.asarray(ROUNDING)) for center in (start, end))
+        return meets(kinds, *discs), gap_on_the_way(scene, start, end, axis)
+
+    hit, gap = found(start, end, axis)
+    assert 20 < hit.sum() < 80
+    assert hit[gap < -1e-3].all()  # the nearest of some points is farther than the disc by up to 2 mm
+    assert not hit[gap > 4e-3].any()
+
+
+def test_three_walls_of_a_corner_are_three_planes_and_what_is_behind_is_none():
+    corner = Scene.of(*(Box(pos=0.5 * np.eye(3)[i], size=np.full(3, 2.0) - 1.4 * np.eye(3)[i]) for i in range(3)))
+    kinds = corner.shapes(jnp.float64)  # faces at x, y, z = 0.2 m
+    level = jnp.array([0.0, 0.0, 1.0])
+
+    def disc(center):
+        return Disc(jnp.array(center), level, jnp.asarray(RING), jnp.asarray(ROUNDING))
+
+    found = planes(kinds, disc([0.0, 0.0, 0.0]), disc([0.4, 0.4, 0.4]))
+    free = 0.2 - ROUNDING - np.array([RING, RING, 0])
+    order = np.argmax(np.abs(found.normals), axis=1)
+    assert sorted(order) == [0, 1, 2]
+    np.testing.assert_allclose(found.normals, -np.eye(3)[order], atol=1e-6)
+    np.testing.assert_allclose(found.heights, -free[order], atol=1e-6)
+    assert not planes(kinds, disc([0.0, 0.0, 0.0]), disc([-0.4, -0.4, -0.4])).normals.any()

@@ -94,8 +94,9 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     """Normal force and friction of the obstacles of a scene on a drone that touches them, by the law of the ground.
 
     Each of the eight spheres touches the obstacle that is nearest to it, or in which it is deepest. What fits between
-    two spheres, such as a thin pole, or a corner, reaches into the disc. Not for the Bullet backend, which resolves
-    these contacts itself.
+    two spheres, such as a thin pole, or a corner, reaches into the disc. The explicit backend also sweeps the way
+    of every physics step and stops the disc, less its rounding, at the surface of an obstacle (`stop_at`). Not for the
+    Bullet backend, which resolves these contacts itself.
 
     Args:
         params: of the drone.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_keywords, check_number, check_whole
+from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -50,6 +50,7 @@ def hover(
         ValueError: a number out of range.
     """
     check_whole("number of drones of hover", drones)
+    check_positive("duration", duration, "s")
     check_number("reach", reach, "m", at_least=0, at_most=_MAX_REACH)
     check_number("speed", speed, "m/s", at_least=0, at_most=_MAX_SPEED)
     check_number("omega", omega, "rad/s", at_least=0, below=MAX_SPIN)

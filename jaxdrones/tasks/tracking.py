@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.checks import check_choice, check_keywords, check_number, check_switch, check_whole
+from jaxdrones.checks import check_choice, check_keywords, check_number, check_positive, check_switch, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -42,6 +42,7 @@ def tracking(
     """
     check_whole("number of drones of tracking", drones)
     check_choice("curve", curve, SHAPES)
+    check_positive("duration", duration, "s")
     check_number("period", period, "s", at_least=_MIN_PERIOD)
     check_switch("random_start", random_start)
     shape = SHAPES[curve]

@@ -14,14 +14,13 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
-from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 
-import published
-from common import about
+from benchmarks import published
+from benchmarks.common import about
 
-HERE = Path(__file__).parent
+ROOT = Path(__file__).parent.parent
 SHARES = {"tests": 0.25, "plant": 0.25, "cameras": 0.1, "envs": 0.1, "swarm": 0.1, "learning": 0.2}
 """Of the time; what a section leaves, the next ones have."""
 
@@ -46,25 +45,24 @@ HOVERS = 0.99  # success from which a training counts as one
 Row = dict[str, object]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sections", nargs="+", default=list(SHARES), choices=list(SHARES))
     parser.add_argument("--budget", type=float, default=570.0, metavar="S", help="seconds for all (570)")
     parser.add_argument("--output", type=Path, default=Path("runs/accelerator.json"), help="JSON to write")
-    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     parser.add_argument("--rows", type=Path, help=argparse.SUPPRESS)  # of a section's own process: where rows go
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.rows:
         measure(options)
-        return
+        return {}, []
     result = measured(options)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(json.dumps(result, indent=2))
-    print(json.dumps(result) if options.json else "\n".join([*table(result), f"written: {options.output}"]))
+    return result, [*table(result), f"written: {options.output}"]
 
 
-def measured(options: Namespace) -> dict[str, object]:
+def measured(options: argparse.Namespace) -> dict[str, object]:
     """What all sections found, each in the time that it has."""
     end = time.monotonic() + options.budget
     result: dict[str, object] = {"about": {}, "rows": [], "stopped": {}}
@@ -83,7 +81,17 @@ def run(sections: list[str], seconds: float, quick: bool) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows"
         file.touch()
-        command = [sys.executable, __file__, "--sections", *sections, "--rows", str(file), *["--quick"] * quick]
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks",
+            "accelerator",
+            "--sections",
+            *sections,
+            "--rows",
+            str(file),
+            *["--quick"] * quick,
+        ]
         stopped = ended(command, seconds)
         rows = [json.loads(line) for line in file.read_text().splitlines()]
     about = [row.pop("about") for row in rows if "about" in row]
@@ -97,7 +105,7 @@ def run(sections: list[str], seconds: float, quick: bool) -> dict[str, object]:
 def ended(command: list[str], seconds: float) -> str | None:
     """Run a command, and end it with all that it started when the time is up; why it did not come to its end."""
     process = subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
         _, said = process.communicate(timeout=seconds)
@@ -108,7 +116,7 @@ def ended(command: list[str], seconds: float) -> str | None:
     return said.strip().splitlines()[-1] if process.returncode else None
 
 
-def measure(options: Namespace) -> None:
+def measure(options: argparse.Namespace) -> None:
     """Write a line for each measurement as soon as it is made."""
     for section in options.sections:
         if section != "tests":  # they need the accelerator for themselves
@@ -129,7 +137,7 @@ def tests(quick: bool) -> Iterator[Row]:
         with tempfile.TemporaryDirectory() as folder:
             report = Path(folder) / "report.xml"
             command = [sys.executable, "-m", "pytest", "-q", path, "-m", "not slow", f"--junitxml={report}"]
-            subprocess.run(command, cwd=HERE.parent, capture_output=True, check=False)
+            subprocess.run(command, cwd=ROOT, capture_output=True, check=False)
             cases = list(ElementTree.parse(report).iter("testcase"))
         failed = [x.get("name") for x in cases if x.find("failure") is not None or x.find("error") is not None]
         tried = len(cases) - sum(x.find("skipped") is not None for x in cases)
@@ -153,7 +161,7 @@ def swarm(quick: bool) -> Iterator[Row]:
 
 def cameras(quick: bool) -> Iterator[Row]:
     """Images per second, 64 x 48, with 20 solids and in a forest of 103; each camera in a world of its own."""
-    import cameras as benchmark
+    from benchmarks import cameras as benchmark
 
     for scene in ("A",) if quick else ("A", "B"):
         for count in (2,) if quick else (4096, 1024):
@@ -172,7 +180,7 @@ def envs(quick: bool) -> Iterator[Row]:
 def flown(
     what: str, worlds: int, drones: int, figure: published.Figure | None, quick: bool, **changes
 ) -> Iterator[Row]:
-    import throughput
+    from benchmarks import throughput
 
     options = dict(effects="drag", rotors="lagging", integrator="semi_implicit_euler", substeps=1)
     options |= dict(
@@ -183,7 +191,7 @@ def flown(
         quick=quick,
         repeats=1 if quick else 3,
     )
-    options = Namespace(**options | changes)
+    options = argparse.Namespace(**options | changes)
     found = throughput.measure(throughput.make_step(options), worlds, options)
     of = {"worlds": worlds, "unit": "drone-steps/s"}
     compiling = f"first call {found['forward first call']:.1f} s"
@@ -194,25 +202,23 @@ def flown(
 
 
 def stepped(what: str, task: str, quick: bool, **options) -> Iterator[Row]:
-    import envs as benchmark
-
+    from benchmarks import envs as benchmark
     from jaxdrones.envs import make
 
     env = make(task, **options)
     for worlds in (4,) if quick else (65_536, 4_096):
-        rate = env.drones * benchmark.in_jit(env, Namespace(worlds=worlds, repeats=1 if quick else 3))
+        rate = env.drones * benchmark.in_jit(env, argparse.Namespace(worlds=worlds, repeats=1 if quick else 3))
         yield row(what, rate, published.QUADSWARM[env.drones], worlds=worlds, unit="drone-steps/s", note="environment")
 
 
 def learning(quick: bool) -> Iterator[Row]:
     """Seconds of training to hover, full four motors from any motion, and what success that has."""
-    import learning as benchmark
-
+    from benchmarks import learning as benchmark
     from jaxdrones.training.recipe import Recipe
 
     small = dict(updates=2, worlds=8, horizon=4) if quick else {}
     for algorithm in ("bptt",) if quick else ("bptt", "ppo"):
-        options = Namespace(cache=None, first_seed=0, seeds=1, episodes=10 if quick else 10_000)
+        options = argparse.Namespace(cache=None, first_seed=0, seeds=1, episodes=10 if quick else 10_000)
         (found,), spent = benchmark.measure(Recipe.of("hover", algorithm, **small), options)
         hovers = found["success"] >= HOVERS
         figure = published.LEARNING_TO_FLY_IN_SECONDS if hovers else None
@@ -234,7 +240,7 @@ MEASURES = {"tests": tests, "plant": plant, "cameras": cameras, "envs": envs, "s
 
 def table(result: dict) -> list[str]:
     """Lines for people."""
-    lines = [f"{name}: {value}" for name, value in result["about"].items()]
+    lines: list[str] = []
     sources: dict[str, int] = {}
     for found in result["rows"]:
         theirs = found.get("published")
@@ -247,7 +253,3 @@ def table(result: dict) -> list[str]:
         lines.append(f"{line} | {found['note']}")
     lines += [f"[{number}] {source}" for source, number in sources.items()]
     return lines + [f"stopped: {section}: {why}" for section, why in result["stopped"].items()]
-
-
-if __name__ == "__main__":
-    main()

@@ -2,7 +2,7 @@
 
 A tape of rotor speeds, a start that turns and moves, one second, float64 (l2f: float32). Everybody flies it: ours as it
 comes; gym-pybullet-drones (2021) and (2.x), both of its models, from recorded data (tests/golden); and, in an
-environment of their own (rivals_venv.py), crazyflow 0.4.0, rotorpy 3.0.0 and, where it can be installed, l2f 2.0.18,
+environment of their own (venv.py), crazyflow 0.4.0, rotorpy 3.0.0 and, where it can be installed, l2f 2.0.18,
 with their own default integrators. Tapes of other vehicles have the same shares of hover speed.
 
 A difference is the largest in that second. Each has its causes, which agreement_switches.py switches in ours, so that
@@ -12,18 +12,15 @@ left when all others are switched and this one is not.
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
-import agreement_switches as switches
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rivals_venv
-from agreement_switches import Cause, Setup
-from common import about, report
 
 import jaxdrones as jd
+from benchmarks.rivals import environment, switches
+from benchmarks.rivals.switches import Cause, Setup
 from jaxdrones import rotation
 
 GOLDEN = Path(__file__).parent.parent / "tests" / "golden"
@@ -32,23 +29,19 @@ L2F = "l2f==2.0.18"
 _BULLET_DAMPING = 0.03999999910593033  # 0.04 in single precision
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="gym-pybullet-drones alone, which needs no environment")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     jax.config.update("jax_enable_x64", True)
-    rows, facts = recorded(), about()
+    rows, versions = recorded(), {}
     if not options.quick:
-        there = rivals_venv.add(L2F)
-        result = rivals_venv.run("rivals_agreement.py", *([] if there else ["--without-l2f"]))
-        rows, facts = rows + result["rows"], facts | result["versions"]
-    lines = [f"{name}: {value}" for name, value in facts.items()]
-    lines += [line for row in rows for line in _table(row)]
-    report({"about": facts, "rows": rows}, options.json, lines)
+        there = environment.add(L2F)
+        result = environment.run("benchmarks.rivals.agreement", *([] if there else ["--without-l2f"]))
+        rows, versions = rows + result["rows"], result["versions"]
+    lines = [line for row in rows for line in _table(row)]
+    result = {"about": versions, "rows": rows}
     unexplained = [row["simulator"] for row in rows if not row["explained"]]
     if unexplained:
-        sys.exit(f"differences that no switch explains: {', '.join(unexplained)}")
+        result["failed"] = f"differences that no switch explains: {', '.join(unexplained)}"
+    return result, lines
 
 
 def recorded() -> list[dict]:
@@ -123,7 +116,3 @@ def _table(row: dict) -> list[str]:
     lines += [f"    {'all but ' + c['kind'] + ': ' + c['what']:66}{numbers(c)}" for c in row["causes"]]
     verdict = "" if row["explained"] else f"  NOT EXPLAINED, above {row['rounding']:.0e}"
     return [*lines, f"    {'all switched':66}{numbers(row['all switched'])}{verdict}"]
-
-
-if __name__ == "__main__":
-    main()

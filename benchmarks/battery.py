@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import about, report
 
 import jaxdrones as jd
 from jaxdrones.checks import check_choice
@@ -20,19 +19,18 @@ ON = 0.3 * 65535  # mean PWM of a drone that is about to fly
 GAUSS_NEWTON_STEPS = 8
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flights", nargs="+", type=Path)
     parser.add_argument("--vehicle", default="cf2x")
     parser.add_argument("--propellers", default="2.1+")
     parser.add_argument("--seconds", type=float, default=5.0, help="with the motors on, to find the resistance")
     parser.add_argument("--resistance", type=float, help="ohm, for all flights, instead of one found for each")
-    parser.add_argument("--quick", action="store_true", help="the first flight alone: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     jax.config.update("jax_enable_x64", True)
     rows = [measure(flight, options) for flight in options.flights[: 1 if options.quick else None]]
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines.append("flight | resistance ohm | rms V: all, motors on, after the first seconds | mean current A")
     lines += [
         f"{row['flight']:26} | {row['resistance']:.3f} | {row['rms']:.3f} {row['rms on']:.3f} {row['rms after']:.3f} |"
@@ -40,7 +38,7 @@ def main() -> None:
         for row in rows
     ]
     lines.append("mean rms V: " + " ".join(f"{np.mean([row[key] for row in rows]):.3f}" for key in RMS))
-    report({"about": about(), "rows": rows}, options.json, lines)
+    return {"rows": rows}, lines
 
 
 RMS = "rms", "rms on", "rms after"
@@ -96,7 +94,3 @@ def voltage(params: jd.Params, propellers: str, rest: float, pwm: jax.Array):
         return tuple(jax.vmap(f, (None, 0))(one, of_row) for f in (jd.battery_voltage, jd.battery_current))
 
     return fly
-
-
-if __name__ == "__main__":
-    main()

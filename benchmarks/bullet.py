@@ -5,7 +5,6 @@ One process, one thread of Bullet. A physics step is 1/240 s. Medians of repeats
 
 import argparse
 import functools
-import json
 import statistics
 import time
 
@@ -84,11 +83,7 @@ def frames(count: int, repeats: int) -> float:
         return median_rate(work, count, repeats)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="few steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     steps, repeats = (20, 1) if options.quick else (3000, 7)
     rates = {
         "1 drone, every effect: physics steps/s": open_loop(1, steps, repeats),
@@ -96,12 +91,4 @@ def main() -> None:
         "10 drones, every effect: world steps/s": open_loop(10, steps // 4, repeats),
         "64 x 48 RGB + depth + segmentation, ten primitives: frames/s": frames(steps // 10, repeats),
     }
-    if options.json:
-        print(json.dumps({name: round(rate, 1) for name, rate in rates.items()}))
-    else:
-        for name, rate in rates.items():
-            print(f"{rate:10,.0f}  {name}")
-
-
-if __name__ == "__main__":
-    main()
+    return {"rates": rates}, [f"{rate:10,.0f}  {name}" for name, rate in rates.items()]

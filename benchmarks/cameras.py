@@ -14,11 +14,11 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rivals_venv
-from cameras_scenes import forest, objects20, poses
-from common import about, compiled, report, seconds
 
 import jaxdrones as jd
+from benchmarks.cameras_scenes import forest, objects20, poses
+from benchmarks.common import compiled, seconds
+from benchmarks.rivals import environment
 
 CAMERAS = (1, 64, 1024, 4096)
 RESOLUTIONS = ((64, 48), (64, 64), (16, 12))
@@ -90,14 +90,13 @@ def bullet_rate(scene: jd.Scene, resolution: tuple[int, int], count: int, repeat
         return count / seconds(look, repeats=repeats)["median"]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", nargs="+", default=("A", "B"), choices=("A", "B"))
     parser.add_argument("--cameras", type=int, nargs="+", default=CAMERAS)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="two small cameras, without rivals: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     resolutions = RESOLUTIONS
     if options.quick:
         options.cameras, options.repeats, resolutions = (2,), 1, ((8, 6),)
@@ -111,9 +110,8 @@ def main() -> None:
         "TinyRenderer, A, 64 x 48": bullet_rate(objects20(), (64, 48), min(64, *options.cameras), options.repeats)
     }
     if not options.quick:
-        others |= rivals_venv.run("rivals_cameras.py")
-    facts = about()
-    lines = [f"{name}: {value}" for name, value in facts.items()]
+        others |= environment.run("benchmarks.rivals.cameras")
+    lines = []
     for row in rows:
         lines.append(f"scene {row['scene']}, {row['resolution'][0]} x {row['resolution'][1]}, {row['cameras']} cameras")
         lines += [
@@ -122,8 +120,4 @@ def main() -> None:
         ]
         lines.append(f"    forward and backward take {row['forward and backward over forward']:.1f} times forward")
     lines += [f"{name}: {rate:,.0f} images/s" for name, rate in others.items() if rate]
-    report({"about": facts, "rows": rows, "others": others}, options.json, lines)
-
-
-if __name__ == "__main__":
-    main()
+    return {"rows": rows, "others": others}, lines

@@ -1,9 +1,10 @@
-"""What every benchmark prints about itself, and how it takes time."""
+"""Versions, machine and commit, timers, and a figure with logarithmic axes."""
 
-import json
 import os
+import statistics
 import subprocess
 import time
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 
@@ -46,6 +47,37 @@ def success_rate(success: float | None, interval: tuple[float, float] | None) ->
     return f"{success:.4f} [{interval[0]:.4f}, {interval[1]:.4f}]"
 
 
-def report(result: dict, as_json: bool, lines: list[str]) -> None:
-    """Print one JSON object, or the lines for people."""
-    print(json.dumps(result) if as_json else "\n".join(lines))
+Program = Callable[[], object]
+"""Does its work and returns what it made; arrays of JAX are waited for."""
+
+
+def in_turn(programs: dict[str, Program], repeats: int, shortest: float = 0.05) -> dict[str, dict[str, float]]:
+    """Median and best seconds of each, warmed up; a turn takes `shortest` s, in many calls if need be."""
+    for program in programs.values():
+        _seconds(program, 1)
+    calls = {name: 1 + int(shortest / _seconds(program, 1)) for name, program in programs.items()}
+    times = {name: [] for name in programs}
+    for _ in range(repeats):
+        for name, program in programs.items():
+            times[name].append(_seconds(program, calls[name]))
+    return {name: {"median": statistics.median(taken), "best": min(taken)} for name, taken in times.items()}
+
+
+def _seconds(program: Program, calls: int) -> float:
+    start = time.perf_counter()
+    for _ in range(calls):
+        jax.block_until_ready(program())
+    return (time.perf_counter() - start) / calls
+
+
+def loglog(path: str, curves: Mapping[str, Sequence[tuple[float, float]]], x: str, y: str) -> None:
+    """Write a PNG with a line for every curve, points (x, y)."""
+    from matplotlib.figure import Figure  # only if a figure is asked for
+
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    axes = figure.add_subplot(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    for name, points in curves.items():
+        axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=name)
+    axes.grid(which="both", alpha=0.2)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=120)

@@ -11,36 +11,33 @@ import statistics
 import time
 
 import jax
-from common import about, report
 
 from jaxdrones.learning import sharding
 from jaxdrones.training import presets
 from jaxdrones.training.algorithms import ALGORITHMS, learner
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--algo", nargs="+", default=["bptt", "ppo"], choices=ALGORITHMS)
     parser.add_argument("--worlds", type=int, help="instead of the preset's")
     parser.add_argument("--cpu-devices", type=int, default=2, metavar="N")
     parser.add_argument("--repeats", type=int, default=15, help="updates on one device and on all, in turn")
-    parser.add_argument("--quick", action="store_true", help="a few worlds: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     jax.config.update("jax_num_cpu_devices", options.cpu_devices)
     changes = {} if options.worlds is None else {"worlds": options.worlds}
     if options.quick:
         changes, options.algo, options.repeats = {"worlds": 8, "horizon": 4}, options.algo[:1], 2
 
     rows = [measure(algorithm, changes, options.repeats) for algorithm in options.algo]
-    facts = about() | {"devices": jax.device_count(), "load": os.getloadavg()[0]}
-    lines = [f"{name}: {value}" for name, value in facts.items()]
-    lines += [
+    facts = {"devices": jax.device_count(), "load": os.getloadavg()[0]}
+    lines = [
         f"{row['algorithm']}, hover, {row['worlds']} worlds x {row['horizon']}: {1e3 * row['one']:.1f} ms on one, "
         f"{1e3 * row['all']:.1f} ms on all ({row['one'] / row['all']:.2f} times as fast)"
         for row in rows
     ]
-    report({"about": facts, "rows": rows}, options.json, lines)
+    return {"about": facts, "rows": rows}, lines
 
 
 def measure(algorithm: str, changes: dict, repeats: int) -> dict[str, object]:
@@ -72,7 +69,3 @@ def measure(algorithm: str, changes: dict, repeats: int) -> dict[str, object]:
             times[name].append(time.perf_counter() - start)
     medians = {name: statistics.median(seconds[1:]) for name, seconds in times.items()}
     return {"algorithm": algorithm, "worlds": config.worlds, "horizon": config.horizon} | medians
-
-
-if __name__ == "__main__":
-    main()

@@ -10,10 +10,10 @@ import time
 import gymnasium
 import jax
 import numpy as np
-from cameras_scenes import objects20
-from common import about, compiled, report, seconds
 
 import jaxdrones.adapters.gymnasium  # noqa: F401 (registers the environments)
+from benchmarks.cameras_scenes import objects20
+from benchmarks.common import compiled, seconds
 from jaxdrones.envs import make
 from jaxdrones.tasks import forest
 from jaxdrones.throughput import programs
@@ -22,13 +22,12 @@ STEPS = 50  # of a compiled call
 SLOW_CAMERA = dataclasses.replace(forest.camera, rate=15.0)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.worlds, options.repeats = 16, 1
 
@@ -49,9 +48,8 @@ def main() -> None:
         "hover, one gymnasium environment: steps/s": single(options),
     }
     a_step = {"worlds": options.worlds, "control": "100 Hz", "substeps": 5, "integrator": "semi_implicit_euler"}
-    lines = [f"{name}: {value}" for name, value in (a_step | about()).items()]
-    lines += [f"{rate:14,.0f}  {name}" for name, rate in rows.items()]
-    report({"step": a_step, "about": about(), "rates": rows}, options.json, lines)
+    lines = [f"{rate:14,.0f}  {name}" for name, rate in rows.items()]
+    return {"about": a_step, "rates": rows}, lines
 
 
 def in_jit(env, options) -> float:
@@ -92,7 +90,3 @@ def _rate(step, options) -> float:
             step()
         rates.append(100 / (time.perf_counter() - start))
     return float(np.median(rates))
-
-
-if __name__ == "__main__":
-    main()

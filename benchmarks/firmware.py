@@ -17,10 +17,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rivals_ours as ours
-from common import about, report, seconds
 
 import jaxdrones as jd
+from benchmarks.common import seconds
+from benchmarks.rivals import ours
 from jaxdrones.control import Setpoint, firmware_motors, firmware_pid, for_team
 
 BUNDLED = Path(__file__).parent.parent / "tests/control/recorded/B10_lissajous_slow_rep1_from_take_off.npz"
@@ -28,15 +28,14 @@ DT = 0.002  # s
 WORLDS, STEPS = 1024, 500
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flights", nargs="*", type=Path, default=[BUNDLED], metavar="FLIGHT.npz")
-    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     rows = [{"flight": path.stem, **agreement(path)} for path in options.flights]
     costs = cost(*((4, 10, 1) if options.quick else (WORLDS, STEPS, 7)))
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines.append("flight                                   | roll, deg | pitch, deg | thrust | without drift | PWM")
     lines += [
         f"{row['flight']:40} | {row['roll']:9.3f} | {row['pitch']:10.3f} | {row['thrust']:6.0f} | "
@@ -44,7 +43,7 @@ def main() -> None:
         for row in rows
     ]
     lines += [f"{name}: {1e9 * row['seconds']:.1f} ns, {row['ratio']:.2f} times" for name, row in costs.items()]
-    report({"rows": rows, "costs": costs, "about": about()}, options.json, lines)
+    return {"rows": rows, "costs": costs}, lines
 
 
 @jax.jit
@@ -114,7 +113,3 @@ def cost(worlds: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
     times = {name: seconds(program, repeats=repeats)["best"] / (worlds * steps) for name, program in programs.items()}
     first = next(iter(times.values()))
     return {name: {"seconds": time, "ratio": time / first} for name, time in times.items()}
-
-
-if __name__ == "__main__":
-    main()

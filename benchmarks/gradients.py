@@ -11,7 +11,6 @@ import dataclasses
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
-from common import about, report
 
 from jaxdrones.learning import bptt, collect
 from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
@@ -22,15 +21,14 @@ HORIZONS = (8, 16, 32, 64, 128, 256)
 OPTIONS = ("exact", "decay", "surrogate")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", default="hover")
     parser.add_argument("--realistic", action="store_true")
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--decay", type=float, default=0.98)
-    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     env, config = presets.preset(options.task, "bptt", realistic=options.realistic)
     horizons = HORIZONS
     if options.quick:
@@ -47,14 +45,14 @@ def main() -> None:
         for name, policy in policies.items():
             mean, noise = (x.tolist() for x in measure(policy))
             rows.append({"gradient": option, "policy": name, "norm": mean, "noise": noise})
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines.append("gradient  | policy       | " + " | ".join(f"{h:>9} steps" for h in horizons) + "  (norm, noise)")
     lines += [
         f"{row['gradient']:9} | {row['policy']:12} | "
         + " | ".join(f"{a:7.3g} {b:7.3g}" for a, b in zip(row["norm"], row["noise"], strict=True))
         for row in rows
     ]
-    report({"horizons": horizons, "rows": rows, "about": about()}, options.json, lines)
+    return {"horizons": horizons, "rows": rows}, lines
 
 
 def norms(env, config, policy, worlds: int, horizons) -> tuple[jax.Array, jax.Array]:
@@ -85,7 +83,3 @@ def norms(env, config, policy, worlds: int, horizons) -> tuple[jax.Array, jax.Ar
     mean = jnp.mean(each, axis=0)
     noise = jnp.sqrt(jnp.mean(jnp.sum((each - mean[None]) ** 2, axis=-1), axis=0))
     return jnp.linalg.norm(mean, axis=-1), noise
-
-
-if __name__ == "__main__":
-    main()

@@ -8,8 +8,8 @@ import argparse
 import time
 
 import jax
-from common import about, report, success_rate
 
+from benchmarks.common import success_rate
 from jaxdrones.cli.settings import parse_settings
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.result import training_program
@@ -17,8 +17,7 @@ from jaxdrones.training.algorithms import ALGORITHMS, learner
 from jaxdrones.training.recipe import Recipe
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--task", default="hover")
     parser.add_argument("--realistic", action="store_true", help="lag, drag, delay, noise, parameter ranges")
     parser.add_argument("--algo", default="bptt", help=", ".join(ALGORITHMS))
@@ -27,9 +26,9 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="as of `jaxdrones train`")
     parser.add_argument("--episodes", type=int, default=10_000, help="of the evaluation of a seed")
     parser.add_argument("--cache", help="folder of compiled programs, filled by a first run, for a warm start")
-    parser.add_argument("--quick", action="store_true", help="two updates of few worlds: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     changes = parse_settings(options.set)
     if options.quick:
         changes |= dict(updates=2, worlds=8, horizon=4)
@@ -37,15 +36,14 @@ def main() -> None:
     recipe = Recipe.of(options.task, options.algo, options.realistic, **changes)
 
     rows, spent = measure(recipe, options)
-    lines = [f"{name}: {value}" for name, value in (recipe.as_dict() | about() | spent).items()]
-    lines.append("seed |     steps | run s (CPU s) | success [95 % interval] |  error cm p50   p99 | rms cm | others")
+    lines = ["seed |     steps | run s (CPU s) | success [95 % interval] |  error cm p50   p99 | rms cm | others"]
     lines += [
         f"{row['seed']:4} | {row['steps']:9} | {row['run']:5.1f} ({row['run CPU']:5.1f}) |"
         f" {success_rate(row['success'], row['interval'])} |"
         f"  {100 * row['error p50']:8.2f} {100 * row['error p99']:8.2f} | {100 * row['rms']:6.2f} | {row['metrics']}"
         for row in rows
     ]
-    report({"settings": recipe.as_dict(), "about": about(), "spent": spent, "rows": rows}, options.json, lines)
+    return {"about": recipe.as_dict() | spent, "rows": rows}, lines
 
 
 def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
@@ -82,7 +80,3 @@ def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
             }
         )
     return rows, spent
-
-
-if __name__ == "__main__":
-    main()

@@ -14,7 +14,6 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import about, report
 
 import jaxdrones as jd
 from jaxdrones.control import for_team, geometric, pid
@@ -33,12 +32,11 @@ CONTROLLERS = {"pid": pid, "geometric": geometric, "lqr": lqr, "ilqr": ilqr, "mp
 HZ, MPC_HZ, PHYSICS_HZ = 100, 40, 240
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of a flight")
-    parser.add_argument("--quick", action="store_true", help="one curve, flights of 1.2 s: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     rows = ROWS[1:2] if options.quick else ROWS
     seconds = 1.2 if options.quick else options.seconds
     results = []
@@ -56,14 +54,14 @@ def main() -> None:
                 {"controller": f"mpc, {solver}", "curve": row[0], "period": row[1], **by_mpc(solver, seconds, *row)}
                 for row in rows
             ]
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines.append("controller   | curve, period        | rms error, cm | ms a command, median (95 %)")
     for row in results:
         times = f"{row['ms']:.3f}" + (f" ({row['ms_95']:.1f})" if "ms_95" in row else "")
         curve = f"{row['curve']}, {row['period']:g} s"
         lines.append(f"{row['controller']:12} | {curve:20} | {100 * row['rms']:13.3f} | {times}")
     lines.append("MPC: casadi is not installed" if twin is None else f"symbolic twin: made in {twin['seconds']:.2f} s")
-    report({"rows": results, "twin": twin, "about": about()}, options.json, lines)
+    return {"rows": results, "twin": twin}, lines
 
 
 def target_on(curve: str, period: float):
@@ -145,7 +143,3 @@ def by_mpc(solver: str, seconds: float, curve: str, period: float) -> dict[str, 
     wanted = targets(dt * jnp.arange(1, length + 1)).pos
     error = rms(jnp.stack(places) - wanted, MPC_HZ)
     return {"rms": error, "ms": 1e3 * float(np.median(times)), "ms_95": 1e3 * float(np.percentile(times, 95))}
-
-
-if __name__ == "__main__":
-    main()

@@ -9,21 +9,19 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import about, report
 
 import jaxdrones as jd
 
 PLAIN = "lagging rotors"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--repeats", type=int, default=25)
-    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.worlds, options.steps, options.repeats = 8, 5, 1
     programs = {
@@ -43,14 +41,14 @@ def main() -> None:
         best = min(all_times[1:]) / min(times[PLAIN, how][1:])
         ns = 1e9 * median / options.steps / options.worlds
         rows.append({"case": name, "how": how, "ns": ns, "ratio": median / plain, "ratio of best": best})
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines.append(f"{options.worlds} worlds, {options.steps} steps of 1/240 s, semi-implicit Euler, drag, float32")
     lines.append("case | many worlds | ns of a drone-step, median | over that of lagging rotors: medians, bests")
     lines += [
         f"{row['case']:36} | {row['how']:11} | {row['ns']:6.2f} | {row['ratio']:.2f} {row['ratio of best']:.2f}"
         for row in rows
     ]
-    report({"about": about(), "rows": rows}, options.json, lines)
+    return {"rows": rows}, lines
 
 
 def cases() -> dict:
@@ -90,7 +88,3 @@ def program(case, how: str, options):
 
     spread = np.random.default_rng(0).uniform(0.9, 1.1, (options.worlds, 1, 4))
     return (jd.over_worlds(fly) if how == "over_worlds" else jax.jit(jax.vmap(fly))), jnp.asarray(mean * spread)
-
-
-if __name__ == "__main__":
-    main()

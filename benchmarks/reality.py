@@ -2,7 +2,7 @@
 
 The open loop of `jaxdrones score`: from every state of every log a simulator is given the recorded inputs of the next
 half second, and what is printed is the mean distance from the flight after 0.1, 0.25 and 0.5 s. Ours flies in this
-process, crazyflow 0.4.0 and rotorpy 3.0.0 in an environment of their own (rivals_venv.py, rivals_reality.py).
+process, crazyflow 0.4.0 and rotorpy 3.0.0 in an environment of their own (venv.py, rivals_reality.py).
 
   vehicles  Each simulator has its own public numbers of the Crazyflie that flew: the brushless one where the log has
             rotor speeds (`cf21_brushless`, cf21B_500, crazyfliebrushless_params), the 2.1 where it has PWM (`cf21` and
@@ -26,9 +26,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import rivals_venv
-from common import about, report
 
+from benchmarks.rivals import environment
 from jaxdrones import assets
 from jaxdrones.dynamics import crazyflie_motors
 from jaxdrones.identification import FlightLog, hold_errors, open_loop_errors
@@ -38,24 +37,23 @@ OURS = {True: ("cf2x", "cf21_brushless"), False: ("cf2x", "cf21")}
 """Bundled vehicles, by whether the rotor speeds were measured."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "flights", nargs="*", type=Path, default=list(assets.flights().values()), help="logs (.npz) or folders of them"
     )
     parser.add_argument(
         "--vehicle", nargs="+", default=[], metavar="NAME|URDF|FOLDER", help="more of ours, for all of the flights"
     )
-    parser.add_argument("--quick", action="store_true", help="our side alone, which needs no environment")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     files = [file for path in options.flights for file in (sorted(path.rglob("*.npz")) if path.is_dir() else [path])]
     logs = [FlightLog.load(file) for file in files]
-    facts, theirs = about(), {}
+    versions, theirs = {}, {}
     if not options.quick:
-        result = rivals_venv.run("rivals_reality.py", *(str(file.resolve()) for file in files))
-        facts, theirs = facts | result["versions"], result["errors"]
-    rows, lines = [], [f"{name}: {value}" for name, value in facts.items()]
+        result = environment.run("benchmarks.rivals.reality", *(str(file.resolve()) for file in files))
+        versions, theirs = result["versions"], result["errors"]
+    rows, lines = [], []
     for measured, inputs in (True, "rotor speeds"), (False, "PWM and voltage"):
         group = [(file, log) for file, log in zip(files, logs, strict=True) if log.has_rotor_speeds == measured]
         if not group:
@@ -66,7 +64,7 @@ def main() -> None:
         models = {name: mean([errors[name] for errors in flown]) for name in flown[0]}
         rows.append({"input": inputs, "flights": [log.name for _, log in group], "models": models})
         lines += [f"{inputs}: {', '.join(log.name for _, log in group)}", *table(models)]
-    report({"about": facts, "rows": rows}, options.json, lines)
+    return {"about": versions, "rows": rows}, lines
 
 
 def ours(log: FlightLog, vehicles: tuple[str, ...]) -> dict[str, dict]:
@@ -92,7 +90,3 @@ def table(models: dict[str, dict]) -> list[str]:
         for name, horizons in models.items()
     }
     return [f"    {'':32}{head}", *(f"    {name[-32:]:32}{text}" for name, text in numbers.items())]
-
-
-if __name__ == "__main__":
-    main()

@@ -12,12 +12,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rivals_ours as ours
-from common import about, first_call, report
-from figure import loglog
-from rivals_timing import in_turn
 
 import jaxdrones as jd
+from benchmarks.common import first_call, in_turn, loglog
+from benchmarks.rivals import ours
 from jaxdrones.accelerate.compiler import kernel_options
 
 WORLDS = (1, 16, 256, 4096, 65536, 1048576)
@@ -26,23 +24,21 @@ BYTES_OF_COMMANDS = 2**27
 DT = 1 / 240
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     parser.add_argument("--devices", type=int, default=os.cpu_count(), help="to cut the CPU into")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--figure", help="PNG to write")
-    parser.add_argument("--quick", action="store_true", help="few worlds: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.worlds, options.repeats = (2, 8), 1
     jax.config.update("jax_num_cpu_devices", options.devices)
 
     rows = [measure(worlds, options) for worlds in options.worlds]
-    facts = about() | {"devices": jax.device_count(), "load": os.getloadavg()[0]}
-    lines = [f"{name}: {value}" for name, value in facts.items()]
-    lines.append("M drone-steps/s; beside them bytes per world beyond inputs and results, and s to compile")
+    facts = {"devices": jax.device_count(), "load": os.getloadavg()[0]}
+    lines = ["M drone-steps/s; beside them bytes per world beyond inputs and results, and s to compile"]
     lines += [
         f"{row['worlds']:8} | "
         + " | ".join(f"{name} {rate:7.1f} {_rest(row, name)}" for name, rate in row["rates"].items())
@@ -54,7 +50,7 @@ def main() -> None:
             name: [(row["worlds"], 1e6 * row["rates"][name]) for row in rows if name in row["rates"]] for name in names
         }
         loglog(options.figure, rates, "worlds", "drone-steps per second")
-    report({"about": facts, "rows": rows}, options.json, lines)
+    return {"about": facts, "rows": rows}, lines
 
 
 def _rest(row: dict, name: str) -> str:
@@ -94,7 +90,3 @@ def _memory(program: partial) -> int:
     """Bytes that the compiled program takes beside its inputs and results."""
     compiled = jax.jit(program.func).lower(*program.args).compile(kernel_options())
     return compiled.memory_analysis().temp_size_in_bytes
-
-
-if __name__ == "__main__":
-    main()

@@ -9,8 +9,6 @@ import statistics
 import subprocess
 import sys
 
-from common import about, report
-
 KINDS = {
     "import jax, flax.struct": "import jax, flax.struct",
     "import jaxdrones": "import jaxdrones",
@@ -31,12 +29,11 @@ def run(code: str) -> str:
     return done.stdout
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=9)
-    parser.add_argument("--quick", action="store_true", help="once: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     times = {kind: [] for kind in KINDS}
     for _ in range(1 if options.quick else options.repeats):
         for kind, code in KINDS.items():
@@ -44,14 +41,10 @@ def main() -> None:
     medians = {kind: statistics.median(values) for kind, values in times.items()}
     ratio = medians["import jaxdrones"] / medians["import jax, flax.struct"]
     loaded = run(f"import sys, jaxdrones; print(*[name for name in {UNWANTED} if name in sys.modules])").split()
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines += [f"{value:7.2f} s  {kind}" for kind, value in medians.items()]
     lines += [
         f"{ratio:7.2f}    import jaxdrones over import jax, flax.struct",
         f"optional libraries loaded: {loaded or 'none'}",
     ]
-    report({"about": about(), "seconds": medians, "import ratio": ratio, "loaded": loaded}, options.json, lines)
-
-
-if __name__ == "__main__":
-    main()
+    return {"seconds": medians, "import ratio": ratio, "loaded": loaded}, lines

@@ -9,13 +9,11 @@ how far Vicon's attitude is from Vicon's own acceleration.
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import about
 from scipy.signal import butter, filtfilt
 
 from jaxdrones import rotation
@@ -115,26 +113,19 @@ def row(path: Path) -> dict:
     }
 
 
-def main():
-    """Print a table, or JSON."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flights", nargs="+", type=Path, help="flights of NanoBench, .npz")
-    parser.add_argument("--quick", action="store_true", help="only the first flight")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     jax.config.update("jax_enable_x64", True)
     rows = [row(path) for path in (options.flights[:1] if options.quick else options.flights)]
-    if options.json:
-        print(json.dumps({"about": about(), "rows": rows}))
-        return
-    print(about())
     names = ("as logged", "tilt", "roll", "pitch", "with attitude", "vicon itself")
-    print(f"{'rms, degrees':24}", *(f"{name:>14}" for name in names), f"{'mounting':>14}")
+    lines = [" ".join([f"{'rms, degrees':24}", *(f"{name:>14}" for name in names), f"{'mounting':>14}"])]
     for found in rows:
         mounting = "{:.1f}, {:.1f}".format(*found["mounting"])
-        print(f"{found['flight']:24}", *(f"{found[name]:14.2f}" for name in names), f"{mounting:>14}")
-    print(f"{'mean':24}", *(f"{np.mean([found[name] for found in rows]):14.2f}" for name in names))
-
-
-if __name__ == "__main__":
-    main()
+        lines.append(
+            " ".join([f"{found['flight']:24}", *(f"{found[name]:14.2f}" for name in names), f"{mounting:>14}"])
+        )
+    lines.append(" ".join([f"{'mean':24}", *(f"{np.mean([found[name] for found in rows]):14.2f}" for name in names)]))
+    return {"rows": rows}, lines

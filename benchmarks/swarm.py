@@ -13,11 +13,9 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import about, compiled, report
-from figure import loglog
-from rivals_timing import in_turn
 
 import jaxdrones as jd
+from benchmarks.common import compiled, in_turn, loglog
 
 DRONES = (1, 8, 32, 100, 300, 1000, 2000, 4096)
 REACH = 2.0  # m
@@ -26,21 +24,20 @@ MOST_PAIRS = 2**22  # tried by `all pairs`, so that a benchmark ends
 STEPS = 5
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--drones", type=int, nargs="+", default=DRONES)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--figure", help="PNG to write")
-    parser.add_argument("--quick", action="store_true", help="few drones: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.drones, options.repeats = (1, 40), 1
 
     a_pair = gym_pybullet_drones_pair(options.repeats)
     rows = [measure(n, options.repeats) | {"gym-pybullet-drones": a_pair * n * (n - 1)} for n in options.drones]
     names = ("all pairs", "cells", "gym-pybullet-drones")
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines.append("ms per step of the world; cells over N log N, us; gym-pybullet-drones over our faster one")
     for row in rows:
         n, ours = row["drones"], min(row[name] for name in names[:2] if name in row)
@@ -50,7 +47,7 @@ def main() -> None:
     if options.figure:
         curves = {name: [(row["drones"], row[name]) for row in rows if row.get(name)] for name in names}
         loglog(options.figure, curves, "drones in a world", "s per step")
-    report({"about": about(), "rows": rows}, options.json, lines)
+    return {"rows": rows}, lines
 
 
 def measure(n: int, repeats: int) -> dict[str, float]:
@@ -96,7 +93,3 @@ def gym_pybullet_drones_pair(repeats: int) -> float:
         return time.perf_counter() - start
 
     return sorted(all_forces() for _ in range(repeats))[repeats // 2] / FEW**2
-
-
-if __name__ == "__main__":
-    main()

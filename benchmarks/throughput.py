@@ -7,9 +7,9 @@ import argparse
 
 import jax
 import jax.numpy as jnp
-from common import about, first_call, report, seconds
 
 import jaxdrones as jd
+from benchmarks.common import first_call, seconds
 from jaxdrones.checks import check_choice
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.throughput.programs import crazyflies, held
@@ -19,8 +19,7 @@ GRADIENT_STEPS = 100
 STEPS_OF_A_CALL = 2**23  # drone-steps of a forward measurement, about
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     parser.add_argument("--drones", type=int, default=1, help="drones per world")
     parser.add_argument("--vmap", action="store_true", help="fly by plain jax.vmap instead of jaxdrones.over_worlds")
@@ -31,9 +30,9 @@ def main() -> None:
     parser.add_argument("--gradient-worlds", type=int, default=8192, help="at most, of a gradient, whose memory grows")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--float64", action="store_true")
-    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     jax.config.update("jax_enable_x64", options.float64)
     if options.quick:
         options.worlds, options.repeats = (1, 32), 1
@@ -52,16 +51,15 @@ def main() -> None:
         "dtype": "float64" if options.float64 else "float32",
         "gradient": f"of the mean squared final position in the rotor speeds of {GRADIENT_STEPS} steps",
     }
-    lines = [f"{name}: {value}" for name, value in (a_step | about()).items()]
-    lines.append(
+    lines = [
         "   worlds | forward M/s (best) | with backward M/s | time over forward | first call s, forward and backward"
-    )
+    ]
     lines += [
         f"{row['worlds']:9} | {row['forward']:8.1f} ({row['forward best']:6.1f})  | {row['with backward']:17.2f} |"
         f" {row['time over forward']:17.1f} | {row['forward first call']:.2f} {row['backward first call']:.2f}"
         for row in rows
     ]
-    report({"step": a_step, "about": about(), "rows": rows}, options.json, lines)
+    return {"about": a_step, "rows": rows}, lines
 
 
 def make_step(options) -> jd.Step:
@@ -114,7 +112,3 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
         "forward first call": first_forward,
         "backward first call": first_backward,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -7,8 +7,8 @@ Hover policies are trained on our plant and flown, with their weights frozen, on
   bullet     the same with Bullet as integrator, with contacts and the damping of gym-pybullet-drones (2021), 0.04 1/s;
              25 drones, 3 m apart, share a world;
   crazyflow  crazyflow 0.4.0: its airframes, thrust curves, rotors and drag, at its rate and by its integrator, in an
-             environment of its own (rivals_venv.py). Delay and noise are the preset's. An action asks for the same
-             share of the hover speed as in training: mass and hover speed are all that is told of the airframe.
+             environment of its own. Delay and noise are the preset's. An action asks for the same share of the hover
+             speed as in training: the environment knows only mass and hover speed of the airframe.
 Starts, observations, delay, noise and the criterion (within 5 cm and 0.1 m/s for the last two of five seconds) are
 computed by one and the same code: an environment whose physics is exchanged. Before crazyflow counts, four constant
 rotor speeds must give the same flight there and here.
@@ -26,10 +26,10 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import rivals_venv
-from common import about, report, success_rate
 
 import jaxdrones as jd
+from benchmarks.common import success_rate
+from benchmarks.rivals import environment
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
 from jaxdrones.envs.randomize import AnyVehicle
@@ -49,8 +49,7 @@ MASSES = (0.02, 0.035, 0.1, 0.3, 1.0, 2.0, 3.0)  # kg, bounds of the classes
 AGREED = 1e-9  # m, m/s, rad/s, RPM: largest difference that is rounding
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--policy", nargs="*", type=Path, help="folders of `jaxdrones train hover --realistic`")
     parser.add_argument("--algo", default="bptt", help="trains, where no policy is given: " + ", ".join(ALGORITHMS))
     parser.add_argument("--seeds", type=int, default=3, help="how many to train")
@@ -59,9 +58,9 @@ def main() -> None:
     parser.add_argument("--airframes", nargs="*", help="of crazyflow; all its Crazyflies when left out")
     parser.add_argument("--episodes", type=int, default=2000, help="of a policy on each plant")
     parser.add_argument("--bullet-episodes", type=int, default=200, help="of a policy on Bullet")
-    parser.add_argument("--quick", action="store_true", help="two updates, two episodes, no crazyflow: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     for plant in options.plants:
         check_choice("plant", plant, PLANTS)
     changes = {} if options.updates is None else {"updates": options.updates}
@@ -72,7 +71,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         runs = [Run(path) for path in options.policy or trained(options, changes, Path(folder))]
         result = measure(runs, options)
-    lines = [f"{name}: {value}" for name, value in (result["about"] | result["crazyflow"]).items()]
+    lines = [f"{name}: {value}" for name, value in result["crazyflow"].items()]
     lines.append("plant                | policy       | episodes | success [95 % interval]  | error cm p50    p99")
     lines += [
         f"{row['plant']:20} | {row['policy']:12} | {row['episodes']:8} |"
@@ -80,7 +79,7 @@ def main() -> None:
         f" {100 * row['error p50']:12.2f} {100 * row['error p99']:6.2f}"
         for row in result["rows"]
     ]
-    report(result, options.json, lines)
+    return result, lines
 
 
 def trained(options, changes: dict, folder: Path) -> Iterator[Path]:
@@ -105,7 +104,7 @@ def measure(runs: list[Run], options) -> dict:
         if plant == "crazyflow":
             crazyflow = checked_crazyflow()
         rows += FLOWN[plant](recipe, runs, options)
-    return {"about": about(), "crazyflow": crazyflow, "rows": rows}
+    return {"crazyflow": crazyflow, "rows": rows}
 
 
 def on_own(recipe: Recipe, runs: list[Run], options) -> list[dict]:
@@ -139,7 +138,7 @@ def on_bullet(recipe: Recipe, runs: list[Run], options) -> list[dict]:
 
 
 def on_crazyflow(recipe: Recipe, runs: list[Run], options) -> list[dict]:
-    import rivals_crazyflow as crazyflow  # only in the environment of the rivals
+    from benchmarks.rivals import crazyflow  # only in the environment of the rivals
 
     rows = []
     nominal = jax.tree.map(lambda x: x[0], recipe.env().params)
@@ -193,7 +192,7 @@ def checked_crazyflow() -> dict:
     Raises:
         RuntimeError: further than rounding, so frames, units or rotors are not what is taken for granted here.
     """
-    import rivals_crazyflow as crazyflow
+    from benchmarks.rivals import crazyflow
 
     apart = crazyflow.agreement()
     if not all(x <= AGREED for x in apart.values()):
@@ -207,8 +206,6 @@ def flown_elsewhere(runs: list[Run], options) -> dict:
     airframes = ["--airframes", *options.airframes] if options.airframes else []
     folders = [str(run.folder.resolve()) for run in runs]
     episodes = ["--episodes", str(options.episodes)]
-    return rivals_venv.run("transfer.py", "--plants", "crazyflow", *episodes, *airframes, "--policy", *folders)
-
-
-if __name__ == "__main__":
-    main()
+    return environment.run(
+        "benchmarks", "transfer", "--json", "--plants", "crazyflow", *episodes, *airframes, "--policy", *folders
+    )

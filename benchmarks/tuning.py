@@ -8,13 +8,11 @@ with a controller compiles.
 
 import argparse
 import functools
-import json
 import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import about
 
 import jaxdrones as jd
 from jaxdrones.control import CONTROLLERS, for_team, pid
@@ -27,29 +25,25 @@ CURVES = (("lissajous", 9.0), ("figure-eight", 6.0), ("polynomial", 14.0))
 STEP = (0.5, -0.4, 0.3)  # m
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--controllers", default=",".join(name for name in CONTROLLERS if name != "mrac"))
     parser.add_argument("--vehicles", default="cf2x,hb,racer,drawn 0,drawn 1")
-    parser.add_argument("--quick", action="store_true", help="one controller, one vehicle, 2 iterations: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     jax.config.update("jax_enable_compilation_cache", False)
     controllers, vehicles = options.controllers.split(","), options.vehicles.split(",")
     if options.quick:
         controllers, vehicles = ["geometric"], ["racer"]
-    say = functools.partial(print, flush=True) if not options.json else lambda *_: None
-    say("\n".join(f"{name}: {value}" for name, value in about().items()))
-    say("controller   | vehicle | kg    | curves, cm: before -> after | step, cm: before -> after | s (of CPU)")
+    lines = ["controller   | vehicle | kg    | curves, cm: before -> after | step, cm: before -> after | s (of CPU)"]
     rows = []
     for controller in controllers:
         for vehicle in vehicles:
             params = params_of(vehicle)
             if controller != "pid" or pid.fits(params):
                 rows.append({"controller": controller, "vehicle": vehicle} | row(controller, params, options.quick))
-                say(line(rows[-1]))
-    if options.json:
-        print(json.dumps({"rows": rows, "about": about()}))
+                lines.append(line(rows[-1]))
+    return {"rows": rows}, lines
 
 
 def line(row: dict) -> str:
@@ -106,7 +100,3 @@ def flown_errors(module, params: jd.Params, gains) -> jax.Array:
     wanted = jax.vmap(target)(jnp.arange(1, SECONDS * HZ + 1) / HZ).pos
     squares = jnp.mean(jnp.sum((flown.pos - wanted) ** 2, axis=-1), axis=0)
     return jnp.sqrt(jnp.stack([jnp.mean(squares[:-1]), squares[-1]]))
-
-
-if __name__ == "__main__":
-    main()

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from common import about, report
 
 import jaxdrones as jd
 from jaxdrones.visualization.browser import find_browser, open_tab
@@ -61,21 +60,16 @@ def measure(drones: int, rows: int) -> dict:
         }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--drones", type=int, nargs="+", default=[4, 100, 1000])
     parser.add_argument("--rows", type=int, default=1000)
-    parser.add_argument("--quick", action="store_true", help="few drones for a moment: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if find_browser() is None:
-        parser.error("there is no Chromium")
+        raise SystemExit("there is no Chromium")
     drones, rows = ([4], 200) if options.quick else (options.drones, options.rows)
     measured = [measure(count, rows) for count in drones]
-    lines = [f"{name}: {value}" for name, value in about().items()]
+    lines = []
     lines += ["  ".join(f"{name} {value:.4g}" for name, value in row.items()) for row in measured]
-    report({"about": about(), "rows": measured}, options.json, lines)
-
-
-if __name__ == "__main__":
-    main()
+    return {"rows": measured}, lines

@@ -1,5 +1,6 @@
 """The benchmarks run and say what they measured."""
 
+import ast
 import json
 import re
 import shutil
@@ -13,30 +14,27 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
+from benchmarks.__main__ import NAMES
+from benchmarks.common import success_rate
 from jaxdrones.visualization.browser import find_browser
 
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+ROOT = Path(__file__).parent.parent
 SECTIONS = {"tests", "plant", "cameras", "envs", "swarm", "learning"}
-HELPERS = {
-    "agreement_switches.py",
-    "cameras_scenes.py",
-    "common.py",
-    "figure.py",
-    "published.py",
-    *(path.name for path in BENCHMARKS.glob("rivals_*.py")),
-}
+
+
+def benchmark(name: str, *options: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "benchmarks", name, *options]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
 
 
 def quick(name: str, *options: str) -> dict:
-    command = [sys.executable, str(BENCHMARKS / name), "--quick", "--json", *options]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
+    return json.loads(benchmark(name, "--quick", "--json", *options).stdout)
 
 
 @pytest.mark.slow
 def test_throughput_reports_what_a_step_is_and_every_rate():
-    result = quick("throughput.py")
-    assert {"dt", "substeps", "integrator", "effects", "dtype", "many worlds"} <= set(result["step"])
+    result = quick("throughput")
+    assert {"dt", "substeps", "integrator", "effects", "dtype", "many worlds"} <= set(result["about"])
     assert {"commit", "jax", "device", "cores"} <= set(result["about"])
     assert [row["worlds"] for row in result["rows"]] == [1, 32]
     for row in result["rows"]:
@@ -45,16 +43,16 @@ def test_throughput_reports_what_a_step_is_and_every_rate():
 
 @pytest.mark.slow
 def test_swarm_and_scaling_report_every_way_to_fly():
-    alone, crowd = quick("swarm.py")["rows"]
+    alone, crowd = quick("swarm")["rows"]
     assert "cells" not in alone and min(crowd[way] for way in ("all pairs", "cells", "gym-pybullet-drones")) > 0
-    for row in quick("scaling.py")["rows"]:
+    for row in quick("scaling")["rows"]:
         assert {"held", "controlled"} <= set(row["rates"]) and min(row["rates"].values()) > 0
         assert set(row["memory"]) == set(row["compile"]) == set(row["rates"])
 
 
 @pytest.mark.slow
 def test_power_reports_every_case_both_ways():
-    rows = quick("power.py")["rows"]
+    rows = quick("power")["rows"]
     assert len(rows) == 18 and all(row["ratio"] > 0 for row in rows)
 
 
@@ -72,26 +70,26 @@ def test_battery_finds_the_resistance_that_a_flight_was_made_with(tmp_path):
     states = jd.rollout(step, lambda p, m, s, k: (m, pwm[k][None]), team, start, None, len(pwm))[1]
     volts = jax.vmap(jax.vmap(jd.battery_voltage), (None, 0))(team, states)[:, 0]
     np.savez(tmp_path / "flight.npz", t=time, pwm=pwm, vbat=volts)
-    (row,) = quick("battery.py", str(tmp_path / "flight.npz"), "--seconds", "2")["rows"]
+    (row,) = quick("battery", str(tmp_path / "flight.npz"), "--seconds", "2")["rows"]
     assert abs(row["resistance"] - 0.37) < 0.005 and row["rms"] < 0.005
 
 
 @pytest.mark.slow
 def test_startup_loads_nothing_optional():
-    result = quick("startup.py")
+    result = quick("startup")
     assert result["loaded"] == [] and len(result["seconds"]) == 3
 
 
 @pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_bullet_reports_four_rates():
-    rates = quick("bullet.py")
+    rates = quick("bullet")["rates"]
     assert len(rates) == 4 and min(rates.values()) > 0
 
 
 @pytest.mark.slow
 def test_cameras_report_both_scenes_in_every_way():
-    rows = quick("cameras.py")["rows"]
+    rows = quick("cameras")["rows"]
     assert {row["scene"] for row in rows} == {"A", "B"}
     for row in rows:
         assert len(row["rates"]) == 5 and min(row["rates"].values()) > 0
@@ -99,14 +97,14 @@ def test_cameras_report_both_scenes_in_every_way():
 
 @pytest.mark.slow
 def test_optimal_reports_error_and_time_of_every_controller():
-    rows = quick("optimal.py")["rows"]
+    rows = quick("optimal")["rows"]
     assert {"pid", "geometric", "lqr", "ilqr", "mppi"} <= {row["controller"] for row in rows}
     assert all(0 < row["rms"] < 0.2 and row["ms"] > 0 for row in rows)
 
 
 @pytest.mark.slow
 def test_firmware_reports_agreement_and_cost():
-    result = quick("firmware.py")
+    result = quick("firmware")
     (row,) = result["rows"]
     assert max(row["roll"], row["pitch"]) < 0.3 and abs(row["pwm_ratio"] - 1) < 0.01
     assert min(cost["seconds"] for cost in result["costs"].values()) > 0
@@ -114,40 +112,40 @@ def test_firmware_reports_agreement_and_cost():
 
 @pytest.mark.slow
 def test_tuning_reports_errors_before_and_after():
-    (row,) = quick("tuning.py")["rows"]
+    (row,) = quick("tuning")["rows"]
     assert row["controller"] == "geometric" and row["seconds"] > 0
     assert row["after"][0] < row["before"][0] < 0.1
 
 
 @pytest.mark.slow
 def test_envs_reports_a_rate_of_every_environment():
-    result = quick("envs.py")
+    result = quick("envs")
     assert len(result["rates"]) == 8 and min(result["rates"].values()) > 0
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_browser() is None, reason="there is no Chromium")
 def test_viewer_reports_frames_per_second():
-    (row,) = quick("viewer.py")["rows"]
+    (row,) = quick("viewer")["rows"]
     assert row["frames/s"] > 0 and 0 < row["share"] <= 1
 
 
 @pytest.mark.slow
 def test_devices_reports_one_and_all():
-    (row,) = quick("devices.py")["rows"]
+    (row,) = quick("devices")["rows"]
     assert row["one"] > 0 and row["all"] > 0
 
 
 @pytest.mark.slow
 def test_learning_reports_every_seed():
-    rows = quick("learning.py")["rows"]
+    rows = quick("learning")["rows"]
     assert rows and all(0 <= row["success"] <= 1 for row in rows)
 
 
 @pytest.mark.needs("pybullet")
 @pytest.mark.slow
 def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_path):
-    result = quick("accelerator.py", "--output", str(tmp_path / "result.json"))
+    result = quick("accelerator", "--output", str(tmp_path / "result.json"))
     assert not result["stopped"] and {row["section"] for row in result["rows"]} == SECTIONS
     assert json.loads((tmp_path / "result.json").read_text()) == result
     for row in result["rows"]:
@@ -156,23 +154,19 @@ def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_
 
 
 def test_accelerator_names_tests_that_exist():
-    named = re.findall(r'"(tests/.*\.py)"', (BENCHMARKS / "accelerator.py").read_text())
-    assert len(named) > 5 and all((BENCHMARKS.parent / file).is_file() for file in named)
+    named = re.findall(r'"(tests/.*\.py)"', (ROOT / "benchmarks" / "accelerator.py").read_text())
+    assert len(named) > 5 and all((ROOT / file).is_file() for file in named)
 
 
 @pytest.mark.slow
 def test_accelerator_stops_what_takes_longer_than_its_share(tmp_path):
     file = tmp_path / "result.json"
-    command = [sys.executable, str(BENCHMARKS / "accelerator.py"), "--budget", "1", "--sections", "plant", "learning"]
-    subprocess.run([*command, "--output", str(file)], capture_output=True, check=True)
+    benchmark("accelerator", "--budget", "1", "--sections", "plant", "learning", "--output", str(file))
     result = json.loads(file.read_text())
     assert result["rows"] == [] and set(result["stopped"]) == {"plant", "learning"}
 
 
-def test_a_success_rate_is_reported_with_its_interval_if_there_is_one(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    from common import success_rate
-
+def test_a_success_rate_is_reported_with_its_interval_if_there_is_one():
     assert success_rate(0.5, (0.25, 0.75)) == "0.5000 [0.2500, 0.7500]"
     assert success_rate(1.0, None) == "1.0000 [1 distinct episode]" and success_rate(None, None) == "no criterion"
 
@@ -180,14 +174,14 @@ def test_a_success_rate_is_reported_with_its_interval_if_there_is_one(monkeypatc
 @pytest.mark.slow
 @pytest.mark.needs("pybullet")
 def test_transfer_flies_a_policy_on_our_plant_and_on_bullet():
-    result = quick("transfer.py")
+    result = quick("transfer")
     assert [row["plant"] for row in result["rows"]] == ["own", "bullet, damping 0.04"]
     assert all(0 <= row["success"] <= 1 and row["error p50"] > 0 for row in result["rows"])
 
 
 @pytest.mark.slow
 def test_agreement_explains_every_difference_from_recorded_flights():
-    rows = quick("agreement.py")["rows"]
+    rows = quick("agreement")["rows"]
     assert len(rows) == 5 and all(row["explained"] for row in rows)
     for row in rows:
         worth = [max(cause[name] for name in ("pos", "angle", "vel", "omega")) for cause in row["causes"]]
@@ -196,7 +190,7 @@ def test_agreement_explains_every_difference_from_recorded_flights():
 
 @pytest.mark.slow
 def test_reality_reports_every_horizon_of_our_models():
-    (row,) = quick("reality.py")["rows"]
+    (row,) = quick("reality")["rows"]
     assert row["input"] == "PWM and voltage" and set(row["models"]) == {"hold", "ours cf2x", "ours cf21"}
     for horizons in row["models"].values():
         assert set(horizons) == {"10", "25", "50"} and all(min(e.values()) > 0 for e in horizons.values())
@@ -204,7 +198,7 @@ def test_reality_reports_every_horizon_of_our_models():
 
 @pytest.mark.slow
 def test_rivals_races_our_side_where_there_are_no_rivals():
-    rows = quick("rivals.py")["rows"]
+    rows = quick("race")["rows"]
     assert {row["race"] for row in rows} == {"plant-symplectic_euler", "attitude"}
     assert all(row["agree"] is None and min(row["rates"].values()) > 0 for row in rows)
 
@@ -217,19 +211,14 @@ def test_limit_in_c_flies_our_trajectory():
     assert all(row["share"] > 0 and len(row["rates"]) == 5 for row in result["rows"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted({path.name for path in BENCHMARKS.glob("*.py")} - HELPERS | {"limit"}))
-def test_every_benchmark_explains_itself(name):
-    done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / name), "--help"], capture_output=True, text=True, check=True
-    )
-    assert "--quick" in done.stdout and "--json" in done.stdout
+@pytest.mark.parametrize("name", NAMES)
+def test_every_benchmark_asks_a_question(name):
+    tree = ast.parse((ROOT / "benchmarks" / f"{name}.py").read_text())
+    assert "?" in ast.get_docstring(tree) and "main" in [node.name for node in tree.body if hasattr(node, "name")]
 
 
 @pytest.mark.slow
 def test_the_state_estimate_of_a_recorded_flight_has_a_tilt_below_a_degree():
     """Against Vicon's attitude less the mean, which is how the markers were declared level."""
-    (row,) = quick("state_estimate.py", str(BENCHMARKS.parent / "assets" / "flights" / "B10_lissajous_slow_rep1.npz"))[
-        "rows"
-    ]
+    (row,) = quick("state_estimate", str(ROOT / "assets" / "flights" / "B10_lissajous_slow_rep1.npz"))["rows"]
     assert row["tilt"] < 1 and row["as logged"] < 1.5 and row["with attitude"] < 0.5

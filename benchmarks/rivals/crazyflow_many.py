@@ -15,9 +15,9 @@ from crazyflow.sim import Sim
 from crazyflow.sim import functional as F
 from crazyflow.sim.integration import Integrator
 from crazyflow.sim.sharding import placement, world_mesh
-from rivals_crazyflow import AIRFRAMES, make_sim, told
 
 import jaxdrones as jd
+from benchmarks.rivals.crazyflow import AIRFRAMES, make_sim, told
 from jaxdrones.accelerate.compiler import kernel_options
 
 

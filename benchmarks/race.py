@@ -1,7 +1,7 @@
 """How many times as fast as other simulators are we, on the same work in the same run?
 
 crazyflow 0.4.0 and rotorpy 3.0.0 live with this library in an environment of their own, made at the first call
-(rivals_venv.py); one process there races all of them, A B A B, medians of repeats (rivals_races.py). The races:
+(venv.py); one process there races all of them, A B A B, medians of repeats (rivals_races.py). The races:
 
   plant-symplectic_euler, plant-euler, plant-rk4
       rotor speeds held, lagging rotors, constant drag, our Crazyflie told to crazyflow, 500 Hz, float32. `euler` is
@@ -23,10 +23,8 @@ PyFlyt 0.29.0 is not raced: it needs numpy below 2, this library 2 or later, so 
 
 import argparse
 import os
-import sys
 
-import rivals_venv
-from common import about, report
+from benchmarks.rivals import environment
 
 WORLDS = (1, 64, 1024, 16384, 262144)
 RACES = ("plant-symplectic_euler", "plant-euler", "plant-rk4", "attitude", "rotorpy")
@@ -35,35 +33,34 @@ AGREED = {"pos": 1e-2, "vel": 1e-2, "omega": 1e-3, "rpm": 1.0, "angle": 2e-3}
 HELD = 0.05  # rad, between the attitude asked for, which drifts, and the one flown
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     parser.add_argument("--races", nargs="+", default=RACES, choices=RACES)
     parser.add_argument("--devices", type=int, default=os.cpu_count(), help="to cut the CPU into")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="our side alone, few worlds, no environment: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.worlds, options.races, options.repeats = (2,), ("plant-symplectic_euler", "attitude"), 1
 
     arguments = ["--worlds", *map(str, options.worlds), "--races", *options.races]
     arguments += ["--devices", str(options.devices), "--repeats", str(options.repeats)]
-    start = rivals_venv.run_here if options.quick else rivals_venv.run
-    result = start("rivals_races.py", *arguments, *(["--alone"] if options.quick else []))
+    start = environment.run_here if options.quick else environment.run
+    result = start("benchmarks.rivals.races", *arguments, *(["--alone"] if options.quick else []))
     rows = [row | _ratio(row) for row in result["rows"]]
-    facts = about() | result["versions"] | {"devices": options.devices, "load": result["load"]}
-    lines = [f"{name}: {value}" for name, value in facts.items()]
-    lines += ["M drone-steps/s, median (best); ratio of the best of ours to the best of theirs"]
+    facts = result["versions"] | {"devices": options.devices, "load": result["load"]}
+    lines = ["M drone-steps/s, median (best); ratio of the best of ours to the best of theirs"]
     for row in rows:
         lines.append(f"{row['race']}, {row['worlds']} worlds, {row['steps']} steps a call: {_verdict(row)}")
         lines += [
             f"    {name:30} {rate:9.3f} ({row['best'][name]:.3f}){'' if name in row['alike'] else ' does not count'}"
             for name, rate in row["rates"].items()
         ]
-    report({"about": facts, "rows": rows}, options.json, lines)
+    result = {"about": facts, "rows": rows}
     if any(row["agree"] is False for row in rows):
-        sys.exit("some contenders did not fly alike; their rates do not count")
+        result["failed"] = "some contenders did not fly alike; their rates do not count"
+    return result, lines
 
 
 def _ratio(row: dict) -> dict[str, object]:
@@ -94,7 +91,3 @@ def _verdict(row: dict) -> str:
     if not row["agree"]:
         return f"NOT ALIKE: {row['differences']}"
     return f"{row['ratio']:.1f} times as fast, {row['ratio to their defaults']:.1f} without our options for them"
-
-
-if __name__ == "__main__":
-    main()

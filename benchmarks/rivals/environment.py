@@ -13,18 +13,18 @@ from pathlib import Path
 
 RIVALS = ("torch==2.13.0", "crazyflow==0.4.0", "rotorpy[batched]==3.0.0")
 
-_HERE = Path(__file__).parent
-_FOLDER = _HERE.parent / ".venv-rivals"
+_ROOT = Path(__file__).parents[2]
+_FOLDER = _ROOT / ".venv-rivals"
 
 
-def run(script: str, *arguments: str) -> dict:
-    """What a benchmark prints with `--json` in the environment of the rivals."""
-    return _run(_python(), script, *arguments)
+def run(module: str, *arguments: str) -> dict:
+    """The JSON object that a module prints in the environment of the rivals."""
+    return _run(_python(), module, *arguments)
 
 
-def run_here(script: str, *arguments: str) -> dict:
+def run_here(module: str, *arguments: str) -> dict:
     """The same in the environment at hand, which has no rivals."""
-    return _run(Path(sys.executable), script, *arguments)
+    return _run(Path(sys.executable), module, *arguments)
 
 
 def add(package: str) -> bool:
@@ -33,11 +33,13 @@ def add(package: str) -> bool:
     return subprocess.run(pip, stdout=sys.stderr, check=False).returncode == 0
 
 
-def _run(python: Path, script: str, *arguments: str) -> dict:
-    command = [str(python), str(_HERE / script), *arguments, "--json"]
+def _run(python: Path, module: str, *arguments: str) -> dict:
+    command = [str(python), "-m", module, *arguments]
+    variables = {"PYTHONPATH": str(_ROOT), "SCIPY_ARRAY_API": "1"}  # crazyflow wants the latter before scipy
     with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it runs
-        environment = os.environ | {"SCIPY_ARRAY_API": "1"}  # crazyflow asks for it before scipy is imported
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, cwd=folder, env=environment)
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, text=True, check=True, cwd=folder, env=os.environ | variables
+        )
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -52,6 +54,6 @@ def _python() -> Path:
         pip = [str(python), "-m", "pip", "install", "--quiet"]
         torch, *others = RIVALS  # torch first: a later pip does not exchange it for one that needs a GPU
         subprocess.run([*pip, torch], check=True, stdout=sys.stderr)
-        subprocess.run([*pip, *others, "--editable", str(_HERE.parent)], check=True, stdout=sys.stderr)
+        subprocess.run([*pip, *others, "--editable", str(_ROOT)], check=True, stdout=sys.stderr)
         holds.write_text(wanted)
     return python

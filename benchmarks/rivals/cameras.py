@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from cameras_scenes import numbers, poses
-from common import compiled, seconds
 from crazyflow.sim.sensors.depth import _camera_rays, _render_rays
 from mujoco import mjx
 
+from benchmarks.cameras_scenes import numbers, poses
+from benchmarks.common import compiled, seconds
 from jaxdrones import rotation
 
 _GROUPS = (1,) * 6
@@ -36,7 +36,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cameras", type=int, nargs="+", default=(1, 64))
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     options = parser.parse_args()
     plain = model()
     placed = mujoco.MjData(plain)

@@ -13,13 +13,12 @@ import argparse
 import os
 
 import jax
-import native
 import numpy as np
-import rivals_ours as ours
-from common import about, report
-from rivals_timing import in_turn
 
 import jaxdrones as jd
+from benchmarks.common import in_turn
+from benchmarks.native import plant as native
+from benchmarks.rivals import ours
 
 WORLDS = (1, 64, 1024, 16384, 65536, 262144)
 STEPS_OF_A_CALL = 2**23  # drone-steps, about
@@ -29,14 +28,13 @@ AGREED = 1e-4
 large thrusts, and 240 steps of sums in another order make it 2e-5 of the angular velocity. A missing term is 1e-2."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=WORLDS)
     parser.add_argument("--devices", type=int, default=os.cpu_count(), help="to cut the CPU into; also threads of C")
     parser.add_argument("--repeats", type=int, default=9)
-    parser.add_argument("--quick", action="store_true", help="few worlds and steps: does it run?")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-    options = parser.parse_args()
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.worlds, options.repeats = (2, 64), 1
     jax.config.update("jax_num_cpu_devices", options.devices)
@@ -51,10 +49,9 @@ def main() -> None:
     if max(differences.values()) > AGREED:
         raise SystemExit(f"the C flies another trajectory, no rate is worth printing; differences: {differences}")
 
-    facts = about() | {"devices": jax.device_count(), "compiler": plant.compiler, "load": os.getloadavg()[0]}
+    facts = {"devices": jax.device_count(), "compiler": plant.compiler, "load": os.getloadavg()[0]}
     rows = [measure(plant, step, params, worlds, options) for worlds in options.worlds]
-    lines = [f"{name}: {value}" for name, value in facts.items()]
-    lines.append("agreement, of the largest value: " + ", ".join(f"{k} {v:.0e}" for k, v in differences.items()))
+    lines = ["agreement, of the largest value: " + ", ".join(f"{k} {v:.0e}" for k, v in differences.items())]
     names = list(rows[-1]["rates"])
     lines.append("M drone-steps/s, median (best)")
     lines.append("   worlds | " + " | ".join(names) + " | our best share of C")
@@ -64,7 +61,7 @@ def main() -> None:
         + f" | {100 * row['share']:.0f} %"
         for row in rows
     ]
-    report({"about": facts, "agreement": differences, "rows": rows}, options.json, lines)
+    return {"about": facts, "agreement": differences, "rows": rows}, lines
 
 
 def agreement(plant: native.Plant, step: jd.Step, params: jd.Params, worlds: int = 100) -> dict[str, float]:

@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 from crazyflow.dynamics import Dynamics, load_params
-from rivals_crazyflow import make_sim, make_step
-from rivals_rotorpy import RADIANS_PER_SECOND
 from rotorpy.vehicles import crazyflie_params, crazyfliebrushless_params
 from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams
 
 import jaxdrones as jd
+from benchmarks.rivals.crazyflow import make_sim, make_step
+from benchmarks.rivals.rotorpy import RADIANS_PER_SECOND
 from jaxdrones.dynamics import FULL_PWM, crazyflie_motors
 from jaxdrones.identification import HORIZONS, FlightLog
 from jaxdrones.identification.files import errors_as_dict
@@ -39,7 +39,6 @@ Plant = Callable[[FlightLog, np.ndarray], jd.State]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="+", type=Path)
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     warnings.filterwarnings("ignore")
     errors: dict[str, dict[str, dict]] = {}

@@ -11,9 +11,9 @@ from crazyflow.control import Control
 from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.sim import Sim
 from crazyflow.sim.integration import Integrator
-from rivals_ours import DRAG, constant_drag
 
 import jaxdrones as jd
+from benchmarks.rivals.ours import DRAG, constant_drag
 from jaxdrones import rotation
 
 AIRFRAMES = ("cf21B_500", "cf2x_L250", "cf2x_P250", "cf2x_T350")

@@ -1,4 +1,4 @@
-"""The flights of crazyflow, rotorpy and l2f for agreement.py, which runs this in their environment (rivals_venv.py).
+"""The flights of crazyflow, rotorpy and l2f for agreement.py, which runs this in their environment (venv.py).
 
 Each flies its own vehicle, or ours with the numbers that it takes, by its own default integrator.
 """
@@ -9,16 +9,16 @@ import json
 import warnings
 from pathlib import Path
 
-import agreement_switches as switches
 import jax
 import jax.numpy as jnp
 import numpy as np
-from agreement_switches import RADIANS_PER_SECOND, Cause, Setup
 
 import jaxdrones as jd
+from benchmarks.rivals import switches
+from benchmarks.rivals.switches import RADIANS_PER_SECOND, Cause, Setup
 from jaxdrones import rotation
 
-TAPE = Path(__file__).parent.parent / "tests" / "golden" / "dyn_main_cf2x_random_b_init.npz"
+TAPE = Path(__file__).parents[2] / "tests" / "golden" / "dyn_main_cf2x_random_b_init.npz"
 DT, STEPS = 1 / 240, 240
 GRAVITY = Cause("constant", "gravity 9.81 m/s^2", lambda setup: setup.but(gravity=9.81))
 
@@ -26,7 +26,6 @@ GRAVITY = Cause("constant", "gravity 9.81 m/s^2", lambda setup: setup.but(gravit
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--without-l2f", action="store_true", help="which could not be installed")
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     warnings.filterwarnings("ignore")

@@ -1,4 +1,4 @@
-"""Races crazyflow and rotorpy against this library in one process, in the environment of the rivals (rivals_venv.py).
+"""Races crazyflow and rotorpy against this library in one process, in the environment of the rivals (venv.py).
 
 `rivals.py` starts it and says what the races are. In each, all contenders get the same starts and commands.
 """
@@ -15,10 +15,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import rivals_ours as ours
-from rivals_timing import in_turn
 
 import jaxdrones as jd
+from benchmarks.common import in_turn
+from benchmarks.rivals import ours
 
 FREQ = 500  # Hz, crazyflow's default
 DT = 1 / FREQ
@@ -43,7 +43,6 @@ def main() -> None:
     parser.add_argument("--devices", type=int, required=True)
     parser.add_argument("--repeats", type=int, required=True)
     parser.add_argument("--alone", action="store_true", help="without rivals: does our side run?")
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     jax.config.update("jax_num_cpu_devices", options.devices)
     warnings.filterwarnings("ignore", message="Attaching a spec")
@@ -71,7 +70,7 @@ class Plant:
         programs = ours.ways(ours.flight(step, steps), jax.devices(), params, start, rpm)
         if alone:
             return programs
-        import rivals_crazyflow_many as crazyflow
+        from benchmarks.rivals import crazyflow_many as crazyflow
 
         return programs | crazyflow.plant(self.integrator, params, start, rpm, FREQ, steps, jax.devices())
 
@@ -98,7 +97,7 @@ class Attitude:
         programs = ours.ways(ours.controlled(step, DT), jax.devices(), params, start, commands, axis=1)
         if alone:
             return programs
-        import rivals_crazyflow_many as crazyflow
+        from benchmarks.rivals import crazyflow_many as crazyflow
 
         return programs | crazyflow.attitude(start, rpy, thrust_to_weight, FREQ, jax.devices())
 
@@ -125,9 +124,9 @@ class Rotorpy(Plant):
             programs = ours.ways(ours.flight(step, steps), jax.devices(), params, start, rpm)
             if alone:
                 return programs
-            import rivals_rotorpy
+            from benchmarks.rivals import rotorpy
 
-            return programs | rivals_rotorpy.plant(params, start, rpm, DT, steps)
+            return programs | rotorpy.plant(params, start, rpm, DT, steps)
 
 
 RACES = {f"plant-{name}": partial(Plant, name) for name in INTEGRATORS} | {"attitude": Attitude, "rotorpy": Rotorpy}

@@ -1,0 +1,1 @@
+"""The plant in hand-written C."""

@@ -1,0 +1,1 @@
+"""Other simulators, run in an environment of their own."""

@@ -1,4 +1,4 @@
-"""Builds the page of the viewer, where it is not there yet, when the package is built or installed from its sources."""
+"""Builds the page of the viewer with npm, where it is missing, when the package is built or installed from a checkout."""
 
 import shutil
 import subprocess
@@ -8,19 +8,24 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class ViewerPage(BuildHookInterface):
-    """Bundles viewer/ into one page by npm; without npm everything but the viewer is installed."""
+    """Bundle viewer/ into one page. An sdist needs the page; without it, an installation lacks `jaxdrones view` alone."""
 
     def initialize(self, version, build_data):
         """Build the page."""
-        viewer = Path(self.root) / "viewer"
         if (Path(self.root) / "jaxdrones/visualization/viewer/page.html").exists():
             return
+        try:
+            self.bundle()
+        except (OSError, subprocess.SubprocessError) as error:
+            message = f"the page of the viewer is missing and could not be built ({error}); see `make viewer`"
+            if self.target_name == "sdist":
+                raise RuntimeError(message) from error
+            self.app.display_warning(message)
+
+    def bundle(self):
+        """Run npm in viewer/."""
         npm = shutil.which("npm")
         if npm is None:
-            self.app.display_warning("npm was not found, so the viewer is not built; see `make viewer`")
-            return
-        try:
-            for command in (["ci", "--no-audit", "--no-fund"], ["run", "build"]):
-                subprocess.run([npm, *command], cwd=viewer, check=True, timeout=300)
-        except (OSError, subprocess.SubprocessError) as error:
-            self.app.display_warning(f"the viewer is not built ({error}); see `make viewer`")
+            raise FileNotFoundError("npm was not found")
+        for command in (["ci", "--no-audit", "--no-fund"], ["run", "build"]):
+            subprocess.run([npm, *command], cwd=Path(self.root) / "viewer", check=True, timeout=300)

@@ -1,4 +1,4 @@
-"""Builds the page of the viewer with npm, where it is missing, when the package is built or installed from a checkout."""
+"""Builds the page of the viewer with npm, where it is missing, when the package is built from a checkout."""
 
 import shutil
 import subprocess
@@ -8,7 +8,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class ViewerPage(BuildHookInterface):
-    """Bundle viewer/ into one page. An sdist needs the page; without it, an installation lacks `jaxdrones view` alone."""
+    """Bundle viewer/ into one page. An sdist needs the page; an installation without it lacks the viewer alone."""
 
     def initialize(self, version, build_data):
         """Build the page."""

@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 import jax
 
-from jaxdrones.throughput import timing
-from jaxdrones.throughput.machine import versions
-from jaxdrones.throughput.timing import seconds as seconds
+from jaxdrones.cli import throughput as timing
+from jaxdrones.cli.machine import versions
+from jaxdrones.cli.throughput import seconds as seconds
 
 
 def about() -> dict[str, object]:

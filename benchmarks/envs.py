@@ -14,9 +14,9 @@ import numpy as np
 import jaxdrones.adapters.gymnasium  # noqa: F401 (registers the environments)
 from benchmarks.cameras_scenes import objects20
 from benchmarks.common import compiled, seconds
+from jaxdrones.cli import throughput as programs
 from jaxdrones.envs import make
 from jaxdrones.tasks import forest
-from jaxdrones.throughput import programs
 
 STEPS = 50  # of a compiled call
 SLOW_CAMERA = dataclasses.replace(forest.camera, rate=15.0)

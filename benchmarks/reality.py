@@ -30,8 +30,7 @@ import numpy as np
 from benchmarks.rivals import environment
 from jaxdrones import assets
 from jaxdrones.dynamics import crazyflie_motors
-from jaxdrones.identification import FlightLog, hold_errors, open_loop_errors
-from jaxdrones.identification.files import errors_as_dict, load_vehicle
+from jaxdrones.flights import FlightLog, errors_as_dict, hold_errors, load_flights, load_vehicle, open_loop_errors
 
 OURS = {True: ("cf2x", "cf21_brushless"), False: ("cf2x", "cf21")}
 """Bundled vehicles, by whether the rotor speeds were measured."""
@@ -48,14 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     files = [file for path in options.flights for file in (sorted(path.rglob("*.npz")) if path.is_dir() else [path])]
-    logs = [FlightLog.load(file) for file in files]
+    logs = [log for file in files for log in load_flights(file)]
     versions, theirs = {}, {}
     if not options.quick:
         result = environment.run("benchmarks.rivals.reality", *(str(file.resolve()) for file in files))
         versions, theirs = result["versions"], result["errors"]
     rows, lines = [], []
     for measured, inputs in (True, "rotor speeds"), (False, "PWM and voltage"):
-        group = [(file, log) for file, log in zip(files, logs, strict=True) if log.has_rotor_speeds == measured]
+        group = [(file, log) for file, log in zip(files, logs, strict=True) if log.has("rpm") == measured]
         if not group:
             continue
         flown = [

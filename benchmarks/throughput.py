@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import jaxdrones as jd
 from benchmarks.common import first_call, seconds
 from jaxdrones.checks import check_choice
+from jaxdrones.cli.throughput import crazyflies, held
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
-from jaxdrones.throughput.programs import crazyflies, held
 
 WORLDS = (1, 64, 1024, 16384, 262144)
 GRADIENT_STEPS = 100

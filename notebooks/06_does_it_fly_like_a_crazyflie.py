@@ -23,16 +23,16 @@ import jaxdrones as jd
 from jaxdrones.cli.score import closed_loop_table, open_loop_table
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import crazyflie_motors
-from jaxdrones.identification import (
+from jaxdrones.flights import (
     HORIZONS,
-    FlightLog,
     Vehicle,
+    errors_as_dict,
     fit,
     hold_errors,
+    load_flights,
     open_loop_errors,
     simulate_closed_loop,
 )
-from jaxdrones.identification.files import errors_as_dict
 from jaxdrones.visualization.palette import COLORS
 
 plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True, "grid.linewidth": 0.3}
@@ -43,17 +43,17 @@ plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True,
 # and the set-points, at 100 Hz. The firmware's PID flew the drone; rotor speeds were not measured.
 
 # %%
-told = FlightLog.load("B10_lissajous_slow_rep1")  # to identify the vehicle
-kept = FlightLog.load("B3_figure8_slow_rep2")  # to score it
+# The first identifies the vehicle, the second scores it.
+told, kept = load_flights("B10_lissajous_slow_rep1", "B3_figure8_slow_rep2")
 
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.2), dpi=80, layout="constrained")
 for axis, log, use in (left, told, "to identify"), (middle, kept, "to score"):
-    axis.plot(*log.ref_pos[:, :2].T, color="grey", linewidth=1, label="set-points")
-    axis.plot(*log.pos[:, :2].T, label="flown")
+    axis.plot(*log.target_pos[:, 0, :2].T, color="grey", linewidth=1, label="set-points")
+    axis.plot(*log.pos[:, 0, :2].T, label="flown")
     axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{use}: {log.name.split('_')[1]}")
 middle.legend(loc="lower center", bbox_to_anchor=(0.5, 1.25), ncols=2, fontsize="small")
 left.set_xticks([-0.5, 0, 0.5])
-right.plot(kept.t, kept.pwm.mean(axis=1) / 65535, label="mean PWM, share of the time")
+right.plot(kept.t, kept.pwm.mean(axis=(1, 2)) / 65535, label="mean PWM, share of the time")
 right.plot(kept.t, kept.vbat / 4.2, label="voltage over 4.2 V")
 right.set(xlabel="t (s)", ylim=(0, 1.1), title="motors and battery")
 right.legend(loc="lower center", fontsize="small")

@@ -14,7 +14,6 @@ NOUNS = (
     "checks",
     "errors",
     "limits",
-    "npz",
     "params",
     "pytree",
     "quantity",
@@ -35,8 +34,8 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("dynamics",), ("control",), ("sensing",), ("accelerate",)),
     (("engine",), ("tasks",)),
     (("optimal",),),
-    (("envs",), ("flights",), ("identification",), ("symbolic",)),
-    (("adapters",), ("learning",), ("ros2",), ("throughput",), ("visualization",)),
+    (("envs",), ("flights",), ("symbolic",)),
+    (("adapters",), ("learning",), ("ros2",), ("visualization",)),
     (("training",),),
     (("cli",),),
     (("",),),  # the package itself, which re-exports

@@ -10,9 +10,8 @@ import pytest
 from documents import ROOT
 
 import jaxdrones as jd
-from jaxdrones.cli import doctor, main
+from jaxdrones.cli import doctor, machine, main
 from jaxdrones.flights import self_test
-from jaxdrones.throughput import machine
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 VERSION = importlib.metadata.version

@@ -15,7 +15,7 @@ ELSEWHERE = {  # page -> the tests that try its commands
     "docs/own-policy.md": "tests/test_cli_user_code.py",
     "docs/own-task.md": "tests/test_cli_user_code.py",
     "docs/own-vehicle.md": "tests/test_cli_user_code.py",
-    "docs/reality.md": "tests/identification/test_fit.py",
+    "docs/reality.md": "tests/flights/test_fit.py",
     "docs/ros2.md": "tests/ros2/test_cli_ros2.py",
     "docs/viewer.md": "tests/visualization/test_viewer.py",
 }

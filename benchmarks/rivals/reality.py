@@ -24,10 +24,9 @@ import jaxdrones as jd
 from benchmarks.rivals.crazyflow import make_sim, make_step
 from benchmarks.rivals.rotorpy import RADIANS_PER_SECOND
 from jaxdrones.dynamics import FULL_PWM, crazyflie_motors
-from jaxdrones.identification import HORIZONS, FlightLog
-from jaxdrones.identification.files import errors_as_dict
-from jaxdrones.identification.log import PERIOD
-from jaxdrones.identification.open_loop import cut_windows, mean_errors, window_starts
+from jaxdrones.flights import HORIZONS, FlightLog, errors_as_dict, load_flights
+from jaxdrones.flights.open_loop import cut_windows, mean_errors, window_starts
+from jaxdrones.flights.preparation import PERIOD
 
 BEFORE, LENGTH = 30, HORIZONS[-1]  # rows before a start, in which lagging rotors come to their speed, and after it
 SUBSTEPS = 5  # of crazyflow in a row: its 500 Hz
@@ -43,7 +42,7 @@ def main() -> None:
     warnings.filterwarnings("ignore")
     errors: dict[str, dict[str, dict]] = {}
     for file in options.logs:
-        log = FlightLog.load(file)
+        (log,) = load_flights(file)
         starts = window_starts(log)
         logged = cut_windows(log, starts).logged
         found = {name: mean_errors(fly(log, starts), logged) for name, fly in plants(log).items()}
@@ -54,7 +53,7 @@ def main() -> None:
 
 def plants(log: FlightLog) -> dict[str, Plant]:
     """Rivals with their own parameters of the Crazyflie that flew, the brushless one where speeds were measured."""
-    if log.has_rotor_speeds:
+    if log.has("rpm"):
         own = crazyfliebrushless_params
         return {"crazyflow cf21B_500": crazyflow("cf21B_500"), "rotorpy Crazyflie Brushless": rotorpy(own.quad_params)}
     return {"crazyflow cf2x_P250": crazyflow("cf2x_P250"), "rotorpy Crazyflie": rotorpy(crazyflie_params.quad_params)}
@@ -70,19 +69,19 @@ def crazyflow(airframe: str) -> Plant:
 
     def fly(log: FlightLog, starts: np.ndarray) -> jd.State:
         sim = make_sim(airframe, round(SUBSTEPS / PERIOD))
-        if log.has_rotor_speeds:
+        if log.has("rpm"):
             at_once = SUBSTEPS / PERIOD * jnp.array([1.0, 0, 1, 0])
             coefficients = jnp.broadcast_to(at_once, sim.data.params.rotor_dyn_coef.shape)
             sim.data = sim.data.replace(params=sim.data.params.replace(rotor_dyn_coef=coefficients))
         step = jax.vmap(make_step(sim, 1), (None, 0, 0))
-        speeds = log.rpm if log.has_rotor_speeds else speed(thrusts(log))
+        speeds = log.rpm[:, 0] if log.has("rpm") else speed(thrusts(log))
 
         def advance(states, rpm):
             for j in range(SUBSTEPS):
                 states = step(None, states, rpm[:, j][:, None])
             return states, states
 
-        fine = subdivided(speeds) if log.has_rotor_speeds else np.repeat(speeds[:, None], SUBSTEPS, axis=1)
+        fine = subdivided(speeds) if log.has("rpm") else np.repeat(speeds[:, None], SUBSTEPS, axis=1)
         rows = starts[:, None] + np.arange(-BEFORE, LENGTH)
         inputs = jnp.asarray(np.moveaxis(fine[np.maximum(rows, 0)], 1, 0))  # (rows, n, substeps, 4)
         start = cut_windows(log, starts).start
@@ -116,11 +115,11 @@ def rotorpy(own: dict) -> Plant:
 
     def fly(log: FlightLog, starts: np.ndarray) -> jd.State:
         n, cpu = len(starts), torch.device("cpu")
-        speeds = RADIANS_PER_SECOND * log.rpm if log.has_rotor_speeds else np.sqrt(thrusts(log) / own["k_eta"])
+        speeds = RADIANS_PER_SECOND * log.rpm[:, 0] if log.has("rpm") else np.sqrt(thrusts(log) / own["k_eta"])
         rows = starts[:, None] + np.arange(-BEFORE, LENGTH)
         inputs = torch.from_numpy(speeds[np.maximum(rows, 0)][..., ours])
         start = {"x": log.pos, "v": log.vel, "q": log.quat, "w": log.omega}
-        start = {name: torch.from_numpy(x[starts]).double() for name, x in start.items()}
+        start = {name: torch.from_numpy(x[starts, 0]).double() for name, x in start.items()}
         start |= {"wind": torch.zeros(n, 3).double(), "rotor_speeds": inputs[:, 0].clone()}
         vehicles = BatchedMultirotor(BatchedMultirotorParams([own] * n, n, cpu), n, start, cpu, integrator="rk4")
         everyone, state, kept = np.arange(n), {k: v.clone() for k, v in start.items()}, []
@@ -129,7 +128,7 @@ def rotorpy(own: dict) -> Plant:
                 given = inputs[:, BEFORE + row]
                 if row == 0:
                     state = {k: v.clone() for k, v in start.items()} | {"rotor_speeds": state["rotor_speeds"]}
-                if log.has_rotor_speeds:
+                if log.has("rpm"):
                     state["rotor_speeds"] = given.clone()
                 state = vehicles.step(state, {"cmd_motor_speeds": given}, PERIOD, everyone)
                 if row + 1 in HORIZONS:
@@ -142,7 +141,7 @@ def rotorpy(own: dict) -> Plant:
 
 def thrusts(log: FlightLog) -> np.ndarray:
     """(T, 4) thrusts by the firmware's curve of the propellers 2.1+, N."""
-    return np.asarray(crazyflie_motors().thrust(jnp.asarray(log.pwm / FULL_PWM * log.vbat[:, None])))
+    return np.asarray(crazyflie_motors().thrust(jnp.asarray(log.pwm[:, 0] / FULL_PWM * log.vbat)))
 
 
 if __name__ == "__main__":

@@ -10,13 +10,14 @@ import jax
 
 from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.checks import check_number
+from jaxdrones.cli import machine
+from jaxdrones.cli import throughput as programs
 from jaxdrones.cli.common import as_json
+from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics import drag
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.envs import make
 from jaxdrones.limits import LARGEST_COUNT, check_at_most
-from jaxdrones.throughput import machine, programs
-from jaxdrones.throughput.timing import seconds
 
 _WORLDS = {"cpu": (1024, 16384), "other": (16384, 262144)}
 _DT = 1 / 240  # s

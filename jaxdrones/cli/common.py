@@ -17,8 +17,8 @@ import jax
 
 from jaxdrones import user_code
 from jaxdrones.checks import UnexpectedKeyword
+from jaxdrones.cli import machine
 from jaxdrones.errors import UserError
-from jaxdrones.throughput import machine
 
 DIVERGED, MISTAKE, FAULT, INTERRUPTED = 1, 2, 70, 130
 EXIT_CODES = """exit codes:

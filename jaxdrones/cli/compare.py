@@ -9,9 +9,11 @@ from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import as_json, check_writable, folder, table
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
 from jaxdrones.errors import UserError
+from jaxdrones.flights import results
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.flights.record import Record, divergence
+from jaxdrones.flights.files import save_npz
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import comparison, plots
 
 _BACKENDS = "explicit,bullet"
@@ -49,22 +51,22 @@ def _compare(options: argparse.Namespace) -> int:
     records = {name: fly_options(flown, backend=backend) for name, (flown, backend) in cases.items()}
     settling_time = FLIGHTS[options.flight].settling_time
     for name, log in logs.items():
-        records[name].save_npz(log)
+        save_npz(records[name], log)
     files = list(logs.values())
     if logs and not options.no_figure:
         files.append(options.output / "compare.png")
         title = (" against " if len(cases) == 2 else ", ").join(cases)
         comparison.save_comparison(records, files[-1], f"{options.flight}: {title}")
-    diverged = {name: record.diverged() for name, record in records.items()}
+    diverged = {name: results.diverged(record) for name, record in records.items()}
     about: dict[str, Any] = {"flight": options.flight, kind: list(cases)}
     if kind == "backends":
         first, second = records.values()
-        found = {"divergence": divergence(first, second)}
+        found = {"divergence": results.divergence(first, second)}
         headline, text = " against ".join(cases) + ", largest difference over the drones", table(found["divergence"])
     else:
         found = {"results": _results(records, settling_time)}
         headline = ", ".join(cases) + ", largest over the drones"
-        text = f"{table(found['results'])}\n{next(iter(records.values())).definitions(settling_time)}"
+        text = f"{table(found['results'])}\n{results.definitions(next(iter(records.values())), settling_time)}"
     if options.json:
         print(as_json(about | found | {"diverged": diverged, "files": list(map(str, files))}))
     else:
@@ -121,11 +123,11 @@ def _logs(options: argparse.Namespace, names: list[str]) -> dict[str, Path]:
     return logs
 
 
-def _results(records: Mapping[str, Record], after: float) -> list[dict[str, Any]]:
+def _results(records: Mapping[str, FlightLog], after: float) -> list[dict[str, Any]]:
     """One row of numbers per controller: the largest over the drones; `None` where one of them has none."""
     rows = []
     for name, record in records.items():
-        drones = record.results(after)
+        drones = results.results(record, after)
         row: dict[str, Any] = {"controller": name}
         for column in drones[0]:
             if "error" in column or column in ("settled_after_s", "rpm_std"):

@@ -34,7 +34,7 @@ def add(commands) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from jaxdrones.throughput import machine
+    from jaxdrones.cli import machine
 
     wrong: list[str] = []
     versions = machine.versions()
@@ -135,7 +135,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def _devices(wrong: list[str]) -> list[str]:
-    from jaxdrones.throughput import machine
+    from jaxdrones.cli import machine
 
     try:
         return machine.devices()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxdrones.cli.common import as_json, check_writable, folder, print_warning
+from jaxdrones.errors import install
 
 _FIGURE = "errors.png"
 
@@ -15,12 +16,12 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "fit",
         help="identify a vehicle from recorded flights",
-        description="Estimate parameters of a vehicle from flight logs (.npz with t, pos, quat, vel, omega and rpm, or "
-        "pwm and vbat). Prints each with its standard error, and writes a folder with vehicle.urdf, report.json and a "
-        "figure. Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
+        description="Estimate parameters of a vehicle from flights: logs of `jaxdrones fly`, .npz or .csv files with "
+        "t, pos, quat, vel, omega and rpm (or pwm and vbat), or bags of ROS 2. Prints each with its standard error, "
+        "and writes a folder with vehicle.urdf, report.json and a figure. Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
         allow_abbrev=False,
     )
-    parser.add_argument("logs", nargs="+", type=Path, metavar="FLIGHT.npz", help="flights to fit")
+    parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="flights to fit")
     parser.add_argument(
         "--vehicle",
         default="cf2x",
@@ -35,9 +36,9 @@ def add(commands) -> None:
     parser.add_argument(
         "--validate",
         nargs="+",
-        type=Path,
+        type=folder,
         default=[],
-        metavar="FLIGHT.npz",
+        metavar="FLIGHT",
         help="flights that are not fitted, on which the best round is chosen",
     )
     parser.add_argument(
@@ -58,8 +59,10 @@ def add(commands) -> None:
 def _fit(options: argparse.Namespace) -> int:
     from jaxdrones.control import firmware_pid
     from jaxdrones.dynamics import crazyflie_motors
-    from jaxdrones.identification import fit
-    from jaxdrones.identification.files import REPORT, URDF, check_no_fit, report_as_dict, write_vehicle
+    from jaxdrones.flights import fit
+    from jaxdrones.flights.files import find_log
+    from jaxdrones.flights.report import check_no_fit, report_as_dict, write_vehicle
+    from jaxdrones.flights.vehicle import REPORT, URDF
     from jaxdrones.urdf import load_params
     from jaxdrones.visualization.residuals import save_errors
 
@@ -69,7 +72,8 @@ def _fit(options: argparse.Namespace) -> int:
     check_no_fit(options.output)
     check_writable(options.output / REPORT)
     logs = load_logs([*options.logs, *options.validate], options.allow_inconsistent)
-    fitted, validate = logs[: len(options.logs)], logs[len(options.logs) :]
+    kept = {find_log(file) for file in options.validate}
+    fitted, validate = ([log for log in logs if (log.file in kept) is given] for given in (False, True))
     report = fit(fitted, params, names, validate, motors, lambda line: print(line, file=sys.stderr), gains)
     write_vehicle(options.output, report, options.vehicle)
     if options.json:
@@ -81,7 +85,7 @@ def _fit(options: argparse.Namespace) -> int:
         save_errors(report.errors, options.output / _FIGURE)
         files.append(_FIGURE)
     except ImportError as error:
-        print_warning(f'no {_FIGURE}: {error}; pip install "jaxdrones[cli]"')
+        print_warning(f"no {_FIGURE}: {error}; {install('cli')}")
     if not options.json:
         print(f"{options.output}: {', '.join(files)}")
     return 0
@@ -97,13 +101,12 @@ def add_consistency(parser: argparse.ArgumentParser) -> None:
 
 
 def load_logs(files: Sequence[Path], allow_inconsistent: bool) -> list:
-    """The flight logs of files, with different names; warns of contradictions that are allowed."""
-    from jaxdrones.identification import FlightLog
-    from jaxdrones.identification.log import named_apart
+    """The drones of logs, with different names; warns of contradictions that are allowed."""
+    from jaxdrones.flights import inconsistencies, load_flights
 
-    logs = named_apart([FlightLog.load(file, allow_inconsistent) for file in files])
+    logs = load_flights(*files, allow_inconsistent=allow_inconsistent)
     for log in logs if allow_inconsistent else ():
-        for found in log.inconsistencies():
+        for found in inconsistencies(log):
             print_warning(f"{log.name}: {found}")
     return logs
 

@@ -9,7 +9,7 @@ from jaxdrones.cli.common import bar, print_error
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights.conditions import CONTROLLERS, Conditions
 from jaxdrones.flights.fly import fly
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.urdf import load_params
 
 
@@ -33,7 +33,7 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
 
 
-def fly_options(options: argparse.Namespace, **more: Any) -> Record:
+def fly_options(options: argparse.Namespace, **more: Any) -> FlightLog:
     """The record of the flight that the options describe; a progress bar shows how far it is.
 
     Args:
@@ -60,7 +60,7 @@ def warn(diverged: dict[str, str]) -> int:
     """Write to stderr that a flight diverged, if it did; returns the exit code.
 
     Args:
-        diverged: result of `Record.diverged`.
+        diverged: result of `diverged`.
     """
     if not diverged:
         return 0

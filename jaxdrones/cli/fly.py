@@ -14,9 +14,11 @@ from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.settings import parse_settings
 from jaxdrones.errors import UserError
+from jaxdrones.flights import results
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.flights.record import Record, check_pwm
+from jaxdrones.flights.files import check_pwm, save_csv, save_npz
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.limits import check_seed
 from jaxdrones.visualization import films, plots
 
@@ -133,8 +135,9 @@ def _fly_example(options: argparse.Namespace) -> int:
         conditions = dict(backend=options.backend, obstacles=options.obstacles, gui=options.gui)
         record = fly_options(options, **conditions, watch=live.add if live else None)
     files = _write(record, options, output, title, example.panels)
-    _report(options, record, example.settling_time, files, record.diverged())
-    return warn(record.diverged())
+    diverged = results.diverged(record)
+    _report(options, record, example.settling_time, files, diverged)
+    return warn(diverged)
 
 
 def _fly_policy(options: argparse.Namespace) -> int:
@@ -196,21 +199,21 @@ def _options_of_task(options: argparse.Namespace) -> dict[str, Any]:
 
 def _report(
     options: argparse.Namespace,
-    record: Record,
+    record: FlightLog,
     after: float,
     files: list[Path],
     diverged: dict[str, str],
     end: dict | None = None,
 ) -> None:
     """Print the results from a time on, s; `end` describes how an episode of a policy ended."""
-    results = record.results(after)
+    rows = results.results(record, after)
     if options.json:
         about = record.conditions.as_dict() | (end or {})
-        print(as_json(about | {"results": results, "diverged": diverged, "files": list(map(str, files))}))
+        print(as_json(about | {"results": rows, "diverged": diverged, "files": list(map(str, files))}))
     else:
         print(record.conditions)
-        print(table(results))
-        print(record.definitions(after))
+        print(table(rows))
+        print(results.definitions(record, after))
         if end is not None:
             how = {True: "success", False: "no success", None: "done"}[end["success"]]
             why = f"ended by {', '.join(end['ended_by'])}" if end["ended_by"] else "to the end"
@@ -232,13 +235,15 @@ def _check_files(options: argparse.Namespace, output: Path) -> None:
             raise UserError(f"--video {options.video} cannot be written: {error.strerror}; choose another") from None
 
 
-def _write(record: Record, options: argparse.Namespace, output: Path, title: str, panels: Sequence[str]) -> list[Path]:
+def _write(
+    record: FlightLog, options: argparse.Namespace, output: Path, title: str, panels: Sequence[str]
+) -> list[Path]:
     """Write log, figure, film and pictures, as asked for; returns their paths."""
     files = [output / "log.npz"]
-    record.save_npz(files[0], options.pwm)
+    save_npz(record, files[0], options.pwm)
     if options.csv:
         files.append(output / "log.csv")
-        record.save_csv(files[-1], options.pwm)
+        save_csv(record, files[-1], options.pwm)
     if not options.no_figure:
         files.append(output / "flight.png")
         plots.save_flight(record, files[-1], title, panels)
@@ -251,5 +256,5 @@ def _write(record: Record, options: argparse.Namespace, output: Path, title: str
 
         files.append(output / "cameras")
         images = {"rgb": replay.save_cameras(record, files[-1])}
-        dataclasses.replace(record, images={**record.images, **images}).save_npz(files[0], options.pwm)
+        save_npz(dataclasses.replace(record, images={**record.images, **images}), files[0], options.pwm)
     return files

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import as_json, bar, check_writable
+from jaxdrones.cli.common import as_json, bar, check_writable, folder
 from jaxdrones.cli.fit import add_consistency, load_logs
 from jaxdrones.errors import UserError
 
@@ -21,7 +21,7 @@ def add(commands) -> None:
         "for comparison. A log with set-points is also simulated as a whole, with the firmware's PID (closed loop).",
         allow_abbrev=False,
     )
-    parser.add_argument("logs", nargs="+", type=Path, metavar="FLIGHT.npz", help="flight logs")
+    parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="logs, see `jaxdrones fit`")
     parser.add_argument(
         "--vehicle",
         required=True,
@@ -45,15 +45,20 @@ def _score(options: argparse.Namespace) -> int:
 
     from jaxdrones.control import firmware_pid
     from jaxdrones.dynamics import crazyflie_motors
-    from jaxdrones.identification import hold_errors, open_loop_errors, simulate_closed_loop
-    from jaxdrones.identification.files import errors_as_dict, load_vehicle
+    from jaxdrones.flights import (
+        errors_as_dict,
+        hold_errors,
+        load_vehicle,
+        open_loop_errors,
+        simulate_closed_loop,
+    )
     from jaxdrones.visualization.residuals import save_paths
 
     motors = crazyflie_motors(options.propellers)
     vehicles = {"nominal": load_vehicle(options.nominal), "vehicle": load_vehicle(options.vehicle)}
     logs = load_logs(options.logs, options.allow_inconsistent)
     gains = firmware_pid.gains(propellers=options.propellers)
-    with_setpoints = [log for log in logs if log.has_setpoints]
+    with_setpoints = [log for log in logs if log.has("target_pos", "pwm")]
     flights = len(logs) + len(vehicles) * (len(logs) + len(with_setpoints))
     with bar(flights, "score", " flights") as shown:
 

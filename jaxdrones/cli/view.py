@@ -3,15 +3,15 @@
 import argparse
 import sys
 import webbrowser
-import zipfile
 from pathlib import Path
 
 from jaxdrones.checks import check_choice, check_whole
 from jaxdrones.cli.common import as_json, check_writable, folder
 from jaxdrones.errors import UserError
+from jaxdrones.flights.files import find_log
 from jaxdrones.visualization import video
 from jaxdrones.visualization.viewer.film import CAMERAS, film
-from jaxdrones.visualization.viewer.show import LAYOUTS, find_log, show
+from jaxdrones.visualization.viewer.show import LAYOUTS, show
 
 
 def add(commands) -> None:
@@ -92,10 +92,7 @@ def _is_flight(path: Path) -> bool:
         log = find_log(path)
     except ValueError:
         return False
-    if not zipfile.is_zipfile(log):
-        return log.suffix == ".npz"
-    with zipfile.ZipFile(log) as archive:
-        return "conditions.npy" in archive.namelist()
+    return log.is_dir() or log.suffix in (".npz", ".csv")
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,1 +1,37 @@
-"""The demonstrations of the command line: what is flown, under which conditions, and the record of it."""
+"""Flights: demonstrations of control, logs, and identification of vehicles from logs."""
+
+from jaxdrones.flights.closed_loop import ClosedLoopResult, simulate_closed_loop
+from jaxdrones.flights.files import read_log, save_csv, save_npz
+from jaxdrones.flights.fit import Estimate, Report, fit
+from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
+from jaxdrones.flights.open_loop import HORIZONS, QUANTITIES, hold_errors, open_loop_errors
+from jaxdrones.flights.parameters import PARAMETERS
+from jaxdrones.flights.preparation import inconsistencies, load_flights, prepare
+from jaxdrones.flights.report import errors_as_dict
+from jaxdrones.flights.vehicle import Instruments, Vehicle, load_vehicle
+
+__all__ = [
+    "HORIZONS",
+    "PARAMETERS",
+    "QUANTITIES",
+    "ClosedLoopResult",
+    "Estimate",
+    "FlightLog",
+    "ImageSequence",
+    "Instruments",
+    "LoggedConditions",
+    "Report",
+    "Vehicle",
+    "errors_as_dict",
+    "fit",
+    "hold_errors",
+    "inconsistencies",
+    "load_flights",
+    "load_vehicle",
+    "open_loop_errors",
+    "prepare",
+    "read_log",
+    "save_csv",
+    "save_npz",
+    "simulate_closed_loop",
+]

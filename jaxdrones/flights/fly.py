@@ -16,7 +16,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.controllers import controller_of
 from jaxdrones.flights.examples import FLIGHTS, Flight
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Scene, obstacles_2021
 from jaxdrones.state import State
@@ -29,9 +29,9 @@ def fly(
     flight: str,
     gui: bool = False,
     progress: Callable[[float], None] | None = None,
-    watch: Callable[[Record, float], None] | None = None,
+    watch: Callable[[FlightLog, float], None] | None = None,
     **options: Any,
-) -> Record:
+) -> FlightLog:
     """Fly one of the examples.
 
     Args:
@@ -67,17 +67,13 @@ def fly(
 
     params, start, memory = prepare(load_params(conditions.vehicle))
     planned, team = jax.device_get((plan(params), params))
-    nothing = np.full(
-        (steps, len(start.pos), 3), np.nan, planned["t"].dtype
-    )  # where positions or velocities are not commanded
-    planned = {"target_pos": nothing, "target_vel": nothing} | planned
 
-    def record(trajectory: State, first: int) -> Record:
+    def record(trajectory: State, first: int) -> FlightLog:
         rows = slice(first, first + len(trajectory.pos))
-        return Record(
+        return FlightLog(
             **{name: np.asarray(getattr(trajectory, name)) for name in ("pos", "quat", "vel", "omega", "rpm")},
             **{name: x[rows] for name, x in planned.items()},
-            labels=example.labels or tuple(f"drone {i}" for i in range(n)),
+            labels=example.labels,
             conditions=conditions,
             params=team,
             scene=scene_of(conditions),

@@ -15,7 +15,7 @@ from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2.topics import Topic
 
 if TYPE_CHECKING:
-    from jaxdrones.flights.record import Record
+    from jaxdrones.flights.log import FlightLog
 
 _DTYPES = {"float64": np.float64, "float32": np.float32, "uint8": np.uint8}
 
@@ -123,7 +123,7 @@ def read(path: Path) -> Iterator[Recorded]:
         raise UserError(f"{path} is no bag of ROS 2, or is damaged: {error}; give the folder of a sound one") from None
 
 
-def write_flight(record: Record, path: Path) -> None:
+def write_flight(record: FlightLog, path: Path) -> None:
     """Write the log of a flight as a bag: clock, poses, twists, odometry and rotor speeds.
 
     Raises:
@@ -141,28 +141,3 @@ def write_flight(record: Record, path: Path) -> None:
             for i in range(record.pos.shape[1]):
                 for name, message in convert.state_messages(now, i, ns).items():
                     recorder.write(topics.output(i, name), message, ns)
-
-
-def read_flight(path: Path) -> dict[str, np.ndarray]:
-    """The flight that a bag holds, as arrays by the names and shapes of a `Record`.
-
-    Returns:
-        `t` (K,) s, `pos` (K, n, 3) m, `quat` (K, n, 4), `vel` (K, n, 3) m/s, `omega` (K, n, 3) rad/s and
-        `rpm` (K, n, 4) RPM.
-
-    Raises:
-        ValueError: there is no bag, or no flight of whole steps in it.
-    """
-    found: dict[str, dict[int, Any]] = {}
-    for topic, ns, message in read(path):
-        found.setdefault(topic, {})[ns] = message
-    n = 0
-    while topics.output(n, "odom").name in found:
-        n += 1
-    streams = {name: [found.get(topics.output(i, name).name, {}) for i in range(n)] for name in ("odom", "motors")}
-    times = sorted(set.intersection(*(set(stream) for kind in streams.values() for stream in kind))) if n else []
-    if not times:
-        raise UserError(f"{path} holds no flight: it lacks /drone_0/odom and /drone_0/motors; record it with both")
-    states = [convert.to_state(*([stream[ns] for stream in kind] for kind in streams.values())) for ns in times]
-    arrays = {name: np.stack([getattr(s, name) for s in states]) for name in ("pos", "quat", "vel", "omega", "rpm")}
-    return arrays | {"t": np.array(times) / 1e9}

@@ -14,7 +14,7 @@ import numpy as np
 from jaxdrones.engine.legs import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
-from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
+from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
 from jaxdrones.learning import compilation
 from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
 from jaxdrones.params import Params
@@ -26,7 +26,7 @@ from jaxdrones.visualization.viewer.show import records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
 """(memory, observations) -> (memory, actions)"""
-_LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `Record` holds
+_LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `FlightLog` holds
 
 
 class EpisodeLog(PyTreeNode):
@@ -56,7 +56,7 @@ class EpisodeLog(PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeConditions:
-    """The conditions under which a policy flew an episode, for a `Record`."""
+    """The conditions under which a policy flew an episode, for a `FlightLog`."""
 
     run: str
     task: str
@@ -82,15 +82,13 @@ class EpisodeConditions:
         )
 
 
-def to_record(log: EpisodeLog, conditions: EpisodeConditions | LoggedConditions) -> Record:
+def to_record(log: EpisodeLog, conditions: EpisodeConditions | LoggedConditions) -> FlightLog:
     """The log of an episode in the form that demonstration flights have too."""
     drones = jax.tree.map(np.asarray, log.drones)
-    return Record(
+    return FlightLog(
         **{name: getattr(drones, name) for name in _LOGGED},
         t=log.t,
         target_pos=log.target,
-        target_vel=np.full_like(log.target, np.nan),
-        labels=tuple(f"drone {i}" for i in range(drones.pos.shape[1])),
         conditions=conditions,
         params=log.params,
         scene=log.scene,
@@ -106,7 +104,7 @@ def _renewed(t: np.ndarray, frames: np.ndarray) -> ImageSequence:
 
 
 @records_of.register
-def _(flight: EpisodeLog, of_trajectory: dict[str, Any]) -> list[Record]:
+def _(flight: EpisodeLog, of_trajectory: dict[str, Any]) -> list[FlightLog]:
     refuse(of_trajectory)
     end = {"success": flight.success, "ended_by": list(flight.ended_by), "duration": float(flight.t[-1])}
     how = {True: ", success", False: ", no success", None: ""}[flight.success]

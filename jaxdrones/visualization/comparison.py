@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import paths, style
 from jaxdrones.visualization.palette import colors
 
@@ -17,7 +17,7 @@ _SMALLEST = 0.01  # m or m/s: range of an axis
 _CELLS = 100  # along each side of a panel: what is commanded is drawn once in each, so that dashes stay dashes
 
 
-def save_comparison(records: Mapping[str, Record], path: Path, title: str) -> None:
+def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str) -> None:
     """Draw flights of the same example: a color for each, all of its drones, and what is commanded dashed.
 
     Beside the paths are the errors of each flight over time, mean and range over its drones. Two flights with the same
@@ -50,7 +50,7 @@ def _widths(count: int) -> np.ndarray:
     return np.linspace(_WIDEST, _NARROWEST, count) if count > 1 else np.array([_NARROWEST])
 
 
-def _draw_paths(axis: Any, flights: list[Record], tints: tuple[str, ...]) -> None:
+def _draw_paths(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> None:
     """The paths of all drones in the plane in which they are widest, at the same scale along both axes."""
     plane = list(paths.widest_plane(flights[0].pos))
     names = ["xyz"[k] for k in plane]
@@ -86,7 +86,7 @@ def _once(lines: np.ndarray) -> list[np.ndarray]:
     return shown
 
 
-def _draw_errors(axis: Any, flights: list[Record], tints: tuple[str, ...]) -> None:
+def _draw_errors(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> None:
     """Mean and range over the drones of the distance to the target position, or of the difference in velocity."""
     ends = []
     for record, tint, width in zip(flights, tints, _widths(len(flights)), strict=True):
@@ -102,7 +102,7 @@ def _draw_errors(axis: Any, flights: list[Record], tints: tuple[str, ...]) -> No
     axis.set(title=what, ylabel=f"error ({unit})")
 
 
-def _draw_distance(axis: Any, first: Record, second: Record) -> None:
+def _draw_distance(axis: Any, first: FlightLog, second: FlightLog) -> None:
     """The distance between the same drones of two flights, largest over the drones, on a logarithmic axis."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -118,7 +118,7 @@ def _draw_distance(axis: Any, first: Record, second: Record) -> None:
     axis.set(title="distance between the two flights", ylabel="largest (m)")
 
 
-def _handles(records: Mapping[str, Record], tints: tuple[str, ...]) -> list[Any]:
+def _handles(records: Mapping[str, FlightLog], tints: tuple[str, ...]) -> list[Any]:
     """The lines of the legend: flights, what is dashed, start and end, and the band."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from jaxdrones import rotation
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera
 from jaxdrones.sensing.images import Images, view
@@ -27,7 +27,7 @@ _SCALED = ("rotor_pos", "prop_radius", "collision_radius", "collision_height", "
 _ROUGH = 24.0  # levels of brightness between neighboring pixels from which on an edge is smoothed
 
 
-def frames(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
     """The pictures (height, width, 3) uint8 of a film that JAX draws."""
     shot = shoot(record, fps, size[0] / size[1])
     camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW)

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxdrones.checks import check_choice
 from jaxdrones.errors import UserError
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import video
 from jaxdrones.visualization.browser import find_browser
 from jaxdrones.visualization.shots import shoot
@@ -36,7 +36,7 @@ def choose_renderer(renderer: str | None, path: Path) -> str:
 
 
 def film(
-    record: Record,
+    record: FlightLog,
     path: Path,
     title: str,
     renderer: str | None = None,
@@ -75,20 +75,20 @@ def film(
         return video.write(reported(), path, fps)
 
 
-def _by_page(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+def _by_page(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
     from jaxdrones.visualization.viewer import film, show
 
     shot = shoot(record, fps, size[0] / size[1])
     return film.frames(show(record, scene=shot.scene, title=title), fps, size, shot)
 
 
-def _by_jax(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+def _by_jax(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
     from jaxdrones.visualization import drawn_film  # needs Pillow
 
     return drawn_film.frames(record, title, fps, size)
 
 
-def _by_bullet(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+def _by_bullet(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
     from jaxdrones.visualization import replay  # needs pybullet
 
     return replay.frames(record, title, fps, size)

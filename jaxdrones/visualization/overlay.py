@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization.palette import colors
 
 _MOST_NAMED = 8  # drones that have their names in the picture
@@ -52,7 +52,7 @@ class Lens(NamedTuple):
 class Overlay:
     """Draws over the pictures of one flight."""
 
-    def __init__(self, record: Record, title: str, scale: float) -> None:
+    def __init__(self, record: FlightLog, title: str, scale: float) -> None:
         """Prepare for a record; drones are drawn `scale` times as large as they are."""
         self._record, self._title = record, title
         self._colors = [(*(int(color[i : i + 2], 16) for i in (1, 3, 5)), 255) for color in colors(len(record.labels))]

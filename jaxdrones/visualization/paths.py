@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.sensing import Mesh, Scene
 from jaxdrones.sensing.files import File
 from jaxdrones.visualization import style
@@ -38,7 +38,7 @@ def widest_plane(pos: np.ndarray) -> tuple[int, int]:
     return min(first, second), max(first, second)
 
 
-def draw_plane(axis: Any, record: Record, colors: Sequence[str]) -> None:
+def draw_plane(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
     """Draw the paths in the widest plane, at the same scale along both axes, and obstacles as their outlines."""
     plane = list(widest_plane(record.pos))
     names = ["xyz"[k] for k in plane]
@@ -71,7 +71,7 @@ def set_equal(axis: Any, x: np.ndarray, y: np.ndarray) -> None:
     axis.set_aspect("equal")
 
 
-def draw_space(axis: Any, record: Record, colors: Sequence[str]) -> None:
+def draw_space(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
     """Draw the paths in three dimensions, with their shadows on the floor of the panel."""
     spaces = ranges(record, [0, 1, 2])
     floor = spaces[2][0]
@@ -94,7 +94,7 @@ def draw_space(axis: Any, record: Record, colors: Sequence[str]) -> None:
     axis.set_title("path")
 
 
-def legend_handles(record: Record) -> list[Any]:
+def legend_handles(record: FlightLog) -> list[Any]:
     """Lines for a legend that explain what all drones of a figure have in common."""
     from matplotlib.lines import Line2D
 
@@ -131,7 +131,7 @@ def outlines(scene: Scene, right: np.ndarray, up: np.ndarray) -> list[np.ndarray
     return found
 
 
-def ranges(record: Record, axes: Sequence[int]) -> list[tuple[float, float]]:
+def ranges(record: FlightLog, axes: Sequence[int]) -> list[tuple[float, float]]:
     """Ranges of panels that show paths and what is commanded along some axes, 0 to 2."""
     both = np.concatenate([record.pos, record.target_pos], axis=1)
     return [style.limits(both[..., axis], _SMALLEST) for axis in axes]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.errors import UserError
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import paths, style
 from jaxdrones.visualization.palette import colors
 
@@ -51,7 +51,7 @@ def check_matplotlib() -> None:
         ) from None
 
 
-def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = ()) -> None:
+def save_flight(record: FlightLog, path: Path, title: str, panels: Sequence[str] = ()) -> None:
     """Draw a flight: its paths, and signals over time; one color per drone, what is commanded dashed.
 
     Args:
@@ -82,7 +82,7 @@ def save_flight(record: Record, path: Path, title: str, panels: Sequence[str] = 
         style.save(figure, path)
 
 
-def _draw_signal(axis: Any, record: Record, name: str, tints: Sequence[str]) -> None:
+def _draw_signal(axis: Any, record: FlightLog, name: str, tints: Sequence[str]) -> None:
     """Draw one panel over time, and say what of it lies outside of the axes."""
     array, column, label = (PANELS | ERROR)[name]
     signal = np.asarray(getattr(record, array), float)[..., column]
@@ -109,7 +109,7 @@ def _range(values: np.ndarray) -> str:
     return " to ".join(dict.fromkeys(ends))
 
 
-def _handles(record: Record, tints: Sequence[str]) -> list[Any]:
+def _handles(record: FlightLog, tints: Sequence[str]) -> list[Any]:
     """The lines of the legend: drones, what is dashed, start and end."""
     from matplotlib.lines import Line2D
 

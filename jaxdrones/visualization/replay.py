@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxdrones.engine import bullet
-from jaxdrones.flights.record import ImageSequence, Record
+from jaxdrones.flights.log import FlightLog, ImageSequence
 from jaxdrones.sensing import Camera, camera_2021
 from jaxdrones.state import State
 from jaxdrones.visualization.shots import FIELD_OF_VIEW, rows_of_frames, shoot
@@ -14,7 +14,7 @@ from jaxdrones.visualization.shots import FIELD_OF_VIEW, rows_of_frames, shoot
 FPS = 24  # frames per simulated second; the camera rate of gym-pybullet-drones (2021)
 
 
-def frames(record: Record, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
     """The pictures (height, width, 3) uint8 of a film that Bullet draws, without its title."""
     shot = shoot(record, fps, size[0] / size[1])
     camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW, near=0.02)
@@ -23,7 +23,7 @@ def frames(record: Record, title: str, fps: int, size: tuple[int, int]) -> Gener
             yield step.photo(record.params, _state(record, row), eye, target, camera)
 
 
-def save_cameras(record: Record, folder: Path, fps: int = FPS) -> ImageSequence:
+def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequence:
     """Write the pictures of every drone's camera as `drone 0/00000.png` and so on; returns them."""
     from matplotlib.image import imsave
 
@@ -39,10 +39,10 @@ def save_cameras(record: Record, folder: Path, fps: int = FPS) -> ImageSequence:
     return ImageSequence(np.array(t), np.stack(pictures))
 
 
-def _states(record: Record, fps: int) -> Iterator[State]:
+def _states(record: FlightLog, fps: int) -> Iterator[State]:
     """The recorded state nearest to every frame's time, out of those that can be shown; at least one."""
     return (_state(record, row) for row in rows_of_frames(record, fps))
 
 
-def _state(record: Record, row: int) -> State:
+def _state(record: FlightLog, row: int) -> State:
     return State(record.pos[row], record.quat[row], record.vel[row], record.omega[row], record.rpm[row])

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxdrones.identification import HORIZONS, QUANTITIES, ClosedLoopResult
-from jaxdrones.identification.log import PERIOD
+from jaxdrones.flights import HORIZONS, QUANTITIES, ClosedLoopResult
+from jaxdrones.flights.preparation import PERIOD
 from jaxdrones.visualization import style
 from jaxdrones.visualization.palette import COLORS, colors
 

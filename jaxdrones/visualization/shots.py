@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxdrones.errors import UserError
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.sensing import Mesh, Scene, Urdf, from_urdf, ray
 
 FIELD_OF_VIEW = 45.0  # degrees, vertical
@@ -44,7 +44,7 @@ class Shot(NamedTuple):
     """How many times as large as they are drones are drawn; above 1 where they would be too small to be seen."""
 
 
-def shoot(record: Record, fps: int, aspect: float) -> Shot:
+def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
     """Choose the camera of a film that has a frame for every 1/fps of simulated time, at least one.
 
     The camera stands still if it can show the whole flight with drones that are large enough. Otherwise it follows the
@@ -85,7 +85,7 @@ def shoot(record: Record, fps: int, aspect: float) -> Shot:
     return Shot(rows, eyes[best], middle, scene, scale)
 
 
-def rows_of_frames(record: Record, fps: int) -> np.ndarray:
+def rows_of_frames(record: FlightLog, fps: int) -> np.ndarray:
     """The row (F,) nearest to the time of every frame, at least one, in which the pose of every drone is a number.
 
     Raises:
@@ -98,7 +98,7 @@ def rows_of_frames(record: Record, fps: int) -> np.ndarray:
     return finite[[int(np.abs(record.t[finite] - time).argmin()) for time in times]]
 
 
-def _finite_rows(record: Record) -> np.ndarray:
+def _finite_rows(record: FlightLog) -> np.ndarray:
     """Rows in which the pose of every drone is a number that can be shown."""
     poses = np.concatenate([record.pos, record.quat], axis=-1)
     return np.flatnonzero((np.abs(poses) < _FAR).all(axis=(1, 2)))

@@ -8,6 +8,7 @@ from in_process import InProcess, Wire
 from ros2_team import make_simulation
 
 from jaxdrones.cli import main
+from jaxdrones.flights import read_log
 from jaxdrones.flights.fly import fly
 from jaxdrones.ros2 import Node, Peer, bag, convert, topics
 from jaxdrones.ros2 import messages as msg
@@ -68,11 +69,11 @@ def test_a_bag_opens_in_an_independent_reader(recorded):
 def test_a_flight_comes_back_from_its_bag(tmp_path):
     record = fly("circle", drones=2, duration=0.25)
     bag.write_flight(record, tmp_path / "bag")
-    back = bag.read_flight(tmp_path / "bag")
-    np.testing.assert_allclose(back["t"], record.t, atol=1e-9)
+    back = read_log(tmp_path / "bag")
+    np.testing.assert_allclose(back.t, record.t, atol=1e-9)
     for name in ("pos", "quat", "omega", "rpm"):
-        np.testing.assert_array_equal(back[name], getattr(record, name))
-    np.testing.assert_allclose(back["vel"], record.vel, atol=1e-14)
+        np.testing.assert_array_equal(getattr(back, name), getattr(record, name))
+    np.testing.assert_allclose(back.vel, record.vel, atol=1e-14)
 
 
 @pytest.mark.slow
@@ -111,7 +112,7 @@ def test_a_bag_without_a_flight_is_refused(tmp_path):
     with bag.Recorder(tmp_path / "bag") as recorder:
         recorder.write(topics.CLOCK, msg.Clock(convert.stamp(5)), 5)
     with pytest.raises(ValueError, match="holds no flight"):
-        bag.read_flight(tmp_path / "bag")
+        read_log(tmp_path / "bag")
 
 
 @pytest.fixture

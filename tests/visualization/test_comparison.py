@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxdrones.cli import main
-from jaxdrones.flights.record import Record
+from jaxdrones.flights import read_log
 from jaxdrones.visualization import comparison, style
 from jaxdrones.visualization.palette import colors
 
@@ -91,7 +91,7 @@ def test_the_command_line_compares_controllers(tmp_path, capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["controllers"] == ["pid", "geometric"]
     assert [row["controller"] for row in report["results"]] == ["pid", "geometric"]
-    logs = [Record.load(tmp_path / name / "log.npz") for name in report["controllers"]]
+    logs = [read_log(tmp_path / name / "log.npz") for name in report["controllers"]]
     assert all(log.conditions.as_dict()["feedforward"] for log in logs)
     for row, log in zip(report["results"], logs, strict=True):
         peak = log.error[log.t >= 0.1].max()  # the flight is shorter than it takes to settle: its second half counts

@@ -16,8 +16,9 @@ from helpers import flying
 
 import jaxdrones as jd
 from jaxdrones.cli import main
+from jaxdrones.flights import read_log, save_npz
 from jaxdrones.flights.fly import fly
-from jaxdrones.flights.record import ImageSequence, Record
+from jaxdrones.flights.log import ImageSequence
 from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
 from jaxdrones.visualization.viewer import show
 from jaxdrones.visualization.viewer.payload import decode
@@ -120,10 +121,10 @@ def test_obstacles_that_are_not_active_are_not_in_the_page(record):
 
 def test_a_log_shows_what_its_record_shows(record, tmp_path):
     record = dataclasses.replace(record, scene=SCENE)
-    record.save_npz(tmp_path / "log.npz")
+    save_npz(record, tmp_path / "log.npz")
     assert show(tmp_path, title="").payload == show(str(tmp_path / "log.npz"), title="").payload
     assert header(show(tmp_path, title="")) | {"worlds": []} == header(show(record, title="")) | {"worlds": []}
-    loaded = Record.load(tmp_path / "log.npz")
+    loaded = read_log(tmp_path / "log.npz")
     for name in (*ARRAYS, "t", "rpy", "target_pos", "labels"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(record, name))
     for ours, theirs in zip(jax.tree.leaves(loaded.params), jax.tree.leaves(record.params), strict=True):
@@ -224,8 +225,8 @@ def test_images_of_the_cameras_are_in_the_log_and_in_the_page(team, record, tmp_
     np.testing.assert_array_equal(grey["frames"][..., 0], 0)  # what is farthest is black
     np.testing.assert_allclose(grey["t"], 0.01 * np.arange(1, 21), rtol=1e-6)
     images = {"rgb": ImageSequence(np.arange(3.0), rgb[:3, :2])}
-    dataclasses.replace(record, images=images).save_npz(tmp_path / "log.npz")
-    loaded = Record.load(tmp_path / "log.npz").images["rgb"]
+    save_npz(dataclasses.replace(record, images=images), tmp_path / "log.npz")
+    loaded = read_log(tmp_path / "log.npz").images["rgb"]
     np.testing.assert_array_equal(loaded.frames, images["rgb"].frames)
     np.testing.assert_array_equal(loaded.t, images["rgb"].t)
     with pytest.raises(ValueError, match=r"images 'depth' have shape .* of 20 times and 3 drones"):
@@ -242,7 +243,7 @@ def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(reco
     """As `runs/compare/*` holds a figure beside the logs; but not one that is not there, a damaged log, or all."""
     for name in "one", "other":
         (tmp_path / name).mkdir()
-        record.save_npz(tmp_path / name / "log.npz")
+        save_npz(record, tmp_path / name / "log.npz")
     (tmp_path / "compare.png").write_bytes(b"\x89PNG")
     (tmp_path / "empty").mkdir()
     np.savez(tmp_path / "weights.npz", weights=np.zeros(3))

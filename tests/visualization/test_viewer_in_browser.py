@@ -12,7 +12,7 @@ from PIL import Image
 
 import jaxdrones as jd
 from jaxdrones.flights.fly import fly
-from jaxdrones.flights.record import ImageSequence
+from jaxdrones.flights.log import ImageSequence
 from jaxdrones.sensing import obstacles_2021
 from jaxdrones.visualization import browser
 from jaxdrones.visualization.overlay import Lens

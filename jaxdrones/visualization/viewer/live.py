@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.errors import UserError
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.limits import check_at_most
 from jaxdrones.visualization.viewer.payload import encode, encode_rows
 from jaxdrones.visualization.viewer.server import Server
@@ -58,7 +58,7 @@ class Live:
         self.url = self._server.url
         self._title, self._wait, self._say = title, wait, say
         self._changed = threading.Condition()
-        self._parts: list[Record] = []  # of the flight that is shown
+        self._parts: list[FlightLog] = []  # of the flight that is shown
         self._flight = 0  # its number; 0 before the first
         self._header: dict[str, Any] = {}
         self._viewers = 0
@@ -126,7 +126,7 @@ class Live:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _begin(self, record: Record, live: dict[str, Any]) -> None:
+    def _begin(self, record: FlightLog, live: dict[str, Any]) -> None:
         check_size(np.broadcast_to(0.0, (live["rows"], *record.pos.shape[1:])))
         title = str(record.conditions) if self._title is None else self._title
         with self._changed:
@@ -195,7 +195,7 @@ class Live:
                 self._changed.notify_all()
 
 
-def _joined(parts: Sequence[Record]) -> Record:
+def _joined(parts: Sequence[FlightLog]) -> FlightLog:
     """Successive parts of a flight as one."""
     rows: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ROWS}
     return dataclasses.replace(parts[0], **rows | {"images": {}})

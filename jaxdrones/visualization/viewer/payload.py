@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.flights.record import Record
+from jaxdrones.flights.log import FlightLog
 from jaxdrones.params import Params
 from jaxdrones.sensing.serialization import scene_to_dict
 from jaxdrones.visualization.palette import COLORS, as_rgb
@@ -64,7 +64,7 @@ class _Arrays:
         return entry
 
 
-def encode(records: Sequence[Record], names: Sequence[str], title: str, **looks: Any) -> str:
+def encode(records: Sequence[FlightLog], names: Sequence[str], title: str, **looks: Any) -> str:
     """The payload of a page.
 
     Args:
@@ -89,13 +89,13 @@ def encode(records: Sequence[Record], names: Sequence[str], title: str, **looks:
     return _packed({"title": title, "worlds": worlds, "vehicles": vehicles, "scenes": scenes} | looks, arrays)
 
 
-def encode_rows(record: Record) -> str:
+def encode_rows(record: FlightLog) -> str:
     """Further rows of the only world of a page, in the same form: a header that is `{"rows": arrays by name}`."""
     arrays = _Arrays()
     return _packed({"rows": _rows(arrays, record)}, arrays)
 
 
-def _rows(arrays: _Arrays, record: Record) -> dict[str, Any]:
+def _rows(arrays: _Arrays, record: FlightLog) -> dict[str, Any]:
     """What a page plays of a flight, by name; targets that are nowhere known are `None`."""
     rows: dict[str, Any] = {"t": arrays.add(record.t)}
     for name in ("pos", "quat", "vel", "omega", "rpm"):

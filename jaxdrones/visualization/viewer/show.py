@@ -7,7 +7,6 @@ import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from jaxdrones.checks import check_choice, check_params, check_positive, shown
 from jaxdrones.errors import UserError
-from jaxdrones.flights.record import ImageSequence, LoggedConditions, Record
+from jaxdrones.flights.files import read_log
+from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.scene import check_scene
@@ -49,10 +49,10 @@ def show(
 
     Args:
         flight: what to show. The trajectory that `rollout` returns, a `State` of arrays (K, n, ...), or (W, K, n, ...)
-            for W worlds; a `Record`; the episode of a policy that `fly_episode` returns; the path of a log.npz or of
+            for W worlds; a `FlightLog`; the episode of a policy that `fly_episode` returns; the path of a log.npz or of
             the folder it is in; or several of these, a list or a dictionary by name, each of them a world.
-        params: of the team, with a leading drone axis. Records, logs and episodes have their own.
-        dt: time between the rows of a trajectory, s. Records, logs and episodes have their own.
+        params: of the team, with a leading drone axis. Logs and episodes have their own.
+        dt: time between the rows of a trajectory, s. Logs and episodes have their own.
         scene: obstacles and ground; the flight's own, or a bare ground, when left out.
         targets: positions (n, 3), (K, n, 3) or (W, K, n, 3), m, world, of a trajectory; none when left out.
         labels: names of the drones of a trajectory; `drone 0`, ... when left out.
@@ -80,14 +80,14 @@ def show(
     return Page(title, encode(records, list(worlds), title, layout=LAYOUTS[others], **looks(records)), height)
 
 
-def looks(records: Sequence[Record]) -> dict[str, Any]:
+def looks(records: Sequence[FlightLog]) -> dict[str, Any]:
     """Colors of drones, and the signals that are plotted at first, as the page reads them."""
     has_targets = any(np.isfinite(record.target_pos).any() for record in records)
     signals = ["distance from target" if has_targets else "position z", "rotor speeds"]  # names in plots.js
     return {"palette": colors(DISTINCT), "signals": signals}
 
 
-def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, Record]:
+def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, FlightLog]:
     """The worlds of one or several flights, by name."""
     if isinstance(flight, Mapping):
         named = {str(name): records_of(part, of_trajectory) for name, part in flight.items()}
@@ -106,7 +106,7 @@ def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, Record]:
 
 
 @functools.singledispatch
-def records_of(flight: Any, of_trajectory: dict[str, Any]) -> list[Record]:
+def records_of(flight: Any, of_trajectory: dict[str, Any]) -> list[FlightLog]:
     """The worlds of a flight. Other modules register kinds of flights here, `@records_of.register`.
 
     Args:
@@ -127,35 +127,20 @@ def refuse(of_trajectory: dict[str, Any]) -> None:
 
 
 @records_of.register
-def _(flight: Record, of_trajectory: dict[str, Any]) -> list[Record]:
+def _(flight: FlightLog, of_trajectory: dict[str, Any]) -> list[FlightLog]:
     refuse(of_trajectory)
     return [flight]
 
 
 @records_of.register(str)
 @records_of.register(os.PathLike)
-def _(flight: str | os.PathLike, of_trajectory: dict[str, Any]) -> list[Record]:
+def _(flight: str | os.PathLike, of_trajectory: dict[str, Any]) -> list[FlightLog]:
     refuse(of_trajectory)
-    return [Record.load(find_log(Path(flight)))]
-
-
-def find_log(path: Path) -> Path:
-    """The log of a path: itself, or `log.npz` or `flight/log.npz` in a folder.
-
-    Raises:
-        ValueError: there is no log.
-    """
-    if path.is_file():
-        return path
-    found = [log for log in (path / "log.npz", path / "flight" / "log.npz") if log.is_file()]
-    if not found:
-        what = "has no log of a flight" if path.is_dir() else "is not there"
-        raise UserError(f"{path} {what}; fly first, `jaxdrones fly circle --output {path}`, or give another path")
-    return found[0]
+    return [read_log(flight)]
 
 
 @records_of.register
-def _(flight: State, of_trajectory: dict[str, Any]) -> list[Record]:
+def _(flight: State, of_trajectory: dict[str, Any]) -> list[FlightLog]:
     params, dt = of_trajectory["params"], of_trajectory["dt"]
     for name, value, what in ("params", params, "the team's"), ("dt", dt, "seconds between two rows"):
         if value is None:
@@ -188,7 +173,7 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[Record]:
     ]
 
 
-def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Record:
+def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> FlightLog:
     """One world of arrays (K, n, ...)."""
     steps, n = flight.pos.shape[:2]
     if np.shape(params.mass) != (n,):
@@ -200,20 +185,18 @@ def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Rec
     labels = tuple(f"drone {i}" for i in range(n)) if labels is None else tuple(map(str, labels))
     if len(labels) != n:
         raise UserError(f"labels are {len(labels)} names and there are {n} drones; give as many")
-    nowhere = np.full((steps, n, 3), np.nan)
-    targets = nowhere if of_trajectory["targets"] is None else of_trajectory["targets"]
+    targets = np.asarray(np.nan) if of_trajectory["targets"] is None else of_trajectory["targets"]
     try:
-        targets = np.broadcast_to(targets, nowhere.shape)
+        targets = np.broadcast_to(targets, (steps, n, 3))
     except ValueError:
         raise UserError(
             f"targets have shape {targets.shape}; give (n, 3) or (K, n, 3) of {steps} times and {n} drones"
         ) from None
     dt = of_trajectory["dt"]
-    return Record(
+    return FlightLog(
         t=dt * np.arange(1, steps + 1),
         **{name: getattr(flight, name) for name in ("pos", "quat", "vel", "omega", "rpm")},
         target_pos=targets,
-        target_vel=nowhere,
         labels=labels,
         conditions=LoggedConditions({}, f"{n} drone{'s' * (n > 1)}, {steps * dt:g} s"),
         params=params,

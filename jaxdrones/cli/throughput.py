@@ -1,8 +1,10 @@
-"""The flights whose steps are counted: the plant, the plant under a controller, and an environment."""
+"""Programs whose steps are counted, and a timer: the plant, the plant under a controller, and an environment."""
 
 from __future__ import annotations
 
 import functools
+import statistics
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +19,8 @@ from jaxdrones.envs import AutoReset, Env
 from jaxdrones.params import Params, repeat
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
+
+_SHORTEST = 0.02  # s, of a measurement
 
 
 def crazyflies(worlds: int, drones: int) -> tuple[Params, State, Float[Array, "w n 4"]]:
@@ -76,3 +80,25 @@ def episodes(env: Env, worlds: int, length: int) -> tuple[Callable[[Any, Array],
         return jax.lax.scan(advance, first, jax.random.split(key, length))[0]
 
     return fly, begun
+
+
+def first_call(function: Callable, *arguments: Any) -> float:
+    """Seconds of the first call, in which a function compiles itself."""
+    start = time.perf_counter()
+    jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - start
+
+
+def seconds(program: Callable, *arguments: Any, repeats: int) -> dict[str, float]:
+    """Median and best seconds of a call, after calls that warm up; short calls are timed many at a time."""
+
+    def of_calls(calls: int) -> float:
+        start = time.perf_counter()
+        for _ in range(calls):
+            jax.block_until_ready(program(*arguments))
+        return (time.perf_counter() - start) / calls
+
+    of_calls(1)
+    calls = 1 + int(_SHORTEST / of_calls(1))
+    times = [of_calls(calls) for _ in range(repeats)]
+    return {"median": statistics.median(times), "best": min(times)}

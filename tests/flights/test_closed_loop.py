@@ -7,7 +7,7 @@ import pytest
 import jaxdrones
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import FULL_PWM, crazyflie_motors
-from jaxdrones.identification import FlightLog, Vehicle, simulate_closed_loop
+from jaxdrones.flights import FlightLog, Vehicle, simulate_closed_loop
 
 ROWS, REST, LOADED = 700, 4.1, 3.3
 HEIGHT = 0.5  # m, of the set-point
@@ -16,20 +16,19 @@ TAKE_OFF = 100  # row
 
 def log_of(height, begin):
     """A log whose motors start in the row `begin`, with a drone at this height and a set-point at `HEIGHT`."""
-    zero, up = np.zeros((ROWS, 3)), np.array([0.0, 0, 1])
+    zero, up = np.zeros((ROWS, 1, 3)), np.array([0.0, 0, 1])
     runs = np.arange(ROWS) >= begin
     pos = np.where((np.arange(ROWS) < 2 * begin)[:, None], height * up, HEIGHT * up)
     return FlightLog(
-        "flight",
         np.arange(ROWS) * 0.01,
-        pos,
-        np.tile([0, 0, 0, 1.0], (ROWS, 1)),
+        pos[:, None],
+        np.tile([0, 0, 0, 1.0], (ROWS, 1, 1)),
         zero,
         zero,
-        pwm=np.where(runs, 0.6 * FULL_PWM, 0)[:, None] * np.ones(4),
-        vbat=np.where(runs, LOADED, REST),
-        ref_pos=np.where(runs[:, None], HEIGHT * up, 0),
-        ref_yaw=np.zeros(ROWS),
+        pwm=np.where(runs, 0.6 * FULL_PWM, 0)[:, None, None] * np.ones(4),
+        vbat=np.where(runs, LOADED, REST)[:, None],
+        target_pos=np.where(runs[:, None], HEIGHT * up, 0)[:, None],
+        target_yaw=np.zeros((ROWS, 1)),
     )
 
 

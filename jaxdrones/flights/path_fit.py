@@ -13,17 +13,19 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import FULL_PWM, Motors
-from jaxdrones.identification.closed_loop import (
+from jaxdrones.flights.closed_loop import (
     ClosedLoopInputs,
+    closed_loop_columns,
     closed_loop_inputs,
     motor_start_row,
     rows_after_climb,
     simulate,
 )
-from jaxdrones.identification.least_squares import standard_errors
-from jaxdrones.identification.log import PERIOD, FlightLog
-from jaxdrones.identification.parameters import with_parameters
-from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, standard_errors
+from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.parameters import with_parameters
+from jaxdrones.flights.preparation import PERIOD
+from jaxdrones.flights.vehicle import Vehicle
 
 BALANCE_PARAMETERS = ("mass", "unfelt_sag")
 """Parameters that are estimated from the balance of vertical forces."""
@@ -91,9 +93,9 @@ def _balance_data(log: FlightLog) -> tuple[np.ndarray, ...]:
     air = rows_after_climb(log)
     starts = np.arange(air.start, air.stop - _BALANCE_ROWS, _BALANCE_ROWS)
     rows = starts[:, None] + np.arange(_BALANCE_ROWS)
-    up = np.asarray(jax.vmap(rotation.z_axis)(jnp.asarray(log.quat, float)))[:, 2]
-    acc = (log.vel[starts + _BALANCE_ROWS, 2] - log.vel[starts, 2]) / (_BALANCE_ROWS * PERIOD)
-    _, _, pwm, vbat = log.closed_loop_columns
+    up = np.asarray(jax.vmap(rotation.z_axis)(jnp.asarray(log.quat[:, 0], float)))[:, 2]
+    acc = (log.vel[starts + _BALANCE_ROWS, 0, 2] - log.vel[starts, 0, 2]) / (_BALANCE_ROWS * PERIOD)
+    _, _, pwm, vbat = closed_loop_columns(log)
     return pwm[rows] / FULL_PWM, vbat[rows], np.full((len(starts), 1), log.sag), up[rows], acc
 
 
@@ -116,7 +118,7 @@ def _path_data(logs: Sequence[FlightLog]) -> tuple[ClosedLoopInputs, Array, Arra
     recorded, mask = np.zeros((len(logs), rows, 2)), np.zeros((len(logs), rows))
     for i, log in enumerate(logs):
         air, begin = rows_after_climb(log), motor_start_row(log)
-        recorded[i, air.start - begin : air.stop - begin] = log.pos[air, :2]
+        recorded[i, air.start - begin : air.stop - begin] = log.pos[air, 0, :2]
         mask[i, air.start - begin : air.stop - begin] = 1
 
     def padded(x: Array) -> Array:
@@ -161,20 +163,12 @@ def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float
         matrix = weighted @ jacobian.T + _PRIOR_PRECISION * jnp.eye(count)
         return matrix, weighted @ r + _PRIOR_PRECISION * x, loss
 
-    x, damping = np.zeros(count), 1e-3
-    matrix, gradient, loss = (np.asarray(part, float) for part in normal(jnp.asarray(x, float)))
-    for _ in range(_MAX_STEPS):
-        candidate = x - np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
-        at_candidate = [np.asarray(part, float) for part in normal(jnp.asarray(candidate, float))]
-        decrease = loss - at_candidate[2]
-        if decrease > 0:
-            x, damping = candidate, damping / 10
-            matrix, gradient, loss = at_candidate
-        else:
-            damping *= 10
-        if 0 < decrease < _MIN_DECREASE * loss:
-            break
-    return jnp.asarray(x, float), standard_errors(matrix)
+    def evaluated(x: np.ndarray) -> Normal:
+        matrix, gradient, loss = normal(jnp.asarray(x, float))
+        return Normal(np.asarray(matrix, float), np.asarray(gradient, float), float(loss))
+
+    x, last = levenberg_marquardt(evaluated, np.zeros(count), _MAX_STEPS, _MIN_DECREASE)
+    return jnp.asarray(x, float), standard_errors(last.matrix)
 
 
 def _rms(x: Array) -> float:

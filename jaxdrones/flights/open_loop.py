@@ -14,8 +14,9 @@ from jaxdrones.dynamics import Motors, drag, flapping_moment, midpoint, rate_dam
 from jaxdrones.dynamics.propulsion import FULL_PWM
 from jaxdrones.engine.explicit import Derivative, make_derivative
 from jaxdrones.errors import UserError
-from jaxdrones.identification.log import PERIOD, FlightLog
-from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.preparation import PERIOD
+from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import atan2, dot, safe_sqrt
@@ -53,12 +54,12 @@ def cut_windows(log: FlightLog, starts: np.ndarray) -> Windows:
         log: log of the flight.
         starts: (n,) rows, from `window_starts`.
     """
-    command = log.rpm if log.rpm is not None else _duty_and_voltages(log)
+    command = log.rpm[:, 0] if log.has("rpm") else _duty_and_voltages(log)
     padded = np.pad(command, ((_WARM_UP + _MAX_DELAY, _MAX_DELAY + 1), (0, 0)), mode="edge")
     rows = starts[:, None] + np.arange(_WARM_UP + _LENGTH + 2 * _MAX_DELAY + 1)
 
     def state(rows: np.ndarray) -> State:
-        pos, quat, vel, omega = (jnp.asarray(x[rows], float) for x in (log.pos, log.quat, log.vel, log.omega))
+        pos, quat, vel, omega = (jnp.asarray(x[rows, 0], float) for x in (log.pos, log.quat, log.vel, log.omega))
         return State(pos, quat, vel, omega, jnp.zeros((*rows.shape, 4)))
 
     return Windows(state(starts), jnp.asarray(padded[rows], float), state(starts[:, None] + np.array(HORIZONS)))
@@ -132,7 +133,7 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.nda
         (horizons, 4) mean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular
         velocity (rad/s).
     """
-    return np.asarray(_errors(vehicle, *_all_windows(log), None if log.has_rotor_speeds else motors))
+    return np.asarray(_errors(vehicle, *_all_windows(log), None if log.has("rpm") else motors))
 
 
 def hold_errors(log: FlightLog) -> np.ndarray:
@@ -227,5 +228,4 @@ def lagged_rpm(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"]
 
 def _duty_and_voltages(log: FlightLog) -> np.ndarray:
     """(T, 6) duty cycles, 0 to 1, voltage of the battery and its sag at take-off, V."""
-    assert log.pwm is not None and log.vbat is not None  # a log without rotor speeds has both
-    return np.column_stack([log.pwm / FULL_PWM, log.vbat, np.full(len(log.vbat), log.sag)])
+    return np.column_stack([log.pwm[:, 0] / FULL_PWM, log.vbat, np.full(len(log.vbat), log.sag)])

@@ -1,28 +1,20 @@
-"""The folder of an identified vehicle: reads and writes `vehicle.urdf` and `report.json`."""
+"""Writing the report of a fit: `vehicle.urdf` and `report.json`."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.errors import UserError
-from jaxdrones.identification.fit import Report
-from jaxdrones.identification.instruments import Instruments
-from jaxdrones.identification.open_loop import HORIZONS, QUANTITIES
-from jaxdrones.identification.vehicle import Vehicle
-from jaxdrones.urdf import load_params
+from jaxdrones.flights.fit import Report
+from jaxdrones.flights.open_loop import HORIZONS, QUANTITIES
+from jaxdrones.flights.vehicle import REPORT, URDF
 from jaxdrones.urdf_writer import to_urdf
 from jaxdrones.writing import write
-
-URDF = "vehicle.urdf"
-REPORT = "report.json"
-_INSTRUMENTS = tuple(field.name for field in dataclasses.fields(Instruments))
 
 
 def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
@@ -55,7 +47,7 @@ def report_as_dict(report: Report) -> dict[str, Any]:
     instruments = report.vehicle.instruments
     return {
         "parameters": {name: dataclasses.asdict(estimate) for name, estimate in report.parameters.items()},
-        "instruments": {name: np.asarray(getattr(instruments, name), float).tolist() for name in _INSTRUMENTS},
+        "instruments": {name: np.asarray(getattr(instruments, name), float).tolist() for name in vars(instruments)},
         "per_flight": report.per_flight,
         "losses": list(report.losses),
         "errors": {flight: errors_as_dict(errors) for flight, errors in report.errors.items()},
@@ -67,21 +59,3 @@ def errors_as_dict(errors: np.ndarray) -> dict[str, dict[str, float]]:
     return {
         str(h): dict(zip(QUANTITIES, map(float, row), strict=True)) for h, row in zip(HORIZONS, errors, strict=True)
     }
-
-
-def load_vehicle(vehicle: str | os.PathLike) -> Vehicle:
-    """Load a bundled vehicle or a URDF, with ideal instruments, or a folder of `jaxdrones fit` with fitted ones.
-
-    Raises:
-        ValueError: there is no such vehicle, or its files are invalid.
-    """
-    folder = Path(vehicle)
-    if not folder.is_dir():
-        return Vehicle.of(load_params(vehicle))
-    report = folder / REPORT
-    try:
-        entries = json.loads(report.read_text())["instruments"]
-        instruments = Instruments(**{name: jnp.asarray(entries[name], float) for name in _INSTRUMENTS})
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{report}: cannot be read ({error!r}); give the --output folder of `jaxdrones fit`") from None
-    return Vehicle(load_params(folder / URDF), instruments)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from jaxdrones.identification import quaternions
-from jaxdrones.identification.motor_effects import motor_effects
+from jaxdrones.flights.motor_order import check_motors
 
 _PERIOD = 0.01  # s
 _GRAVITY = 9.81  # m/s^2
@@ -31,48 +31,50 @@ _TURN_RATIO = (0.88, 1.14)  # of turns of the attitudes and by the rates
 _ACC_RATIO = (0.5, 1.5)  # of accelerations and those of the tilted thrust
 _MAX_CLOCK_MISFIT = 0.1  # a ratio is meaningful up to this misfit
 _NED, _SWAPPED = np.array([1, -1, -1]), np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
-_MIN_LIKENESS, _MIN_LEAD = 0.75, 0.15  # of an order of the motors; over the documented order
-_PATTERNS = {
-    "X": np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]]) / 2,  # roll and pitch by each motor
-    "+": np.array([[0, -1, 0, 1], [-1, 0, 1, 0]]) / np.sqrt(2),
-}
 _MAX_RISE = 0.1  # V, by which a battery may rise when the motors start
-_NAMES = ("front right", "back right", "back left", "front left")
-
-Change = tuple[str, Callable[[np.ndarray], np.ndarray]]
 
 
-class Columns(NamedTuple):
-    """The motion that a log has, see `FlightLog`."""
+Change = tuple[str, Callable[[Any], Any]]
+
+
+class Motion(NamedTuple):
+    """The motion of one drone in T rows, see `FlightLog`."""
 
     pos: np.ndarray
-    quat: np.ndarray
+    """(T, 3)"""
+    attitude: Rotation
     vel: np.ndarray
+    """(T, 3)"""
     omega: np.ndarray
+    """(T, 3)"""
 
 
 def _flipped(x: np.ndarray) -> np.ndarray:
     return x * _NED
 
 
-def _turned(quat: np.ndarray) -> np.ndarray:
+_HALF_TURN = Rotation.from_quat([1.0, 0, 0, 0])  # about x: between z-up and z-down axes
+
+
+def _turned(attitude: Rotation) -> Rotation:
     """Attitudes of z-up axes from those of z-down axes in world and body."""
-    return quat * np.array([1, -1, -1, 1])
+    return _HALF_TURN * attitude * _HALF_TURN
 
 
-_HALF_TURN = np.array([1.0, 0, 0, 0])  # about x: between z-up and z-down axes
-_W_FIRST: Change = ("the quaternions look like w, x, y, z", lambda q: q[:, [1, 2, 3, 0]])
-_CONJUGATED: Change = ("the quaternions look conjugated (world to body)", quaternions.conjugate)
+def _w_last(attitude: Rotation) -> Rotation:
+    return Rotation.from_quat(attitude.as_quat()[:, [1, 2, 3, 0]])
+
+
 _READINGS: dict[str, tuple[Change, ...]] = {
     "pos": (("pos looks like x, -y, -z (NED axes)", _flipped), ("pos looks like NED axes", lambda x: x @ _SWAPPED)),
     "vel": (("vel looks like x, -y, -z (NED axes)", _flipped), ("vel looks like NED axes", lambda x: x @ _SWAPPED)),
-    "quat": (
-        _W_FIRST,
-        _CONJUGATED,
-        ("the quaternions look like w, x, y, z and conjugated", lambda q: quaternions.conjugate(_W_FIRST[1](q))),
+    "attitude": (
+        ("the quaternions look like w, x, y, z", _w_last),
+        ("the quaternions look conjugated (world to body)", Rotation.inv),
+        ("the quaternions look like w, x, y, z and conjugated", lambda r: _w_last(r).inv()),
         ("the attitude looks like that of NED axes (z down in world and body)", _turned),
-        ("the attitude looks like that of a z-down body", lambda q: quaternions.multiply(q, _HALF_TURN)),
-        ("the attitude looks like that of a z-down world", lambda q: quaternions.multiply(_HALF_TURN, q)),
+        ("the attitude looks like that of a z-down body", lambda r: r * _HALF_TURN),
+        ("the attitude looks like that of a z-down world", lambda r: _HALF_TURN * r),
     ),
     "omega": (
         ("omega looks like p, -q, -r (z-down body axes)", _flipped),
@@ -82,16 +84,16 @@ _READINGS: dict[str, tuple[Change, ...]] = {
 _ALL_NED = "all columns look like NED axes (z down in world and body)"
 
 
-def contradictions(columns: Columns, thrusts: np.ndarray, sag: float) -> list[str]:
+def contradictions(motion: Motion, thrusts: np.ndarray, sag: float) -> list[str]:
     """Contradictions within a flight, a sentence each with the likely cause; none for a sound one.
 
     Args:
-        columns: pos, quat, vel and omega of T rows in which the motors run.
+        motion: of the T rows in which the motors run.
         thrusts: (T, 4) relative thrusts of the motors.
         sag: of the battery at take-off, V.
     """
-    found, read = _check_axes(columns)
-    found = (found or _check_scales(columns)) + _check_motors(thrusts, read)
+    found, read = _check_axes(motion)
+    found = (found or _check_scales(motion)) + check_motors(thrusts, read.attitude, read.vel, read.omega)
     if sag < -_MAX_RISE:
         found.append(f"vbat rises by {-sag:.2f} V when the motors start: the load of the battery has the wrong sign")
     return found
@@ -148,23 +150,22 @@ def shift_test(pos: np.ndarray, vel: np.ndarray) -> _Test:
     return _Test(pos[ends] - pos[starts], path[ends] - path[starts], _MIN_SHIFT, _MAX_SHIFT_MISFIT, _MAX_SHIFT_ERROR)
 
 
-def turn_test(quat: np.ndarray, omega: np.ndarray) -> _Test:
+def turn_test(attitude: Rotation, omega: np.ndarray) -> _Test:
     """Rotation vectors of the attitude in the body frame, rad, and those of the integrated rates."""
-    starts = _starts(len(quat), _TURN_ROWS)
-    turned = np.tile([0, 0, 0, 1.0], (len(starts), 1))
+    starts = _starts(len(omega), _TURN_ROWS)
+    turned = Rotation.identity(len(starts))
     for row in range(_TURN_ROWS):
-        mean = (omega[starts + row] + omega[starts + row + 1]) / 2
-        turned = quaternions.multiply(turned, quaternions.exp(mean * _PERIOD))
-    relative = quaternions.multiply(quaternions.conjugate(quat[starts]), quat[starts + _TURN_ROWS])
-    return _Test(quaternions.log(relative), quaternions.log(turned), _MIN_TURN, _MAX_TURN_MISFIT, _MAX_TURN_ERROR)
+        turned *= Rotation.from_rotvec((omega[starts + row] + omega[starts + row + 1]) / 2 * _PERIOD)
+    relative = attitude[starts].inv() * attitude[starts + _TURN_ROWS]
+    return _Test(relative.as_rotvec(), turned.as_rotvec(), _MIN_TURN, _MAX_TURN_MISFIT, _MAX_TURN_ERROR)
 
 
-def force_test(vel: np.ndarray, quat: np.ndarray) -> _Test:
+def force_test(vel: np.ndarray, attitude: Rotation) -> _Test:
     """Horizontal accelerations, m/s^2, and those of a thrust along body z that carries the weight, without means."""
     starts = _starts(len(vel), _FORCE_ROWS)
     ends = starts + _FORCE_ROWS
     acc = (vel[ends] - vel[starts]) / (_FORCE_ROWS * _PERIOD)
-    up = quaternions.rotate(quat, np.array([0, 0, 1.0]))
+    up = attitude.apply([0, 0, 1.0])
     summed = np.concatenate([np.zeros((1, 3)), np.cumsum(up, axis=0)])
     mean_up = (summed[ends + 1] - summed[starts]) / (_FORCE_ROWS + 1)
     implied = mean_up[:, :2] * (acc[:, 2:] + _GRAVITY)
@@ -172,41 +173,44 @@ def force_test(vel: np.ndarray, quat: np.ndarray) -> _Test:
     return _Test(has, implied, _MIN_ACC, _MAX_FORCE_MISFIT, _MAX_FORCE_ERROR)
 
 
-def _failures(columns: Columns) -> list[str]:
-    pos, quat, vel, omega = columns
+def _failures(motion: Motion) -> list[str]:
+    pos, attitude, vel, omega = motion
     found = []
     if not (test := shift_test(pos, vel)).passes:
         found.append(f"vel is not the derivative of pos (misfit {test.misfit:.2f} of 1)")
-    if not (test := turn_test(quat, omega)).passes:
+    if not (test := turn_test(attitude, omega)).passes:
         found.append(f"omega is not the rate of quat (misfit {test.misfit:.2f} of 1)")
-    force = force_test(vel, quat)
+    force = force_test(vel, attitude)
     axes = [force._replace(has=force.has[:, i : i + 1], implied=force.implied[:, i : i + 1]) for i in range(2)]
     if not all(axis.passes for axis in axes):
         misfit = max(axis.misfit for axis in axes if not axis.passes)
         found.append(f"the acceleration does not follow the tilt of the thrust (misfit {misfit:.2f} of 1)")
-    up = np.mean(quaternions.rotate(quat, np.array([0, 0, 1.0]))[:, 2]) if len(quat) else 1.0
+    up = np.mean(attitude.apply([0, 0, 1.0])[:, 2]) if len(pos) else 1.0
     if up < _MIN_UP:
         found.append(f"body z points down or sideways (mean cosine of the tilt {up:.2f})")
     return found
 
 
-def _check_axes(logged: Columns) -> tuple[list[str], Columns]:
+def _check_axes(logged: Motion) -> tuple[list[str], Motion]:
     """What does not fit, with the simplest reading of the columns that explains it, and the columns so read."""
     failures = _failures(logged)
     if not failures:
         return [], logged
-    for causes, columns in _readings(logged):
-        if not _failures(columns):
-            return [f"{'; '.join(failures)}: {' and '.join(causes)}"], columns
+    for causes, motion in _readings(logged):
+        if not _failures(motion):
+            return [f"{'; '.join(failures)}: {' and '.join(causes)}"], motion
     hint = ": vel has another unit, or belongs to other positions, axes or times" if "vel" in failures[0] else ""
     return ["; ".join(failures) + hint], logged
 
 
-def _readings(logged: Columns):
+def _readings(logged: Motion):
     """Other readings of the columns, those with the fewest changes first: their causes, and the columns so read."""
     every = [(name, cause, change) for name, changes in _READINGS.items() for cause, change in changes]
-    yield ["vel looks like body axes"], logged._replace(vel=quaternions.rotate(logged.quat, logged.vel))
-    yield [_ALL_NED], Columns(_flipped(logged.pos), _turned(logged.quat), _flipped(logged.vel), _flipped(logged.omega))
+    yield ["vel looks like body axes"], logged._replace(vel=logged.attitude.apply(logged.vel))
+    yield (
+        [_ALL_NED],
+        Motion(_flipped(logged.pos), _turned(logged.attitude), _flipped(logged.vel), _flipped(logged.omega)),
+    )
     for count in (1, 2):
         for changes in itertools.combinations(every, count):
             if len({name for name, _, _ in changes}) == count:
@@ -225,15 +229,15 @@ def _ratio(test: _Test, axes: slice) -> float | None:
     return float(ratio) if unlike < 2 * _MAX_CLOCK_MISFIT else None
 
 
-def _check_scales(columns: Columns) -> list[str]:
+def _check_scales(motion: Motion) -> list[str]:
     """Whether distances and turns are as large as the velocities and rates imply; a wrong clock scales both."""
-    pos, quat, vel, omega = columns
+    pos, attitude, vel, omega = motion
     shifts = shift_test(pos, vel)
     ratios = {
         "horizontal distances over integrals of vel": (_ratio(shifts, slice(0, 2)), _HORIZONTAL_RATIO),
         "vertical distances over integrals of vel": (_ratio(shifts, slice(2, 3)), _VERTICAL_RATIO),
-        "turns of quat over integrals of omega": (_ratio(turn_test(quat, omega), slice(0, 3)), _TURN_RATIO),
-        "accelerations over those of the tilted thrust": (_ratio(force_test(vel, quat), slice(0, 2)), _ACC_RATIO),
+        "turns of quat over integrals of omega": (_ratio(turn_test(attitude, omega), slice(0, 3)), _TURN_RATIO),
+        "accelerations over those of the tilted thrust": (_ratio(force_test(vel, attitude), slice(0, 2)), _ACC_RATIO),
     }
     off = [
         f"{name}: {ratio:.2f}"
@@ -249,22 +253,3 @@ def _check_scales(columns: Columns) -> list[str]:
         "t runs at another rate than the flight (a wrong clock)" if clock else "pos or vel has another unit or scale"
     )
     return [f"{'; '.join(off)} instead of 1: {cause}"]
-
-
-def _check_motors(squares: np.ndarray, columns: Columns) -> list[str]:
-    """Whether roll and pitch accelerate as the documented order of the motors implies."""
-    effect = motor_effects(squares, columns.quat, columns.vel, columns.omega)
-    if effect is None:
-        return []
-    orders = list(itertools.permutations(range(4)))
-    likeness = np.array([max(_likeness(effect, p[:, list(order)]) for p in _PATTERNS.values()) for order in orders])
-    best = int(np.argmax(likeness))
-    documented = likeness[0]
-    if likeness[best] < _MIN_LIKENESS or likeness[best] - documented < _MIN_LEAD:
-        return []
-    order = ", ".join(_NAMES[motor] for motor in orders[best])
-    return [f"the motors turn the drone as if their columns were {order}: give {', '.join(_NAMES)}"]
-
-
-def _likeness(effect: np.ndarray, pattern: np.ndarray) -> float:
-    return float(np.mean(np.sum(effect * pattern, axis=1)))

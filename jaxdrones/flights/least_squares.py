@@ -1,8 +1,9 @@
-"""Normal equations of a robust sum of squares over the windows of a flight."""
+"""Levenberg-Marquardt, and normal equations of a robust sum of squares over the windows of a flight."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -11,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.dynamics import Motors
-from jaxdrones.identification.open_loop import HORIZONS, Windows, predict, residuals
-from jaxdrones.identification.parameters import with_parameters
-from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.flights.open_loop import HORIZONS, Windows, predict, residuals
+from jaxdrones.flights.parameters import with_parameters
+from jaxdrones.flights.vehicle import Vehicle
 
 _CAUCHY_SCALE_SQUARED = 1.0  # c^2 of the Cauchy loss c^2 log(1 + s / c^2); s is a window's mean squared residual
+_INITIAL_DAMPING = 1e-3  # fraction of the diagonal
 _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 
 
@@ -27,8 +29,33 @@ class Normal(NamedTuple):
     gradient: np.ndarray
     """(n,) J'Wr."""
     loss: float
-    scale: np.ndarray
+    scale: np.ndarray = np.ones(())
     """(horizons, 4) robust standard deviation of the unweighted residuals, by horizon and quantity."""
+
+
+def levenberg_marquardt(
+    normal: Callable[[np.ndarray], Normal], x: np.ndarray, steps: int, min_decrease: float = 0.0
+) -> tuple[np.ndarray, Normal]:
+    """Minimize a sum of squares; returns the best coordinates and the normal equations there.
+
+    Args:
+        normal: the normal equations at coordinates (n,).
+        x: (n,) initial coordinates.
+        steps: largest number of steps; steps that do not decrease the loss count.
+        min_decrease: relative decrease of the loss below which a step is the last one.
+    """
+    best, damping = normal(x), _INITIAL_DAMPING
+    for _ in range(steps):
+        candidate = x - np.linalg.solve(best.matrix + damping * np.diag(np.diag(best.matrix)), best.gradient)
+        tried = normal(candidate)
+        decrease = best.loss - tried.loss
+        if decrease > 0:
+            x, best, damping = candidate, tried, damping / 10
+        else:
+            damping *= 10
+        if 0 < decrease < min_decrease * best.loss:
+            break
+    return x, best
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -14,9 +14,10 @@ from jaxdrones import rotation
 from jaxdrones.control import Setpoint, firmware_pid
 from jaxdrones.dynamics import FULL_PWM, Motors, midpoint
 from jaxdrones.errors import UserError
-from jaxdrones.identification.log import PERIOD, FlightLog
-from jaxdrones.identification.open_loop import equations_of_motion, lagged_rpm
-from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.open_loop import equations_of_motion, lagged_rpm
+from jaxdrones.flights.preparation import PERIOD
+from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.state import State
 from jaxdrones.thrust_curves import thrust_at
 
@@ -81,14 +82,25 @@ class ClosedLoopInputs(NamedTuple):
     """Sag of the battery at take-off, V."""
 
 
+def closed_loop_columns(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Set-points of position (K, 3) and heading (K,), PWM (K, 4) and battery voltage (K,) of a log.
+
+    Raises:
+        UserError: the log lacks one of them.
+    """
+    if not log.has("target_pos", "pwm", "vbat"):
+        raise UserError(f"{log.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop")
+    return log.target_pos[:, 0], log.target_yaw[:, 0], log.pwm[:, 0], log.vbat[:, 0]
+
+
 def rows_after_climb(log: FlightLog) -> slice:
     """The rows from the end of the climb to the landing.
 
     Raises:
         ValueError: the log has no set-points and battery, or the drone is never near the height of its set-point.
     """
-    ref_pos, *_ = log.closed_loop_columns
-    height = log.pos[:, 2]
+    ref_pos, *_ = closed_loop_columns(log)
+    height = log.pos[:, 0, 2]
     up = log.in_flight & (height > _MIN_HEIGHT) & (np.abs(height - ref_pos[:, 2]) < _CLIMB_TOLERANCE)
     if not up.any():
         raise UserError(
@@ -101,8 +113,8 @@ def closed_loop_inputs(log: FlightLog) -> ClosedLoopInputs:
     """Initial state, set-points and battery of a log, from the row in which the motors start."""
     stop = rows_after_climb(log).stop
     begin = motor_start_row(log)
-    ref_pos, ref_yaw, _, vbat = log.closed_loop_columns
-    pos, quat, vel, omega = (jnp.asarray(x[begin], float) for x in (log.pos, log.quat, log.vel, log.omega))
+    ref_pos, ref_yaw, _, vbat = closed_loop_columns(log)
+    pos, quat, vel, omega = (jnp.asarray(x[begin, 0], float) for x in (log.pos, log.quat, log.vel, log.omega))
     start, ground = State(pos, quat, vel, omega, jnp.zeros(4)), jnp.array(-jnp.inf)
     if begin > 0:
         upright = rotation.from_rpy(rotation.to_rpy(quat) * jnp.array([0.0, 0, 1]))
@@ -138,10 +150,10 @@ def simulate_closed_loop(
         ValueError: see `rows_after_climb`.
     """
     rows, begin = rows_after_climb(log), motor_start_row(log)
-    ref_pos, _, recorded_pwm, _ = log.closed_loop_columns
+    ref_pos, _, recorded_pwm, _ = closed_loop_columns(log)
     simulated = _simulate(vehicle, motors, gains, closed_loop_inputs(log))
     pos, pwm = (np.asarray(x)[rows.start - begin : rows.stop - begin] for x in simulated)
-    return ClosedLoopResult(log.name, log.t[rows], log.pos[rows], pos, ref_pos[rows], recorded_pwm[rows], pwm)
+    return ClosedLoopResult(log.name, log.t[rows], log.pos[rows, 0], pos, ref_pos[rows], recorded_pwm[rows], pwm)
 
 
 def simulate(

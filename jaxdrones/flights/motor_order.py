@@ -1,12 +1,20 @@
-"""The effect of each motor on roll and pitch, estimated from a flight log."""
+"""The order of the motors in a log: whether roll and pitch accelerate as the documented order implies."""
 
 from __future__ import annotations
 
-import numpy as np
+import itertools
 
-from jaxdrones.identification import quaternions
+import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 _PERIOD = 0.01  # s
+_MIN_LIKENESS, _MIN_LEAD = 0.75, 0.15  # of an order of the motors; over the documented order
+_PATTERNS = {
+    "X": np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]]) / 2,  # roll and pitch by each motor
+    "+": np.array([[0, -1, 0, 1], [-1, 0, 1, 0]]) / np.sqrt(2),
+}
+_NAMES = ("front right", "back right", "back left", "front left")
 _MAX_MOTOR_ROWS = 6000  # a minute of flight shows the order of the motors
 _RIDGE = 1e-9  # of the trace of the moment matrix, where motors or velocities are constant
 _LAGS = range(-1, 7)  # rows by which motors act later than they are logged
@@ -14,14 +22,33 @@ _MOTOR_ROWS, _TREND_ROWS = 4, 101  # of the angular acceleration; of the slow pa
 _MIN_EXPLAINED = 0.15  # share of the angular acceleration that the motors explain
 
 
-def motor_effects(squares: np.ndarray, quat: np.ndarray, vel: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
+def check_motors(squares: np.ndarray, attitude: Rotation, vel: np.ndarray, omega: np.ndarray) -> list[str]:
+    """Whether roll and pitch accelerate as the documented order of the motors implies."""
+    effect = motor_effects(squares, attitude, vel, omega)
+    if effect is None:
+        return []
+    orders = list(itertools.permutations(range(4)))
+    likeness = np.array([max(_likeness(effect, p[:, list(order)]) for p in _PATTERNS.values()) for order in orders])
+    best = int(np.argmax(likeness))
+    documented = likeness[0]
+    if likeness[best] < _MIN_LIKENESS or likeness[best] - documented < _MIN_LEAD:
+        return []
+    order = ", ".join(_NAMES[motor] for motor in orders[best])
+    return [f"the motors turn the drone as if their columns were {order}: give {', '.join(_NAMES)}"]
+
+
+def _likeness(effect: np.ndarray, pattern: np.ndarray) -> float:
+    return float(np.mean(np.sum(effect * pattern, axis=1)))
+
+
+def motor_effects(squares: np.ndarray, attitude: Rotation, vel: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
     """(2, 4) relative effect of each motor on roll and pitch, rows of length 1; `None` where it is not observable."""
     n = _MOTOR_ROWS
-    squares, quat, vel, omega = (x[:_MAX_MOTOR_ROWS] for x in (squares, quat, vel, omega))
+    squares, vel, omega = (x[:_MAX_MOTOR_ROWS] for x in (squares, vel, omega))
     if len(squares) < 2 * _TREND_ROWS:
         return None
     acc = (omega[n:, :2] - omega[:-n, :2]) / (n * _PERIOD)
-    body_vel = quaternions.rotate(quaternions.conjugate(quat), vel)
+    body_vel = attitude[: len(vel)].inv().apply(vel)
     others = [(x[n:] + x[:-n]) / 2 for x in (body_vel, omega)]
     summed = np.cumsum((squares[1:] + squares[:-1]) / 2 / np.mean(squares), axis=0)
     mean = np.concatenate([summed[n - 1 : n], summed[n:] - summed[:-n]]) / n
@@ -45,6 +72,4 @@ def motor_effects(squares: np.ndarray, quat: np.ndarray, vel: np.ndarray, omega:
 
 def _without_trend(x: np.ndarray) -> np.ndarray:
     """Columns (K, n) without their moving mean."""
-    half = _TREND_ROWS // 2
-    summed = np.cumsum(np.pad(x, ((half + 1, half), (0, 0)), mode="edge"), axis=0)
-    return x - (summed[_TREND_ROWS:] - summed[:-_TREND_ROWS]) / _TREND_ROWS
+    return x - ndimage.uniform_filter1d(x, _TREND_ROWS, axis=0, mode="nearest")

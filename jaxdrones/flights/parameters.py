@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from jaxdrones.checks import check_choice
-from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.limits import check_at_most
 from jaxdrones.params import Params
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,9 +16,9 @@ from jaxdrones.checks import shown
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics import Motors, crazyflie_motors
 from jaxdrones.errors import UserError
-from jaxdrones.identification.least_squares import Normal, normal_equations, standard_errors
-from jaxdrones.identification.log import FlightLog, named_apart
-from jaxdrones.identification.open_loop import (
+from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, normal_equations, standard_errors
+from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.open_loop import (
     HORIZONS,
     Windows,
     cut_windows,
@@ -25,7 +26,7 @@ from jaxdrones.identification.open_loop import (
     open_loop_errors,
     window_starts,
 )
-from jaxdrones.identification.parameters import (
+from jaxdrones.flights.parameters import (
     PARAMETERS,
     default_parameters,
     scale_of,
@@ -33,8 +34,9 @@ from jaxdrones.identification.parameters import (
     value_of,
     with_parameters,
 )
-from jaxdrones.identification.path_fit import fit_path
-from jaxdrones.identification.vehicle import Vehicle
+from jaxdrones.flights.path_fit import fit_path
+from jaxdrones.flights.preparation import named_apart
+from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
 
 _STRIDE = 25  # rows between the starts of windows
@@ -42,7 +44,6 @@ _INITIAL_SCALE = np.array([0.05, 0.25, 0.1, 0.4])  # of residuals at the last ho
 _INACTIVE = 1e3  # factor on the scale of a horizon whose residuals are not used yet
 _ROUNDS = 4  # rounds with robust scales, which are estimated anew after each
 _STEPS_PER_ROUND = 4
-_INITIAL_DAMPING = 1e-3
 _PRIOR_PRECISION = 1e-2  # inverse variance of x, which keeps parameters finite that are not identifiable
 _LOG_PRIOR_PRECISION = 1.0  # inverse variance of x where x is a logarithm
 _PRIOR_REMAINDER = 1e-3  # fraction of the prior in the information matrix, which keeps it invertible
@@ -119,11 +120,11 @@ def fit(
     for log in named_logs:
         if np.sqrt(np.mean(log.vel**2)) < _MIN_SPEED:
             raise UserError(f"{log.name}: the drone rests in the whole log; give a log of a flight")
-    kinds = {log.has_rotor_speeds for log in (*logs, *validate)}
+    kinds = {log.has("rpm") for log in (*logs, *validate)}
     if len(kinds) > 1:
         raise UserError("some logs have rotor speeds and others only PWM; fit them one after the other")
     motors = motors or crazyflie_motors()
-    if not named and all(log.has_setpoints for log in logs):
+    if not named and all(log.has("target_pos", "pwm") for log in logs):
         return _fit_paths(logs, params, validate, motors, gains or firmware_pid.gains(), progress)
     names = select_parameters(names) if named else default_parameters(kinds.pop())
     return _Problem(logs, params, names, motors).solve(validate, named, progress)
@@ -160,7 +161,7 @@ class _Problem:
     def __init__(self, logs: Sequence[FlightLog], params: Params, names: tuple[str, ...], motors: Motors):
         self.logs, self.start = logs, Vehicle.of(params)
         self.motors = motors
-        self.pwm_motors = None if logs[0].has_rotor_speeds else motors
+        self.pwm_motors = None if logs[0].has("rpm") else motors
         self.shared = tuple(name for name in names if not PARAMETERS[name].per_flight)
         self.per_flight = tuple(name for name in names if PARAMETERS[name].per_flight)
         self.names, self.flights = self.shared + self.per_flight, [log.name for log in logs]
@@ -179,7 +180,7 @@ class _Problem:
         first = len(self.shared) + flight * len(self.per_flight)
         return np.concatenate([np.arange(len(self.shared)), np.arange(first, first + len(self.per_flight))])
 
-    def normal(self, x: np.ndarray, scales: list[np.ndarray]) -> tuple[Normal, list[np.ndarray]]:
+    def normal(self, x: np.ndarray, scales: list[np.ndarray]) -> Normal:
         """Normal equations of all flights with the prior, and the robust scales of each flight's residuals."""
         matrix, gradient, robust = np.diag(self.prior), self.prior * x, []
         loss = float(self.prior @ x**2)
@@ -191,7 +192,7 @@ class _Problem:
             gradient[i] += part.gradient
             loss += part.loss
             robust.append(part.scale)
-        return Normal(matrix, gradient, loss, np.stack(robust)), robust
+        return Normal(matrix, gradient, loss, np.stack(robust))
 
     def _flight_normal(self, x: np.ndarray, scale: np.ndarray, windows: Windows, mask: jax.Array) -> Normal:
         return normal_equations(self.start, self.names, x, scale, windows, mask, self.pwm_motors)
@@ -216,7 +217,8 @@ class _Problem:
         best: tuple[float, np.ndarray, Normal | None] = (np.inf, x, None)
         for k in range(len(active) + _ROUNDS):
             scales = [initial * active[k]] * len(self.flights) if k < len(active) else robust
-            x, normal, robust = self._descend(x, scales)
+            x, normal = levenberg_marquardt(functools.partial(self.normal, scales=scales), x, _STEPS_PER_ROUND)
+            robust = list(normal.scale)
             if k < len(active) - 1:
                 continue
             loss = self._validation_loss(x, validate) if validate else normal.loss
@@ -228,27 +230,12 @@ class _Problem:
         assert last is not None  # there is at least one round
         return self._report(x, last, tuple(losses), validate, named)
 
-    def _descend(self, x: np.ndarray, scales: list[np.ndarray]) -> tuple[np.ndarray, Normal, list[np.ndarray]]:
-        """The Levenberg-Marquardt steps of one round."""
-        damping = _INITIAL_DAMPING
-        normal, robust = self.normal(x, scales)
-        for _ in range(_STEPS_PER_ROUND):
-            damped = normal.matrix + damping * np.diag(np.diag(normal.matrix))
-            candidate = x - np.linalg.solve(damped, normal.gradient)
-            candidate_normal, candidate_robust = self.normal(candidate, scales)
-            if candidate_normal.loss < normal.loss:
-                x, normal, robust, damping = candidate, candidate_normal, candidate_robust, damping / 10
-            else:
-                damping *= 10
-        return x, normal, robust
-
     def _validation_loss(self, x: np.ndarray, validate: Sequence[FlightLog]) -> float:
         """Mean ratio of the errors at the last horizon to those of the persistence model."""
         vehicle = self.vehicle(x)
-        return float(np.mean([self._errors(log, vehicle)[-1] / hold_errors(log)[-1] for log in validate]))
-
-    def _errors(self, log: FlightLog, vehicle: Vehicle) -> np.ndarray:
-        return open_loop_errors(log, vehicle, self.motors)
+        return float(
+            np.mean([open_loop_errors(log, vehicle, self.motors)[-1] / hold_errors(log)[-1] for log in validate])
+        )
 
     def _report(
         self, x: np.ndarray, normal: Normal, losses: tuple[float, ...], validate: Sequence[FlightLog], named: bool
@@ -272,7 +259,7 @@ class _Problem:
         for i, flight in enumerate(self.flights):
             flown = with_parameters(self.start, self.names, list(x[self.indices(i)]))
             values[flight] = {name: value_of(flown, name) for name in self.per_flight}
-        open_loop = {log.name: self._errors(log, vehicle) for log in (*self.logs, *validate)}
+        open_loop = {log.name: open_loop_errors(log, vehicle, self.motors) for log in (*self.logs, *validate)}
         return Report(vehicle, estimates, values, losses, open_loop)
 
 

@@ -1,7 +1,5 @@
 """A flight that a known vehicle flew."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +8,9 @@ import pytest
 import jaxdrones
 from jaxdrones import State
 from jaxdrones.control import Setpoint, for_team, geometric
-from jaxdrones.identification import FlightLog
-from jaxdrones.identification.open_loop import EFFECTS
+from jaxdrones.flights import FlightLog
+from jaxdrones.flights.log import OPTIONAL, STATE
+from jaxdrones.flights.open_loop import EFFECTS
 
 ROWS = 300
 
@@ -45,12 +44,17 @@ def simulated(name, params):
     memory = for_team(geometric.init(), 1)
     start = step.init(team, State.at_rest(jnp.zeros((1, 3))))
     _, (states, rpm) = jax.jit(lambda: jax.lax.scan(advance, (memory, start), jnp.arange(ROWS) * 0.01))()
-    pos, quat, vel, omega = (np.asarray(x[:, 0], float) for x in (states.pos, states.quat, states.vel, states.omega))
-    return FlightLog(name, np.arange(ROWS) * 0.01, pos, quat, vel, omega, rpm=np.asarray(rpm[:, 0], float))
+    arrays = {column: np.asarray(getattr(states, column), float) for column in STATE}
+    return FlightLog(np.arange(ROWS) * 0.01, **arrays, rpm=np.asarray(rpm, float), name=name)
+
+
+@pytest.fixture(scope="session")
+def columns_of():
+    """The columns of a log of one drone, without the drone axis."""
+    return lambda log: {"t": log.t} | {x: getattr(log, x)[:, 0] for x in STATE | OPTIONAL if log.has(x)}
 
 
 @pytest.fixture
-def columns(flown):
+def columns(flown, columns_of):
     """The columns of a sound log."""
-    _, log = flown
-    return {k: v for k, v in dataclasses.asdict(log).items() if v is not None and k != "name"}
+    return columns_of(flown[1])

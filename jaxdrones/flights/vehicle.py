@@ -1,14 +1,25 @@
-"""The measurement model: how a log differs from the flight."""
+"""A vehicle together with the measurement model of its logs, and the folder of an identified vehicle."""
 
 from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.errors import UserError
+from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
+from jaxdrones.urdf import load_params
 from jaxdrones.vector import components
+
+URDF, REPORT = "vehicle.urdf", "report.json"
+"""Files in the folder of `jaxdrones fit`."""
 
 _SAG_THRESHOLD = 0.55  # V; up to this sag at take-off a Crazyflie's motors get the voltage that is logged
 
@@ -64,3 +75,34 @@ class Instruments(PyTreeNode):
         return state.replace(
             pos=state.pos - self.estimate_delay * state.vel, quat=rotation.multiply(rotation.exp(more_tilt), late)
         )
+
+
+class Vehicle(PyTreeNode):
+    """Parameters of one drone, and of the instruments that log its flights."""
+
+    params: Params
+    instruments: Instruments
+
+    @classmethod
+    def of(cls, params: Params) -> Vehicle:
+        """A vehicle with ideal instruments."""
+        return cls(params, Instruments.ideal())
+
+
+def load_vehicle(vehicle: str | os.PathLike) -> Vehicle:
+    """Load a bundled vehicle or a URDF, with ideal instruments, or a folder of `jaxdrones fit` with fitted ones.
+
+    Raises:
+        UserError: there is no such vehicle, or its files are invalid.
+    """
+    folder = Path(vehicle)
+    if not folder.is_dir():
+        return Vehicle.of(load_params(vehicle))
+    report = folder / REPORT
+    try:
+        entries = json.loads(report.read_text())["instruments"]
+        names = [field.name for field in dataclasses.fields(Instruments)]
+        instruments = Instruments(**{name: jnp.asarray(entries[name], float) for name in names})
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{report}: cannot be read ({error!r}); give the --output folder of `jaxdrones fit`") from None
+    return Vehicle(load_params(folder / URDF), instruments)

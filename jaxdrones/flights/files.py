@@ -1,0 +1,268 @@
+"""Reading and writing logs: .npz, .csv, and bags of ROS 2."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdrones import assets
+from jaxdrones.control.pid import VEHICLES, rpm_to_pwm
+from jaxdrones.errors import UserError, install
+from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog, ImageSequence, LoggedConditions
+from jaxdrones.params import Params
+from jaxdrones.sensing import Scene
+from jaxdrones.sensing.serialization import scene_from_dict, scene_to_dict
+from jaxdrones.writing import replaced
+
+_ALIASES = {"gyro": "omega", "ref_pos": "target_pos", "ref_yaw": "target_yaw"}
+_WIDTHS = STATE | OPTIONAL
+_AXES = {"quat": "xyzw", "rpy": "rpy", "rpm": "0123", "pwm": "0123", "vbat": ("",), "target_yaw": ("",)}  # else "xyz"
+_MEANINGS = {
+    "t": "time, s",
+    "pos": "position, m, world",
+    "quat": "attitude, quaternion x, y, z, w, body to world",
+    "vel": "velocity, m/s, world",
+    "omega": "angular velocity, rad/s, body",
+    "rpm": "rotor speeds, RPM",
+    "pwm": "duty cycles of the motors, 0 to 65535",
+    "vbat": "voltage of the battery, V",
+    "target_pos": "commanded position, m, world",
+    "target_vel": "commanded velocity, m/s, world",
+    "target_yaw": "commanded heading, rad",
+}
+_IMAGES = "images/"  # prefix of the names of their arrays
+_DAMAGE = (OSError, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError, MemoryError)
+
+
+def find_log(path: str | os.PathLike) -> Path:
+    """The log of a path: a bundled log by its name, a file, a bag, or the log in a folder of `jaxdrones fly`.
+
+    Raises:
+        UserError: there is no log.
+    """
+    path = assets.flights().get(os.fspath(path), Path(path))
+    if path.is_file() or (path / "metadata.yaml").is_file():
+        return path
+    found = [log for log in (path / "log.npz", path / "flight" / "log.npz") if log.is_file()]
+    if not found:
+        what = "has no log of a flight" if path.is_dir() else "is not there"
+        raise UserError(f"{path} {what}; fly first, `jaxdrones fly circle --output {path}`, or give another path")
+    return found[0]
+
+
+def read_log(path: str | os.PathLike) -> FlightLog:
+    """Read the log of a flight.
+
+    Arrays are those of `FlightLog` by name; `gyro`, `ref_pos` and `ref_yaw` stand for `omega`, `target_pos` and
+    `target_yaw`. The arrays of a single drone may lack the drone axis. Other arrays are ignored.
+
+    Args:
+        path: an .npz or .csv file, a bag of ROS 2, a folder of `jaxdrones fly`, or the name of a bundled log.
+
+    Raises:
+        UserError: there is no log, or it is damaged: an array is missing, has another shape, is not finite, or time
+            does not increase.
+        ImportError: a bag is given and rosbags is not installed.
+    """
+    file = find_log(path)
+    arrays = _bag(file) if file.is_dir() else _csv(file) if file.suffix == ".csv" else _npz(file)
+    for alias, name in _ALIASES.items():
+        if alias in arrays:
+            arrays.setdefault(name, arrays.pop(alias))
+    columns = _columns(file.name, arrays)
+    labels = arrays.get("labels")
+    try:
+        texts = {name: json.loads(str(arrays[name])) for name in ("conditions", "params", "scene") if name in arrays}
+        params = {name: np.asarray(x, float) for name, x in texts["params"].items()} if "params" in texts else None
+        log = FlightLog(
+            **columns,
+            labels=() if labels is None else tuple(map(str, labels)),
+            conditions=LoggedConditions(texts.get("conditions", {}), str(arrays.get("about", file.name))),
+            params=None if params is None else Params(**params),  # type: ignore[arg-type]
+            scene=scene_from_dict(texts["scene"]) if "scene" in texts else Scene(),
+            images={
+                kind: ImageSequence(*(arrays[f"{_IMAGES}{kind}/{name}"] for name in ImageSequence._fields))
+                for kind in sorted({name.split("/")[1] for name in arrays if name.startswith(_IMAGES)})
+            },
+            name=file.name,
+            file=file,
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        why = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) and error.args else error
+        raise UserError(f"{file}: the log is damaged ({why}); record it again") from None
+    _check(log)
+    return log
+
+
+def arrays_of(log: FlightLog, pwm: bool = False) -> dict[str, np.ndarray]:
+    """The log by name; conditions, parameters and scene are JSON; `pwm` adds the Crazyflie's PWM signals.
+
+    Raises:
+        UserError: PWM is asked for and the vehicle is no Crazyflie.
+    """
+    if pwm:
+        check_pwm(log.conditions.vehicle)
+    texts = {
+        "conditions": log.conditions.as_dict(),
+        "params": {name: np.asarray(x).tolist() for name, x in vars(log.params).items() if name != "aux"},
+        "scene": scene_to_dict(log.scene),
+    }
+    arrays = {name: np.asarray(getattr(log, name)) for name in ("t", *STATE, "rpy")}
+    arrays |= {name: np.asarray(getattr(log, name)) for name in OPTIONAL if log.has(name)}
+    arrays |= {name: np.asarray(json.dumps(entries)) for name, entries in texts.items()}
+    arrays |= {"labels": np.asarray(log.labels), "about": np.asarray(str(log.conditions))}
+    for kind, images in log.images.items():
+        arrays |= {f"{_IMAGES}{kind}/{name}": array for name, array in images._asdict().items()}
+    return arrays | {"pwm": rpm_to_pwm(log.rpm)} if pwm else arrays
+
+
+def save_npz(log: FlightLog, path: Path, pwm: bool = False) -> None:
+    """Write a log as named arrays."""
+    arrays: dict[str, Any] = arrays_of(log, pwm)
+    with replaced(path) as new:
+        np.savez_compressed(new, **arrays)
+
+
+def save_csv(log: FlightLog, path: Path, pwm: bool = False) -> None:
+    """Write a log as one line per time and drone."""
+    arrays = {name: x for name, x in arrays_of(log, pwm).items() if name in (*_WIDTHS, "rpy")}
+    names = [f"{name}_{axis}".rstrip("_") for name in arrays for axis in _AXES.get(name, "xyz")]
+    rows = np.concatenate([x.reshape(len(log.t), len(log.labels), -1) for x in arrays.values()], axis=-1)
+    with replaced(path) as new, new.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "drone", *names])
+        writer.writerows([t, label, *rows[k, i]] for k, t in enumerate(log.t) for i, label in enumerate(log.labels))
+
+
+def check_pwm(vehicle: str) -> None:
+    """Raise `UserError` unless a vehicle has the motors of the Crazyflie, whose PWM is known."""
+    if vehicle not in VEHICLES:
+        raise UserError(
+            f"PWM is asked for with {vehicle!r}; it is known for {' and '.join(VEHICLES)} only, leave it out"
+        )
+
+
+def _npz(file: Path) -> dict[str, np.ndarray]:
+    try:
+        with file.open("rb") as content, np.load(content, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive}
+    except (*_DAMAGE, TypeError, AttributeError, zipfile.BadZipFile, zlib.error):
+        raise UserError(f"{file}: is not an .npz file of arrays; give the log of a flight") from None
+
+
+def _csv(file: Path) -> dict[str, np.ndarray]:
+    """The arrays of a table as `save_csv` writes it; without the column `drone` it is of one drone."""
+    try:
+        with file.open(newline="") as lines:
+            reader = csv.DictReader(lines)
+            table: dict[str, list[str]] = {name: [] for name in reader.fieldnames or ()}
+            for row in reader:
+                for name, entries in table.items():
+                    entries.append(row[name])
+        labels = list(dict.fromkeys(table.pop("drone", ["drone 0"])))
+        numbers = {name: np.array(x, float).reshape(-1, len(labels)) for name, x in table.items()}
+    except (*_DAMAGE, TypeError, csv.Error) as error:
+        raise UserError(f"{file}: is not a table of numbers ({error}); give the log of a flight") from None
+    arrays = {"t": numbers.pop("t")[:, 0]} if "t" in numbers else {}
+    for name in (*_WIDTHS, *_ALIASES):
+        axes = [f"{name}_{axis}".rstrip("_") for axis in _AXES.get(_ALIASES.get(name, name), "xyz")]
+        if all(axis in numbers for axis in axes):
+            stacked = np.stack([numbers[axis] for axis in axes], axis=-1)
+            arrays[name] = stacked if len(axes) > 1 else stacked[..., 0]
+    return arrays | {"labels": np.array(labels)}
+
+
+def _bag(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a bag: poses and twists of /drone_0/odom, ... and rotor speeds of /drone_0/motors, ..."""
+    try:
+        from rosbags.rosbag2 import Reader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError(f"rosbags is not installed; {install('ros2')}") from error
+    store, found = get_typestore(Stores.ROS2_JAZZY), {}
+    try:
+        with Reader(path) as reader:
+            kinds = {"nav_msgs/msg/Odometry": "odom", "std_msgs/msg/Float64MultiArray": "motors"}
+            wanted = [c for c in reader.connections if c.topic.endswith(f"/{kinds.get(c.msgtype, '?')}")]
+            for connection, ns, data in reader.messages(wanted):
+                message = store.deserialize_cdr(data, connection.msgtype)
+                found.setdefault(connection.topic.strip("/"), {})[ns] = message
+    except Exception as error:  # the reader raises errors of any type on damaged bytes
+        raise UserError(f"{path} is no bag of ROS 2, or is damaged: {error}; give the folder of a sound one") from None
+    n = 0
+    while {f"drone_{n}/odom", f"drone_{n}/motors"} <= found.keys():
+        n += 1
+    times = sorted(set.intersection(*map(set, found.values()))) if n else []
+    if not times:
+        raise UserError(f"{path} holds no flight: it lacks /drone_0/odom and /drone_0/motors; record it with both")
+    odometry = [[found[f"drone_{i}/odom"][ns] for i in range(n)] for ns in times]
+
+    def stacked(part: str, kind: str, axes: str) -> np.ndarray:
+        values = [[getattr(getattr(getattr(m, part), part), kind) for m in team] for team in odometry]
+        return np.array([[[getattr(v, axis) for axis in axes] for v in team] for team in values])
+
+    quat, body_vel = stacked("pose", "orientation", "xyzw"), stacked("twist", "linear", "xyz")
+    turned = 2 * np.cross(quat[..., :3], body_vel)  # R v = v + w t + u x t with t = 2 u x v and q = (u, w)
+    return {
+        "t": np.array(times) / 1e9,
+        "pos": stacked("pose", "position", "xyz"),
+        "quat": quat,
+        "vel": body_vel + quat[..., 3:] * turned + np.cross(quat[..., :3], turned),
+        "omega": stacked("twist", "angular", "xyz"),
+        "rpm": np.array([[found[f"drone_{i}/motors"][ns].data for i in range(n)] for ns in times]),
+    }
+
+
+def _columns(name: str, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Times and arrays (K, n, ...) of a log, with the shapes that belong together."""
+    for column in ("t", *STATE):
+        if column not in arrays:
+            raise UserError(f"{name}: has no column {column!r}: {_MEANINGS[column]}; add it to the log")
+    rows, drones = np.size(arrays["t"]), np.shape(arrays["pos"])[1] if np.ndim(arrays["pos"]) == 3 else 1
+    if ("labels" in arrays and len(arrays["labels"]) != drones) or not (rows and drones):
+        raise UserError(f"{name}: has {rows} times, {drones} drones and {len(arrays.get('labels', ()))} labels")
+    columns = {}
+    for column in ("t", *_WIDTHS):
+        if column in arrays:
+            x, width = np.asarray(arrays[column]), _WIDTHS.get(column, 0)
+            single = x[:, None] if column != "t" and x.ndim == (2 if width else 1) else x  # no drone axis
+            shape = (rows,) if column == "t" else (rows, drones, width) if width else (rows, drones)
+            if single.shape != shape or x.dtype.kind not in "fiu":
+                raise UserError(
+                    f"{name}: {column} is {x.dtype} of shape {x.shape}; give numbers of shape {shape}, {rows} times "
+                    f"and {drones} drones: {_MEANINGS[column]}"
+                )
+            columns[column] = single
+    return columns
+
+
+def _check(log: FlightLog) -> None:
+    """Raise unless time increases, and states are finite until they break for good."""
+    steps = np.diff(log.t)
+    if not np.isfinite(log.t).all() or not (steps > 0).all():
+        row = int(np.argmin(np.append(steps, 1) > 0)) + 1
+        raise UserError(
+            f"{log.name}: time goes from {log.t[row - 1]:g} to {log.t[row]:g} s in row {row}; sort the rows by time, "
+            "and remove broken ones"
+        )
+    names = (*STATE, *["rpm"] * log.has("rpm"))
+    finite = np.isfinite(np.concatenate([getattr(log, name) for name in names], axis=-1)).all(axis=-1)
+    row, drone = np.nonzero(np.concatenate([~finite[:1], ~finite[:-1] & finite[1:]]))
+    if len(row):
+        where = f"before row {row[0]}" if row[0] else "in row 0"
+        raise UserError(f"{log.name}: the state of {log.labels[drone[0]]} is not finite {where}; remove such rows")
+    n = len(log.labels)
+    for field, x in vars(log.params).items():
+        if field != "aux" and (np.ndim(x) < 1 or len(x) != n):
+            raise UserError(f"{log.name}: params.{field} has shape {np.shape(x)}; give one entry for each of {n} drones")
+    for kind, images in log.images.items():
+        if len(images.t) != len(images.frames) or np.shape(images.frames)[1:2] != (n,):
+            shape = np.shape(images.frames)
+            raise UserError(f"{log.name}: images {kind!r} have shape {shape} for {len(images.t)} times")

@@ -1,0 +1,167 @@
+"""The log of a flight: states, rotor speeds, commands, and the conditions under which it was flown."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones import rotation
+from jaxdrones.params import Params, repeat
+from jaxdrones.sensing import Scene
+from jaxdrones.urdf import load_params
+
+STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3}
+"""Arrays of the state and their widths."""
+OPTIONAL = {"rpm": 4, "pwm": 4, "vbat": 0, "target_pos": 3, "target_vel": 3, "target_yaw": 0}
+"""Arrays that a log may lack and their widths; 0 is a number per drone."""
+
+_TAKE_OFF = slice(150, 350)  # rows after the motors start, over which the voltage at take-off is averaged
+_RUNNING_PWM = 100.0  # a motor with more PWM than this runs
+
+
+class ImageSequence(NamedTuple):
+    """Images of the drones' cameras."""
+
+    t: np.ndarray
+    """(F,) when each was taken or, of an episode, observed first, s."""
+    frames: np.ndarray
+    """(F, n, height, width, ...): of colors uint8 with 3 or 4 channels, of depth in m, of segmentation numbers."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LoggedConditions:
+    """The conditions of a flight as its log has them."""
+
+    entries: dict[str, Any]
+    about: str
+    """The same in words."""
+
+    @property
+    def vehicle(self) -> str:
+        """Name of a bundled vehicle, or path of a URDF."""
+        return self.entries["vehicle"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The conditions for JSON."""
+        return self.entries
+
+    def __str__(self) -> str:
+        return self.about
+
+
+def _unknown() -> np.ndarray:
+    return np.asarray(np.nan)
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightLog:
+    """The log of a flight of n drones over K rows; row k is the state at time t[k]. Unknown numbers are NaN."""
+
+    t: np.ndarray
+    """(K,) time, s."""
+    pos: np.ndarray
+    """(K, n, 3) position, m, world."""
+    quat: np.ndarray
+    """(K, n, 4) attitude, quaternion x, y, z, w, body to world."""
+    vel: np.ndarray
+    """(K, n, 3) velocity, m/s, world."""
+    omega: np.ndarray
+    """(K, n, 3) angular velocity, rad/s, body."""
+    rpm: np.ndarray = dataclasses.field(default_factory=_unknown)
+    """(K, n, 4) rotor speeds, RPM; motors front right, back right, back left, front left."""
+    pwm: np.ndarray = dataclasses.field(default_factory=_unknown)
+    """(K, n, 4) duty cycles of the motors, 0 to 65535."""
+    vbat: np.ndarray = dataclasses.field(default_factory=_unknown)
+    """(K, n) voltage of the battery, V."""
+    target_pos: np.ndarray = dataclasses.field(default_factory=_unknown)
+    """(K, n, 3) commanded position, m, world."""
+    target_vel: np.ndarray = dataclasses.field(default_factory=_unknown)
+    """(K, n, 3) commanded velocity, m/s, world."""
+    target_yaw: np.ndarray = dataclasses.field(default_factory=_unknown)
+    """(K, n) commanded heading, rad."""
+    labels: tuple[str, ...] = ()
+    """Names of the n drones."""
+    conditions: Any = dataclasses.field(default_factory=lambda: LoggedConditions({}, ""))
+    """Conditions of the flight, with `as_dict()` for JSON."""
+    params: Params = None  # type: ignore[assignment]  # filled in below
+    """Constants of the team, with a leading axis of length n; those of cf2x when left out."""
+    scene: Scene = dataclasses.field(default_factory=Scene)
+    images: Mapping[str, ImageSequence] = dataclasses.field(default_factory=dict)
+    """Images of the on-board cameras, by kind."""
+    name: str = "flight"
+    file: Path | None = None
+    """The file that the log was read from."""
+
+    def __post_init__(self):
+        rows, drones = np.shape(self.pos)[:2]
+        for name, width in OPTIONAL.items():
+            shape = (rows, drones, width) if width else (rows, drones)
+            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), shape))
+        if not self.labels:
+            object.__setattr__(self, "labels", tuple(f"drone {i}" for i in range(drones)))
+        if self.params is None:
+            object.__setattr__(self, "params", repeat(load_params("cf2x"), drones))
+
+    def has(self, *names: str) -> bool:
+        """Whether the log has all of these optional arrays."""
+        return all(bool(np.isfinite(getattr(self, name)).any()) for name in names)
+
+    def drone(self, i: int) -> FlightLog:
+        """The log of one drone of a team."""
+        arrays: dict[str, Any] = {name: getattr(self, name)[:, i : i + 1] for name in STATE | OPTIONAL}
+        params = jax.tree.map(lambda x: x[i : i + 1], self.params)
+        return dataclasses.replace(self, **arrays, labels=self.labels[i : i + 1], params=params)
+
+    @property
+    def in_flight(self) -> np.ndarray:
+        """(K,) whether all motors run; true in all rows of a log without PWM."""
+        return np.min(self.pwm, axis=(1, 2)) > _RUNNING_PWM if self.has("pwm") else np.ones(len(self.t), bool)
+
+    @property
+    def sag(self) -> float:
+        """Drop of the battery voltage of the first drone from rest to take-off, V; 0 for a log that begins in flight.
+
+        The voltage at rest is the highest one before the motors start, that at take-off the mean from 1.5 to 3.5 s
+        after they start, at 100 rows per second.
+        """
+        begin, voltage = int(np.argmax(self.in_flight)), self.vbat[:, 0]
+        return (
+            float(np.max(voltage[:begin]) - np.mean(voltage[begin:][_TAKE_OFF])) if begin and self.has("vbat") else 0.0
+        )
+
+    @functools.cached_property
+    def rpy(self) -> np.ndarray:
+        """(K, n, 3) roll, pitch and yaw, rad."""
+        return np.asarray(jax.jit(jax.vmap(jax.vmap(rotation.to_rpy)))(jnp.asarray(self.quat)))
+
+    @property
+    def last_quarter(self) -> np.ndarray:
+        """(K,) which times are in the last quarter of the flight."""
+        return self.t >= self.t[-1] * 3 / 4
+
+    @property
+    def error(self) -> np.ndarray:
+        """(K, n, 1) distance to the target position, m."""
+        return np.linalg.norm(self.pos.astype(float) - self.target_pos, axis=-1, keepdims=True)
+
+    def difference(self) -> tuple[np.ndarray, str]:
+        """(K, n, 3) difference between actual and commanded position or velocity, and its unit."""
+        if np.isnan(self.target_pos).any():
+            return self.vel - self.target_vel, "m/s"
+        return self.pos - self.target_pos, "m"
+
+    def not_finite(self) -> dict[str, str]:
+        """Drones whose state is not finite at some time: label -> what happened and when."""
+        states = [getattr(self, name) for name in (*STATE, *["rpm"] * self.has("rpm"))]
+        broken = np.any([~np.isfinite(x).all(-1) for x in states], axis=0)
+        return {
+            self.labels[i]: f"the state of {self.labels[i]} is not finite from t = {self.t[broken[:, i]][0]:.3f} s on"
+            for i in np.flatnonzero(broken.any(axis=0))
+        }

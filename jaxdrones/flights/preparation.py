@@ -1,0 +1,179 @@
+"""Logs for identification: one drone each, at 100 Hz, with plausible units and columns that agree with each other."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from jaxdrones.checks import shown
+from jaxdrones.errors import UserError
+from jaxdrones.flights.consistency import Motion, contradictions
+from jaxdrones.flights.files import read_log
+from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
+
+PERIOD = 0.01
+"""Time between the rows of a prepared log, s."""
+
+_MAX_PERIOD = 0.012 + 1e-8  # s; rows further apart do not show the motion of a small quadrotor
+_MAX_GAP = 0.05  # s
+_MAX_JITTER = 0.5e-3  # s, by which the times of rows that are not resampled differ from 100 Hz
+_MIN_ROWS = 100
+_FULL_PWM = 65535
+_MAX_RATE = 60.0  # rad/s; gyroscopes of small quadrotors saturate at 35
+_MIN_VOLTAGE, _MAX_VOLTAGE = 1.0, 60.0  # V
+_MAX_RPM = 1e6
+_MIN_MEDIAN_RPM = 2700.0  # small quadrotors do not fly at a lower median speed; 16,000 RPM are 1,700 rad/s
+_MAX_PERCENT = 100.0  # PWM that never exceeds this is a percentage
+
+
+def load_flights(*files: str | os.PathLike, allow_inconsistent: bool = False) -> list[FlightLog]:
+    """Read logs for identification: one for each drone, resampled to 100 Hz, with different names.
+
+    Args:
+        files: see `read_log`.
+        allow_inconsistent: whether to accept logs whose columns contradict each other, see `inconsistencies`.
+
+    Raises:
+        UserError: a log cannot be read, has no inputs, implausible units, or a rate that is too low; or its columns
+            contradict each other.
+    """
+    return named_apart([drone for file in files for drone in prepare(read_log(file), allow_inconsistent)])
+
+
+def prepare(log: FlightLog, allow_inconsistent: bool = False) -> list[FlightLog]:
+    """The drones of a log, each as `load_flights` returns it."""
+    drones = [log.drone(i) for i in range(len(log.labels))]
+    if len(drones) > 1:
+        drones = [dataclasses.replace(one, name=f"{log.name}, {one.labels[0]}") for one in drones]
+    drones = [_resampled(_checked(one)) for one in drones]
+    for one in () if allow_inconsistent else drones:
+        if found := inconsistencies(one):
+            raise UserError(
+                f"{one.name}: {'; '.join(found)}; repair the log, or pass allow_inconsistent=True "
+                "(--allow-inconsistent) to take it as it is"
+            )
+    return drones
+
+
+def inconsistencies(log: FlightLog) -> list[str]:
+    """Contradictions between the columns of a prepared log, a sentence each with the likely cause."""
+    flying = np.flatnonzero(log.in_flight)
+    rows = slice(int(flying[0]), int(flying[-1]) + 1) if len(flying) else slice(0)
+    pos, quat, vel, omega = (np.array(getattr(log, name)[rows, 0]) for name in STATE)  # SciPy needs writable arrays
+    motion = Motion(pos, Rotation.from_quat(quat), vel, omega)
+    thrusts = log.rpm**2 if log.has("rpm") else log.pwm
+    return contradictions(motion, thrusts[rows, 0], log.sag)
+
+
+def named_apart(logs: Sequence[FlightLog]) -> list[FlightLog]:
+    """The logs with different names: equal ones get the folders of their files that differ, or a number.
+
+    Raises:
+        UserError: a drone of a file is given twice.
+    """
+    given = [(log.file.resolve(), log.labels) for log in logs if log.file is not None]
+    for file, labels in given:
+        if given.count((file, labels)) > 1:
+            raise UserError(f"{file} is given twice; give each flight once")
+    names = [log.name for log in logs]
+    named = []
+    for i, log in enumerate(logs):
+        name, file = log.name, log.file
+        if names.count(name) > 1 and file is not None:
+            others = [o.file.resolve().parts for o in logs if o.name == name and o.file not in (None, file)]
+            parts = file.resolve().parts
+            count = next(n for n in range(2, len(parts) + 1) if all(parts[-n:] != other[-n:] for other in others))
+            name = "/".join((*parts[-count:-1], name))
+        elif names.index(name) < i:
+            name = f"{name} ({names[: i + 1].count(name)})"
+        named.append(dataclasses.replace(log, name=name))
+    return named
+
+
+def _resampled(log: FlightLog) -> FlightLog:
+    """The log at 100 Hz by its times; rows that are at 100 Hz already stay as they are."""
+    times = log.t
+    if np.max(np.abs(times - times[0] - PERIOD * np.arange(len(times)))) <= _MAX_JITTER:
+        return log
+    t = times[0] + PERIOD * np.arange(int((times[-1] - times[0]) / PERIOD + 1e-6) + 1)
+
+    def interpolated(x: np.ndarray) -> np.ndarray:
+        columns = [np.interp(t, times, column) for column in x.reshape(len(x), -1).T]
+        return np.stack(columns, axis=-1).reshape(-1, *x.shape[1:])
+
+    arrays: dict[str, Any] = {name: interpolated(getattr(log, name)) for name in STATE | OPTIONAL if log.has(name)}
+    arrays["quat"] = Slerp(times, Rotation.from_quat(np.array(log.quat[:, 0])))(t).as_quat()[:, None]
+    if log.has("target_yaw"):
+        arrays["target_yaw"] = interpolated(np.unwrap(log.target_yaw, axis=0))
+    arrays |= {name: np.asarray(np.nan) for name in OPTIONAL if not log.has(name)}
+    return dataclasses.replace(log, t=t, images={}, **arrays)
+
+
+def _checked(log: FlightLog) -> FlightLog:
+    """The log in float64, with unit quaternions and one kind of input; raises `UserError` on invalid data."""
+    inputs = ("rpm",) if log.has("rpm") else ("pwm", "vbat")
+    for name in inputs:
+        if not log.has(name):
+            raise UserError(f"{log.name}: has no column {name!r} (or rpm); add it to the log")
+    names = [name for name in ("t", *STATE, *OPTIONAL) if log.has(name)]
+    arrays: dict[str, Any] = {name: np.array(getattr(log, name), float) for name in names}
+    if log.has("rpm"):
+        arrays["pwm"] = np.asarray(np.nan)
+    for name, x in arrays.items():
+        if x.ndim and not np.isfinite(x).all():
+            row = int(np.argmin(np.isfinite(x.reshape(len(x), -1)).all(axis=1)))
+            raise UserError(f"{log.name}: {name} is not finite in row {row}; remove or repair such rows")
+        if x.ndim:
+            _check_units(log.name, name, x)
+    _check_times(log.name, arrays["t"])
+    if log.has("target_pos") and not log.has("target_yaw"):
+        arrays["target_yaw"] = np.zeros((len(log.t), 1))
+    arrays["quat"] /= np.linalg.norm(arrays["quat"], axis=-1, keepdims=True)
+    return dataclasses.replace(log, **arrays)
+
+
+def _check_times(name: str, t: np.ndarray) -> None:
+    if t[-1] - t[0] < (_MIN_ROWS - 1) * PERIOD - _MAX_JITTER:
+        raise UserError(f"{name}: has {len(t)} rows, {t[-1] - t[0]:.2g} s; give at least one second of flight")
+    steps = np.diff(t)
+    if (period := np.median(steps)) > _MAX_PERIOD:
+        raise UserError(f"{name}: rows are {period:.4g} s apart; record them at least every {_MAX_PERIOD:.3g} s")
+    if np.max(steps) > _MAX_GAP:
+        row = int(np.argmax(steps))
+        raise UserError(f"{name}: no rows between {t[row]:g} and {t[row + 1]:g} s; cut the log there")
+
+
+def _check_units(name: str, column: str, x: np.ndarray) -> None:
+    """Raise on values that are implausible in the column's unit; the message names the likely unit."""
+
+    def require(condition, looks: str, give: str) -> None:
+        if not condition:
+            low, high = np.min(x), np.max(x)
+            raise UserError(f"{name}: {column} is {low:.4g} to {high:.4g}, which looks like {looks}; give {give}")
+
+    largest = np.max(np.abs(x))
+    if column == "quat":
+        length = np.linalg.norm(x, axis=-1)
+        require(np.all(np.abs(length - 1) < 0.05), f"no unit quaternion (length {shown(length[0, 0])})", "x, y, z, w")
+    elif column == "omega":
+        require(largest <= _MAX_RATE, "degrees/s", "rad/s")
+    elif column == "target_yaw":
+        require(largest <= 4 * np.pi, "degrees", "rad")
+    elif column in ("vel", "target_vel"):
+        require(largest <= 100, "mm/s or cm/s", "m/s")
+    elif column in ("pos", "target_pos"):
+        require(largest <= 1e4, "mm", "m")
+    elif column == "vbat":
+        require(largest <= _MAX_VOLTAGE, "millivolts", "V")
+        require(np.min(x) >= _MIN_VOLTAGE, "no voltage that turns motors", "V")
+    elif column == "pwm":
+        require(0 <= np.min(x) and largest <= _FULL_PWM, "no duty cycle of 16 bits", "0 to 65535")
+        require(largest > _MAX_PERCENT, "percent", "0 to 65535")
+    elif column == "rpm":
+        require(0 <= np.min(x) and largest <= _MAX_RPM, "no rotor speed", "RPM")
+        require(np.median(x) >= _MIN_MEDIAN_RPM, "rad/s", "RPM, 60 / (2 pi) times as many")

@@ -1,0 +1,108 @@
+"""Logs of flights are loaded, and invalid ones are refused."""
+
+import dataclasses
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from jaxdrones.cli import main
+from jaxdrones.flights import load_flights, read_log, save_csv
+from jaxdrones.flights.log import OPTIONAL, STATE
+from jaxdrones.urdf import load_params
+
+
+def written(folder, columns):
+    np.savez(folder / "flight.npz", **columns)
+    (log,) = load_flights(folder / "flight.npz")
+    return log
+
+
+def test_a_log_is_read_as_it_was_written(columns, tmp_path):
+    log = written(tmp_path, columns)
+    np.testing.assert_array_equal(log.rpm[:, 0], columns["rpm"])
+    assert log.name == "flight.npz" and log.has("rpm") and not log.has("target_pos")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda c: c.pop("vel"), "has no column 'vel'"),
+        (lambda c: c.pop("rpm"), r"has no column 'pwm' \(or rpm\)"),
+        (lambda c: c.update(t=c["t"][::-1]), "time goes from 2.99 to 2.98 s in row 1"),
+        (lambda c: c.update(t=2 * c["t"]), "rows are 0.02 s apart; record them"),
+        (
+            lambda c: c.update(pos=np.where(np.arange(300)[:, None] == 7, np.nan, c["pos"])),
+            "the state of drone 0 is not finite before row 8",
+        ),
+        (lambda c: c.update(omega=np.rad2deg(c["omega"]) + 100), "looks like degrees/s; give rad/s"),
+        (lambda c: c.update(rpm=c["rpm"] / 9.549), "looks like rad/s; give RPM"),
+        (lambda c: c.update(pwm=c.pop("rpm") / 300, vbat=np.full(300, 3.7)), "pwm .* looks like percent"),
+        (lambda c: c.update(pwm=c.pop("rpm"), vbat=np.full(300, 3700.0)), "vbat .* looks like millivolts"),
+        (lambda c: c.update(quat=c["quat"] * 2), "looks like no unit quaternion"),
+        (lambda c: c.update({k: v[:50] for k, v in c.items()}), "has 50 rows, 0.49 s; give at least one second"),
+        (
+            lambda c: c.update(pos=c["pos"][:, :2]),
+            r"pos is float64 of shape \(300, 2\); give numbers of shape \(300, 1, 3\)",
+        ),
+    ],
+)
+def test_what_no_flight_has_is_named(columns, tmp_path, change, says):
+    change(columns)
+    with pytest.raises(ValueError, match=says):
+        written(tmp_path, columns)
+
+
+def test_what_is_no_file_of_arrays_is_named(tmp_path):
+    (tmp_path / "text.npz").write_text("t, pos")
+    with pytest.raises(ValueError, match=r"is not an \.npz file"):
+        read_log(tmp_path / "text.npz")
+    with pytest.raises(ValueError, match="is not there; fly first"):
+        read_log(tmp_path / "missing.npz")
+
+
+def test_headers_that_claim_too_much_and_plain_arrays_are_refused(columns, tmp_path):
+    """A header of 8 TB over a few bytes allocates nothing; a .npy is no .npz."""
+    np.savez(tmp_path / "flight.npz", **columns)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    with zipfile.ZipFile(tmp_path / "huge.npz", "w") as archive:
+        archive.writestr("t.npy", header.getvalue() + b"few bytes")
+    with pytest.raises(ValueError, match=r"is not an \.npz file"):
+        read_log(tmp_path / "huge.npz")
+    np.save(tmp_path / "plain.npy", columns["pos"])
+    with pytest.raises(ValueError, match=r"is not an \.npz file"):
+        read_log(tmp_path / "plain.npy")
+    whole = (tmp_path / "flight.npz").read_bytes()
+    for cut in (0, 1, 100, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.npz").write_bytes(whole[:cut])
+        with pytest.raises(ValueError, match=r"is not an \.npz file"):
+            read_log(tmp_path / "cut.npz")
+
+
+def test_a_table_of_one_drone_or_of_a_team_is_read_as_it_was_written(columns, tmp_path):
+    log = written(tmp_path, columns)
+    for log in (
+        log,
+        dataclasses.replace(
+            log, **{x: np.repeat(getattr(log, x), 2, axis=1) for x in STATE | OPTIONAL}, labels=("a", "b"), params=None
+        ),
+    ):
+        save_csv(log, tmp_path / "flight.csv")
+        read = read_log(tmp_path / "flight.csv")
+        assert read.labels == log.labels
+        for name in ("t", *STATE, "rpm"):
+            np.testing.assert_allclose(getattr(read, name), getattr(log, name), rtol=1e-6)
+
+
+def test_what_fly_wrote_is_fitted(tmp_path, capsys):
+    """The thrust of the vehicle that flew, from the log of each drone of a team at 120 Hz."""
+    assert main(["fly", "circle", "--drones", "2", "--duration", "3", "--output", str(tmp_path), "--no-figure"]) == 0
+    capsys.readouterr()
+    assert main(["fit", str(tmp_path), "--parameters", "kf", "--output", str(tmp_path / "fit"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert set(report["errors"]) == {"log.npz, drone 0", "log.npz, drone 1"}
+    estimate = report["parameters"]["kf"]
+    assert estimate["identifiable"] and estimate["value"] == pytest.approx(float(load_params("cf2x").kf), rel=0.01)

@@ -18,7 +18,8 @@ def add(commands) -> None:
         help="identify a vehicle from recorded flights",
         description="Estimate parameters of a vehicle from flights: logs of `jaxdrones fly`, .npz or .csv files with "
         "t, pos, quat, vel, omega and rpm (or pwm and vbat), or bags of ROS 2. Prints each with its standard error, "
-        "and writes a folder with vehicle.urdf, report.json and a figure. Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
+        "and writes a folder with vehicle.urdf, report.json and a figure. "
+        "Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
         allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="flights to fit")

@@ -3,6 +3,7 @@
 import argparse
 import sys
 import webbrowser
+import zipfile
 from pathlib import Path
 
 from jaxdrones.checks import check_choice, check_whole
@@ -92,7 +93,10 @@ def _is_flight(path: Path) -> bool:
         log = find_log(path)
     except ValueError:
         return False
-    return log.is_dir() or log.suffix in (".npz", ".csv")
+    if not zipfile.is_zipfile(log):
+        return log.is_dir() or log.suffix in (".npz", ".csv")
+    with zipfile.ZipFile(log) as archive:
+        return "pos.npy" in archive.namelist()
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -186,7 +186,8 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ImportError(f"rosbags is not installed; {install('ros2')}") from error
-    store, found = get_typestore(Stores.ROS2_JAZZY), {}
+    store = get_typestore(Stores.ROS2_JAZZY)
+    found: dict[str, dict[int, Any]] = {}
     try:
         with Reader(path) as reader:
             kinds = {"nav_msgs/msg/Odometry": "odom", "std_msgs/msg/Float64MultiArray": "motors"}
@@ -254,14 +255,15 @@ def _check(log: FlightLog) -> None:
         )
     names = (*STATE, *["rpm"] * log.has("rpm"))
     finite = np.isfinite(np.concatenate([getattr(log, name) for name in names], axis=-1)).all(axis=-1)
-    row, drone = np.nonzero(np.concatenate([~finite[:1], ~finite[:-1] & finite[1:]]))
-    if len(row):
-        where = f"before row {row[0]}" if row[0] else "in row 0"
-        raise UserError(f"{log.name}: the state of {log.labels[drone[0]]} is not finite {where}; remove such rows")
+    broken = np.argwhere(np.concatenate([~finite[:1], ~finite[:-1] & finite[1:]]))
+    if len(broken):
+        row, drone = broken[0].tolist()
+        where = f"before row {row}" if row else "in row 0"
+        raise UserError(f"{log.name}: the state of {log.labels[drone]} is not finite {where}; remove such rows")
     n = len(log.labels)
     for field, x in vars(log.params).items():
         if field != "aux" and (np.ndim(x) < 1 or len(x) != n):
-            raise UserError(f"{log.name}: params.{field} has shape {np.shape(x)}; give one entry for each of {n} drones")
+            raise UserError(f"{log.name}: params.{field} has shape {np.shape(x)}; give one entry for each drone, {n}")
     for kind, images in log.images.items():
         if len(images.t) != len(images.frames) or np.shape(images.frames)[1:2] != (n,):
             shape = np.shape(images.frames)

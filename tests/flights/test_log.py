@@ -83,13 +83,9 @@ def test_headers_that_claim_too_much_and_plain_arrays_are_refused(columns, tmp_p
 
 
 def test_a_table_of_one_drone_or_of_a_team_is_read_as_it_was_written(columns, tmp_path):
-    log = written(tmp_path, columns)
-    for log in (
-        log,
-        dataclasses.replace(
-            log, **{x: np.repeat(getattr(log, x), 2, axis=1) for x in STATE | OPTIONAL}, labels=("a", "b"), params=None
-        ),
-    ):
+    one = written(tmp_path, columns)
+    twice = {name: np.repeat(getattr(one, name), 2, axis=1) for name in STATE | OPTIONAL}
+    for log in (one, dataclasses.replace(one, **twice, labels=("a", "b"), params=None)):
         save_csv(log, tmp_path / "flight.csv")
         read = read_log(tmp_path / "flight.csv")
         assert read.labels == log.labels

@@ -181,7 +181,7 @@ def test_the_page_was_built_from_its_sources():
         (lambda path: 3, {}, "3 cannot be shown"),
         (lambda path: [], {}, "give at least one"),
         (lambda path: "nowhere/log.npz", {}, "nowhere/log.npz is not there; fly first"),
-        (lambda path: __file__, {}, "is not the log of a flight"),
+        (lambda path: __file__, {}, r"is not an \.npz file"),
     ],
 )
 def test_a_mistake_is_one_line_that_says_what_to_do(team, flight, arguments, message):
@@ -257,7 +257,7 @@ def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(reco
     (tmp_path / "damaged.npz").write_bytes((tmp_path / "one" / "log.npz").read_bytes()[:2000])
     for others, message in (
         (["nowhere"], "nowhere is not there"),
-        (["damaged.npz"], "damaged.npz is not the log of a flight"),
+        (["damaged.npz"], "damaged.npz: is not an .npz file"),
     ):
         assert main(["view", str(tmp_path / "one"), *(str(tmp_path / x) for x in others), *page]) == 2
         assert message in capsys.readouterr().err

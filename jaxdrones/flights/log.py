@@ -103,7 +103,8 @@ class FlightLog:
         rows, drones = np.shape(self.pos)[:2]
         for name, width in OPTIONAL.items():
             shape = (rows, drones, width) if width else (rows, drones)
-            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), shape))
+            known = np.isfinite(getattr(self, name)).any()
+            object.__setattr__(self, name, np.broadcast_to(getattr(self, name) if known else np.nan, shape))
         if not self.labels:
             object.__setattr__(self, "labels", tuple(f"drone {i}" for i in range(drones)))
         if self.params is None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.errors import UserError
-from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
 from jaxdrones.limits import check_at_most
 from jaxdrones.visualization.viewer.payload import encode, encode_rows
 from jaxdrones.visualization.viewer.server import Server
@@ -21,7 +21,7 @@ from jaxdrones.visualization.viewer.show import LAYOUTS, check_size, looks, reco
 _RELOADING = 2.0  # s, for which a viewer that left is awaited
 _ALIVE = 0.5  # s between signs of life, by which it is noticed that a viewer left
 _FLUSHING = 5.0  # s, for which viewers may take what is left at the end
-_ROWS = ("t", "pos", "quat", "vel", "omega", "rpm", "target_pos", "target_vel")  # of a record, one per time
+_ROWS = ("t", *STATE, *OPTIONAL)  # arrays of a log that grow
 
 
 class Live:

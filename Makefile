@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fly train rllib test test-slow test-libraries test-rllib lint docs notebooks viewer
+.PHONY: fly train rllib sb3 test test-slow test-libraries test-rllib lint docs notebooks viewer
 
 fly: .venv/installed  ## four Crazyflies on the paper's circle
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
@@ -14,9 +14,12 @@ train: .venv/installed  ## full four-motor hover, by the gradient of the simulat
 	$(BIN)/jaxdrones fly --policy runs/hover
 
 rllib: .venv-rllib/installed  ## the paper's leader and follower by RLlib, three seeds, and a flight of the best
-	if [ -e runs/leader-follower-rllib-ppo ]; then mv runs/leader-follower-rllib-ppo runs/leader-follower-rllib-ppo-$$(date +%Y%m%d-%H%M%S); fi
-	.venv-rllib/bin/jaxdrones train leader-follower --library rllib --seeds 3
-	.venv-rllib/bin/jaxdrones fly --policy runs/leader-follower-rllib-ppo
+	.venv-rllib/bin/python examples/rllib_leader_follower.py --output runs/leader-follower-rllib
+	.venv-rllib/bin/jaxdrones fly --policy runs/leader-follower-rllib
+
+sb3: .venv-libraries/installed  ## the paper's one-dimensional hover by Stable-Baselines3, and a flight of the policy
+	.venv-libraries/bin/python examples/sb3_hover.py --output runs/hover-2021-sb3
+	.venv-libraries/bin/jaxdrones fly --policy runs/hover-2021-sb3
 
 test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
@@ -28,7 +31,7 @@ test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Ba
 	.venv-libraries/bin/pytest tests/test_examples.py $(patsubst %,tests/adapters/test_%.py,other_libraries gymnasium gymnax jaxmarl sb3)
 
 test-rllib: .venv-rllib/installed
-	.venv-rllib/bin/pytest tests/adapters/test_rllib.py tests/training/test_rllib.py tests/test_cli_train_rllib.py tests/test_docs.py -k rllib
+	.venv-rllib/bin/pytest tests/adapters/test_rllib.py tests/test_examples.py -k rllib
 
 lint: .venv/installed
 	$(BIN)/ruff format --check .
@@ -53,7 +56,7 @@ viewer:  ## the page of the viewer, from its sources; needs Node.js, which nothi
 .venv-libraries/installed: pyproject.toml
 	$(PYTHON) -m venv .venv-libraries
 	.venv-libraries/bin/pip install --quiet torch==2.13.0
-	.venv-libraries/bin/pip install --quiet -e ".[pettingzoo,video]" torchrl==0.14.1 skrl==2.1.1 tianshou==2.0.1 stable-baselines3==2.9.2 \
+	.venv-libraries/bin/pip install --quiet -e ".[cli,pettingzoo,video]" torchrl==0.14.1 skrl==2.1.1 tianshou==2.0.1 stable-baselines3==2.9.2 \
 		gymnax==1.0.1 jaxmarl==0.2.0 six beartype pytest
 	touch $@
 

@@ -126,9 +126,7 @@ def test_the_default_folder_and_those_of_seeds_are_not_replaced_unasked(
     assert contents(tmp_path / "runs/hover") == before
 
 
-@pytest.mark.parametrize(
-    "name", ["best.json", "last.msgpack", "state.msgpack", "best.zip", "progress.csv", "report.json"]
-)
+@pytest.mark.parametrize("name", ["best.json", "last.msgpack", "state.msgpack", "progress.csv", "report.json"])
 def test_whatever_is_left_of_a_run_is_not_replaced_unasked(name, nothing_compiles, tmp_path, capsys):
     (tmp_path / name).write_text("mine")
     assert main([*TRAIN, "--output", str(tmp_path)]) == 2

@@ -1,6 +1,8 @@
 """The examples run and learn; in the tests' environment only those whose library is installed."""
 
 import importlib.util
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -79,3 +81,46 @@ def test_torchrls_checker_passes():
     env = example("torchrl_ppo").DroneEnv(jd.make("hover", duration=0.1), 3)
     check_env_specs(env)
     assert env.rollout(25, break_when_any_done=False)["next", "truncated"].sum() == 6  # every 10 steps
+
+
+@pytest.mark.needs("ray")
+def test_what_the_script_for_rllib_saves_flies_without_ray(tmp_path, monkeypatch):
+    sizes = ["--seeds", "1", "--updates", "2", "--worlds", "4", "--horizon", "150", "--output", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["rllib_leader_follower.py", *sizes])
+    example("rllib_leader_follower").main()
+    flies_without(("ray", "torch"), tmp_path, "leader-follower by ppo")
+
+
+@pytest.mark.needs("stable_baselines3")
+def test_what_the_script_for_sb3_saves_flies_without_sb3(tmp_path, monkeypatch):
+    sizes = ["--steps", "64", "--worlds", "2", "--horizon", "16", "--output", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["sb3_hover.py", *sizes])
+    example("sb3_hover").main()
+    flies_without(("stable_baselines3", "torch"), tmp_path, "hover-2021 by ppo")
+
+
+@pytest.mark.needs("stable_baselines3")
+def test_the_policy_in_jax_predicts_what_the_model_of_sb3_does():
+    module = example("sb3_hover")
+    import torch
+    from stable_baselines3 import PPO
+
+    env = module.RECIPE.env()
+    network = {"net_arch": [8, 8], "activation_fn": torch.nn.ReLU}
+    model = PPO(module.TanhPolicy, module.VecEnv(env, 2), policy_kwargs=network, device="cpu")
+    for x in model.policy.parameters():
+        x.data *= 2
+    obs = np.random.default_rng(0).uniform(-1, 1, (100, 1, env.observation_size)).astype(np.float32)
+    expected, _ = model.predict(obs.reshape(100, *model.observation_space.shape), deterministic=True)
+    np.testing.assert_allclose(module.policy_of(model)(obs), expected.reshape(100, 1, 1), atol=1e-5)
+    assert expected.std() > 1e-3
+
+
+def flies_without(libraries, folder, title):
+    """Fly the policy of a folder in a process without some libraries."""
+    hidden = "".join(f"sys.modules[{name!r}] = None; " for name in libraries)
+    command = ["fly", "--policy", str(folder)]
+    code = f"import sys; {hidden}from jaxdrones.cli import main; raise SystemExit(main({command}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and title in done.stdout, done.stderr
+    assert (folder / "curve.png").stat().st_size > 0 and (folder / "flight" / "flight.png").stat().st_size > 0

@@ -56,7 +56,7 @@ class Short(NamedTuple):
 
 
 FLIGHT, TRAINING = "--duration 0.2", "--set worlds=8 --set horizon=4 --budget 2 --episodes 8"
-BULLET, FILM, SB3 = ("pybullet",), ("pybullet", "imageio_ffmpeg"), ("stable_baselines3",)
+BULLET, FILM = ("pybullet",), ("pybullet", "imageio_ffmpeg")
 LOGGED = r"wrote \S+/log\.npz, \S+/flight\.png"
 TRAINED = "compiled in ... trained in ... success ... wrote runs/ ... /best.msgpack, ... /report.json ... fly it: "
 FLIGHTS = {
@@ -118,10 +118,6 @@ TRAININGS = {
     ),
     "view runs/hover --output hover.html": Short(r"wrote hover\.html \([01]\.\d MB\)"),
     "view runs/circle --output circle.html": Short(r"wrote circle\.html \([01]\.\d MB\)"),
-    "train hover-2021 --library sb3 --algo ppo": Short(
-        "trained in ", "--budget 64 --set n_steps=8 --set batch_size=32 --episodes 2", SB3
-    ),
-    "fly --policy runs/hover-2021-sb3-ppo": Short(LOGGED, needs=SB3),
 }
 
 

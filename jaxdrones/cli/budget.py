@@ -13,8 +13,8 @@ _FIGURE_SECONDS = 2.0  # to draw the learning curves
 _TOLERANCE = 1.1  # times the budget from which on it was missed
 
 
-def parse_budget(text: str | None, unit: str, example: int) -> tuple[int | None, float | None]:
-    """The number of `unit`, or the seconds, that --budget gives; the other is `None`."""
+def parse_budget(text: str | None) -> tuple[int | None, float | None]:
+    """The number of updates, or the seconds, that --budget gives; the other is `None`."""
     if text is None:
         return None, None
     try:
@@ -27,7 +27,7 @@ def parse_budget(text: str | None, unit: str, example: int) -> tuple[int | None,
     except ValueError:
         pass
     raise UserError(
-        f"--budget is {text!r}; give {unit}, for example {example}, or a time up to 1000h, for example 60s, 5m or 2h"
+        f"--budget is {text!r}; give updates, for example 300, or a time up to 1000h, for example 60s, 5m or 2h"
     )
 
 
@@ -48,11 +48,10 @@ class Deadlines:
         self._figure = 0.0 if options.no_figure else _FIGURE_SECONDS
         self._left = runs
 
-    def start(self, resumable: bool) -> None:
+    def start(self) -> None:
         """Say so if compiling took the time of a whole run."""
         if self.seconds is not None and time.perf_counter() - self._begin > self.seconds:
-            more = "; --resume continues it" * resumable
-            print_warning(f"compiling took all of --budget {self._text}, so one update is made{more}")
+            print_warning(f"compiling took all of --budget {self._text}; one update is made, --resume continues it")
 
     def next(self) -> float | None:
         """The time of `time.perf_counter` at which the next training has to be over, s; `None` without a limit."""

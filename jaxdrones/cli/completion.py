@@ -19,7 +19,6 @@ _KINDS = {  # argument -> kind of the names that it takes
     "rotors": "rotors",
     "integrator": "integrators",
     "algo": "algorithms",
-    "library": "libraries",
 }
 _FOLDERS, _FILES = ("DIR", "RUN", "BAG"), ("FILE",)  # metavars
 

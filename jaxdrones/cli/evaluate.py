@@ -85,7 +85,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 def described(recipe) -> str:
     """The task, the learner and the options that differ from their defaults, such as `hover by bptt`."""
     options = "".join(f", {name} {x}" for name, x in recipe.options.items())
-    return f"{recipe.task} by {recipe.trained_by}{realism(recipe.realistic)}{options}"
+    return f"{recipe.task} by {recipe.algorithm}{realism(recipe.realistic)}{options}"
 
 
 def evaluation_table(report: dict) -> str:

@@ -158,14 +158,14 @@ def _fly_policy(options: argparse.Namespace) -> int:
     with recipe.env(backend=options.backend) as env, progress() as report:
         policy = run.policy(env=env)
         _check_files(options, output)
-        title = f"{recipe.task}: {env.task.summary} ({recipe.trained_by}, {options.backend})"
+        title = f"{recipe.task}: {env.task.summary} ({recipe.algorithm}, {options.backend})"
         with live_server(options, title) as live:
             on_progress = report or (lambda fraction: None)
             episode = fly_episode(env, policy, jax.random.key(seed), on_progress, live.add if live else None)
     conditions = EpisodeConditions(
         str(options.policy),
         recipe.task,
-        recipe.trained_by,
+        recipe.algorithm,
         recipe.realistic,
         options.backend,
         seed,

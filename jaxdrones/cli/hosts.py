@@ -40,8 +40,6 @@ def _on_hosts(train: Callable[[argparse.Namespace], int], options: argparse.Name
         return train(options)
     if None in asked:
         raise UserError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
-    if options.library in ("rllib", "sb3"):
-        raise UserError(f"--library {options.library} trains on one host; leave out --hosts, --host and --coordinator")
     if options.live is not None:
         raise UserError("--live is given with --hosts, whose trainings are not shown; leave one of them out")
     from jaxdrones.training import distributed

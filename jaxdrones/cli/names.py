@@ -8,9 +8,7 @@ from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.training.algorithms import ALGORITHMS, RLLIB_ALGORITHMS, SB3_ALGORITHMS
-
-LIBRARIES = ("jaxdrones", "rllib", "sb3")
+from jaxdrones.training.algorithms import ALGORITHMS
 
 
 def add(commands) -> None:
@@ -36,9 +34,6 @@ def known_names() -> dict[str, list[str]]:
         "actions": list(ACTIONS),
         "observations": list(OBSERVATIONS),
         "algorithms": list(ALGORITHMS),
-        "rllib": list(RLLIB_ALGORITHMS),
-        "sb3": list(SB3_ALGORITHMS),
-        "libraries": list(LIBRARIES),
     }
 
 

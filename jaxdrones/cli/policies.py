@@ -27,9 +27,8 @@ def open_policy(
 
     Raises:
         ValueError: the task is missing, or something is given that the run says itself.
-        ImportError: Stable-Baselines3 trained the run, and is not installed.
     """
-    from jaxdrones.training.open_run import open_run
+    from jaxdrones.training.run import Run
     from jaxdrones.training.user_policy import UserPolicy
 
     if is_user_policy(policy):
@@ -40,7 +39,7 @@ def open_policy(
     for name, x in given.items():
         if x not in (None, False):
             raise UserError(f"{name} is given beside the run {policy}, which says what is flown; leave it out")
-    run = open_run(policy)
+    run = Run(policy)
     recipe = run.sidecar_entry("last" if last else "best", "recipe")
     names = recipe.get("files", ()) if isinstance(recipe, dict) else ()
     if code := " and ".join(name for name in names if is_reference(name)):

@@ -13,7 +13,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.user_code import blame, is_reference
 
 # Arguments of `Recipe.of` that are options of the command.
-_NO_SETTINGS = ("cls", "task", "algorithm", "realistic", "library")
+_NO_SETTINGS = ("cls", "task", "algorithm", "realistic")
 
 
 REALISTIC_KINDS = ("any",)

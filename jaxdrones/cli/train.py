@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import assets
-from jaxdrones.checks import check_choice
 from jaxdrones.cli import hosts
 from jaxdrones.cli.budget import Deadlines, parse_budget
 from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
-from jaxdrones.cli.names import ALGORITHMS, LIBRARIES, SB3_ALGORITHMS
+from jaxdrones.cli.names import ALGORITHMS
 from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.cli.train_runs import episodes_of, folders_of, recipe_of, remaining, runs_of
 from jaxdrones.cli.training import (
@@ -41,7 +40,7 @@ def add(commands) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Train a policy with settings that were found to work, and evaluate the best one.\n\n"
         "The command writes these files:\n\n"
-        "  best, last     policies, each a .msgpack and a .json; with sb3 a .zip\n"
+        "  best, last     policies, each a .msgpack and a .json\n"
         "  state          everything that --resume needs to continue, bit for bit\n"
         "  progress.csv   a row for each update; an event file holds the same for TensorBoard\n"
         "  curve.png      learning curves\n"
@@ -54,8 +53,6 @@ def add(commands) -> None:
         "  --resume --set updates=400   train to 400 updates in total\n\n"
         "A longer training continues as if all its updates had been asked for at the start: the learning rate rises\n"
         "to its value at this point of the longer schedule. The best policy is replaced only by a better one.\n\n"
-        "With --library sb3, Stable-Baselines3 trains the paper's network (512-512-256-128, ReLU). The paper's task\n"
-        "is `hover-2021`. Such a training keeps no state to resume from.\n\n"
         "A run of a task or vehicle of your own keeps the text of its file, and flies that text when it is resumed,\n"
         "evaluated or flown: open runs of people you trust alone.",
         epilog="JAX_COMPILATION_CACHE_DIR=folder keeps compiled programs, so that the next training starts sooner.\n\n"
@@ -66,16 +63,14 @@ def add(commands) -> None:
         "task", metavar="TASK", help=f"{', '.join(TASKS)}; or file.py:function, a function of yours that returns a task"
     )
     parser.add_argument("--vehicle", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
-    parser.add_argument("--library", default=LIBRARIES[0], help=f"{', '.join(LIBRARIES)} ({LIBRARIES[0]})")
-    algorithms, sb3_algorithms = ", ".join(ALGORITHMS), ", ".join(SB3_ALGORITHMS)
-    parser.add_argument("--algo", help=f"{algorithms} (bptt; gates: ppo); with sb3 {sb3_algorithms} (ppo)")
+    parser.add_argument("--algo", help=f"{', '.join(ALGORITHMS)} (bptt; gates: ppo)")
     add_realistic(parser)
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds, each in DIR/seed-K (1)")
     parser.add_argument("--seed", type=int, metavar="K", help="the first seed (0)")
     parser.add_argument(
         "--budget",
         metavar="N|Ns",
-        help="number of updates, such as 300 (with sb3 control steps, such as 100000), or time per seed, such as "
+        help="number of updates, such as 300, or time per seed, such as "
         "60s, 5m, 2h, for everything: compiling, updates, evaluations and files",
     )
     parser.add_argument(
@@ -90,13 +85,10 @@ def add(commands) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="setting of the learner (worlds, horizon, learning_rate; with sb3 net_arch and arguments of its class) or "
-        "of the environment (vehicle, period, drones)",
+        help="setting of the learner (worlds, horizon, learning_rate) or of the environment (vehicle, period, drones)",
     )
-    parser.add_argument("--episodes", type=int, metavar="N", help="episodes of every evaluation (1000, with sb3 100)")
-    parser.add_argument(
-        "--output", type=folder, metavar="DIR", help="folder of the run (runs/TASK, runs/TASK-sb3-ALGO)"
-    )
+    parser.add_argument("--episodes", type=int, metavar="N", help="episodes of every evaluation (1000)")
+    parser.add_argument("--output", type=folder, metavar="DIR", help="folder of the run (runs/TASK)")
     parser.add_argument(
         "--resume", action="store_true", help="continue the run in --output; with --budget train a finished one longer"
     )
@@ -109,31 +101,27 @@ def add(commands) -> None:
 
 
 def _train(options: argparse.Namespace) -> int:
-    check_choice("library", options.library, LIBRARIES)
-    if options.library == "sb3":
-        from jaxdrones.cli import train_sb3
-
-        return train_sb3.train(options)
     from jaxdrones.training import loop
     from jaxdrones.training.distributed import fail_together
     from jaxdrones.training.lock import locked
     from jaxdrones.training.run import Run
+    from jaxdrones.training.trainer import Trainer
 
     begin = time.perf_counter()
     with contextlib.ExitStack() as stack:
         with fail_together():
             if not options.no_figure:
                 plots.check_matplotlib()
-            output = options.output or run_folder(options.task, _ending(options))
+            output = options.output or run_folder(options.task)
             _check_numbers(options)
-            updates, seconds = parse_budget(options.budget, "updates", 300)
+            updates, seconds = parse_budget(options.budget)
             asked = merge_budget("updates", asked_settings(options), updates, seconds)
             for folder in folders_of(options, output):
                 stack.enter_context(locked(folder, print_warning))
             runs = runs_of(options, output)
             with user_mistakes(asked, options.task):
                 recipe = recipe_of(options, runs, output, asked, seconds)
-                trainer = _trainer_type(options.library)(recipe, episodes_of(options, runs))
+                trainer = Trainer(recipe, episodes_of(options, runs))
             resumed = [run for run in runs.values() if run.started and options.resume]
             for run in resumed:
                 loop.check_resumable(trainer, run)
@@ -150,7 +138,7 @@ def _train_runs(options: argparse.Namespace, runs: dict, output: Path, trainer: 
     from jaxdrones.training.run import Run
 
     recipe, print_line = trainer.recipe, quiet if options.json else print
-    known = settings_known(recipe.task, recipe.algorithm, recipe.library, recipe.realistic == "any")
+    known = settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any")
     if not options.resume and not known:
         warn_of_unknown_settings(recipe)
     print_line(f"{_headline(recipe)}; compiling")
@@ -159,7 +147,7 @@ def _train_runs(options: argparse.Namespace, runs: dict, output: Path, trainer: 
         seed: run.sidecar_entry("state", "update") if options.resume and run.started else 0
         for seed, run in runs.items()
     }
-    deadlines.start(resumable=options.library != "rllib")
+    deadlines.start()
     total = recipe.config.updates if deadlines.seconds is None else None
     so_far = f", {max(made.values())} of them made" * (max(made.values()) > 0)
     print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total or 'as many as the time allows'}{so_far}")
@@ -199,22 +187,6 @@ def _train_runs(options: argparse.Namespace, runs: dict, output: Path, trainer: 
     return code
 
 
-def _ending(options: argparse.Namespace) -> str:
-    """What the folder of a run has after the name of the task, where no folder is given."""
-    return "" if options.library == LIBRARIES[0] else f"-rllib-{options.algo or 'ppo'}"
-
-
-def _trainer_type(library: str):
-    """The class that trains by this library or by RLlib; raises with what to install."""
-    if library == "rllib":
-        from jaxdrones.training.rllib.trainer import RLlibTrainer
-
-        return RLlibTrainer
-    from jaxdrones.training.trainer import Trainer
-
-    return Trainer
-
-
 def _headline(recipe) -> str:
     config = recipe.config
     what = described(recipe)
@@ -228,7 +200,5 @@ def _check_numbers(options: argparse.Namespace) -> None:
         check_seed("the last seed", options.seed + options.seeds - 1)
     if options.episodes is not None:
         check_at_most("episodes", options.episodes, LARGEST_COUNT)
-    if options.resume and options.library == "rllib":
-        raise UserError("--resume is given with --library rllib, whose trainings are not continued here; leave it out")
     if options.resume and options.overwrite:
         raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")

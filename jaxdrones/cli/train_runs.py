@@ -69,9 +69,8 @@ def _fresh(options: argparse.Namespace, runs: dict, output: Path, asked: dict):
     from jaxdrones.training.recipe import Recipe
     from jaxdrones.training.run import Run
 
-    default = "ppo" if options.library == "rllib" else default_algorithm(options.task)
-    algorithm = default if options.algo is None else options.algo
-    recipe = Recipe.of(options.task, algorithm, options.realistic, options.library, **asked)
+    algorithm = default_algorithm(options.task) if options.algo is None else options.algo
+    recipe = Recipe.of(options.task, algorithm, options.realistic, **asked)
     recipe = dataclasses.replace(recipe, stop_at=options.stop_at)
     for run in (*runs.values(), Run(output)):
         check_free(run, options.overwrite)

@@ -1,4 +1,4 @@
-"""Arguments, progress and results of a training at the shell, for every library."""
+"""Arguments, progress and results of a training at the shell."""
 
 import argparse
 import contextlib
@@ -17,7 +17,7 @@ def warn_of_unknown_settings(recipe) -> None:
     """Say that no settings are known with which a learner masters a task."""
     task = recipe.task + " on any vehicle" * (recipe.realistic == "any")
     print_warning(
-        f"no settings are known with which {recipe.trained_by} masters {task}; it may fail, then try "
+        f"no settings are known with which {recipe.algorithm} masters {task}; it may fail, then try "
         "another --algo, --set learning_rate=... or horizon=..., or a longer --budget"
     )
 
@@ -61,18 +61,17 @@ def check_free(run, overwrite: bool) -> None:
 class ProgressDisplay(contextlib.ExitStack):
     """A progress bar, and a line for every evaluation."""
 
-    def __init__(self, total: int | None, what: str, episodes: int, print_line, unit: str = "update"):
+    def __init__(self, total: int | None, what: str, episodes: int, print_line):
         """Prepare; the bar appears with the first call of `update`.
 
         Args:
-            total: number of `unit` of the whole training; `None` if it is not known.
+            total: number of updates of the whole training; `None` if it is not known.
             what: label, such as the seed.
             episodes: number of episodes of an evaluation.
             print_line: function that prints a line.
-            unit: what is counted.
         """
         super().__init__()
-        self._total, self._what, self._episodes, self._print_line, self._unit = total, what, episodes, print_line, unit
+        self._total, self._what, self._episodes, self._print_line = total, what, episodes, print_line
         self._bar: Any = None
         self._evaluated, self._started = "", False
 
@@ -80,14 +79,14 @@ class ProgressDisplay(contextlib.ExitStack):
         """Move the bar, and print the results of an evaluation."""
         if not self._started:
             self._started = True
-            self._bar = self.enter_context(bar(self._total, self._what, self._unit, initial=count))
+            self._bar = self.enter_context(bar(self._total, self._what, "update", initial=count))
         speed = _speed(now["steps_per_s"])
         if "evaluated_return" in now:
             self._evaluated = f"return {now['evaluated_return']:.1f}"
             if "success" in now:
                 self._evaluated += f", success {percent(now['success'], self._episodes)}"
             of = "" if self._total is None else f"/{self._total}"
-            line = f"{self._what}: {self._unit} {count:4}{of}  {self._evaluated}, "
+            line = f"{self._what}: update {count:4}{of}  {self._evaluated}, "
             line += f"median error {now['evaluated_error']:.3f} m, {speed}, {now['seconds']:.1f} s"
             if self._bar is None or self._bar.disable:
                 self._print_line(line)
@@ -116,9 +115,7 @@ def quiet(_: str) -> None:
 
 def remaining_best(run) -> str:
     """A phrase that names the best policy that an unfinished training leaves."""
-    return (
-        f"{run.folder / 'best'}.{run.policy_suffix} is the best policy, of update {run.sidecar_entry('best', 'update')}"
-    )
+    return f"{run.folder / 'best'}.msgpack is the best policy, of update {run.sidecar_entry('best', 'update')}"
 
 
 def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[Path]:
@@ -131,7 +128,7 @@ def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[P
     kept = {f"seed {seed}": run.sidecar_entry("best", "update") for seed, run in runs.items()}
     recipe = next(iter(runs.values())).recipe()
     episodes = next(iter(runs.values())).sidecar().get("distinct_episodes", 1)
-    title = f"training {recipe.task} by {recipe.trained_by}"
+    title = f"training {recipe.task} by {recipe.algorithm}"
     interval = (lambda success: wilson_interval(success * episodes, episodes)) if episodes > 1 else None
     learning_curves.save_curves(histories, folder / "curve.png", title, interval, kept)
     return [folder / "curve.png"]
@@ -158,7 +155,7 @@ def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
         Run(output).remove_report()  # that of an earlier best seed
         Run(output).save_policy("best", run.policy(), **about)
         Run(output).save_report({"run_id": about["run_id"], "best_seed": best, "seeds": list(reports.values())})
-    files = [output / f"best.{run.policy_suffix}", output / "report.json", *draw_curves(options, runs, output)]
+    files = [output / "best.msgpack", output / "report.json", *draw_curves(options, runs, output)]
     if options.json:
         result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
         print(as_json(result | {"files": list(map(str, files))}))

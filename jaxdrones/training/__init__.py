@@ -1,1 +1,1 @@
-"""Training at the command line: presets, recipes, runs on disk, the training loop, and Stable-Baselines3."""
+"""Training at the command line: presets, recipes, runs on disk and the training loop."""

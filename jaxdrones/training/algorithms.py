@@ -20,12 +20,6 @@ ALGORITHMS = {
 }
 """Module of each learner."""
 
-RLLIB_ALGORITHMS = {"ppo": "jaxdrones.training.rllib.config"}
-"""Module of the settings of each learner of RLlib, which need no ray."""
-
-SB3_ALGORITHMS = {"ppo": "PPO", "a2c": "A2C", "sac": "SAC"}
-"""Class of each learner of Stable-Baselines3."""
-
 
 class Learner(Protocol):
     """What the module of a learner defines.
@@ -55,16 +49,3 @@ def learner(algorithm: str) -> Learner:
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
     return cast(Learner, importlib.import_module(ALGORITHMS[algorithm]))
-
-
-def config_type(library: str, algorithm: str) -> type[Any]:
-    """The type of the settings of a learner, of this library (`jaxdrones`) or of RLlib (`rllib`).
-
-    Raises:
-        ValueError: unknown library or algorithm; lists the known ones.
-    """
-    check_choice("library of a recipe", library, ("jaxdrones", "rllib"))
-    if library == "jaxdrones":
-        return learner(algorithm).Config
-    check_choice("algorithm of rllib", algorithm, RLLIB_ALGORITHMS)
-    return importlib.import_module(RLLIB_ALGORITHMS[algorithm]).Config

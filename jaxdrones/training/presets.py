@@ -141,12 +141,10 @@ def realism(realistic: bool | str) -> str:
     return f", realistic{', any vehicle' if realistic == 'any' else ''}" if realistic else ""
 
 
-def settings_known(task: str, algorithm: str, library: str = "jaxdrones", any_vehicle: bool = False) -> bool:
-    """Whether settings are known with which a learner of a library masters a task, that of its default options."""
+def settings_known(task: str, algorithm: str, any_vehicle: bool = False) -> bool:
+    """Whether there are tuned settings for a learner on a task with default options."""
     if any_vehicle:
-        return library == "jaxdrones" and (task, algorithm) in _ANY_VEHICLE_CONFIGS
-    if library == "rllib":
-        return task == "leader-follower"
+        return (task, algorithm) in _ANY_VEHICLE_CONFIGS
     found = (task, algorithm) in _CONFIGS or algorithm in _BY_DEFAULT.get(task, ())
     return found and (task, algorithm) not in _UNFINISHED
 

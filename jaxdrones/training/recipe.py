@@ -15,7 +15,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 from jaxdrones.tasks.task import Task
 from jaxdrones.training import user_files
-from jaxdrones.training.algorithms import config_type
+from jaxdrones.training.algorithms import learner
 from jaxdrones.training.presets import preset
 
 _DRONE_BYTES = 256  # memory that the parameters and the state of a drone take
@@ -36,7 +36,6 @@ class Recipe:
     """Settings of the learner, its `Config`."""
     files: user_files.Files = dataclasses.field(default_factory=dict)
     """Texts of the user's files that task and vehicle are in."""
-    library: str = "jaxdrones"
     stop_at: float | None = None
     """Lower bound of the success rate at which to stop; `None` to make all updates."""
 
@@ -46,16 +45,14 @@ class Recipe:
         task: str,
         algorithm: str = "bptt",
         realistic: bool | str = False,
-        library: str = "jaxdrones",
         **changes: Any,
     ) -> Recipe:
         """A preset with changes.
 
         Args:
             task: a name of `jaxdrones.envs.TASKS`, or `file.py:function` of a function that returns a task.
-            algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`, or for RLlib of `RLLIB_ALGORITHMS`.
+            algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
             realistic: see `presets.preset`.
-            library: library of the learner, jaxdrones or rllib.
             **changes: settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
 
         Raises:
@@ -63,23 +60,17 @@ class Recipe:
         """
         task, files = user_files.take_task(task)
         function = user_files.task_of(task, files)
-        settings_type = config_type(library, algorithm)
+        settings_type = learner(algorithm).Config
         fields = dataclasses.fields(settings_type)
         known = {field.name for field in fields if field.default is not None}  # JSON holds no functions
         options, settings = split_changes(function, changes, known)
         options, vehicle = user_files.take_vehicle(options)
         _, config = checked_preset(function, algorithm, realistic, user_files.options_of(options, vehicle))
-        config = config if isinstance(config, settings_type) else settings_type()
         settings = {name: convert_setting(name, x, getattr(config, name)) for name, x in settings.items()}
         config = dataclasses.replace(config, **settings)
         for name in ("updates", "worlds", "horizon"):
             check_at_most(name, getattr(config, name), LARGEST_COUNT)
-        return cls(task, algorithm, realistic, options, config, files | vehicle, library)
-
-    @property
-    def trained_by(self) -> str:
-        """Name of the learner for titles."""
-        return self.algorithm if self.library == "jaxdrones" else f"{self.library} {self.algorithm}"
+        return cls(task, algorithm, realistic, options, config, files | vehicle)
 
     def env(self, practice: bool = False, **options: Any) -> Env:
         """The environment to fly in or to train in; options of `jaxdrones.make` replace those of the recipe."""
@@ -103,7 +94,7 @@ class Recipe:
         try:
             user_files.task_of(entries["task"], entries.get("files", {}))
             config = {name: tuple(x) if isinstance(x, list) else x for name, x in entries["config"].items()}
-            settings_type = config_type(entries.get("library", "jaxdrones"), entries["algorithm"])
+            settings_type = learner(entries["algorithm"]).Config
             return cls(**entries | {"config": settings_type(**config)})
         except (AttributeError, KeyError, TypeError) as error:
             raise UserError(f"the recipe is not one of this version ({error!r}); train anew") from error

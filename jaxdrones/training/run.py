@@ -16,7 +16,6 @@ import dataclasses
 import json
 import math
 import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +31,10 @@ from jaxdrones.training.events import PREFIX
 from jaxdrones.training.recipe import Recipe
 
 CHECKPOINTS = ("best", "last", "state")
-RLLIB_CHECKPOINT = "rllib"
-"""Folder of a run that holds a checkpoint of RLlib, if RLlib trained it."""
 
 
 class Run:
     """The folder of the training of one seed."""
-
-    policy_suffix = "msgpack"
 
     def __init__(self, folder: str | os.PathLike):
         """Refer to a folder; nothing is read or made yet."""
@@ -47,8 +42,8 @@ class Run:
 
     @property
     def files(self) -> list[Path]:
-        """The files of a run, of whichever library, that exist: checkpoints, progress, report."""
-        names = [f"{name}.{suffix}" for name in CHECKPOINTS for suffix in ("msgpack", "zip", "json")]
+        """The files of a run that exist: checkpoints, progress, report."""
+        names = [f"{name}.{suffix}" for name in CHECKPOINTS for suffix in ("msgpack", "json")]
         whole = [self.folder / name for name in (*names, "progress.csv", "report.json")]
         candidates = (*whole, *map(writing.beside, whole), *self.event_files())
         return [file for file in candidates if file.exists()]
@@ -76,9 +71,6 @@ class Run:
         """Remove the files of an earlier run, and no others."""
         for file in self.files:
             file.unlink()
-        checkpoint = self.folder / RLLIB_CHECKPOINT
-        if (checkpoint / "rllib_checkpoint.json").exists():
-            shutil.rmtree(checkpoint)
 
     def sidecar(self, name: str = "best") -> dict[str, Any]:
         """The description of the checkpoint `best`, `last` or `state`."""
@@ -105,7 +97,7 @@ class Run:
             ValueError: it is damaged, or of another training.
         """
         self.check_identity(name)
-        files.load_bytes(self.folder / f"{name}.{self.policy_suffix}", self.sidecar(name))
+        files.load_bytes(self.folder / f"{name}.msgpack", self.sidecar(name))
 
     def check_identity(self, name: str) -> None:
         """Check that a checkpoint is of the same training as all that is readable beside it.

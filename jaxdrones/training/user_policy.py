@@ -28,7 +28,7 @@ class UserPolicy:
     """Options of `jaxdrones.make`."""
 
     @property
-    def trained_by(self) -> str:
+    def algorithm(self) -> str:
         """Name of the policy for titles."""
         return self.reference
 

@@ -38,9 +38,7 @@ def test_rllib_trains_with_many_worlds_of_one_id():
     from ray.rllib.algorithms.ppo import PPOConfig
 
     import jaxdrones.adapters.gymnasium
-    from jaxdrones.training.rllib.algorithm import start_ray
 
-    start_ray()
     config = (
         PPOConfig()
         .environment("jaxdrones/Hover-v0", env_config={"autoreset_mode": "NextStep", "duration": 0.2})

@@ -279,6 +279,5 @@ def test_the_command_line_trains_in_the_browser(tmp_path, capsys, monkeypatch):
 
 
 def test_trainings_that_cannot_be_shown_are_refused(capsys):
-    for more in (["--library", "sb3"], ["--hosts", "2", "--host", "0", "--coordinator", "127.0.0.1:9"]):
-        assert main(["train", "hover", "--live", "--no-figure", *more]) == 2
-        assert "--live is given with" in capsys.readouterr().err
+    assert main(["train", "hover", "--live", "--no-figure", "--hosts", "2", "--host", "0", "--coordinator", "a:9"]) == 2
+    assert "--live is given with" in capsys.readouterr().err

@@ -1,1 +1,0 @@
-"""Training by RLlib's new API stack: the paper's multi-agent workflow. Needs ray."""

@@ -1,0 +1,28 @@
+"""Policies from the weights of other libraries."""
+
+import numpy as np
+import pytest
+
+from jaxdrones.learning.weights import mlp_policy
+
+pytestmark = pytest.mark.float32
+
+
+@pytest.mark.parametrize("per_agent", [False, True])
+def test_the_policy_is_the_multilayer_perceptron_of_the_weights(per_agent):
+    rng, drones = np.random.default_rng(0), 2
+    shapes = [(5, 3), (4, 5), (2, 4)]
+    lead = (drones,) if per_agent else ()
+    layers = [(rng.normal(size=(*lead, *shape)), rng.normal(size=(*lead, shape[0]))) for shape in shapes]
+    obs = rng.normal(size=(drones, 3))
+    x = obs.copy()
+    for i, (weight, bias) in enumerate(layers):
+        x = np.stack(
+            [(weight[n] if per_agent else weight) @ x[n] + (bias[n] if per_agent else bias) for n in range(drones)]
+        )
+        x = np.maximum(x, 0) if i < 2 else np.tanh(x)
+    policy = mlp_policy(
+        [(w.astype(np.float32), b.astype(np.float32)) for w, b in layers], activation="relu", per_agent=per_agent
+    )
+    np.testing.assert_allclose(policy(obs.astype(np.float32)), x, atol=1e-5)
+    assert policy.per_agent == per_agent and policy.network.hidden_sizes == (5, 4)

@@ -11,8 +11,7 @@ import jax
 
 from benchmarks.common import success_rate
 from jaxdrones.cli.settings import parse_settings
-from jaxdrones.learning import evaluate
-from jaxdrones.learning.result import training_program
+from jaxdrones.learning import compilation, evaluate
 from jaxdrones.training.algorithms import ALGORITHMS, learner
 from jaxdrones.training.recipe import Recipe
 
@@ -55,7 +54,7 @@ def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
     algorithm, config = learner(recipe.algorithm), recipe.config
     env, practice = recipe.env(), recipe.env(practice=True)
     start, start_cpu = time.perf_counter(), time.process_time()
-    program = training_program(algorithm.init, algorithm.update, practice, config)
+    program = compilation.jit(lambda key: algorithm.train(key, practice, config))
     train = program.lower(jax.random.key(0)).compile()
     spent = {"compile s": time.perf_counter() - start, "compile CPU s": time.process_time() - start_cpu}
 

@@ -143,9 +143,9 @@ def check_policy(name: str, policy: Any, obs: Any, shape: tuple[int, int]) -> No
 
     def act(obs):
         memory, action = None, None
-        if hasattr(policy, "initial_memory"):
-            memory = policy.initial_memory((shape[0],))
-            _check_arrays(f"{name}: initial_memory returns a memory", memory)
+        if hasattr(policy, "initial_hidden_state"):
+            memory = policy.initial_hidden_state((shape[0],))
+            _check_arrays(f"{name}: initial_hidden_state returns a hidden state", memory)
             returned = policy.act(memory, obs)
             if not (isinstance(returned, tuple) and len(returned) == 2):
                 raise UserError(f"{name}: act returns {_kind(returned)}; return the memory and the actions")

@@ -1,9 +1,20 @@
-"""Learners that train policies in seconds, by gradients of the simulation or by policy gradients, and evaluation."""
+"""Learners that train policies by gradients of the simulation or by policy gradients, and evaluation."""
 
-from jaxdrones.learning import bptt, ppo, shac
+from jaxdrones.learning import bptt, loggers, ppo, shac
 from jaxdrones.learning.evaluation import Report, evaluate
-from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.recurrence import RecurrentPolicy
+from jaxdrones.learning.networks import OwnNetwork, Policy, RecurrentPolicy
 from jaxdrones.learning.result import Diverged, Result
 
-__all__ = ["Diverged", "Policy", "RecurrentPolicy", "Report", "Result", "bptt", "evaluate", "ppo", "shac"]
+__all__ = [
+    "Diverged",
+    "OwnNetwork",
+    "Policy",
+    "RecurrentPolicy",
+    "Report",
+    "Result",
+    "bptt",
+    "evaluate",
+    "loggers",
+    "ppo",
+    "shac",
+]

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxdrones.errors import UserError
 from jaxdrones.learning.files import ADVICE, load_bytes, one_line, read_sidecar, save_bytes
-from jaxdrones.learning.networks import MLP, Network, Policy
+from jaxdrones.learning.networks import MLP, Network, OwnNetwork, Policy
 from jaxdrones.learning.normalize import RunningStatistics
 
 
@@ -38,8 +38,12 @@ def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
     save_tree(path, policy, **about, policy=own)
 
 
-def load(path: str | os.PathLike) -> Policy:
+def load(path: str | os.PathLike, network: Any = None) -> Policy:
     """The policy that `save` wrote, bit for bit.
+
+    Args:
+        path: path without an ending.
+        network: the user's network of the policy, see `learning.networks.OwnNetwork`.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
@@ -55,9 +59,15 @@ def load(path: str | os.PathLike) -> Policy:
         settings: dict[str, Any] = {
             name: tuple(x) if isinstance(x, list) else x for name, x in sidecar["policy"]["network"].items()
         }
-        network = Network(**settings) if "recurrent_size" in settings else MLP(**settings)
         obs_stats = RunningStatistics(**{name: jnp.asarray(x) for name, x in arrays["obs_stats"].items()})
         params = jax.tree.map(jnp.asarray, arrays["params"])
+        if "own" in settings:
+            if network is None:
+                raise UserError(f"{path} holds a network of your own, {settings['own']}; give load(path, network=...)")
+            network = OwnNetwork(network, settings["output_size"])
+            params = network.restored(params)
+        else:
+            network = Network(**settings) if "recurrent_size" in settings else MLP(**settings)
         policy = Policy(params, obs_stats, network, sidecar["policy"]["per_agent"])
     except (AttributeError, KeyError, TypeError) as error:
         raise UserError(f"{path} does not hold a policy of this version ({one_line(error)}); {ADVICE}") from error
@@ -106,7 +116,9 @@ def load_tree(path: str | os.PathLike, like: Any) -> Any:
     return jax.tree.map(restored, arrays, like)
 
 
-def _settings(network: MLP | Network) -> dict[str, Any]:
+def _settings(network: MLP | Network | OwnNetwork) -> dict[str, Any]:
+    if isinstance(network, OwnNetwork):
+        return {"own": type(network.module).__qualname__, "output_size": network.output_size}
     names = {field.name for field in dataclasses.fields(network)} - {"parent", "name"}  # flax adds these fields
     return {name: getattr(network, name) for name in names}
 

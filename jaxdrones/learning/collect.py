@@ -15,14 +15,15 @@ from jaxdrones.envs.autoreset import Episode
 from jaxdrones.envs.env import Obs
 from jaxdrones.envs.privileged import PrivilegedObservation
 from jaxdrones.learning import sharding
-from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.layers import expand
+from jaxdrones.learning.networks import Policy, set_zero
 from jaxdrones.learning.normalize import RunningStatistics, state_vector
 from jaxdrones.learning.settings import Scalar
 from jaxdrones.pytree import PyTreeNode
 
 Act = Callable[[jax.Array, Any, Obs], tuple[Any, Array, Any]]
-"""(a key for each world (w,), memory, observations (w, n, d)) -> memory, actions (w, n, a), and extras for the learner,
-such as log probabilities."""
+"""(keys (w,), hidden state, observations (w, n, d)) -> hidden state, actions (w, n, a), and extras such as log
+probabilities."""
 
 
 class Worlds(PyTreeNode):
@@ -37,8 +38,8 @@ class Worlds(PyTreeNode):
     """(w,) return of the last episode that ended, mean of the drones; 0 before the first."""
     last_weight: Array
     """(w,) weight of that episode in the mean return; 0 before the first. See `mean_return`."""
-    memory: Array | None = None
-    """(w, n, m) memory of the policy before the observations, zero at the start of an episode; `None` without one."""
+    hidden_state: Any = None
+    """(w, n, ...) hidden state of the policy before the observations; `None` without one."""
 
 
 class Trajectory(PyTreeNode):
@@ -70,8 +71,8 @@ class Trajectory(PyTreeNode):
     """(t, w, n, ...) privileged observations after the step, before a new episode starts."""
     was_done: Array
     """(t, w) whether the episode had ended before the step; such a step does not count. Always false with `reset`."""
-    memory: Array | None = None
-    """(t, w, n, m) memory of the policy after the observations before the step; `None` without one."""
+    hidden_state: Any = None
+    """(t, w, n, ...) hidden state of the policy after the observations before the step; `None` without one."""
 
     @property
     def done(self) -> Array:
@@ -80,12 +81,12 @@ class Trajectory(PyTreeNode):
 
 
 def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
-    """Worlds in which no episode has begun, for a policy that may have a memory; `restart` starts one in each."""
+    """Worlds in which no episode has begun, for a policy that may be recurrent; `restart` starts one in each."""
     obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), count))
     episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
-    memory = None if policy is None else policy.initial_memory((count, env.drones))
+    hidden_state = None if policy is None else policy.initial_hidden_state((count, env.drones))
     none = jnp.zeros(count, episodes.episode_return.dtype)
-    return Worlds(episodes, obs, jnp.ones(count, bool), none, none, memory)
+    return Worlds(episodes, obs, jnp.ones(count, bool), none, none, hidden_state)
 
 
 def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) -> Worlds:
@@ -102,8 +103,8 @@ def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) ->
     count = len(worlds.done)
     chosen = worlds.done | jax.random.bernoulli(choice_key, fraction, (count,))
     obs, episodes = jax.vmap(AutoReset(env).reset)(jax.random.split(start_key, count))
-    memory = jax.tree.map(jnp.zeros_like, worlds.memory)
-    fresh = worlds.replace(episodes=episodes, obs=obs, done=jnp.zeros_like(chosen), memory=memory)
+    hidden_state = jax.tree.map(jnp.zeros_like, worlds.hidden_state)
+    fresh = worlds.replace(episodes=episodes, obs=obs, done=jnp.zeros_like(chosen), hidden_state=hidden_state)
     return _select(chosen, fresh, worlds)
 
 
@@ -137,7 +138,7 @@ def collect(
     def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Trajectory]:
         act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
         worlds = between_steps(worlds)
-        memory, action, extras = act(act_keys, worlds.memory, worlds.obs)
+        hidden_state, action, extras = act(act_keys, worlds.hidden_state, worlds.obs)
         obs, episodes, reward, terminated, truncated, info = step(step_keys, worlds.episodes, action)
         recorded = Trajectory(
             obs=worlds.obs,
@@ -153,13 +154,13 @@ def collect(
             privileged=privileged_of(worlds.episodes.world),
             final_privileged=privileged_of(info["final_world"]),
             was_done=worlds.done,
-            memory=memory,
+            hidden_state=hidden_state,
         )
         ended = terminated | truncated
         if reset:
-            memory = jax.tree.map(lambda x: jnp.where(ended[:, None, None], 0, x), memory)
-            return worlds.replace(episodes=episodes, obs=obs, memory=memory), recorded
-        after = worlds.replace(episodes=episodes, obs=obs, done=worlds.done | ended, memory=memory)
+            hidden_state = set_zero(ended, hidden_state)
+            return worlds.replace(episodes=episodes, obs=obs, hidden_state=hidden_state), recorded
+        after = worlds.replace(episodes=episodes, obs=obs, done=worlds.done | ended, hidden_state=hidden_state)
         return _select(worlds.done, worlds, after), recorded  # without this, a lost drone would fly on to infinity
 
     def control_steps(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Trajectory]:
@@ -176,7 +177,7 @@ def collect(
 
 def deterministic(policy: Policy) -> Act:
     """Actions of the policy without exploration noise, and no extras."""
-    return jax.tree_util.Partial(lambda policy, keys, memory, obs: (*policy.act(memory, obs), None), policy)
+    return jax.tree_util.Partial(lambda policy, keys, hidden_state, obs: (*policy.act(hidden_state, obs), None), policy)
 
 
 class _NoReset(AutoReset):
@@ -275,8 +276,4 @@ def update_obs_stats(
 
 def _select(condition: Array, worlds: Worlds, others: Worlds) -> Worlds:
     """Worlds where the condition (w,) holds, else the others."""
-
-    def select(x: Array, other: Array) -> Array:
-        return jnp.where(condition.reshape(condition.shape + (1,) * (x.ndim - 1)), x, other)
-
-    return jax.tree.map(select, worlds, others)
+    return jax.tree.map(lambda x, other: jnp.where(expand(condition, x.ndim), x, other), worlds, others)

@@ -1,8 +1,7 @@
-"""What the value functions of the learners know.
+"""Critic inputs and networks.
 
-A critic is an MLP, with a CNN of its own where there are images. It has no memory of its own, but takes that of a
-recurrent policy: the memory sums up what was observed so far, and the critic learns from single control steps, in any
-order.
+A critic is an MLP, with a CNN where there are images. It has no hidden state of its own and takes that of a recurrent
+policy, so that it learns from single control steps in any order.
 """
 
 from __future__ import annotations
@@ -10,47 +9,49 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.envs.privileged import PrivilegedObservation
-from jaxdrones.learning.networks import MLP, Network, Policy, apply, example_observation, make_network
-from jaxdrones.learning.normalize import map_state_vector
+from jaxdrones.learning.layers import make_network
+from jaxdrones.learning.networks import Policy, apply, example_observation, init_params
+from jaxdrones.learning.normalize import map_state_vector, state_vector
 from jaxdrones.learning.settings import Scalar
 
 
-def critic_network(critic_obs: Obs, hidden_sizes: Sequence[int]) -> MLP | Network:
-    """The network of a critic that takes such observations."""
-    return make_network(critic_obs, hidden_sizes, 1, output_scale=0.01)
+def init_critic(key: jax.Array, env: Env, policy: Policy, config: Any) -> Any:
+    """Parameters of the critic.
+
+    Args:
+        key: random key.
+        env: environment.
+        policy: policy that the critic judges.
+        config: settings of shac or ppo.
+    """
+    centralized = getattr(config, "centralized_critic", False)
+    n, size = env.drones, env.observation_size + (env.privileged_size if config.privileged_critic else 0)
+    size = n * size + (n - 1) * env.action_size if centralized else size
+    size += sum(x.size for x in jax.tree.leaves(policy.initial_hidden_state((1,))))
+    example = map_state_vector(lambda _: jnp.zeros(size), example_observation(env))
+    network = make_network(example, config.critic_hidden_sizes, 1, 0.01)
+    return init_params(key, network, example, n if config.per_agent else None)
 
 
 def discounted_value(
     params: Any, critic_obs: Obs, hidden_sizes: Sequence[int], gamma: Scalar, per_agent: bool = False
 ) -> Float[Array, "*batch n"]:
     """The discounted sum of future rewards; the network's output is that sum times one minus `gamma`."""
-    return apply(critic_network(critic_obs, hidden_sizes), params, critic_obs, per_agent)[1][..., 0] / (1 - gamma)
-
-
-def critic_example(env: Env, policy: Policy, privileged: bool = False, centralized: bool = False) -> Obs:
-    """An observation of the critic of one drone, all zero.
-
-    Args:
-        env: environment.
-        policy: policy that the critic judges.
-        privileged: whether the critic takes privileged observations.
-        centralized: whether it takes all drones' observations and the others' actions.
-    """
-    n, size = env.drones, env.observation_size + (env.privileged_size if privileged else 0)
-    size = (n * size + (n - 1) * env.action_size if centralized else size) + policy.recurrent_size
-    return map_state_vector(lambda _: jnp.zeros(size), example_observation(env))
+    network = make_network(critic_obs, hidden_sizes, 1, 0.01)
+    return apply(network, params, critic_obs, per_agent)[1][..., 0] / (1 - gamma)
 
 
 def critic_observation(
     policy: Policy,
     obs: Obs,
-    memory: Array | None,
+    hidden_state: Any,
     privileged: PrivilegedObservation | None = None,
     action: Array | None = None,
 ) -> Obs:
@@ -58,22 +59,20 @@ def critic_observation(
 
     Args:
         policy: policy that the critic judges.
-        obs: (*batch, n, d) what the policy observes, or a dictionary with images.
-        memory: (*batch, n, m) memory of the policy after `obs`; `None` without one.
-        privileged: privileged observation, which takes the place of the vector of `obs`.
-        action: (*batch, n, a) actions of all drones for a centralized critic, which takes all drones' observations and
-            the others' actions; `None` for one that takes a drone's own observation.
+        obs: (*batch, n, d) observations of the policy, or a dictionary with images.
+        hidden_state: (*batch, n, ...) hidden state of the policy after `obs`; `None` without one.
+        privileged: privileged observation, in place of the vector of `obs`.
+        action: (*batch, n, a) actions of all drones for a centralized critic, see `centralized_input`.
     """
+    vector = state_vector(obs) if privileged is None else privileged.obs
+    x = policy.obs_stats.normalize(vector)
     if privileged is not None:
-        obs = map_state_vector(lambda _: privileged.obs, obs)
-    obs = map_state_vector(policy.obs_stats.normalize, obs)
-    if privileged is not None:
-        obs = map_state_vector(lambda x: jnp.concatenate([x, privileged.params], axis=-1), obs)
+        x = jnp.concatenate([x, privileged.params], axis=-1)
     if action is not None:
-        obs = map_state_vector(lambda x: centralized_input(x, action), obs)
-    if memory is not None:
-        obs = map_state_vector(lambda x: jnp.concatenate([x, memory], axis=-1), obs)
-    return obs
+        x = centralized_input(x, action)
+    states = [s.reshape(*x.shape[:-1], -1) for s in jax.tree.leaves(hidden_state)]
+    x = jnp.concatenate([x, *states], axis=-1) if states else x
+    return map_state_vector(lambda _: x, obs)
 
 
 def centralized_input(

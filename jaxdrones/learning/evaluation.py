@@ -15,7 +15,7 @@ from jaxdrones.checks import check_key
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation
-from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
+from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 from jaxdrones.pytree import PyTreeNode
 
@@ -62,7 +62,7 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
     Args:
         env: environment of either backend.
         policy: observations (n, d), or a dictionary with images, -> actions (n, a): a pytree, or any function; or a
-            policy with a memory, see `learning.recurrence`.
+            recurrent policy, see `learning.networks`.
         key: random key.
         episodes: number of episodes.
 
@@ -127,18 +127,18 @@ def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), _metrics_and_ends(info))
 
     def control_step(carry, key):
-        memory, obs, world, diverged, done, last, episode_return, length = carry
-        memory, action = act(policy, memory, obs)
+        state, obs, world, diverged, done, last, episode_return, length = carry
+        state, action = act(policy, state, obs)
         obs, world, reward, terminated, truncated, info = env.step(key, world, action)
         last = jax.tree.map(lambda new, old: jnp.where(done, old, new), _metrics_and_ends(info), last)
         episode_return = episode_return + jnp.where(done, 0, reward)
         length = length + ~done
         diverged = diverged | (~done & ~jnp.all(jnp.isfinite(world.drones.pos)))
-        return (memory, obs, world, diverged, done | terminated | truncated, last, episode_return, length), last[0]
+        return (state, obs, world, diverged, done | terminated | truncated, last, episode_return, length), last[0]
 
     zero = jnp.zeros(env.drones, world.drones.pos.dtype)
     false = jnp.zeros((), bool)
-    carry = (initial_memory(policy, env.drones), obs, world, false, false, zeros, zero, jnp.zeros((), jnp.int32))
+    carry = (initial_hidden_state(policy, env.drones), obs, world, false, false, zeros, zero, jnp.zeros((), jnp.int32))
     carry, metrics = jax.lax.scan(control_step, carry, jax.random.split(key, env.steps))
     _, _, _, diverged, _, (final_metrics, ends), episode_return, length = carry
     flown = jnp.arange(env.steps)[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,24 +15,22 @@ from jaxdrones.learning.networks import Policy
 HALF_LOG_2_PI = math.log(2 * math.pi) / 2
 
 
-def explore(
-    policy: Policy, log_std: Array, keys: jax.Array, memory: Array | None, obs: Obs
-) -> tuple[Array | None, Array, Array]:
+def explore(policy: Policy, log_std: Array, keys: jax.Array, hidden_state: Any, obs: Obs) -> tuple[Any, Array, Array]:
     """Actions about those of a policy in many worlds, for `collect.collect`.
 
     Args:
         policy: policy.
         log_std: (a,) or (n, a), logarithm of the standard deviation of actions.
         keys: (w,) random key of each world.
-        memory: (w, n, m) memory of the policy before the observations; `None` without one.
+        hidden_state: (w, n, ...) hidden state of the policy before the observations; `None` without one.
         obs: (w, n, d) observations, or a dictionary with images.
 
     Returns:
-        The memory after the observations, the actions (w, n, a), and the logarithm of their density (w, n).
+        The hidden state after the observations, the actions (w, n, a), and the logarithm of their density (w, n).
     """
-    memory, mean = policy.act(memory, obs)
+    hidden_state, mean = policy.act(hidden_state, obs)
     action = jax.vmap(sample, (0, 0, None))(keys, mean, log_std)
-    return memory, action, log_prob(action, mean, log_std)
+    return hidden_state, action, log_prob(action, mean, log_std)
 
 
 def sample(key: jax.Array, mean: Float[Array, "*batch n a"], log_std: Array) -> Float[Array, "*batch n a"]:

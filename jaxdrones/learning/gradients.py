@@ -19,7 +19,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -27,42 +27,64 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxdrones import vector
+from jaxdrones.checks import check_callable, check_choice
 from jaxdrones.dynamics import rotors
 from jaxdrones.dynamics.rigid_body import newton_euler
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
-from jaxdrones.learning.settings import Scalar
+from jaxdrones.learning.settings import BelowOne, Bool, Config, Fraction, Scalar
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
+GradientName = Literal["exact", "decay", "surrogate", "point_mass"]
 
-def with_gradient(env: Env, gradient: str, surrogate: Step | None = None, image_gradient: bool = True) -> Env:
-    """The environment whose physics is differentiated in the way that `gradient` names.
 
-    Args:
-        env: environment.
-        gradient: exact, decay, surrogate or point_mass.
-        surrogate: step whose derivatives are taken with `surrogate`; a rigid body with instant rotors when left out.
-        image_gradient: whether the images of cameras have a gradient; otherwise they are constants.
-    """
+def _check_gradient(name: str, value: Any) -> None:
+    check_choice(name, value, get_args(GradientName))
+
+
+def _check_surrogate(name: str, step: Any) -> None:
+    if step is not None:
+        check_callable(name, step, "jaxdrones.make_step()")
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientConfig(Config):
+    """Settings of the learners that differentiate the simulation."""
+
+    adam_b2: BelowOne = 0.95
+    """Decay rate of Adam's mean of squared gradients, of the policy. It is low because gradients shrink by orders of
+    magnitude while the policy learns."""
+    gradient: Annotated[GradientName, _check_gradient] = "exact"
+    """How the flight is differentiated: exact, decay, surrogate or point_mass; see `learning.gradients`."""
+    gradient_decay: Fraction = 0.98
+    """Factor on the gradient per control step with `gradient="decay"`."""
+    surrogate: Annotated[Step | None, _check_surrogate] = None
+    """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+    image_gradient: Bool = True
+    """Whether the gradient goes through the images of cameras, or takes them for constants."""
+
+
+def with_gradient(env: Env, config: GradientConfig) -> Env:
+    """The environment whose physics and images are differentiated as the settings say."""
     changed = copy.copy(env)
-    if gradient == "surrogate":
-        changed.physics = SurrogateStep(env.physics, surrogate or make_step(dt=env.dt))
-    if gradient == "point_mass":
+    if config.gradient == "surrogate":
+        changed.physics = SurrogateStep(env.physics, config.surrogate or make_step(dt=env.dt))
+    if config.gradient == "point_mass":
         changed.physics = SurrogateStep(env.physics, point_mass(env.dt))
-    if env.vision and not image_gradient:
+    if env.vision and not config.image_gradient:
         render = env.vision.render
         changed.vision = dataclasses.replace(env.vision, render=lambda *seen: render(*jax.lax.stop_gradient(seen)))
     return changed
 
 
-def gradient_between_steps(gradient: str, factor: Scalar) -> Callable[[Any], Any]:
-    """A function that is applied to the worlds between control steps; it changes their gradient, not their values."""
-    if gradient == "decay":
-        return lambda worlds: scale_gradient(worlds, factor)
+def gradient_between_steps(config: GradientConfig) -> Callable[[Any], Any]:
+    """A function of the worlds between control steps; it changes their gradient, not their values."""
+    if config.gradient == "decay":
+        return lambda worlds: scale_gradient(worlds, config.gradient_decay)
     return lambda worlds: worlds
 
 

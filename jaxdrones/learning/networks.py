@@ -1,10 +1,11 @@
-"""Policies and value functions: networks of normalized observations."""
+"""Policies: networks of normalized observations, of this package or a user's own."""
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, cast, runtime_checkable
 
 import flax.linen as nn
 import flax.struct
@@ -13,94 +14,119 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice, is_known
+from jaxdrones.checks import check_callable, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
-from jaxdrones.learning.layers import CNN, GRU, IMAGE_CHANNELS, MLP, convolutions, image_channels
+from jaxdrones.learning.layers import MLP, Network, expand, make_network
 from jaxdrones.learning.normalize import RunningStatistics, map_state_vector, state_vector
 from jaxdrones.pytree import PyTreeNode
 
 
-class Network(nn.Module):
-    """An MLP of the vector of an observation, of features that a CNN extracts from its images, and of a GRU's memory.
+@runtime_checkable
+class RecurrentPolicy(Protocol):
+    """A policy with a hidden state, an array or a pytree; `None` for a policy without one."""
 
-    An observation without images needs no CNN; `recurrent_size` 0 means no GRU. What the GRU sees, the MLP sees too.
+    def initial_hidden_state(self, batch: tuple[int, ...]) -> Any:
+        """The hidden state at the start of an episode; `batch` is (drones,) for one team."""
+
+    def act(self, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "*batch n a"]]:
+        """The hidden state after the observations, and actions."""
+
+
+AnyPolicy = RecurrentPolicy | Callable[[Obs], Array]
+"""A recurrent policy, or any function from observations (n, d), or a dictionary with images, to actions (n, a)."""
+
+
+def initial_hidden_state(policy: AnyPolicy, drones: int) -> Any:
+    """The hidden state of a team's policy at the start of an episode; `None` for a plain function."""
+    return policy.initial_hidden_state((drones,)) if isinstance(policy, RecurrentPolicy) else None
+
+
+def act(policy: AnyPolicy, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "n a"]]:
+    """The hidden state after the observations, and actions."""
+    return policy.act(hidden_state, obs) if isinstance(policy, RecurrentPolicy) else (hidden_state, policy(obs))
+
+
+class OwnNetwork:
+    """A user's network: a flax linen module, a flax nnx module, or an equinox module.
+
+    The network maps the normalized observation of one drone, (d,) or a dictionary with images, to one output per
+    action; the policy applies tanh to them. A recurrent network also has `initial_hidden_state()`, zeros of any
+    structure, and maps `(hidden_state, obs)` to `(hidden_state, output)`.
+
+    The parameters of a linen module are its variables. Those of the others, which are trees of arrays, are a tuple of
+    all arrays of floating-point numbers.
     """
 
-    hidden_sizes: Sequence[int]
-    output_size: int
-    output_scale: float = 1.0
-    activation: str = "tanh"
-    channels: Sequence[int] = ()
-    strides: Sequence[int] = ()
-    features: int = 64
-    depth_scale: float = 3.0
-    """Depth that the network takes for a nearness of 1/2, m; of 0.3, 5 and 10 m it makes 0.91, 0.38 and 0.23."""
-    recurrent_size: int = 0
+    def __init__(self, module: Any, output_size: int):
+        check_callable("network", module, "a flax or equinox module")
+        self.module, self.output_size = module, output_size
+        self.recurrent = hasattr(module, "initial_hidden_state")
+        if self.recurrent and any(np.any(x) for x in jax.tree.leaves(module.initial_hidden_state()) if is_known(x)):
+            raise UserError("network.initial_hidden_state() is not zero; give zeros")
+        if not isinstance(module, nn.Module):
+            self._leaves, self._structure = jax.tree.flatten(module)
 
-    @nn.compact
-    def __call__(
-        self, obs: Obs, memory: Array | None = None, starts: Array | None = None
-    ) -> tuple[Array | None, Array]:
-        """The memory after the observations, and outputs (*batch, output_size); see `GRU` for the arguments."""
-        x = obs
-        if isinstance(obs, dict):
-            images = image_channels({name: x for name, x in obs.items() if name != "state"}, self.depth_scale)
-            features = CNN(self.channels, self.strides, self.features)(images)
-            x = jnp.concatenate([obs["state"], features], axis=-1)
-        if self.recurrent_size:
-            memory = GRU(self.recurrent_size)(x, memory, starts)
-            x = jnp.concatenate([x, memory], axis=-1)
-        return memory, MLP(self.hidden_sizes, self.output_size, self.output_scale, self.activation)(x)
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, OwnNetwork) and self.module is other.module
+
+    def __hash__(self) -> int:
+        return id(self.module)
+
+    def init(self, key: jax.Array, example: Obs) -> Any:
+        """The parameters that training starts with; the key is for a linen module alone."""
+        if isinstance(self.module, nn.Module):
+            state = (self.module.initial_hidden_state(),) if self.recurrent else ()
+            return self.module.init(key, *state, example)
+        return tuple(jnp.asarray(x) for x in self._leaves if _is_trained(x))
+
+    def restored(self, params: dict[str, Any]) -> Any:
+        """The parameters of a file, which holds tuples as dictionaries."""
+        return params if isinstance(self.module, nn.Module) else tuple(params[str(i)] for i in range(len(params)))
+
+    def with_params(self, params: Any) -> Callable:
+        """The user's module with other parameters; for linen a function that applies it."""
+        if isinstance(self.module, nn.Module):
+            return functools.partial(self.module.apply, params)
+        rest = iter(params)
+        return jax.tree.unflatten(self._structure, [next(rest) if _is_trained(x) else x for x in self._leaves])
+
+    def apply(self, params: Any, obs: Obs, hidden_state: Any = None, starts: Array | None = None) -> tuple[Any, Array]:
+        """Hidden states and outputs of a batch, or with `starts` of sequences; see `layers.GRU` for the arguments."""
+        if starts is not None:
+
+            def step(state: Any, step_inputs: tuple[Obs, Array]) -> tuple[Any, tuple[Any, Array]]:
+                obs, start = step_inputs
+                state, output = self.apply(params, obs, set_zero(start, state))
+                return state, (state, output)
+
+            return jax.lax.scan(step, hidden_state, (obs, starts))[1]
+
+        def one_drone(state: Any, obs: Obs) -> tuple[Any, Array]:
+            module = self.with_params(params)
+            return module(state, obs) if self.recurrent else (None, module(obs))
+
+        for _ in range(state_vector(obs).ndim - 1):
+            one_drone = jax.vmap(one_drone)
+        return one_drone(hidden_state, obs)
 
 
-def make_network(
-    obs: Obs, hidden_sizes: Sequence[int], output_size: int, output_scale: float, recurrent_size: int = 0
-) -> MLP | Network:
-    """A network of the kind that such observations need, with a CNN that suits the resolution of images.
-
-    Args:
-        obs: observations (*batch, d), or a dictionary of such an array and of images.
-        hidden_sizes: sizes of the hidden layers.
-        output_size: number of outputs.
-        output_scale: scale of the initial outputs.
-        recurrent_size: size of the GRU's memory; 0 for a network without one.
-
-    Raises:
-        ValueError: the observations have images that no network takes.
-    """
-    if isinstance(obs, dict):
-        names = sorted(obs.keys() - {"state"})
-        for name in names:
-            check_choice("image for a policy", name, IMAGE_CHANNELS)
-        batch = obs["state"].ndim - 1
-        channels, strides = convolutions(*obs[names[0]].shape[batch : batch + 2])
-    elif recurrent_size:
-        channels, strides = (), ()
-    else:
-        return MLP(tuple(hidden_sizes), output_size, output_scale)
-    return Network(
-        tuple(hidden_sizes),
-        output_size,
-        output_scale,
-        channels=channels,
-        strides=strides,
-        recurrent_size=recurrent_size,
-    )
+def _is_trained(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray) and jnp.issubdtype(leaf.dtype, jnp.inexact)
 
 
 class Policy(PyTreeNode):
     """A function from a team's observations to its actions; a pytree, which can be saved, mapped and differentiated.
 
-    A recurrent policy also has a memory, see `learning.recurrence`; a policy without one can be called.
+    A recurrent policy has a hidden state, see `RecurrentPolicy`; a policy without one can be called.
     """
 
     params: Any
     """Parameters of the network; with `per_agent` one set for each drone, along a leading axis."""
     obs_stats: RunningStatistics
     """Statistics that normalize the observations."""
-    network: MLP | Network = flax.struct.field(pytree_node=False)
+    network: MLP | Network | OwnNetwork = flax.struct.field(pytree_node=False)
     per_agent: bool = flax.struct.field(pytree_node=False, default=False)
 
     @classmethod
@@ -108,85 +134,104 @@ class Policy(PyTreeNode):
         cls,
         key: jax.Array,
         env: Env,
-        hidden_sizes: Sequence[int],
+        hidden_sizes: Sequence[int] = (32, 32),
         per_agent: bool = False,
         recurrent_size: int = 0,
+        network: Any = None,
     ) -> Policy:
-        """A policy whose actions are nearly zero, with which drones hover in most action types.
+        """A policy whose actions are nearly zero, which is hover in most action types.
 
         Args:
             key: random key.
-            env: environment that the policy is for.
+            env: environment.
             hidden_sizes: sizes of the hidden layers.
             per_agent: whether every drone has a network of its own; otherwise all drones share one.
-            recurrent_size: size of the memory of each drone; 0 for a policy without one.
+            recurrent_size: size of the hidden state of a GRU; 0 for none.
+            network: a network in place of that of these sizes, see `OwnNetwork`.
+
+        Raises:
+            ValueError: the network does not fit the environment.
         """
         obs = example_observation(env)
-        network = make_network(obs, hidden_sizes, env.action_size, 0.01, recurrent_size)
+        own = make_network(obs, hidden_sizes, env.action_size, 0.01, recurrent_size)
+        network = own if network is None else OwnNetwork(network, env.action_size)
         params = init_params(key, network, obs, env.drones if per_agent else None)
-        return cls(params, RunningStatistics.empty(env.observation_size), network, per_agent)
+        policy = cls(params, RunningStatistics.empty(env.observation_size), network, per_agent)
+        if isinstance(network, OwnNetwork):
+            team = jax.tree.map(lambda x: jnp.zeros((env.drones, *x.shape), x.dtype), obs)
+            action = jax.eval_shape(policy.act, policy.initial_hidden_state((env.drones,)), team)[1]
+            if action.shape != (env.drones, env.action_size):
+                raise UserError(f"network has outputs {action.shape[1:]} for one drone; give ({env.action_size},)")
+        return policy
 
     def __repr__(self) -> str:
-        layers = (*np.shape(self.obs_stats.mean)[-1:], *self.network.hidden_sizes, self.network.output_size)
+        sizes = np.shape(self.obs_stats.mean)[-1:]
+        if isinstance(self.network, OwnNetwork):
+            layers = f"{sizes[0]} -> {type(self.network.module).__name__}"
+        else:
+            layers = " -> ".join(map(str, (*sizes, *self.network.hidden_sizes, self.network.output_size)))
+            layers += f", {self.network.activation}"
+        if isinstance(self.network, Network):
+            layers += f", images by {self.network.channels}" if self.network.channels else ""
+            layers += f", GRU of {self.network.recurrent_size}" if self.network.recurrent_size else ""
         numbers = sum(math.prod(np.shape(x)) for x in jax.tree.leaves(self.params))
         count = self.obs_stats.count
         known = isinstance(count, jax.Array | np.ndarray) and is_known(count) and count.ndim == 0
         counted = f", statistics of {float(count):,.0f} observations" if known else ""
-        channels = self.network.channels if isinstance(self.network, Network) else ()
-        images = f" and images by {channels}" if channels else ""
-        memory = f", a memory of {self.recurrent_size}" if self.recurrent_size else ""
         whose = ", one network per drone" if self.per_agent else ""
-        return (
-            f"<Policy {' -> '.join(map(str, layers))}{images}{memory}, {self.network.activation}, "
-            f"{numbers:,} parameters{whose}{counted}>"
-        )
+        return f"<Policy {layers}, {numbers:,} parameters{whose}{counted}>"
 
     @property
-    def recurrent_size(self) -> int:
-        """Size of the memory of each drone; 0 for a policy without one."""
-        return self.network.recurrent_size if isinstance(self.network, Network) else 0
+    def is_recurrent(self) -> bool:
+        """Whether the policy has a hidden state."""
+        own = isinstance(self.network, OwnNetwork)
+        return self.network.recurrent if own else bool(getattr(self.network, "recurrent_size", 0))
 
-    def initial_memory(self, batch: tuple[int, ...]) -> Array | None:
-        """The memory (*batch, recurrent_size) at the start of an episode, zero; `None` for a policy without one.
+    def initial_hidden_state(self, batch: tuple[int, ...]) -> Any:
+        """The hidden state (*batch, ...) at the start of an episode, zero; `None` for a policy without one.
 
         Args:
-            batch: (drones,) for one team; the number of teams before it for many.
+            batch: (drones,) for one team; (teams, drones) for many.
         """
-        return jnp.zeros((*batch, self.recurrent_size)) if self.recurrent_size else None
+        if not self.is_recurrent:
+            return None
+        if isinstance(self.network, OwnNetwork):
+            state = self.network.module.initial_hidden_state()
+            return jax.tree.map(lambda x: jnp.zeros((*batch, *jnp.shape(x)), jnp.result_type(x)), state)
+        return jnp.zeros((*batch, cast(Network, self.network).recurrent_size))
 
-    def act(self, memory: Array | None, obs: Obs) -> tuple[Array | None, Float[Array, "*batch n a"]]:
-        """The memory (*batch, n, m) after the observations, and actions in (-1, 1).
+    def act(self, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "*batch n a"]]:
+        """The hidden state (*batch, n, ...) after the observations, and actions in (-1, 1).
 
         Args:
-            memory: (*batch, n, m) memory before them.
+            hidden_state: hidden state before them.
             obs: observations (*batch, n, d), or a dictionary of such an array and of images.
         """
         x = map_state_vector(self.obs_stats.normalize, obs)
-        memory, output = apply(self.network, self.params, x, self.per_agent, memory)
-        return memory, jnp.tanh(output)
+        hidden_state, output = apply(self.network, self.params, x, self.per_agent, hidden_state)
+        return hidden_state, jnp.tanh(output)
 
-    def replay(self, memory: Array | None, obs: Obs, starts: Array | None) -> Float[Array, "t *batch n a"]:
+    def replay(self, hidden_state: Any, obs: Obs, starts: Array | None) -> Float[Array, "t *batch n a"]:
         """The actions of a sequence of observations.
 
         Args:
-            memory: (*batch, n, m) memory before the first of them.
+            hidden_state: (*batch, n, ...) hidden state before the first observation.
             obs: (t, *batch, n, d) observations, or a dictionary.
-            starts: (t, *batch) whether an episode starts with the observation; a policy without memory needs none.
+            starts: (t, *batch) whether an episode starts with the observation; `None` without a hidden state.
         """
         x = map_state_vector(self.obs_stats.normalize, obs)
-        starts = starts if self.recurrent_size else None
-        return jnp.tanh(apply(self.network, self.params, x, self.per_agent, memory, starts)[1])
+        return jnp.tanh(apply(self.network, self.params, x, self.per_agent, hidden_state, starts)[1])
 
     def __call__(self, obs: Obs) -> Float[Array, "*batch n a"]:
-        """Actions of a policy without memory, as of `act`.
+        """Actions of a policy without a hidden state.
 
         Raises:
-            ValueError: the policy has a memory.
+            ValueError: the policy has a hidden state.
         """
-        if self.recurrent_size:
+        if self.is_recurrent:
             raise UserError(
-                f"this policy has a memory of {self.recurrent_size} numbers per drone; call policy.act(memory, obs), "
-                "at the start of an episode with policy.initial_memory((drones,))"
+                "the policy is recurrent; call policy.act(hidden_state, obs), at the start of an episode with "
+                "policy.initial_hidden_state((drones,))"
             )
         return self.act(None, obs)[1]
 
@@ -197,30 +242,36 @@ def example_observation(env: Env) -> Obs:
     return jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), obs)
 
 
-def init_params(key: jax.Array, network: MLP | Network, example: Obs, agents: int | None = None) -> Any:
-    """Parameters of a network for inputs like the example; with `agents` one set for each, along a leading axis."""
+def init_params(key: jax.Array, network: Any, example: Obs, agents: int | None = None) -> Any:
+    """Parameters of a network for one drone's observation; with `agents` one set each, along a leading axis."""
     if agents is None:
         return network.init(key, example)
-    return jax.vmap(network.init, in_axes=(0, None))(jax.random.split(key, agents), example)
+    return jax.vmap(network.init, in_axes=(0, None), axis_size=agents)(jax.random.split(key, agents), example)
 
 
 def apply(
-    network: MLP | Network,
+    network: MLP | Network | OwnNetwork,
     params: Any,
     x: Obs,
     per_agent: bool,
-    memory: Array | None = None,
+    hidden_state: Any = None,
     starts: Array | None = None,
-) -> tuple[Array | None, Array]:
-    """Memory and outputs of the network that all drones share, or of the network of each drone; see `GRU`."""
+) -> tuple[Any, Array]:
+    """Hidden states and outputs of the network that all drones share, or of the network of each drone."""
 
-    def of_network(params: Any, x: Obs, memory: Array | None) -> tuple[Array | None, Array]:
+    def of_network(params: Any, x: Obs, hidden_state: Any) -> tuple[Any, Array]:
         if isinstance(network, MLP):
             return None, cast(Array, network.apply(params, x))
-        return cast(tuple[Array | None, Array], network.apply(params, x, memory, starts))
+        return cast(tuple[Any, Array], network.apply(params, x, hidden_state, starts))
 
     if not per_agent:
-        return of_network(params, x, memory)
+        return of_network(params, x, hidden_state)
     axis = state_vector(x).ndim - 2
-    memory_axis = axis if starts is None else axis - 1
-    return jax.vmap(of_network, in_axes=(0, axis, memory_axis), out_axes=axis)(params, x, memory)
+    state_axis = axis if starts is None else axis - 1
+    in_axes, out_axes = (0, axis, state_axis), (axis, axis)
+    return jax.vmap(of_network, in_axes=in_axes, out_axes=out_axes)(params, x, hidden_state)
+
+
+def set_zero(where: Array, tree: Any) -> Any:
+    """The tree with zeros where the condition over its leading axes holds."""
+    return jax.tree.map(lambda x: jnp.where(expand(where, x.ndim), 0, x), tree)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,28 +11,26 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_key, check_keywords, check_number, is_known
+from jaxdrones.checks import check_keywords, check_number, is_known
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
-from jaxdrones.learning import collect, result
-from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
+from jaxdrones.learning import collect, result, settings
+from jaxdrones.learning.critic import critic_observation, discounted_value, init_critic
 from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob, sample
-from jaxdrones.learning.networks import Policy, init_params
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import trajectory_advantages
 from jaxdrones.learning.settings import (
     BelowOne,
+    Bool,
     Count,
-    CountOrNone,
     Fraction,
     HiddenSizes,
     NotNegative,
     Positive,
     PositiveOrInfinite,
-    Switch,
     TracedCount,
     check_config,
-    check_settings,
 )
 from jaxdrones.pytree import PyTreeNode
 
@@ -40,33 +39,30 @@ _MAX_LOG_RATIO = 10.0  # far beyond what is rewarded; its exponential is finite
 
 @check_keywords
 @dataclasses.dataclass(frozen=True)
-class Config:
-    """Settings; the numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
+class Config(settings.Config):
+    """Settings; numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
 
     updates: TracedCount = 400
-    worlds: Count = 256
     horizon: Count = 96
     """Control steps of a trajectory. About one second is enough for a rotor's speed to change the position."""
+    obs_stats_freeze: Fraction = 0.1
+    """Fraction of the updates after which the statistics of observations no longer change."""
+    learning_rate: Positive = 2e-3
+    """Learning rate at the start; it then adapts to `target_kl`."""
+    gamma: BelowOne = 0.99
+    """Discount factor."""
+    restart_fraction: Fraction = 0.05
+    """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
+    max_grad_norm: PositiveOrInfinite = 0.5
     epochs: Count = 4
     """Passes over each trajectory."""
     minibatches: Count = 8
     """Minibatches of an epoch, each with all steps of some of the worlds."""
-    hidden_sizes: HiddenSizes = (32, 32)
-    recurrent_size: CountOrNone = 0
-    """Size of the memory that each drone's policy has, of a gated recurrent unit (GRU); 0 for none."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
-    obs_stats_window: PositiveOrInfinite = 1e9
-    """Number of trajectories whose observations the statistics remember."""
-    obs_stats_freeze: Fraction = 0.1
-    """Fraction of the updates after which the statistics of observations no longer change."""
-    per_agent: Switch = False
-    """Whether every drone has a policy and a critic of its own; otherwise all drones share them."""
-    centralized_critic: Switch = False
+    centralized_critic: Bool = False
     """Whether the critic takes all drones' observations and the others' actions, or a drone's own observation."""
-    privileged_critic: Switch = False
-    """Whether the critic takes what the policy does not observe: observations without noise, and drawn parameters."""
-    learning_rate: Positive = 2e-3
-    """Learning rate at the start; it then adapts to `target_kl`."""
+    privileged_critic: Bool = False
+    """Whether the critic takes observations without noise and drawn parameters, which the policy does not observe."""
     target_kl: Positive = 0.02
     """Kullback-Leibler divergence of the updated policy from the one that acted. After an update the learning rate
     falls if the divergence was above twice this value and rises if it was below half of it, between
@@ -76,8 +72,6 @@ class Config:
     anneal_fraction: Fraction = 0.3
     """Fraction of the updates, the last ones, in which the upper bound of the learning rate falls to
     `min_learning_rate`, and that of the standard deviation of actions to `final_std`."""
-    gamma: BelowOne = 0.99
-    """Discount factor."""
     gae_lambda: Fraction = 0.99
     """Lambda of the generalized advantage estimation."""
     clip_epsilon: Positive = 0.2
@@ -92,12 +86,9 @@ class Config:
     final_std: Positive = 0.02
     """Upper bound of the standard deviation after the last update. It is small because rotors whose speed fluctuates
     produce more thrust, so that the mean action alone, which flies after training, would produce too little."""
-    restart_fraction: Fraction = 0.05
-    """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
-    max_grad_norm: PositiveOrInfinite = 0.5
 
     def __post_init__(self):
-        check_settings(self)
+        super().__post_init__()
         if is_known(self.min_learning_rate):
             low = float(self.min_learning_rate)
             check_number("max_learning_rate", self.max_learning_rate, "not below min_learning_rate", at_least=low)
@@ -105,21 +96,15 @@ class Config:
             raise UserError(f"worlds is {self.worlds}; give a multiple of minibatches, {self.minibatches}")
 
 
-class TrainState(PyTreeNode):
+class TrainState(result.TrainState):
     """Everything that training needs to continue."""
 
-    step: Array
-    """() updates made."""
-    key: Array
-    policy: Policy
     log_std: Array
     """(a,), or (n, a) with `per_agent`: logarithm of the standard deviation of actions."""
     critic: Any
     """Parameters of the value function."""
-    opt_state: optax.OptState
     learning_rate: Array
     """()"""
-    worlds: collect.Worlds
 
 
 class Batch(PyTreeNode):
@@ -132,42 +117,33 @@ class Batch(PyTreeNode):
     critic_obs: Obs
     advantage: Array
     value_target: Array
-    memory: Array | None = None
-    """(1, w, n, m) memory of the policy at the start of the trajectories; `None` without one."""
+    hidden_state: Any = None
+    """(1, w, n, ...) hidden state of the policy at the start of the trajectories; `None` without one."""
     starts: Array | None = None
-    """(t, w) whether a new episode starts, with an empty memory; `None` for a policy without one."""
+    """(t, w) whether a new episode starts; `None` for a policy without a hidden state."""
 
 
-def init(key: jax.Array, env: Env, config: Config) -> TrainState:
-    """The state before the first update.
-
-    Raises:
-        ValueError: no random key, or settings of another learner.
-    """
-    check_key("key", key)
-    check_config(config, Config)
+def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> TrainState:
+    """The state before the first update."""
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent, config.recurrent_size)
-    n, a = env.drones, env.action_size
-    log_std = jnp.full((n, a) if config.per_agent else (a,), jnp.log(config.init_std), float)
-    critic_obs = critic_example(env, policy, config.privileged_critic, config.centralized_critic)
-    network = critic_network(critic_obs, config.critic_hidden_sizes)
-    critic = init_params(critic_key, network, critic_obs, n if config.per_agent else None)
+    policy = result.init_policy(policy_key, env, config, network)
+    shape = (env.drones, env.action_size) if config.per_agent else (env.action_size,)
+    log_std = jnp.full(shape, jnp.log(config.init_std), float)
+    critic = init_critic(critic_key, env, policy, config)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,
         policy=policy,
+        opt_state=_optimizer(config).init((policy.params, log_std, critic)),
+        worlds=collect.empty_worlds(env, config.worlds, policy),
         log_std=log_std,
         critic=critic,
-        opt_state=_optimizer(config).init((policy.params, log_std, critic)),
         learning_rate=jnp.asarray(config.learning_rate, log_std.dtype),
-        worlds=collect.empty_worlds(env, config.worlds, policy),
     )
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Collect a trajectory of all worlds, then make some epochs of gradient steps on it."""
-    check_config(config, Config)
     key, restart_key, collect_key, critic_key, optimize_key = jax.random.split(state.key, 5)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
 
@@ -175,7 +151,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     after, trajectory = collect.collect(
         collect_key, env, act, worlds, config.horizon, privileged=config.privileged_critic
     )
-    batch = batch_of(critic_key, config, state, worlds.memory, trajectory)
+    batch = batch_of(critic_key, config, state, worlds.hidden_state, trajectory)
     (params, log_std, critic), opt_state, metrics = _optimize(optimize_key, config, state, batch)
     learning_rate = result.adapted_learning_rate(config, state.step + 1, state.learning_rate, metrics["kl"])
     max_std = result.annealed(config, state.step, config.init_std, config.final_std)
@@ -183,16 +159,22 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
     policy = state.policy.replace(params=params, obs_stats=obs_stats)
     after, measured = collect.measure(env, config, state.step, after, trajectory)
-    metrics |= measured
-    metrics |= {"action_std": jnp.mean(jnp.exp(log_std)), "learning_rate": learning_rate}
-    return TrainState(state.step + 1, key, policy, log_std, critic, opt_state, learning_rate, after), metrics
+    metrics |= measured | {"action_std": jnp.mean(jnp.exp(log_std)), "learning_rate": learning_rate}
+    return TrainState(state.step + 1, key, policy, opt_state, after, log_std, critic, learning_rate), metrics
 
 
-def train(key: jax.Array, env: Env, config: Config) -> result.Result:
-    """Make all updates in one compiled program; see `learning.result.run_training`."""
-    check_key("key", key)
+def train(
+    key: jax.Array,
+    env: Env,
+    config: Config,
+    *,
+    network: Any = None,
+    callback: result.Callback | Sequence[result.Callback] = (),
+    state: TrainState | None = None,
+) -> result.Result:
+    """Make all updates; see `learning.result.run_training`."""
     check_config(config, Config)
-    return result.run_training(init, update, key, env, config)
+    return result.run_training(init, update, key, env, config, network=network, callback=callback, state=state)
 
 
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
@@ -215,29 +197,27 @@ def divergence(policy: Policy, log_std: Array, batch: Batch) -> Array:
 
 def _probability_ratio(policy: Policy, log_std: Array, batch: Batch) -> tuple[Array, Array]:
     """How much more probable the actions are than when they were chosen, and its logarithm."""
-    mean = policy.replay(jax.tree.map(lambda x: x[0], batch.memory), batch.obs, batch.starts)
+    mean = policy.replay(jax.tree.map(lambda x: x[0], batch.hidden_state), batch.obs, batch.starts)
     log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob
     return jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)), log_ratio
 
 
 def batch_of(
-    key: jax.Array, config: Config, state: TrainState, memory: Array | None, trajectory: collect.Trajectory
+    key: jax.Array, config: Config, state: TrainState, hidden_state: Any, trajectory: collect.Trajectory
 ) -> Batch:
     """The transitions of a trajectory with their advantages, normalized, and the targets of their values.
 
-    `memory` (w, n, m) is that of the policy before the trajectory, or `None`. The key draws what a centralized critic
-    takes after the last steps of episodes and of the trajectory: actions with exploration, like those before.
+    `hidden_state` (w, n, ...) is that of the policy before the trajectory, or `None`. The key draws the actions that a
+    centralized critic takes after the last steps of episodes and of the trajectory.
     """
     policy = state.policy
-    final_memory, final_mean = policy.act(trajectory.memory, trajectory.final_obs)
+    final_state, final_mean = policy.act(trajectory.hidden_state, trajectory.final_obs)
     action = final_action = None
     if config.centralized_critic:
         action, last = trajectory.action, trajectory.done.at[-1].set(True)[..., None, None]
         final_action = jnp.where(last, sample(key, final_mean, state.log_std), jnp.roll(action, -1, axis=0))
-    critic_obs = critic_observation(policy, trajectory.obs, trajectory.memory, trajectory.privileged, action)
-    final_obs = critic_observation(
-        policy, trajectory.final_obs, final_memory, trajectory.final_privileged, final_action
-    )
+    critic_obs = critic_observation(policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged, action)
+    final_obs = critic_observation(policy, trajectory.final_obs, final_state, trajectory.final_privileged, final_action)
     value = _value(config, state.critic, critic_obs)
     next_value = _value(config, state.critic, final_obs)
     advantage = trajectory_advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
@@ -248,8 +228,8 @@ def batch_of(
         critic_obs=critic_obs,
         advantage=(advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6),
         value_target=value + advantage,
-        memory=jax.tree.map(lambda x: x[None], memory),
-        starts=None if memory is None else jnp.roll(trajectory.done, 1, axis=0).at[0].set(False),
+        hidden_state=jax.tree.map(lambda x: x[None], hidden_state),
+        starts=None if hidden_state is None else jnp.roll(trajectory.done, 1, axis=0).at[0].set(False),
     )
 
 

@@ -1,7 +1,8 @@
-"""What all learners share: optimizers, the loop over updates, and the result of training."""
+"""Training: the state, the loop over updates, its result, and the optimizers of the learners."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,13 +13,16 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int
 
-from jaxdrones.checks import is_known
+from jaxdrones.checks import check_key, is_known
 from jaxdrones.envs import Env
-from jaxdrones.learning import compilation
+from jaxdrones.errors import UserError
+from jaxdrones.learning import collect, compilation
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.settings import Scalar
+from jaxdrones.learning.settings import Config, Scalar
 from jaxdrones.pytree import PyTreeNode
 
+MAX_CALL = 64
+"""Largest number of updates in one call of a compiled program."""
 PATIENCE = 10
 """Training has diverged when gradients were not finite in so many updates in a row, or in all of fewer updates."""
 
@@ -27,6 +31,21 @@ _RATE_FACTOR = 1.2  # by which the learning rate is raised or lowered
 
 class Diverged(RuntimeError):
     """Training has diverged: its numbers or its gradients are not finite."""
+
+
+class TrainState(PyTreeNode):
+    """Everything that training needs to continue."""
+
+    step: Array
+    """() updates made."""
+    key: Array
+    policy: Policy
+    opt_state: optax.OptState
+    worlds: collect.Worlds
+
+
+Callback = Callable[[int, dict[str, float], Any], Any]
+"""(updates made, metrics of the newest update, training state) -> True to stop the training."""
 
 
 class Result(PyTreeNode):
@@ -43,53 +62,102 @@ class Result(PyTreeNode):
         return f"<Result: {self.policy!r}, history of {', '.join(self.history)}>"
 
 
-def run_training(init: Callable, update: Callable, key: jax.Array, env: Env, config: Any) -> Result:
-    """Make all updates of a learner in one compiled program.
+def init_policy(key: jax.Array, env: Env, config: Config, network: Any) -> Policy:
+    """The policy before the first update, with the network of the settings or a user's own."""
+    return Policy.init(key, env, config.hidden_sizes, config.per_agent, config.recurrent_size, network)
 
-    Inside a function that JAX traces, or with traced settings, the updates become part of that function. Otherwise the
-    program is compiled here, and kept for further calls with equal settings and the same environment, as long as none
-    of its attributes is set.
+
+def run_training(
+    init: Callable,
+    update: Callable,
+    key: jax.Array,
+    env: Env,
+    config: Any,
+    *,
+    network: Any = None,
+    callback: Callback | Sequence[Callback] = (),
+    state: Any = None,
+) -> Result:
+    """Make all updates of a learner.
+
+    Inside `jax.jit` or `jax.vmap`, or with traced settings, the updates become part of that function. Otherwise the
+    program is compiled here and kept for further calls with equal settings and the same environment.
 
     Args:
-        init: the learner's `init(key, env, config)`.
+        init: the learner's `init(key, env, config, network)`.
         update: the learner's `update(env, config, state)`.
-        key: random key.
+        key: random key; not used with a `state`.
         env: environment.
         config: settings of the learner.
+        network: a flax linen, flax nnx or equinox module in place of the network of the settings; see
+            `learning.networks.OwnNetwork`.
+        callback: function, or several, called after every update; see `Callback`.
+        state: state to continue from, the `train_state` of a result; up to `config.updates` updates in total.
 
     Raises:
-        Diverged: gradients were not finite in `PATIENCE` updates in a row. While JAX traces, nothing can be raised;
-            then `history["nonfinite_gradients"]` alone tells.
+        ValueError: no random key, or a state that has made all updates.
+        Diverged: gradients were not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised;
+            `history["nonfinite_gradients"]` has their number.
     """
+    check_key("key", key)
+    callbacks = (callback,) if callable(callback) else tuple(callback)
     if compilation.is_tracing() or not all(map(is_known, (key, *vars(config).values()))):
-        return _all_updates(init, update, env, config, key)
-    result = training_program(init, update, env, config)(key)
-    counts = result.history["nonfinite_gradients"]
-    if is_known(counts):  # not so when an environment with traced parameters is mapped
-        check_gradients(np.asarray(counts), min(PATIENCE, len(counts)))
-    return result
+        if callbacks:
+            raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
+        state = init(key, env, config, network) if state is None else state
+        return _scan_updates(update, env, config, state)
+    start, program = _programs(init, update, env, config)
+    if state is None:
+        state = start(key) if network is None else init(key, env, config, network)
+    total, step = int(config.updates), int(state.step)
+    if step >= total:
+        raise UserError(f"state has made {step} updates; give more updates, config.updates is {total}")
+    rows, streak, stop = [], 0, False
+    while step < total and not stop:
+        count = 1 if callbacks else min(MAX_CALL, total - step)
+        state, metrics = program(state, jnp.asarray(count, jnp.int32), jnp.asarray(total, jnp.int32))
+        rows.append({name: x[:count] for name, x in metrics.items()})
+        step += count
+        nonfinite = rows[-1]["nonfinite_gradients"]
+        if is_known(nonfinite):  # not so when an environment with traced parameters is mapped
+            streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak)
+        values = {name: x[0].item() for name, x in rows[-1].items()} if callbacks else {}
+        stop = any([call(step, values, state) is True for call in callbacks])
+    history = {name: jnp.concatenate([row[name] for row in rows]) for name in rows[0]}
+    return Result(state.policy, state, history)
 
 
-def training_program(init: Callable, update: Callable, env: Env, config: Any) -> Any:
-    """The compiled function of a random key that makes all updates, with the compiler options that suit training."""
-    static = compilation.Static(env)
+def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, total: Array) -> tuple[Any, dict]:
+    """Make `count` updates, at most `MAX_CALL`, of a training of `total`; the metrics are arrays (MAX_CALL,)."""
+    config = dataclasses.replace(config, updates=total)
+    shapes = jax.eval_shape(functools.partial(update, env, config), state)[1]
+    metrics = jax.tree.map(lambda x: jnp.zeros((MAX_CALL, *x.shape), x.dtype), shapes)
+
+    def body(i: Array, carry: tuple[Any, dict]) -> tuple[Any, dict]:
+        state, metrics = carry
+        state, new = update(env, config, state)
+        return state, jax.tree.map(lambda all, x: all.at[i].set(x), metrics, new)
+
+    return jax.lax.fori_loop(0, count, body, (state, metrics))
+
+
+def _programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple[Callable, Callable]:
+    """The compiled `init` and `advance` of an environment and settings."""
     try:
-        return _cached_program(init, update, static, config)
+        return _cached_programs(init, update, compilation.Static(env), config)
     except TypeError:  # settings that cannot be hashed, such as arrays
-        return _program(init, update, static, config)
+        return _cached_programs.__wrapped__(init, update, compilation.Static(env), config)
 
 
-def _program(init: Callable, update: Callable, env: compilation.Static, config: Any) -> Any:
-    return compilation.jit(functools.partial(_all_updates, init, update, env.value, config))
+@functools.lru_cache(maxsize=8)
+def _cached_programs(init: Callable, update: Callable, env: compilation.Static, config: Any) -> tuple:
+    start = compilation.jit(lambda key: init(key, env.value, config))
+    return start, compilation.jit(functools.partial(advance, update, env.value, config))
 
 
-_cached_program = functools.lru_cache(maxsize=8)(_program)
-
-
-def _all_updates(init: Callable, update: Callable, env: Env, config: Any, key: jax.Array) -> Result:
-    state, history = jax.lax.scan(
-        lambda state, _: update(env, config, state), init(key, env, config), length=config.updates
-    )
+def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result:
+    length = config.updates - (int(state.step) if is_known(state.step) else 0)
+    state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=length)
     return Result(state.policy, state, history)
 
 
@@ -97,15 +165,15 @@ def check_gradients(nonfinite: Sequence[int] | np.ndarray, patience: int = PATIE
     """Raise if gradients were not finite in too many updates in a row.
 
     Args:
-        nonfinite: (updates,) for each update, zero if all its gradients were finite.
-        patience: number of updates in a row with gradients that were not finite at which to raise.
+        nonfinite: (updates,) number of gradients of each update that were not finite.
+        patience: number of such updates in a row at which to raise.
         before: number of such updates in a row just before these.
 
     Returns:
         The number of such updates in a row, up to the last of these updates.
 
     Raises:
-        Diverged: says in how many updates in a row.
+        Diverged: too many updates in a row.
     """
     streak = before
     for count in nonfinite:
@@ -136,10 +204,10 @@ def cosine_adam(
 
 
 def adapted_learning_rate(config: Any, updates: Scalar, learning_rate: Scalar, kl: Scalar) -> Array:
-    """The learning rate after an update, with PPO's adaptation to the divergence from the policy that acted.
+    """The learning rate of PPO after an update, adapted to the divergence from the policy that acted.
 
     Args:
-        config: settings, of which `target_kl` and those of the learning rate count.
+        config: settings of ppo.
         updates: updates made, this one included.
         learning_rate: learning rate of this update.
         kl: divergence of the updated policy from the one that acted in this update.
@@ -157,11 +225,7 @@ def annealed(config: Any, updates: Scalar, high: Scalar, low: Scalar) -> Array:
 
 
 def clip_gradient(max_grad_norm: Scalar) -> optax.GradientTransformation:
-    """Scale gradients down to a norm of at most `max_grad_norm`.
-
-    A gradient whose norm is not finite is replaced by zero, so that a single one does not ruin the parameters; learners
-    count these with `count_nonfinite`.
-    """
+    """Scale gradients down to a norm of at most `max_grad_norm`; replace those that are not finite by zero."""
 
     def update(gradient, state, params=None):
         norm = optax.tree.norm(gradient)

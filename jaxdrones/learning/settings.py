@@ -1,7 +1,7 @@
-"""Types of the settings of learners, each with the check of its values.
+"""Settings that all learners share, and the type of each setting with the check of its values.
 
-A learner's `Config` annotates each field with one of these types, and `check_settings` applies the checks. Numbers that
-are not shapes may be traced by JAX; what is traced has no value yet and passes.
+A learner's `Config` annotates each field with one of these types. Numbers that are not shapes may be traced by JAX;
+a traced number is not checked.
 """
 
 from __future__ import annotations
@@ -11,16 +11,12 @@ import functools
 import typing
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import jax
 
-from jaxdrones.checks import check_callable, check_choice, check_number, check_switch, check_whole, is_known, shown
-from jaxdrones.engine.step import Step
+from jaxdrones.checks import check_number, check_switch, check_whole, is_known, shown
 from jaxdrones.errors import UserError
-
-GRADIENTS = ("exact", "decay", "surrogate", "point_mass")
-"""Names of the gradients that `learning.gradients` explains."""
 
 Scalar = float | jax.Array
 """A number that may be traced, so that `jax.vmap` trains with many values of it at once."""
@@ -38,43 +34,21 @@ def _check_layers(name: str, sizes: Any) -> None:
         check_whole(f"an entry of {name}", size)
 
 
-def _check_gradient(name: str, value: Any) -> None:
-    check_choice(name, value, GRADIENTS)
-
-
-def _check_surrogate(name: str, step: Any) -> None:
-    if step is not None:
-        check_callable(name, step, "jaxdrones.make_step()")
-
-
 Positive = Annotated[Scalar, partial(check_number, above=0)]
 PositiveOrInfinite = Annotated[Scalar, partial(check_number, above=0, infinite=True)]
 NotNegative = Annotated[Scalar, partial(check_number, at_least=0)]
 Fraction = Annotated[Scalar, partial(check_number, at_least=0, at_most=1)]
 PositiveFraction = Annotated[Scalar, partial(check_number, above=0, at_most=1)]
 BelowOne = Annotated[Scalar, partial(check_number, at_least=0, below=1)]
-"""At least 0 and below 1, such as the discount of an infinite sum."""
 Count = Annotated[int, check_whole]
 TracedCount = Annotated[int | jax.Array, _check_whole_if_known]
-"""A whole number that may be traced."""
-Switch = Annotated[bool, check_switch]
-CountOrNone = Annotated[int, partial(check_whole, minimum=0)]
-"""A whole number, 0 where the thing that is counted is left out."""
+NonNegativeInt = Annotated[int, partial(check_whole, minimum=0)]
+Bool = Annotated[bool, check_switch]
 HiddenSizes = Annotated[tuple[int, ...], _check_layers]
-"""Sizes of the hidden layers of a network."""
-Gradient = Annotated[Literal["exact", "decay", "surrogate", "point_mass"], _check_gradient]
-Surrogate = Annotated[Step | None, _check_surrogate]
 
 
 def check_settings(config: Any) -> None:
-    """Raise unless every setting is one that its type allows.
-
-    Args:
-        config: dataclass whose fields are annotated with types of this module; fields of other types are not checked.
-
-    Raises:
-        ValueError: names the setting, what was given, and what to give.
-    """
+    """Raise unless every setting of a dataclass is one that its type allows."""
     for name, check in _checks(config.__class__).items():
         check(name, getattr(config, name))
 
@@ -85,6 +59,36 @@ def _checks(kind: type) -> dict[str, Callable[[str, Any], None]]:
     hints = typing.get_type_hints(kind, include_extras=True)
     annotated = {field.name: getattr(hints[field.name], "__metadata__", ()) for field in dataclasses.fields(kind)}
     return {name: metadata[0] for name, metadata in annotated.items() if metadata}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of every learner; numbers that are not shapes may be traced, so that `vmap` trains with many values."""
+
+    updates: TracedCount = 200
+    worlds: Count = 256
+    horizon: Count = 64
+    """Control steps of a trajectory."""
+    hidden_sizes: HiddenSizes = (32, 32)
+    recurrent_size: NonNegativeInt = 0
+    """Size of the hidden state of a gated recurrent unit (GRU) in the policy; 0 for none."""
+    obs_stats_window: PositiveOrInfinite = 1e9
+    """Number of trajectories over which the statistics of observations average."""
+    obs_stats_freeze: Fraction = 0.2
+    """Fraction of the updates after which the statistics of observations no longer change."""
+    per_agent: Bool = False
+    """Whether every drone has networks of its own; otherwise all drones share them."""
+    learning_rate: Positive = 2e-2
+    """Learning rate of the policy at the start."""
+    gamma: Fraction = 1.0
+    """Discount factor."""
+    restart_fraction: Fraction = 0.2
+    """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
+    max_grad_norm: PositiveOrInfinite = 0.3
+    """Largest norm of a gradient; longer gradients are scaled down."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
 
 def check_config(config: Any, kind: type) -> None:

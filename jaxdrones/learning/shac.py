@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,137 +11,85 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_key, check_keywords
+from jaxdrones.checks import check_keywords
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
-from jaxdrones.learning import collect
-from jaxdrones.learning.critic import critic_example, critic_network, critic_observation, discounted_value
-from jaxdrones.learning.gradients import gradient_between_steps, with_gradient
-from jaxdrones.learning.networks import Policy, init_params
-from jaxdrones.learning.result import Result, cosine_adam, count_nonfinite, run_training
+from jaxdrones.learning import collect, result
+from jaxdrones.learning.critic import critic_observation, discounted_value, init_critic
+from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
 from jaxdrones.learning.settings import (
     BelowOne,
+    Bool,
     Count,
-    CountOrNone,
     Fraction,
-    Gradient,
     HiddenSizes,
     Positive,
     PositiveFraction,
-    PositiveOrInfinite,
-    Surrogate,
-    Switch,
     TracedCount,
     check_config,
-    check_settings,
 )
-from jaxdrones.pytree import PyTreeNode
 
 _CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 
 
 @check_keywords
 @dataclasses.dataclass(frozen=True)
-class Config:
-    """Settings; the numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
+class Config(GradientConfig):
+    """Settings; numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
 
     updates: TracedCount = 220
-    worlds: Count = 256
-    horizon: Count = 64
-    """Control steps that the gradient goes back through."""
-    hidden_sizes: HiddenSizes = (32, 32)
-    recurrent_size: CountOrNone = 0
-    """Size of the memory that each drone's policy has, of a gated recurrent unit (GRU); 0 for none."""
+    gamma: BelowOne = 0.98
+    """Discount factor."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
-    obs_stats_window: PositiveOrInfinite = 1e9
-    """Number of trajectories whose observations the statistics remember."""
-    obs_stats_freeze: Fraction = 0.2
-    """Fraction of the updates after which the statistics of observations no longer change."""
-    per_agent: Switch = False
-    """Whether every drone has a policy of its own; otherwise all drones share one."""
-    privileged_critic: Switch = False
-    """Whether the critic takes what the policy does not observe: observations without noise, and drawn parameters."""
-    learning_rate: Positive = 2e-2
-    """Learning rate of the policy at the start; it falls to zero along a cosine."""
+    privileged_critic: Bool = False
+    """Whether the critic takes observations without noise and drawn parameters, which the policy does not observe."""
     critic_learning_rate: Positive = 5e-3
     """Learning rate of the critic at the start; it falls to zero along a cosine."""
     critic_steps: Count = 8
     """Gradient steps of the critic in an update, each on four successive control steps of all worlds."""
     terminal_value_warmup: PositiveFraction = 0.9
     """Fraction of the updates during which the weight of the terminal value rises linearly from 0 to 1."""
-    gamma: BelowOne = 0.98
-    """Discount factor."""
     gae_lambda: Fraction = 0.95
     """Lambda of the critic's TD(lambda) targets."""
     target_update_rate: PositiveFraction = 0.2
     """Fraction by which the target critic approaches the critic in an update."""
-    adam_b2: BelowOne = 0.95
-    """Decay rate of Adam's mean of squared gradients, of the policy. It is low because gradients shrink by orders of
-    magnitude while the policy learns."""
-    max_grad_norm: PositiveOrInfinite = 0.3
-    restart_fraction: Fraction = 0.2
-    """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
-    gradient: Gradient = "exact"
-    """How the flight is differentiated; see `learning.gradients`."""
-    gradient_decay: Fraction = 0.98
-    """Factor on the gradient per control step with `gradient="decay"`."""
-    surrogate: Surrogate = None
-    """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
-    image_gradient: Switch = True
-    """Whether the gradient goes through the images of cameras, or takes them for constants."""
-
-    def __post_init__(self):
-        check_settings(self)
 
 
-class TrainState(PyTreeNode):
+class TrainState(result.TrainState):
     """Everything that training needs to continue."""
 
-    step: Array
-    """() updates made."""
-    key: Array
-    policy: Policy
-    opt_state: optax.OptState
     critic: Any
     """Parameters of the value function."""
     target_critic: Any
     """Parameters of the target value function, which follows the critic slowly."""
     critic_opt_state: optax.OptState
-    worlds: collect.Worlds
 
 
-def init(key: jax.Array, env: Env, config: Config) -> TrainState:
-    """The state before the first update.
-
-    Raises:
-        ValueError: no random key, or settings of another learner.
-    """
-    check_key("key", key)
-    check_config(config, Config)
+def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> TrainState:
+    """The state before the first update."""
     key, policy_key, critic_key = jax.random.split(key, 3)
-    policy = Policy.init(policy_key, env, config.hidden_sizes, config.per_agent, config.recurrent_size)
-    critic_obs = critic_example(env, policy, config.privileged_critic)
-    critic = init_params(critic_key, critic_network(critic_obs, config.critic_hidden_sizes), critic_obs)
+    policy = result.init_policy(policy_key, env, config, network)
+    critic = init_critic(critic_key, env, policy, config)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         key=key,
         policy=policy,
         opt_state=_policy_optimizer(config).init(policy.params),
+        worlds=collect.empty_worlds(env, config.worlds, policy),
         critic=critic,
         target_critic=critic,
         critic_opt_state=_critic_optimizer(config).init(critic),
-        worlds=collect.empty_worlds(env, config.worlds, policy),
     )
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Simulate a trajectory of all worlds, make one step of the policy along its gradient, then fit the critic."""
-    check_config(config, Config)
     key, restart_key, collect_key, critic_key = jax.random.split(state.key, 4)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
-    env = with_gradient(env, config.gradient, config.surrogate, config.image_gradient)
-    between_steps = gradient_between_steps(config.gradient, config.gradient_decay)
+    env = with_gradient(env, config)
+    between_steps = gradient_between_steps(config)
     weight = jnp.minimum(state.step / (config.terminal_value_warmup * config.updates), 1)
 
     def loss(params):
@@ -174,41 +123,47 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     metrics = {
         "gradient_norm": norm,
         "critic_loss": critic_metrics["loss"],
-        "nonfinite_gradients": count_nonfinite(norm) + critic_metrics["nonfinite_gradients"],
+        "nonfinite_gradients": result.count_nonfinite(norm) + critic_metrics["nonfinite_gradients"],
     }
     worlds, measured = collect.measure(env, config, state.step, worlds, trajectory)
-    metrics |= measured
-    state = TrainState(state.step + 1, key, policy, opt_state, critic, target_critic, critic_opt_state, worlds)
-    return state, metrics
+    state = TrainState(state.step + 1, key, policy, opt_state, worlds, critic, target_critic, critic_opt_state)
+    return state, metrics | measured
 
 
-def train(key: jax.Array, env: Env, config: Config) -> Result:
-    """Make all updates in one compiled program; see `learning.result.run_training`."""
-    check_key("key", key)
+def train(
+    key: jax.Array,
+    env: Env,
+    config: Config,
+    *,
+    network: Any = None,
+    callback: result.Callback | Sequence[result.Callback] = (),
+    state: TrainState | None = None,
+) -> result.Result:
+    """Make all updates; see `learning.result.run_training`."""
     check_config(config, Config)
-    return run_training(init, update, key, env, config)
+    return result.run_training(init, update, key, env, config, network=network, callback=callback, state=state)
 
 
 def _at(chosen: Array, trajectory: collect.Trajectory) -> collect.Trajectory:
-    """What the critic needs of one step (w, ...) of each world's trajectory, that which is chosen (t, w)."""
+    """The chosen step (t, w) of each trajectory: the entries that the critic takes, (w, ...)."""
 
     def select(x: Array) -> Array:  # not by an index, with which devices would exchange worlds
         condition = chosen.reshape(chosen.shape + (1,) * (x.ndim - 2))
         return jnp.sum(jnp.where(condition, x, 0), axis=0, dtype=x.dtype)
 
-    names = ("memory", "final_obs", "final_privileged")
+    names = ("hidden_state", "final_obs", "final_privileged")
     return trajectory.replace(**{name: jax.tree.map(select, getattr(trajectory, name)) for name in names})
 
 
 def _final_observation(policy: Policy, trajectory: collect.Trajectory) -> Obs:
     """Observations of the critic after the steps of a trajectory."""
-    memory, _ = policy.act(trajectory.memory, trajectory.final_obs)
-    return critic_observation(policy, trajectory.final_obs, memory, trajectory.final_privileged)
+    hidden_state, _ = policy.act(trajectory.hidden_state, trajectory.final_obs)
+    return critic_observation(policy, trajectory.final_obs, hidden_state, trajectory.final_privileged)
 
 
 def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: collect.Trajectory):
     """Parameters, optimizer state and metrics of the critic after some steps towards the TD(lambda) returns."""
-    obs = critic_observation(state.policy, trajectory.obs, trajectory.memory, trajectory.privileged)
+    obs = critic_observation(state.policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged)
     now = _value(config, state.target_critic, obs)
     later = _value(config, state.target_critic, _final_observation(state.policy, trajectory))
     target = now + trajectory_advantages(trajectory, now, later, config.gamma, config.gae_lambda)
@@ -230,16 +185,16 @@ def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: c
 
     carry = (state.critic, state.critic_opt_state)
     (critic, opt_state), (costs, norms) = jax.lax.scan(step, carry, jax.random.split(key, config.critic_steps))
-    return critic, opt_state, {"loss": jnp.mean(costs), "nonfinite_gradients": count_nonfinite(norms)}
+    return critic, opt_state, {"loss": jnp.mean(costs), "nonfinite_gradients": result.count_nonfinite(norms)}
 
 
 def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
-    return discounted_value(critic, critic_obs, config.critic_hidden_sizes, config.gamma)
+    return discounted_value(critic, critic_obs, config.critic_hidden_sizes, config.gamma, config.per_agent)
 
 
 def _policy_optimizer(config: Config) -> optax.GradientTransformation:
-    return cosine_adam(config.learning_rate, config.updates, config.max_grad_norm, config.adam_b2)
+    return result.cosine_adam(config.learning_rate, config.updates, config.max_grad_norm, config.adam_b2)
 
 
 def _critic_optimizer(config: Config) -> optax.GradientTransformation:
-    return cosine_adam(config.critic_learning_rate, config.updates * config.critic_steps, config.max_grad_norm)
+    return result.cosine_adam(config.critic_learning_rate, config.updates * config.critic_steps, config.max_grad_norm)

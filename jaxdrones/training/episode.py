@@ -16,7 +16,7 @@ from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
 from jaxdrones.learning import compilation
-from jaxdrones.learning.recurrence import AnyPolicy, act, initial_memory
+from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing import Scene
@@ -25,7 +25,7 @@ from jaxdrones.training.presets import realism
 from jaxdrones.visualization.viewer.show import records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
-"""(memory, observations) -> (memory, actions)"""
+"""(hidden_state, observations) -> (hidden_state, actions)"""
 _LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `FlightLog` holds
 
 
@@ -123,8 +123,8 @@ def fly_episode(
 
     Args:
         env: environment of either backend.
-        policy: observations (n, d), or a dictionary with images, -> actions (n, a); or a policy with a memory, see
-            `learning.recurrence`.
+        policy: observations (n, d), or a dictionary with images, -> actions (n, a); or a recurrent policy, see
+            `learning.networks`.
         key: random key of the start and of the noise.
         on_progress: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
         watch: function that is given each thirtieth of a second of the episode as soon as it is flown, and the time at
@@ -134,7 +134,7 @@ def fly_episode(
     keys = jax.random.split(key, env.steps)
     obs, start = env.reset(start_key)
     world = start
-    memory = initial_memory(policy, env.drones)
+    hidden_state = initial_hidden_state(policy, env.drones)
 
     def loop(carry, keys):
         rows = []
@@ -170,7 +170,7 @@ def fly_episode(
     else:
         fly = jax.jit(functools.partial(_leg, env, policy))
     params, scene = jax.device_get((start.params, start.scene))
-    carry: Any = (memory, obs, world)
+    carry: Any = (hidden_state, obs, world)
     leg = env.steps if watch is None else leg_length(env.dt)
     flown, ended, parts = 0, False, []
     while flown < env.steps and not ended:
@@ -188,8 +188,8 @@ def fly_episode(
 
 def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
     """One control step of an episode: what the next one needs, and what is logged of this one with whether it ends."""
-    memory, obs, world = carry
-    memory, action = decide(memory, obs)
+    hidden_state, obs, world = carry
+    hidden_state, action = decide(hidden_state, obs)
     obs, world, reward, terminated, truncated, info = env.step(key, world, action)
     row = (
         world.drones,
@@ -199,7 +199,7 @@ def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple
         info["terminations"] | info["truncations"],
         world.images,
     )
-    return (memory, obs, world), (row, terminated | truncated)
+    return (hidden_state, obs, world), (row, terminated | truncated)
 
 
 def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:

@@ -133,7 +133,7 @@ class Trainer(BaseTrainer):
         """Raise if the worlds, with their observations and actions in an update, need more memory than there is."""
         config, env = self.recipe.config, self.env
         actions = config.worlds * env.drones * env.action_size * jnp.zeros(()).dtype.itemsize
-        step = actions + size_of((self.shapes.worlds.obs, self.shapes.worlds.memory))
+        step = actions + size_of((self.shapes.worlds.obs, self.shapes.worlds.hidden_state))
         size = size_of(self.shapes) + config.horizon * step
         what = f"a training of {config.worlds} worlds x {config.horizon} control steps x {env.drones} drones"
         check_memory(what, size // jax.process_count(), "give fewer worlds, a shorter horizon or smaller networks")

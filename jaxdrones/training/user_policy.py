@@ -12,7 +12,7 @@ from jaxdrones.checks import check_arguments
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.functions import check_policy
 from jaxdrones.errors import UserError
-from jaxdrones.learning.recurrence import AnyPolicy, RecurrentPolicy
+from jaxdrones.learning.networks import AnyPolicy, RecurrentPolicy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +20,7 @@ class UserPolicy:
     """A policy of a user's file and the task that it flies: what is asked of a run, and of its recipe."""
 
     reference: str
-    """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a policy with a memory."""
+    """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a recurrent policy."""
     task: str
     """A name of `jaxdrones.envs.TASKS`, or `file.py:function`."""
     realistic: bool | str
@@ -56,11 +56,11 @@ class UserPolicy:
         if isinstance(policy, type) or not (callable(policy) or recurrent):
             raise UserError(
                 f"{self.reference} is {policy!r:.60}; give a function from observations {sizes[0]} to actions "
-                f"{sizes[1]}, or a policy with a memory"
+                f"{sizes[1]}, or a recurrent policy"
             )
         if recurrent:
-            check_arguments(f"{self.reference}.initial_memory", policy.initial_memory, ("batch",))
-            check_arguments(f"{self.reference}.act", policy.act, ("memory", "obs"))
+            check_arguments(f"{self.reference}.initial_hidden_state", policy.initial_hidden_state, ("batch",))
+            check_arguments(f"{self.reference}.act", policy.act, ("hidden_state", "obs"))
         else:
             check_arguments(self.reference, policy, ("obs",))
         obs, _ = jax.eval_shape(env.reset, jax.random.key(0))

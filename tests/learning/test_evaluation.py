@@ -114,7 +114,7 @@ class YawTorque(PyTreeNode):
 
     steps: jax.Array
 
-    def initial_memory(self, batch):
+    def initial_hidden_state(self, batch):
         return jnp.zeros(())
 
     def act(self, memory, obs):

@@ -85,7 +85,7 @@ def test_a_sequence_is_replayed_as_it_was_flown_with_an_empty_memory_where_episo
 
     @jax.jit
     def actions():
-        fresh = policy.replay(policy.initial_memory((3, 2)), obs[2:], np.zeros((3, 3), bool))
+        fresh = policy.replay(policy.initial_hidden_state((3, 2)), obs[2:], np.zeros((3, 3), bool))
         return jax.lax.scan(step, first, (obs, starts))[1], policy.replay(first, obs, starts), fresh
 
     flown, replayed, fresh = actions()
@@ -105,7 +105,7 @@ def test_episodes_that_follow_one_another_are_flown_as_each_would_be_alone():
         worlds = collect.restart(KEY, env, collect.empty_worlds(env, 3, policy))
         _, flown = collect.collect(KEY, env, collect.deterministic(policy), worlds, 2 * env.steps)
         action, obs = (jnp.concatenate(jnp.split(x, 2), axis=1) for x in (flown.action, flown.obs))
-        return action, policy.replay(policy.initial_memory((6, 1)), obs, jnp.zeros((env.steps, 6), bool))
+        return action, policy.replay(policy.initial_hidden_state((6, 1)), obs, jnp.zeros((env.steps, 6), bool))
 
     np.testing.assert_allclose(*actions(), rtol=1e-9)
 
@@ -119,7 +119,7 @@ def test_ppo_replays_the_probabilities_that_it_recorded():
     for _ in range(4):  # episodes of six steps end within trajectories of four
         state, metrics = update(state)
         assert metrics["kl"] < 1e-14  # before the only gradient step of the update
-    assert jnp.any(state.worlds.memory != 0)
+    assert jnp.any(state.worlds.hidden_state != 0)
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_seeds_by_vmap_are_the_seeds_alone(learner):
 class ThenFall:
     """Thrust for some steps, none afterwards: a policy of a user, whose memory is a count."""
 
-    def initial_memory(self, batch):
+    def initial_hidden_state(self, batch):
         return jnp.zeros(batch, jnp.int32)
 
     def act(self, count, obs):
@@ -162,8 +162,8 @@ def test_a_policy_with_a_memory_is_saved_and_says_how_it_is_called(tmp_path):
     loaded = checkpoint.load(tmp_path / "policy")
     assert jax.tree.structure(loaded) == jax.tree.structure(policy)
     obs = jnp.ones((1, env.observation_size))
-    for mine, theirs in zip(*(p.act(p.initial_memory((1,)), obs) for p in (policy, loaded)), strict=True):
+    for mine, theirs in zip(*(p.act(p.initial_hidden_state((1,)), obs) for p in (policy, loaded)), strict=True):
         np.testing.assert_array_equal(mine, theirs)
-    assert "a memory of 4" in repr(policy)
-    with pytest.raises(ValueError, match=r"memory of 4 numbers per drone; call policy.act\(memory, obs\)"):
+    assert "GRU of 4" in repr(policy)
+    with pytest.raises(ValueError, match=r"recurrent; call policy.act\(hidden_state, obs\)"):
         policy(obs)

@@ -147,12 +147,10 @@ def test_a_learner_takes_its_own_settings_and_no_others(name):
         if other != name:
             with pytest.raises(ValueError, match=rf"config is {other}\.Config; {name} learns with .*{name}\.Config"):
                 learner.train(KEY, env, module.Config())
-            with pytest.raises(ValueError, match=rf"config is {other}\.Config"):
-                learner.update(env, module.Config(), None)
     with pytest.raises(ValueError, match=rf"config is a dictionary; give jaxdrones\.learning\.{name}\.Config"):
         learner.train(KEY, env, dict(updates=3))
     with pytest.raises(ValueError, match=r"config is 'fast'"):
-        learner.init(KEY, env, "fast")
+        learner.train(KEY, env, "fast")
     with pytest.raises(ValueError, match=r"key is 0; give a random key, for example jax\.random\.key\(0\)"):
         learner.train(0, env, learner.Config())
 

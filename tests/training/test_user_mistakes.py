@@ -221,7 +221,7 @@ POLICIES = [
 ]
 MEMORY = """import jax.numpy as jnp
 class Policy:
-    def initial_memory(self, batch): return jnp.zeros((*batch, 1))
+    def initial_hidden_state(self, batch): return jnp.zeros((*batch, 1))
     def act(self, memory, obs): return memory, obs[:, :4]
 policy = Policy()
 """
@@ -241,8 +241,12 @@ POLICIES += [
             "act returns an array .*; return the memory and the actions",
         ),
         ("act(self, memory, obs)", "act(self, obs)", r"act: act takes \(obs\); give a function of \(memory, obs\)"),
-        ("initial_memory(self, batch)", "initial_memory(self)", r"give a function of \(batch\)"),
-        ("return jnp.zeros((*batch, 1))", "return 'none'", "initial_memory returns a memory that hold 'none'"),
+        ("initial_hidden_state(self, batch)", "initial_hidden_state(self)", r"give a function of \(batch\)"),
+        (
+            "return jnp.zeros((*batch, 1))",
+            "return 'none'",
+            "initial_hidden_state returns a hidden state that hold 'none'",
+        ),
         ("policy = Policy()", "policy = Policy", "policy is <class .*; give a function"),
     ]
 ]

@@ -1,0 +1,119 @@
+"""Callbacks of `train`: loggers for CSV, TensorBoard, Weights & Biases and MLflow, and the choice of the best policy.
+
+A logger is called with the number of updates made and their metrics, `logger(update, metrics, state)`.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
+from jaxdrones.learning.evaluation import Report, compile_evaluation
+from jaxdrones.learning.networks import Policy
+
+
+class CSV:
+    """A row per update in a CSV file, with the columns `update` and the metrics of the first update."""
+
+    def __init__(self, path: str | os.PathLike):
+        self._path = Path(path)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._columns: list[str] = []
+
+    def __call__(self, update: int, metrics: dict[str, float], state: Any = None) -> None:
+        """Append the metrics of an update."""
+        row = {"update": update} | metrics
+        with self._path.open("a" if self._columns else "w", newline="") as file:
+            if not self._columns:
+                self._columns = list(row)
+                csv.writer(file).writerow(self._columns)
+            csv.writer(file).writerow([row.get(name, "") for name in self._columns])
+
+
+class TensorBoard:
+    """Scalars of TensorBoard, by tensorboardX.
+
+    Args:
+        folder: folder of the event file.
+    """
+
+    def __init__(self, folder: str | os.PathLike):
+        self._writer = _library("tensorboardX").SummaryWriter(str(folder))
+
+    def __call__(self, update: int, metrics: dict[str, float], state: Any = None) -> None:
+        """Log the metrics of an update."""
+        for name, value in metrics.items():
+            self._writer.add_scalar(name, value, update)
+        self._writer.flush()
+
+
+class WandB:
+    """A run of Weights & Biases; the keyword arguments are those of `wandb.init`."""
+
+    def __init__(self, **options: Any):
+        self.run = _library("wandb").init(**options)
+
+    def __call__(self, update: int, metrics: dict[str, float], state: Any = None) -> None:
+        """Log the metrics of an update."""
+        self.run.log(metrics, step=update)
+
+
+class MLflow:
+    """A run of MLflow; the keyword arguments are those of `mlflow.start_run`."""
+
+    def __init__(self, **options: Any):
+        self._mlflow = _library("mlflow")
+        self.run = self._mlflow.start_run(**options)
+
+    def __call__(self, update: int, metrics: dict[str, float], state: Any = None) -> None:
+        """Log the metrics of an update."""
+        self._mlflow.log_metrics(metrics, step=update, run_id=self.run.info.run_id)
+
+
+class KeepBest:
+    """Evaluate the policy every few updates and keep the best one, by success and then by return."""
+
+    policy: Policy | None = None
+    """Best policy so far; `None` before the first evaluation."""
+    report: Report | None = None
+    """Evaluation of that policy."""
+
+    def __init__(self, env: Env, key: jax.Array, every: int = 20, episodes: int = 200):
+        """Prepare the evaluations.
+
+        Args:
+            env: environment to evaluate in.
+            key: random key of the episodes, which are the same for all policies.
+            every: updates between two evaluations.
+            episodes: episodes of an evaluation.
+        """
+        self._env, self._key, self._every, self._episodes = env, key, every, episodes
+        self._evaluate: Any = None
+
+    def __call__(self, update: int, metrics: dict[str, float], state: Any) -> None:
+        """Evaluate the policy of a training state if it is time."""
+        if update % self._every:
+            return
+        if self._evaluate is None:
+            self._evaluate = compile_evaluation(self._env, state.policy, self._episodes)
+        report = self._evaluate(state.policy, self._key)
+        if self.report is None or _score(report) > _score(self.report):
+            self.policy, self.report = state.policy, report
+
+
+def _score(report: Report) -> tuple[float, float]:
+    return report.success or 0.0, report.mean_return
+
+
+def _library(name: str) -> Any:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise UserError(f"{name} is not installed; run: pip install {name}") from error

@@ -1,0 +1,186 @@
+"""`train` with a user's own network, callbacks, loggers, and a state to continue from."""
+
+import csv
+import dataclasses
+import sys
+import types
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from double_integrator import SMALL, Cue, DoubleIntegrator
+from flax import nnx
+
+from jaxdrones.learning import bptt, checkpoint, loggers
+from jaxdrones.learning.networks import MLP, Policy
+
+KEY = jax.random.key(0)
+SIZES = (2, 8, 1)
+
+
+class NnxNetwork(nnx.Module):
+    def __init__(self, kernels):
+        self.layers = nnx.List([nnx.Linear(*kernel.shape, rngs=nnx.Rngs(0)) for kernel, _ in kernels])
+        for layer, (kernel, bias) in zip(self.layers, kernels, strict=True):
+            layer.kernel[...], layer.bias[...] = kernel, bias
+
+    def __call__(self, x):
+        return self.layers[1](jnp.tanh(self.layers[0](x)))
+
+
+def equinox_network(kernels):
+    eqx = pytest.importorskip("equinox")
+    network = eqx.nn.MLP(*(SIZES[0], SIZES[2], SIZES[1]), depth=1, activation=jnp.tanh, key=KEY)
+    weights = [x for kernel, bias in kernels for x in (kernel.T, bias)]
+    return eqx.tree_at(lambda n: [x for layer in n.layers for x in (layer.weight, layer.bias)], network, weights)
+
+
+class Remember(nn.Module):
+    """The sum of the observations, kept in a dictionary."""
+
+    def initial_hidden_state(self):
+        return {"sum": jnp.zeros(1)}
+
+    @nn.compact
+    def __call__(self, state, obs):
+        total = state["sum"] + obs
+        return {"sum": total}, nn.Dense(1)(total)
+
+
+OWN = {"linen": lambda kernels: MLP(SIZES[1:2], SIZES[2]), "nnx": NnxNetwork, "equinox": equinox_network}
+
+
+@pytest.mark.parametrize("library", OWN)
+def test_the_gradient_of_a_network_is_the_same_in_every_library(library):
+    """The gradient of a flight of the double integrator, of the same weights."""
+    params = MLP(SIZES[1:2], SIZES[2]).init(KEY, jnp.zeros(2))
+    kernels = [(layer["kernel"], layer["bias"]) for layer in params["params"].values()]
+    network = OWN[library](kernels)
+    env, config = DoubleIntegrator(), dataclasses.replace(SMALL[bptt], max_grad_norm=1e-3, learning_rate=1e-3)
+    state = bptt.init(KEY, env, config, network)
+    if library == "linen":
+        state = state.replace(policy=state.policy.replace(params=params))
+    reference = state.replace(policy=state.policy.replace(params=params, network=MLP(SIZES[1:2], SIZES[2])))
+    reference = reference.replace(opt_state=bptt.init(KEY, env, config, None).opt_state)
+    update = jax.jit(lambda state: bptt.update(env, config, state))
+    (mine, metrics), (theirs, expected) = update(state), update(reference)
+    # Parameters of flax are float32, and the sums are in another order.
+    np.testing.assert_allclose(metrics["gradient_norm"], expected["gradient_norm"], rtol=1e-6)
+    entries = lambda tree: np.sort(np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)]))  # noqa: E731
+    np.testing.assert_allclose(entries(mine.policy.params), entries(theirs.policy.params), atol=1e-5)  # a step is 1e-3
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("learner", SMALL)
+def test_an_own_recurrent_network_learns_and_is_saved(learner, tmp_path):
+    env, network = Cue(), Remember()
+    result = learner.train(KEY, env, SMALL[learner], network=network)
+    assert np.all(np.isfinite(result.history["reward"])) and "Remember" in repr(result.policy)
+    checkpoint.save(tmp_path / "policy", result.policy)
+    with pytest.raises(ValueError, match=r"network of your own, Remember; give load\(path, network"):
+        checkpoint.load(tmp_path / "policy")
+    loaded = checkpoint.load(tmp_path / "policy", network=network)
+    state, obs = loaded.initial_hidden_state((1,)), jnp.ones((1, 1))
+    for x, y in zip(loaded.act(state, obs)[1], result.policy.act(state, obs)[1], strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_a_sequence_of_an_own_recurrent_network_is_replayed_as_it_was_flown():
+    policy = Policy.init(KEY, Cue(), network=Remember())
+    obs, starts = np.random.default_rng(0).normal(size=(5, 3, 1, 1)), np.zeros((5, 3), bool)
+    starts[2, 0] = True
+    state, flown = policy.initial_hidden_state((3, 1)), []
+    for i in range(5):
+        state = {"sum": jnp.where(starts[i][:, None, None], 0, state["sum"])}
+        state, action = policy.act(state, obs[i])
+        flown.append(action)
+    np.testing.assert_allclose(policy.replay(policy.initial_hidden_state((3, 1)), obs, starts), flown, rtol=1e-12)
+
+
+class Started(Remember):
+    def initial_hidden_state(self):
+        return jnp.ones(1)
+
+
+@pytest.mark.parametrize(
+    "network, error",
+    [(3, "3 is not a function"), (MLP((4,), 2), r"outputs \(2,\) .* give \(1,\)"), (Started(), "is not zero")],
+)
+def test_a_network_that_does_not_fit_is_refused(network, error):
+    with pytest.raises(ValueError, match=error):
+        bptt.train(KEY, DoubleIntegrator(), SMALL[bptt], network=network)
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("learner", SMALL)
+def test_a_training_continued_from_a_state_is_one_long_training_and_the_callback_sees_every_update(learner):
+    env, config = DoubleIntegrator(), dataclasses.replace(SMALL[learner], updates=5)
+    seen = []
+    half = learner.train(KEY, env, config, callback=lambda update, metrics, state: seen.append(metrics) or update == 2)
+    rest = learner.train(KEY, env, config, state=half.train_state)
+    whole = learner.train(KEY, env, config)
+    assert len(seen) == 2 and int(half.train_state.step) == 2 and int(rest.train_state.step) == 5
+    for name, x in whole.history.items():
+        np.testing.assert_array_equal(jnp.concatenate([half.history[name], rest.history[name]]), x)
+        np.testing.assert_array_equal([row[name] for row in seen], half.history[name])
+    for x, y in zip(jax.tree.leaves(rest.policy), jax.tree.leaves(whole.policy), strict=True):
+        np.testing.assert_array_equal(x, y)
+    with pytest.raises(ValueError, match=r"state has made 5 updates; .* config.updates is 5"):
+        learner.train(KEY, env, config, state=whole.train_state)
+    with pytest.raises(ValueError, match="callback is not supported inside"):
+        jax.eval_shape(lambda key: learner.train(key, env, config, callback=print), KEY)
+
+
+class Recorder:
+    """Stands for the client of a library; records what is logged."""
+
+    def __init__(self):
+        self.rows, self.info = [], types.SimpleNamespace(run_id="one")
+
+    def log(self, metrics, step):
+        self.rows.append((step, metrics))
+
+    def log_metrics(self, metrics, step, run_id):
+        self.rows.append((step, metrics))
+
+    def init(self, **options):
+        return self
+
+    start_run = init
+
+
+def test_loggers_write_every_update(tmp_path, monkeypatch):
+    recorder = Recorder()
+    monkeypatch.setitem(sys.modules, "wandb", recorder)
+    monkeypatch.setitem(sys.modules, "mlflow", recorder)
+    rows = [(1, {"reward": -1.5, "return": float("nan")}), (2, {"reward": -0.5, "return": 3.0})]
+    for logger in loggers.CSV(tmp_path / "a" / "log.csv"), loggers.WandB(project="x"), loggers.MLflow():
+        for update, metrics in rows:
+            logger(update, metrics, None)
+    assert recorder.rows == rows + rows
+    written = list(csv.DictReader((tmp_path / "a" / "log.csv").read_text().splitlines()))
+    assert [(int(row["update"]), float(row["reward"])) for row in written] == [(1, -1.5), (2, -0.5)]
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ValueError, match="wandb is not installed; run: pip install wandb"):
+        loggers.WandB()
+
+
+@pytest.mark.needs("tensorboardX")
+def test_tensorboard_gets_an_event_file(tmp_path):
+    loggers.TensorBoard(tmp_path)(1, {"reward": 1.0})
+    assert list(tmp_path.glob("events.out.tfevents*"))
+
+
+def test_the_best_policy_is_kept(monkeypatch):
+    reports = {1: (0.5, 0.0), 2: (0.9, -3.0), 3: (0.9, -2.0), 4: (0.2, 9.0)}
+
+    def compiled(env, policy, episodes):
+        return lambda policy, key: types.SimpleNamespace(success=reports[policy][0], mean_return=reports[policy][1])
+
+    monkeypatch.setattr(loggers, "compile_evaluation", compiled)
+    best = loggers.KeepBest(None, KEY, every=1)
+    for update in reports:
+        best(update, {}, types.SimpleNamespace(policy=update))
+    assert best.policy == 3 and best.report.success == 0.9

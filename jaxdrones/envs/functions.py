@@ -136,20 +136,20 @@ def check_policy(name: str, policy: Any, obs: Any, shape: tuple[int, int]) -> No
 
     Args:
         name: of the policy.
-        policy: function of observations, or a policy with a memory.
+        policy: function of observations, or a recurrent policy.
         obs: observations of the team, or their shapes.
         shape: that of the actions.
     """
 
     def act(obs):
-        memory, action = None, None
+        state, action = None, None
         if hasattr(policy, "initial_hidden_state"):
-            memory = policy.initial_hidden_state((shape[0],))
-            _check_arrays(f"{name}: initial_hidden_state returns a hidden state", memory)
-            returned = policy.act(memory, obs)
+            state = policy.initial_hidden_state((shape[0],))
+            _check_arrays(f"{name}: initial_hidden_state returns a hidden state", state)
+            returned = policy.act(state, obs)
             if not (isinstance(returned, tuple) and len(returned) == 2):
-                raise UserError(f"{name}: act returns {_kind(returned)}; return the memory and the actions")
-            _check_kept(f"{name}: act", "memory", memory, returned[0])
+                raise UserError(f"{name}: act returns {_kind(returned)}; return the hidden state and the actions")
+            _check_kept(f"{name}: act", "hidden state", state, returned[0])
             action = returned[1]
         else:
             action = policy(obs)

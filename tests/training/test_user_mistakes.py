@@ -231,16 +231,28 @@ POLICIES += [
         (
             "return memory, obs",
             "return jnp.tile(memory, 2), obs",
-            r"act returns memory with an array \(1, 2\).*which was",
+            r"act returns hidden state with an array \(1, 2\).*which was",
         ),
-        ("return memory, obs", "return (memory, memory), obs", "act returns memory PyTreeDef.*return the same kind"),
-        ("return memory, obs", "return memory > 0, obs", r"act returns memory with .*bool.*; keep its shape and type"),
+        (
+            "return memory, obs",
+            "return (memory, memory), obs",
+            "act returns hidden state PyTreeDef.*return the same kind",
+        ),
+        (
+            "return memory, obs",
+            "return memory > 0, obs",
+            r"act returns hidden state with .*bool.*; keep its shape and type",
+        ),
         (
             "return memory, obs[:, :4]",
             "return obs[:, :4]",
-            "act returns an array .*; return the memory and the actions",
+            "act returns an array .*; return the hidden state and the actions",
         ),
-        ("act(self, memory, obs)", "act(self, obs)", r"act: act takes \(obs\); give a function of \(memory, obs\)"),
+        (
+            "act(self, memory, obs)",
+            "act(self, obs)",
+            r"act: act takes \(obs\); give a function of \(hidden_state, obs\)",
+        ),
         ("initial_hidden_state(self, batch)", "initial_hidden_state(self)", r"give a function of \(batch\)"),
         (
             "return jnp.zeros((*batch, 1))",

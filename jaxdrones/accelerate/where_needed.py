@@ -11,8 +11,6 @@ from jaxtyping import Array
 
 from jaxdrones.errors import UserError
 
-_MOST = 4  # if more than one of so many worlds needs a result, all worlds are computed at once
-
 
 def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[..., Any]:
     """`(needed, *args) -> function(*args)`, whose result matters only where `needed` () is true.
@@ -42,19 +40,16 @@ def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[...
         needed = jnp.broadcast_to(needed, (worlds,))
         count, size = jnp.sum(needed), max(worlds // one_in, 1)
 
-        def needed_ones() -> Any:
-            index = jnp.nonzero(needed, size=worlds + -worlds % size, fill_value=worlds)[0]
+        index = jnp.nonzero(needed, size=worlds + -worlds % size, fill_value=worlds)[0]
 
-            def some(i: Array, found: Any) -> Any:
-                to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
-                at = jnp.minimum(to, worlds - 1)
-                new = every([leaf[at] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)])
-                return jax.tree.map(lambda all, x: all.at[to].set(x, mode="drop"), found, new)
+        def some(i: Array, found: Any) -> Any:
+            to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
+            at = jnp.minimum(to, worlds - 1)
+            new = every([leaf[at] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)])
+            return jax.tree.map(lambda all, x: all.at[to].set(x, mode="drop"), found, new)
 
-            zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(every, leaves))
-            return jax.lax.fori_loop(0, -(-count // size), some, zeros)
-
-        out = jax.lax.cond(count <= max(worlds // _MOST, 1), needed_ones, lambda: every(leaves))
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(every, leaves))
+        out = jax.lax.fori_loop(0, -(-count // size), some, zeros)
         return out, jax.tree.map(lambda _: True, out)
 
     @jax.custom_jvp

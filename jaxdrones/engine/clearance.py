@@ -18,6 +18,7 @@ from jaxdrones.checks import with_scene
 from jaxdrones.dynamics.contact import contact_radius, rim, stop_at
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
+from jaxdrones.sensing.distances import merged
 from jaxdrones.sensing.sweep import Disc, planes
 from jaxdrones.state import State
 from jaxdrones.vector import dot, safe_sqrt
@@ -87,7 +88,7 @@ def stopped_by_obstacles(params: Params, before: State, after: State, scene: Sce
     """
 
     def find(params: Params, before: State, after: State, scene: Scene) -> tuple[Array, Array]:
-        kinds = scene.shapes(before.pos.dtype)
+        kinds = merged(scene.shapes(before.pos.dtype))
 
         def of_drone(params: Params, before: State, after: State) -> tuple[Array, Array]:
             start, end = _core(params, before), _core(params, after)

@@ -11,8 +11,8 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_number, check_shape
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.sensing.distances import fold_near
-from jaxdrones.sensing.geometry import length
+from jaxdrones.sensing.distances import fold_near, merged
+from jaxdrones.sensing.geometry import around_z, length
 from jaxdrones.sensing.scene import Scene, check_scene
 from jaxdrones.sensing.shapes import Cylinder, Obstacle
 from jaxdrones.state import State
@@ -53,7 +53,7 @@ def collisions(params: Params, state: State, scene: Scene = _BARE, margin: Array
     _check(params, state, scene, margin)
     bodies = _bodies(params, state)
     touched = jnp.zeros(len(state.pos), bool)
-    for obstacles in scene.shapes(bodies.pos.dtype):
+    for obstacles in merged(scene.shapes(bodies.pos.dtype)):
         touched |= _touch_any(bodies, obstacles, margin)
     return Collisions(
         ground=jax.vmap(_lowest)(bodies) <= margin if scene.ground else jnp.zeros_like(touched),
@@ -128,7 +128,8 @@ def _gap(body: Cylinder, obstacle: Obstacle) -> Float[Array, ""]:
 
     on_obstacle = jax.lax.fori_loop(0, _PROJECTIONS, project, jnp.zeros_like(center))
     radial = center - dot(center, axis) * axis
-    directions = [on_obstacle - nearest_of_body(on_obstacle), center, axis, radial, *obstacle.separating(center, axis)]
+    directions = [on_obstacle - nearest_of_body(on_obstacle), center, axis, radial, *around_z(center, axis)]
+    directions += list(jnp.eye(3, dtype=center.dtype)[:2])
     return jnp.max(jax.vmap(lambda direction: along(unit(direction)))(jnp.stack(directions)))
 
 

@@ -26,7 +26,7 @@ from jaxdrones.checks import (
 )
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.sensing.distances import Surface, as_floats, distance_of, nearest_of, touched_of
+from jaxdrones.sensing.distances import Surface, as_floats, distance_of, merged, nearest_of, touched_of
 from jaxdrones.sensing.files import File, Mesh, Urdf
 from jaxdrones.sensing.geometry import Number
 from jaxdrones.sensing.shapes import LENGTHS, Box, Capsule, Cylinder, Obstacle, Sphere, single
@@ -160,7 +160,7 @@ class Scene(PyTreeNode, kw_only=True):
         check_scene(self)
         if not self.has_obstacles:
             raise UserError("the scene has no obstacles that could be touched; look at scene.has_obstacles before")
-        return touched_of(self.shapes(points.dtype), points, within)
+        return touched_of(merged(self.shapes(points.dtype)), points, within)
 
     def contains(self, point: ArrayLike) -> Bool[Array, ""]:
         """Whether a point (3,) (m, world) is inside an obstacle or underground."""

@@ -6,8 +6,8 @@ segment; a box and a cylinder are their own cores. All methods are about a singl
 
 from __future__ import annotations
 
-import abc
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,7 +22,6 @@ from jaxdrones.sensing.geometry import (
     Interval,
     Number,
     Point,
-    around_z,
     between_planes,
     direction,
     length,
@@ -38,7 +37,7 @@ LENGTHS = {"pos": 3, "quat": 4, "color": 4, "size": 3}
 """Numbers in a field of a single obstacle; a field that is not named here is one number."""
 
 
-class Obstacle(PyTreeNode, abc.ABC, kw_only=True):
+class Obstacle(PyTreeNode, kw_only=True):
     """A solid that does not move, or many of one kind, with leading axes on the arrays."""
 
     pos: Any
@@ -66,55 +65,107 @@ class Obstacle(PyTreeNode, abc.ABC, kw_only=True):
         """A point of the world in the frame of the obstacle, m."""
         return rotation.rotate_inverse(self.quat, point - self.pos)
 
-    @abc.abstractmethod
     def distance(self, point: Point) -> Number:
         """Signed distance of a point from the surface, m; negative inside."""
+        raise NotImplementedError
 
-    @abc.abstractmethod
     def outward(self, point: Point) -> Point:
         """Outward unit normal of the surface where it is nearest to a point: the gradient of the distance.
 
         Where several points of the surface are equally near, it is that of one of them.
         """
+        raise NotImplementedError
 
-    @abc.abstractmethod
     def interval(self, origin: Components, direction: Components) -> Interval:
         """The multiples of `direction`, first and last, at which lines through `origin` are inside.
 
         The first one is larger than the last one where a line misses the obstacle.
         """
+        raise NotImplementedError
 
-    @abc.abstractmethod
     def normals(self, point: Components) -> Components:
         """Vectors of any length that point outward, of many points that are on the surface."""
+        raise NotImplementedError
 
-    @abc.abstractmethod
     def nearest(self, point: Point) -> Point:
         """The point of the core that is nearest to a point, m."""
+        raise NotImplementedError
 
-    @abc.abstractmethod
     def extent(self, direction: Point) -> Number:
         """How far the core extends from its center along a unit vector, m: its support function."""
-
-    def separating(self, center: Point, axis: Point) -> list[Point]:
-        """Directions in which the gap to a cylinder with this center and axis is likely to be widest."""
-        return []
+        raise NotImplementedError
 
 
-class Box(Obstacle, kw_only=True):
+class Rounded(Obstacle, kw_only=True):
+    """An obstacle whose core is a box or a cylinder about `pos`, possibly of no width."""
+
+    @property
+    def half(self) -> Any:
+        """(3,) half of the core's extents along x, y and z, m."""
+        raise NotImplementedError
+
+    @property
+    def is_round(self) -> Any:
+        """() bool: whether the core is a cylinder along z, with a radius of `half[0]`."""
+        return False
+
+    def distance(self, point: Point) -> Number:
+        """Signed distance of a point from the surface, m."""
+        return signed_distance(self._beyond(point)) - self.rounding
+
+    def outward(self, point: Point) -> Point:
+        """Outward unit normal of the surface where it is nearest to a point."""
+        side = jnp.where(point < 0, -1, 1).astype(point.dtype)
+        normal = outward(self._beyond(point))
+
+        def of_cylinder() -> Point:
+            x, y = components(direction(point[:2]))
+            radial, _, along = components(normal)
+            return jnp.stack([radial * x, radial * y, side[2] * along])
+
+        return _either(self.is_round, of_cylinder, lambda: side * normal)
+
+    def nearest(self, point: Point) -> Point:
+        """The point of the core that is nearest to a point, m."""
+        inside = jnp.clip(point, -self.half, self.half)
+
+        def of_cylinder() -> Point:
+            x, y, _ = components(point)
+            radius = self.half[0]
+            inward = jnp.minimum(1, radius / jnp.maximum(length(point[:2]), radius))
+            return jnp.stack([inward * x, inward * y, inside[2]])
+
+        return _either(self.is_round, of_cylinder, lambda: inside)
+
+    def extent(self, direction: Point) -> Number:
+        """How far the core extends from its center along a unit vector, m."""
+        across, _, along = components(self.half)
+        return _either(
+            self.is_round,
+            lambda: along * jnp.abs(direction[2]) + across * length(direction[:2]),
+            lambda: dot(jnp.abs(direction), self.half),
+        )
+
+    def _beyond(self, point: Point) -> Array:
+        """How far a point is beyond the core along x, y and z, or beyond its radius and its ends, m."""
+
+        def of_cylinder() -> Array:
+            radial = length(point[:2]) - self.half[0]
+            return jnp.stack([radial, jnp.full_like(radial, -jnp.inf), jnp.abs(point[2]) - self.half[2]])
+
+        return _either(self.is_round, of_cylinder, lambda: jnp.abs(point) - self.half)
+
+
+class Box(Rounded, kw_only=True):
     """A cuboid about `pos`."""
 
     size: Any
     """(3,) edge lengths along x, y and z, m."""
 
-    def distance(self, point: Point) -> Number:
-        """Signed distance of a point from the surface, m."""
-        return signed_distance(jnp.abs(point) - self.size / 2)
-
-    def outward(self, point: Point) -> Point:
-        """Outward unit normal of the surface where it is nearest to a point."""
-        side = jnp.where(point < 0, -1, 1).astype(point.dtype)
-        return side * outward(jnp.abs(point) - self.size / 2)
+    @property
+    def half(self) -> Array:
+        """(3,) half of the edge lengths, m."""
+        return self.size / 2
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are between all three pairs of faces."""
@@ -128,20 +179,8 @@ class Box(Obstacle, kw_only=True):
         largest = functools.reduce(jnp.maximum, map(jnp.abs, (x, y, z)))
         return [jnp.where(jnp.abs(p) == largest, p, 0) for p in (x, y, z)]
 
-    def nearest(self, point: Point) -> Point:
-        """The point of the box that is nearest to a point, m."""
-        return jnp.clip(point, -self.size / 2, self.size / 2)
 
-    def extent(self, direction: Point) -> Number:
-        """How far the box extends from its center along a unit vector, m."""
-        return dot(jnp.abs(direction), self.size / 2)
-
-    def separating(self, center: Point, axis: Point) -> list[Point]:
-        """The normals of the faces."""
-        return list(jnp.eye(3, dtype=center.dtype))
-
-
-class Sphere(Obstacle, kw_only=True):
+class Sphere(Rounded, kw_only=True):
     """A ball about `pos`."""
 
     radius: Any
@@ -152,13 +191,10 @@ class Sphere(Obstacle, kw_only=True):
         """() radius, m: the core is the center."""
         return self.radius
 
-    def distance(self, point: Point) -> Number:
-        """Signed distance of a point from the surface, m."""
-        return length(point) - self.radius
-
-    def outward(self, point: Point) -> Point:
-        """Outward unit normal of the surface where it is nearest to a point."""
-        return direction(point)
+    @property
+    def half(self) -> Array:
+        """Zero: the core is the center."""
+        return jnp.zeros_like(self.pos)
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are within the radius."""
@@ -168,16 +204,8 @@ class Sphere(Obstacle, kw_only=True):
         """The direction from the center."""
         return point
 
-    def nearest(self, point: Point) -> Point:
-        """The center."""
-        return jnp.zeros_like(point)
 
-    def extent(self, direction: Point) -> Number:
-        """Zero: the core is a point."""
-        return jnp.zeros((), direction.dtype)
-
-
-class Cylinder(Obstacle, kw_only=True):
+class Cylinder(Rounded, kw_only=True):
     """A cylinder about `pos`, with its axis along its own z."""
 
     radius: Any
@@ -185,16 +213,12 @@ class Cylinder(Obstacle, kw_only=True):
     height: Any
     """() m."""
 
-    def distance(self, point: Point) -> Number:
-        """Signed distance of a point from the surface, m."""
-        return signed_distance(self._beyond(point))
+    is_round = True
 
-    def outward(self, point: Point) -> Point:
-        """Outward unit normal of the surface where it is nearest to a point."""
-        x, y = components(direction(point[:2]))
-        _, _, z = components(point)
-        radial, along = components(outward(self._beyond(point)))
-        return jnp.stack([radial * x, radial * y, jnp.where(z < 0, -along, along)])
+    @property
+    def half(self) -> Array:
+        """(3,) radius, radius and half of the height, m."""
+        return jnp.stack([self.radius, self.radius, self.height / 2])
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are within the radius and between the two ends."""
@@ -208,28 +232,8 @@ class Cylinder(Obstacle, kw_only=True):
         at_end = (z * self.radius) ** 2 > (x * x + y * y) * (self.height / 2) ** 2
         return [jnp.where(at_end, 0, x), jnp.where(at_end, 0, y), jnp.where(at_end, z, 0)]
 
-    def nearest(self, point: Point) -> Point:
-        """The point of the cylinder that is nearest to a point, m."""
-        x, y, z = components(point)
-        inward = jnp.minimum(1, self.radius / jnp.maximum(length(point[:2]), self.radius))
-        return jnp.stack([inward * x, inward * y, jnp.clip(z, -self.height / 2, self.height / 2)])
 
-    def extent(self, direction: Point) -> Number:
-        """How far the cylinder extends from its center along a unit vector, m."""
-        _, _, z = components(direction)
-        return self.height / 2 * jnp.abs(z) + self.radius * length(direction[:2])
-
-    def _beyond(self, point: Point) -> Array:
-        """How far a point is beyond the radius and beyond the ends, m."""
-        _, _, z = components(point)
-        return jnp.stack([length(point[:2]) - self.radius, jnp.abs(z) - self.height / 2])
-
-    def separating(self, center: Point, axis: Point) -> list[Point]:
-        """The axis, the radius towards the other cylinder, and the common normal of the two axes."""
-        return around_z(center, axis)
-
-
-class Capsule(Obstacle, kw_only=True):
+class Capsule(Rounded, kw_only=True):
     """A cylinder about `pos`, with its axis along its own z, and half a ball on either end."""
 
     radius: Any
@@ -242,13 +246,11 @@ class Capsule(Obstacle, kw_only=True):
         """() radius, m: the core is the axis of the cylinder."""
         return self.radius
 
-    def distance(self, point: Point) -> Number:
-        """Signed distance of a point from the surface, m."""
-        return length(point - self.nearest(point)) - self.radius
-
-    def outward(self, point: Point) -> Point:
-        """Outward unit normal of the surface where it is nearest to a point."""
-        return direction(point - self.nearest(point))
+    @property
+    def half(self) -> Array:
+        """(3,) zero, zero and half of the height of the cylinder, m."""
+        zero = jnp.zeros_like(self.height)
+        return jnp.stack([zero, zero, self.height / 2])
 
     def interval(self, origin: Components, direction: Components) -> Interval:
         """Where lines are in the cylinder or in a ball: one interval, as the capsule is convex."""
@@ -268,20 +270,12 @@ class Capsule(Obstacle, kw_only=True):
         x, y, z = point
         return [x, y, z - jnp.clip(z, -self.height / 2, self.height / 2)]
 
-    def nearest(self, point: Point) -> Point:
-        """The point of the axis that is nearest to a point, m."""
-        _, _, z = components(point)
-        zero = jnp.zeros_like(z)
-        return jnp.stack([zero, zero, jnp.clip(z, -self.height / 2, self.height / 2)])
 
-    def extent(self, direction: Point) -> Number:
-        """How far the axis extends from the center along a unit vector, m."""
-        _, _, z = components(direction)
-        return self.height / 2 * jnp.abs(z)
-
-    def separating(self, center: Point, axis: Point) -> list[Point]:
-        """The axis, the radius towards the other cylinder, and the common normal of the two axes."""
-        return around_z(center, axis)
+def _either(condition: Any, a: Callable[[], Array], b: Callable[[], Array]) -> Array:
+    """One of two results; both are computed only where the condition is an array."""
+    if isinstance(condition, bool):
+        return a() if condition else b()
+    return jnp.where(condition, a(), b())
 
 
 def single(obstacles: Obstacle, i: int) -> Any:

@@ -8,6 +8,7 @@ from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.dynamics.contact import rim
 from jaxdrones.params import Params
 from jaxdrones.sensing import Collisions, Scene, collisions
+from jaxdrones.sensing.distances import merged
 from jaxdrones.sensing.sweep import Disc, meets
 from jaxdrones.state import State
 from jaxdrones.tasks.task import World, norm
@@ -36,7 +37,7 @@ def _found(params: Params, drones: State, before: Array, scene: Scene) -> tuple[
     found = collisions(params, drones, scene, _MARGIN)
     if not scene.has_obstacles:
         return found.ground, found.drones, found.scene
-    kinds = scene.shapes(before.dtype)
+    kinds = merged(scene.shapes(before.dtype))
 
     def meets_obstacle(params: Params, drone: State, before: Array) -> Array:
         radius, ring = rim(params)

@@ -135,7 +135,11 @@ def test_a_thin_wall_stops_drones_at_any_speed():
 @pytest.mark.parametrize("vehicle", ["cf2x", "hb", "racer", "x500"])
 @pytest.mark.parametrize("kind", ["wall", "beam", "bar", "sphere", "cylinder", "capsule", "gate"])
 def test_nothing_flies_into_a_solid_however_thin_it_is_and_no_energy_is_gained(kind, vehicle):
-    """The disc of a drone, which its rounding surrounds, stays out; rim first it may get in by a few millimeters."""
+    """The disc of a drone, which its rounding surrounds, stays out; rim first it may get in by a few millimeters.
+
+    After an impact a drone turns about the point that touches, so that the center of mass of an hb, 7.5 cm beside its
+    disc, may go on towards a wall. So the law is one of places.
+    """
     depths, gains, states = flights_at(kind, vehicle, n=24)
     assert_finite(states)
     assert depths.max() < 0.01

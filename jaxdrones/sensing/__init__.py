@@ -1,10 +1,9 @@
-"""What stands around, who touches it, and what the drones measure."""
+"""Scenes, collision queries and sensors."""
 
 from jaxdrones.sensing import kalman
 from jaxdrones.sensing.builders import BEAMS, forest, gate, obstacles_2021, room, track
-from jaxdrones.sensing.camera import Camera, camera_2021
+from jaxdrones.sensing.camera import Camera, DepthNoise, camera_2021
 from jaxdrones.sensing.collisions import Collisions, collisions
-from jaxdrones.sensing.depth_noise import DepthNoise
 from jaxdrones.sensing.distances import Surface
 from jaxdrones.sensing.environment import BMP388, EUROPE, LIS3MDL, barometer, magnetometer
 from jaxdrones.sensing.estimator import state_estimate
@@ -19,9 +18,9 @@ from jaxdrones.sensing.range_finders import (
     multi_ranger,
     optical_flow,
     range_finder,
+    ray,
     time_of_flight,
 )
-from jaxdrones.sensing.rays import ray
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere

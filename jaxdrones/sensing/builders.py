@@ -1,7 +1,6 @@
 """Scenes to fly in: forests, rooms, tracks of gates, the obstacles of gym-pybullet-drones (2021).
 
-What is random is drawn from a key and has arrays of the same shapes for every key, so that one compiled program serves
-any number of worlds with a scene each.
+Random scenes have arrays of the same shapes for every key, so that one compiled program serves any number of worlds.
 """
 
 from __future__ import annotations
@@ -9,17 +8,20 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_finite, check_key, check_number, check_positive, check_shape, check_whole, shown
+from jaxdrones import rotation
+from jaxdrones.checks import check_key, check_number, check_shape
 from jaxdrones.errors import UserError
-from jaxdrones.sensing import clutter
 from jaxdrones.sensing.scene import Scene
-from jaxdrones.sensing.shapes import Box, Sphere
+from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle, Sphere
 from jaxdrones.vector import sin_cos
 
-_WALL = (0.8, 0.8, 0.75, 1.0)  # red, green, blue, opacity
+_WALL, _WOOD = (0.8, 0.8, 0.75, 1.0), (0.4, 0.28, 0.18, 1.0)  # red, green, blue, opacity
+_GREEN, _STONE = (0.2, 0.5, 0.2, 1.0), (0.5, 0.5, 0.55, 1.0)
+_SPHERE_RADIUS = (0.2, 0.5)  # m
+_BOX_EDGE = (0.3, 1.0)  # m
 BEAMS = 4
 """Boxes of a gate."""
 _MAX_TREES = 10_000
@@ -60,16 +62,10 @@ def forest(
         clearance: distance of obstacles from the points that are kept free, m.
 
     Raises:
-        ValueError: no random key, or a number out of range.
+        ValueError: no random key, or more than 10,000 trees.
     """
     check_key("key", key)
-    low, high = _range("density of a forest", density, "trees/m^2", at_least=0)
-    for name, value in ("length", length), ("width", width), ("height", height):
-        check_positive(f"{name} of a forest", value, "m")
-    check_number("tilt of a forest", tilt, "degrees", at_least=0, below=90)
-    check_whole("number of spheres of a forest", spheres, minimum=0)
-    check_whole("number of boxes of a forest", boxes, minimum=0)
-    check_number("clearance of a forest", clearance, "m", at_least=0)
+    low, high = np.broadcast_to(np.asarray(density), (2,)).tolist()
     trees = round(high * length * width)
     check_number("density x length x width of a forest", high * length * width, "trees", at_most=_MAX_TREES)
     count_key, tree_key, sphere_key, box_key = jax.random.split(key, 4)
@@ -77,12 +73,12 @@ def forest(
     corners = jnp.array([[0, -width / 2, 0], [length, width / 2, height]])
 
     count = jnp.round(jax.random.uniform(count_key, minval=low, maxval=high) * length * width)
-    trunks = clutter.trunks(tree_key, trees, corners, _range("radius of a forest", radius, "m", above=0), tilt)
+    trunks = _trunks(tree_key, trees, corners, radius, tilt)
     alive = jnp.arange(trees) < count
-    others = clutter.spheres(sphere_key, spheres, corners), clutter.boxes(box_key, boxes, corners)
+    others = _spheres(sphere_key, spheres, corners), _boxes(box_key, boxes, corners)
     return Scene.of(
-        trunks.replace(active=alive & clutter.is_free(trunks, free, clearance)),
-        *(solids.replace(active=clutter.is_free(solids, free, clearance)) for solids in others),
+        trunks.replace(active=alive & _is_free(trunks, free, clearance)),
+        *(solids.replace(active=_is_free(solids, free, clearance)) for solids in others),
     )
 
 
@@ -114,15 +110,8 @@ def room(
         wall: thickness of walls and ceiling, m.
 
     Raises:
-        ValueError: a number out of range, or pillars or clutter without a key.
+        ValueError: pillars or clutter without a key.
     """
-    check_shape("size of a room", size, (3,), "length, width and height, m")
-    for edge in size:
-        check_positive("an edge of a room", edge, "m")
-    check_positive("wall of a room", wall, "m")
-    check_number("clearance of a room", clearance, "m", at_least=0)
-    for name, number in ("pillars", pillars), ("spheres", spheres), ("boxes", boxes):
-        check_whole(f"number of {name} of a room", number, minimum=0)
     x, y, z = size
     shell = Box(
         pos=jnp.array(
@@ -141,11 +130,11 @@ def room(
     pillar_key, sphere_key, box_key = jax.random.split(key, 3)
     free, corners = _points(keep_free), jnp.array([[-x / 2, -y / 2, 0], [x / 2, y / 2, z]])
     inside = (
-        clutter.trunks(pillar_key, pillars, corners, _range("radius of a room", radius, "m", above=0)),
-        clutter.spheres(sphere_key, spheres, corners),
-        clutter.boxes(box_key, boxes, corners),
+        _trunks(pillar_key, pillars, corners, radius),
+        _spheres(sphere_key, spheres, corners),
+        _boxes(box_key, boxes, corners),
     )
-    return Scene.of(shell, *(solids.replace(active=clutter.is_free(solids, free, clearance)) for solids in inside))
+    return Scene.of(shell, *(solids.replace(active=_is_free(solids, free, clearance)) for solids in inside))
 
 
 def track(gates: ArrayLike, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:
@@ -175,11 +164,8 @@ def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: floa
         frame: width of the beams, m.
         depth: of the beams along the heading, m.
     """
-    for name, value in ("opening", opening), ("frame", frame), ("depth", depth):
-        check_positive(f"{name} of a gate", value, "m")
     pos, yaw = jnp.asarray(pos, float), jnp.asarray(yaw, float)
     check_shape("pos of a gate", pos, (3,), "one gate; for many use jax.vmap")
-    check_shape("yaw of a gate", yaw, (), "one gate; for many use jax.vmap")
     outer, offset = opening + 2 * frame, (opening + frame) / 2
     sin, cos = sin_cos(yaw)
     half_sin, half_cos = sin_cos(yaw / 2)
@@ -215,17 +201,67 @@ def _points(points: ArrayLike) -> Float[Array, "k 3"]:
     array = array.reshape(0, 3) if array.size == 0 else array
     if array.ndim != 2 or array.shape[1] != 3:
         raise UserError(f"keep_free has shape {array.shape}; give points (k, 3), m")
-    check_finite("keep_free", array)
     return array
 
 
-def _range(
-    name: str, bounds: ArrayLike, unit: str, at_least: float | None = None, above: float | None = None
-) -> tuple[float, float]:
-    """The two ends of an interval, of which one number is both."""
-    if np.shape(bounds) not in ((), (2,)):
-        raise UserError(f"{name} is {shown(bounds)}; give a number or (smallest, largest) ({unit})")
-    low, high = np.broadcast_to(np.asarray(bounds), (2,)).tolist()
-    check_number(name, low, unit, at_least=at_least, above=above)
-    check_number(f"the largest {name}", high, unit, at_least=low)
-    return low, high
+def _trunks(
+    key: jax.Array, count: int, corners: Float[Array, "2 3"], radius: tuple[float, float], tilt: float = 0.0
+) -> Cylinder:
+    """Cylinders at random places between two corners, which reach from the ground to the height of the second one."""
+    place_key, radius_key, tilt_key, axis_key = jax.random.split(key, 4)
+    height = corners[1, 2]
+    foot = _random_places(place_key, count, corners) * jnp.array([[1, 1, 0]])
+    sin, cos = sin_cos(jax.random.uniform(axis_key, (count,), maxval=2 * jnp.pi))
+    angle = jnp.radians(jax.random.uniform(tilt_key, (count, 1), maxval=tilt))
+    quat = jax.vmap(rotation.exp)(angle * jnp.stack([cos, sin, 0 * sin], axis=-1))
+    return Cylinder(
+        pos=foot + height / 2 * jax.vmap(rotation.z_axis)(quat),
+        quat=quat,
+        radius=jax.random.uniform(radius_key, (count,), minval=radius[0], maxval=radius[1]),
+        height=jnp.full(count, height),
+        color=jnp.tile(jnp.array([_WOOD]), (count, 1)),
+    )
+
+
+def _spheres(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Sphere:
+    """Balls at random places between two corners."""
+    place_key, radius_key = jax.random.split(key)
+    low, high = _SPHERE_RADIUS
+    return Sphere(
+        pos=_random_places(place_key, count, corners),
+        quat=_level(jnp.zeros(count)),
+        radius=jax.random.uniform(radius_key, (count,), minval=low, maxval=high),
+        color=jnp.tile(jnp.array([_GREEN]), (count, 1)),
+    )
+
+
+def _boxes(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Box:
+    """Boxes of any heading at random places between two corners."""
+    place_key, size_key, yaw_key = jax.random.split(key, 3)
+    low, high = _BOX_EDGE
+    return Box(
+        pos=_random_places(place_key, count, corners),
+        quat=_level(jax.random.uniform(yaw_key, (count,), maxval=2 * jnp.pi)),
+        size=jax.random.uniform(size_key, (count, 3), minval=low, maxval=high),
+        color=jnp.tile(jnp.array([_STONE]), (count, 1)),
+    )
+
+
+def _random_places(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Float[Array, "k 3"]:
+    return jax.random.uniform(key, (count, 3), minval=corners[:1], maxval=corners[1:])
+
+
+def _level(yaw: Float[Array, " k"]) -> Float[Array, "k 4"]:
+    """Quaternions of headings, rad."""
+    sin, cos = sin_cos(yaw / 2)
+    return jnp.stack([0 * sin, 0 * sin, sin, cos], axis=-1)
+
+
+def _is_free(solids: Obstacle, points: Float[Array, "k 3"], clearance: float) -> Bool[Array, " n"]:
+    """Whether each obstacle of a kind is far enough from all points."""
+
+    def gap(solid: Obstacle, point: Array) -> Array:
+        return solid.distance(solid.to_local(point))
+
+    gaps = jax.vmap(jax.vmap(gap, (None, 0)), (0, None))(solids, points)
+    return jnp.all(gaps >= clearance, axis=1)

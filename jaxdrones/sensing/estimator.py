@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_positive, check_switch, shown
+from jaxdrones.checks import check_number
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -89,17 +89,8 @@ def state_estimate(
         name: by which observation terms ask for the reading.
 
     Raises:
-        ValueError: a number out of range, or a rate or delay of the poses that does not fit that of the IMU.
+        ValueError: poses without noise, or a rate or delay of the poses that is no multiple of the IMU's period.
     """
-    inertial.check_part(part)
-    if not isinstance(system, MotionCaptureSystem):
-        raise UserError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
-    check_positive(f"rate of {name}", rate, "1/s")
-    check_switch(f"attitude of {name}", attitude)
-    if not isinstance(start, tuple | list) or len(start) != 3:
-        raise UserError(f"start of {name} is {shown(start)}; give deviations of position (m), velocity (m/s), angle")
-    for what, unit, value in zip(("position", "velocity", "angle"), ("m", "m/s", "rad"), start, strict=True):
-        check_positive(f"start of {name}, {what},", value, unit)
     check_number(f"pos_noise of {name}", system.pos_noise, "m", above=0)
     if attitude:
         check_number(f"angle_noise of {name}", system.angle_noise, "rad", above=0)

@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_finite, check_positive, shown
-from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.sensing.noise import Errors, Noise
@@ -69,15 +67,7 @@ def imu(
         rate: measurements per second; control steps of the environment are as frequent or a multiple of it.
         offset: (3,) of the unit from the center of mass, m, body.
         name: by which observation terms ask for the reading.
-
-    Raises:
-        ValueError: something else than a part, or a number out of range.
     """
-    check_part(part)
-    check_positive(f"rate of {name}", rate, "1/s")
-    if np.shape(offset) != (3,):
-        raise UserError(f"offset of {name} is {shown(offset)}; give 3 numbers")
-    check_finite(f"offset of {name}", offset)
     at_center = not np.any(np.asarray(offset))
 
     def measure(key: jax.Array, params: Params, state: State, rate_: State, scene: Scene, memory: dict[str, Errors]):
@@ -90,12 +80,6 @@ def imu(
     entries = (*quantities("specific force", "m/s^2", "body"), *quantities("body rates measured", "rad/s", "body"))
     bound = max(part.acc.limit, part.gyro.limit)
     return Sensor(name, measure, init, bound=bound, rate=rate, entries=entries, clocked=True)
-
-
-def check_part(part: ImuPart) -> None:
-    """Raise unless `part` is one."""
-    if not isinstance(part, ImuPart):
-        raise UserError(f"part of an IMU is {shown(part)}; give jaxdrones.sensing.BMI088 or ImuPart(acc, gyro)")
 
 
 def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_positive, shown
-from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.sensing.scene import Scene
@@ -33,13 +31,6 @@ class MotionCaptureSystem:
     """Standard deviation of each coordinate, m."""
     angle_noise: float = 0.0
     """Standard deviation of the attitude about each axis, rad."""
-
-    def __post_init__(self):
-        check_positive("rate of a motion capture", self.rate, "1/s")
-        check_number("delay of a motion capture", self.delay, "s", at_least=0)
-        check_number("dropout of a motion capture", self.dropout, at_least=0, at_most=1)
-        check_number("pos_noise of a motion capture", self.pos_noise, "m", at_least=0)
-        check_number("angle_noise of a motion capture", self.angle_noise, "rad", at_least=0)
 
     def noisy(
         self, key: jax.Array, pos: Float[Array, "3"], quat: Float[Array, "4"]
@@ -71,12 +62,7 @@ def motion_capture(system: MotionCaptureSystem = VICON, name: str = "motion_capt
     Args:
         system: rate, delay, dropouts and noise; control steps of the environment are as frequent or a multiple of it.
         name: by which observation terms ask for the reading.
-
-    Raises:
-        ValueError: something else than a system.
     """
-    if not isinstance(system, MotionCaptureSystem):
-        raise UserError(f"system of {name} is {shown(system)}; give jaxdrones.sensing.MotionCaptureSystem(rate=...)")
     periods = system.delay * system.rate
     late = math.ceil(periods - 1e-6)
     share = late - periods  # of the later one of the two poses that are `late` and `late` - 1 periods old

@@ -1,8 +1,7 @@
-"""Range finders and optical flow: sensors that measure by a few rays. They see obstacles and ground, not other drones.
+"""Rays through a scene, range finders and optical flow; other drones are not seen.
 
-The defaults are the rates and ranges of the named devices, without noise: data sheets give it for one surface and one
-light only. With `noise` a range has that standard deviation (m), and with `dropout` this share of the ranges is missing
-and reads the largest range, as where nothing is near enough.
+The defaults are the rates and ranges of the named devices, without noise, which data sheets give for one surface and
+one light only.
 """
 
 from __future__ import annotations
@@ -13,22 +12,65 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_finite, check_number, check_positive, check_quaternion, check_whole, shown
-from jaxdrones.errors import UserError
+from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
+from jaxdrones.sensing.distances import as_floats
 from jaxdrones.sensing.geometry import Number
-from jaxdrones.sensing.rays import ray
-from jaxdrones.sensing.scene import Scene
+from jaxdrones.sensing.scene import Scene, check_scene
 from jaxdrones.sensing.sensor import Sensor
+from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.state import State
+from jaxdrones.vector import components
 
 _MULTI_RANGER = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)])
 _DOWN = np.array([(0, 0, -1)])
 _IDENTITY = (0.0, 0.0, 0.0, 1.0)
 _NEAREST_FLOW = 0.08  # m: the PMW3901 sees nothing sharp below
+
+
+def ray(scene: Scene, origin: ArrayLike, direction: ArrayLike) -> Float[Array, ""]:
+    """Distance along a ray to the first surface of a scene that it hits, m; zero where it starts inside.
+
+    It is differentiable in the ray and in the scene.
+
+    Args:
+        scene: of one world.
+        origin: (3,) m, world; for many rays use `jax.vmap`.
+        direction: (3,) unit vector, world. If it has another length, the distance is in multiples of that length.
+
+    Returns:
+        () m; infinity, with a zero gradient, where nothing is hit.
+
+    Raises:
+        ValueError: a wrong shape, or a mesh or URDF file in the scene.
+    """
+    check_scene(scene)
+    origin, direction = as_floats(origin), as_floats(direction)
+    for name, value in ("origin", origin), ("direction", direction):
+        check_shape(name, value, (3,), "x, y, z of one ray; for many use jax.vmap")
+    hits = [jnp.full((), jnp.inf, origin.dtype)]
+    if scene.ground:
+        hits.append(_to_ground(origin, direction))
+    for shapes in scene.shapes(origin.dtype):
+        hits.append(jnp.min(jax.vmap(_to_shape, (0, None, None))(shapes, origin, direction)))
+    return jnp.min(jnp.stack(hits))
+
+
+def _to_shape(shape: Obstacle, origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float[Array, ""]:
+    local_origin, local_direction = shape.to_local(origin), rotation.rotate_inverse(shape.quat, direction)
+    first, last = shape.interval(components(local_origin), components(local_direction))
+    return jnp.where((first <= last) & (last >= 0) & shape.active, jnp.maximum(first, 0), jnp.inf)
+
+
+def _to_ground(origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float[Array, ""]:
+    height, climb = origin[2], direction[2]
+    descends = climb < -jnp.finfo(climb.dtype).eps
+    far = jnp.where(descends, -height / jnp.where(descends, climb, -1), jnp.inf)
+    return jnp.where(height > 0, far, 0)
 
 
 def range_finder(
@@ -53,26 +95,9 @@ def range_finder(
         dropout: share of the ranges that are missing and read `max_range`.
         offset: (3,) where the rays start, relative to the center of mass, m, body axes.
         orientation: (4,) unit quaternion (x, y, z, w), device to body.
-
-    Raises:
-        ValueError: a number out of range or a wrong shape.
     """
     directions = np.asarray(directions, float)
-    if directions.shape[-1:] != (3,):
-        raise UserError(f"directions of {name} have shape {directions.shape}; give vectors (..., 3)")
-    check_finite(f"directions of {name}", directions)
-    length = np.linalg.norm(directions, axis=-1, keepdims=True)
-    if not length.all():
-        raise UserError(f"directions of {name} are {shown(directions)}; give vectors that are not zero")
-    directions = directions / length
-    check_positive(f"max_range of {name}", max_range, "m")
-    check_number(f"noise of {name}", noise, "m", at_least=0)
-    check_number(f"dropout of {name}", dropout, at_least=0, at_most=1)
-    for what, value, length in ("offset", offset, 3), ("orientation", orientation, 4):
-        if np.shape(value) != (length,):
-            raise UserError(f"{what} of {name} is {shown(value)}; give {length} numbers")
-        check_finite(f"{what} of {name}", value)
-    check_quaternion(f"orientation of {name}", orientation)
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     quat = np.asarray(orientation, float) / np.linalg.norm(orientation)
 
     def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: None):
@@ -127,7 +152,6 @@ def lidar(
 
     All rays of a scan are taken at once. Arguments are as for `range_finder`.
     """
-    check_whole("beams of a lidar", beams)
     angle = 2 * np.pi / beams * np.arange(beams)
     around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
     return range_finder(
@@ -154,21 +178,9 @@ def time_of_flight(
 ) -> Sensor:
     """Ranges (zones, zones), rows from top to bottom and columns from left to right, m: the VL53L5CX.
 
-    The zones have equal angles, and each is measured by the ray in its middle. Arguments are as for `range_finder`;
-    the device looks forward.
-
-    Args:
-        zones: number of rows and of columns.
-        field_of_view: from side to side, degrees.
-        max_range: m.
-        rate: measurements per second.
-        noise: standard deviation of a range, m.
-        dropout: share of the ranges that are missing.
-        offset: (3,) of the device, m, body axes.
-        orientation: (4,) unit quaternion (x, y, z, w), device to body.
+    The zones have equal angles over the field of view (degrees), and each is measured by the ray in its middle. Other
+    arguments are as for `range_finder`; the device looks forward.
     """
-    check_whole("zones of a time-of-flight sensor", zones)
-    check_number("field_of_view of a time-of-flight sensor", field_of_view, "degrees", above=0, below=180)
     slope = np.tan(np.radians(field_of_view) * ((zones - 1) / 2 - np.arange(zones)) / zones)
     up, left = np.meshgrid(slope, slope, indexing="ij")
     rays = np.stack([np.ones_like(left), left, up], axis=-1)
@@ -195,12 +207,7 @@ def optical_flow(rate: float | None = 100.0, noise: float = 0.0, dropout: float 
         rate: measurements per second; one every control step when left out.
         noise: standard deviation, rad/s.
         dropout: share of the measurements that are missing and read zero.
-
-    Raises:
-        ValueError: a number out of range.
     """
-    check_number("noise of optical_flow", noise, "rad/s", at_least=0)
-    check_number("dropout of optical_flow", dropout, at_least=0, at_most=1)
 
     def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: None):
         noise_key, dropout_key = jax.random.split(key)

@@ -63,21 +63,3 @@ def test_the_gradient_is_that_of_the_scatter_and_zero_where_a_pixel_is_missing()
     np.testing.assert_allclose(total(scatter), difference / 2e-5, rtol=1e-6)
     lost = whole.apply(KEY, flat(2.0), CAMERA) == 0
     np.testing.assert_allclose(total(whole), jnp.where(lost, 0, total(scatter)), rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (dict(spread=-1), "spread of a depth noise is -1"),
-        (dict(dropout=2), "dropout of a depth noise is 2"),
-        (dict(missing="no"), "unknown value of missing pixels 'no'"),
-    ],
-)
-def test_nonsense_is_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        DepthNoise(**options)
-
-
-def test_a_noise_that_cannot_be_applied_is_refused():
-    with pytest.raises(ValueError, match=r"apply of the noise of a camera.* give for example that of a DepthNoise"):
-        jd.Camera(noise=0.1)

@@ -85,16 +85,6 @@ def test_white_noise_shrinks_and_the_walk_of_the_bias_grows_with_the_root_of_the
         np.testing.assert_allclose(np.std(read), DRIFT.drift, rtol=0.05)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Noise(density=-1), "density of a noise is -1; give a number of at least 0"),
-        (lambda: Noise(correlation=0), "correlation of a noise is 0"),
-        (lambda: Noise(limit=0), "limit of a noise is 0"),
-        (lambda: allan_deviation(np.zeros(20), 0.01, 10), r"\(20,\) readings are too few to average 10; give at least"),
-        (lambda: allan_deviation(np.full(30, np.nan), 0.01, 10), "readings is not finite"),
-    ],
-)
-def test_nonsense_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_too_few_readings_are_refused():
+    with pytest.raises(ValueError, match=r"\(20,\) readings are too few to average 10; give at least"):
+        allan_deviation(np.zeros(20), 0.01, 10)

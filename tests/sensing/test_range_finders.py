@@ -166,25 +166,3 @@ def test_in_an_environment_a_sensor_measures_at_its_rate():
         seen.append(float(obs[0, 0]))
     changes = np.flatnonzero(np.diff(seen)) + 1
     assert changes.tolist() == [4, 8]
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: lidar(beams=0), "beams of a lidar is 0"),
-        (lambda: multi_ranger(max_range=-1), "max_range of multi_ranger is -1"),
-        (lambda: multi_ranger(noise=-1), "noise of multi_ranger is -1"),
-        (lambda: optical_flow(dropout=2), "dropout of optical_flow is 2"),
-        (lambda: lidar(rate=0), "rate of sensor 'lidar' is 0"),
-        (lambda: time_of_flight(field_of_view=180), "field_of_view of a time-of-flight sensor is 180"),
-        (lambda: time_of_flight(orientation=(0, 0, 0, 2)), "orientation of time_of_flight has length 2"),
-        (lambda: lidar(offset=(0, 0)), r"offset of lidar is \(0, 0\); give 3 numbers"),
-        (lambda: range_finder("x", np.array([[1, 0, 0], [0, 0, 0.0]]), max_range=1.0), "vectors that are not zero"),
-        (lambda: range_finder("x", np.array([np.nan, 0, 1]), max_range=1.0), "directions of x is not finite"),
-        (lambda: range_finder("x", np.array([np.inf, 0, 1]), max_range=1.0), "directions of x is not finite"),
-        (lambda: range_finder("x", np.zeros((2, 2)), max_range=1.0), r"directions of x have shape \(2, 2\)"),
-    ],
-)
-def test_nonsense_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()

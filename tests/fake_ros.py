@@ -16,9 +16,9 @@ INTEGERS = {"uint8": (0, 2**8), "uint32": (0, 2**32), "int32": (-(2**31), 2**31)
 
 def message_class(kind):
     def check(field, value):
-        if not isinstance(field.kind, str):
+        if field.is_message:
             entries = [value] if field.length is None else value
-            assert all(type(entry) is classes[field.kind.NAME] for entry in entries), (kind, field.name)
+            assert all(type(entry) is classes[field.kind] for entry in entries), (kind, field.name)
         elif field.length is None:
             wanted = {"string": str, "bool": bool, "float64": float, "float32": float}.get(field.kind, int)
             assert type(value) is wanted, (kind, field.name, value)
@@ -36,24 +36,20 @@ def message_class(kind):
         def __init__(self, **given):
             assert set(given) <= {field.name for field in msg.fields(kind)}
             for field in msg.fields(kind):
-                default = (
-                    msg.encode(getattr(kind(), field.name), lambda k: classes[k.NAME], None)
-                    if (not isinstance(field.kind, str) and field.length is None and field.name not in given)
-                    else getattr(kind(), field.name)
-                )
+                default = getattr(msg.message_class(kind)(), field.name)
+                if field.is_message and field.length is None and field.name not in given:
+                    default = msg.encode(default, classes.__getitem__, None)
                 value = given.get(field.name, default)
                 if field.name in given:
                     check(field, value)
                 setattr(self, field.name, value)
 
-    Generated.__name__ = kind.NAME.rpartition("/")[2]
-    Generated.NAME = kind.NAME
+    Generated.__name__ = kind.rpartition("/")[2]
+    Generated.NAME = kind
     return Generated
 
 
-classes = {}
-for _name, _kind in msg.MESSAGES.items():
-    classes[_name] = message_class(_kind)
+classes = {name: message_class(name) for name in msg.MESSAGES}
 
 
 class Trigger:

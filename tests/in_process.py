@@ -27,7 +27,7 @@ class InProcess:
 
     def publisher(self, topic):
         def publish(message):
-            assert isinstance(message, topic.type)
+            assert message.NAME == topic.type
             self.wire.sent[topic.name].append(message)
             for receive in self.wire.subscribers[topic.name]:
                 receive(message)

@@ -29,7 +29,7 @@ from jaxdrones.urdf import load_params
 
 _SPACING = 0.5  # m between drones at the start, along y
 _MAX_HZ = 20_000
-_OF_REPLAY = ("replay", "speed", "real_time", "transport", "json", "run", "debug")
+_OF_REPLAY = ("bag", "speed", "transport", "json", "run", "debug")
 
 
 def add(commands) -> None:
@@ -44,26 +44,31 @@ def add(commands) -> None:
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--lockstep", action="store_true", help="advance by calls of the service /step")
     pace.add_argument("--real-time", action="store_true", help="advance by the clock (default)")
-    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="simulated over real time (1)")
+    parser.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
     parser.add_argument("--duration", type=float, metavar="S", help="simulated seconds (until it is interrupted)")
     parser.add_argument("--camera", metavar="WxH", help="a camera on every drone, of this resolution (none)")
     parser.add_argument("--camera-hz", type=float, default=10.0, metavar="HZ", help="images per second (10)")
-    parser.add_argument("--timeout", type=float, default=1.0, metavar="S", help="longest time between commands (1)")
-    parser.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time until the first one (30)")
+    parser.add_argument(
+        "--timeout", type=float, default=1.0, metavar="S", help="time without a command before the failsafe acts (1)"
+    )
+    parser.add_argument("--wait", type=float, default=30.0, metavar="S", help="seconds until the first command (30)")
     parser.add_argument("--failsafe", default="hover", help=f"without commands: {', '.join(ACTIONS)} (hover)")
     parser.add_argument("--transport", default="auto", help=f"{', '.join(TRANSPORTS)} (rclpy if there, or cyclonedds)")
     parser.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
-    parser.add_argument("--replay", type=folder, metavar="BAG", help="publish what a bag holds; nothing is simulated")
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
-    parser.set_defaults(run=functools.partial(_run, parser))
+    parser.set_defaults(run=_run)
+    commands = parser.add_subparsers(metavar="[replay]", title="commands")
+    replay = commands.add_parser("replay", help="publish the messages of a bag", allow_abbrev=False)
+    replay.add_argument("bag", type=folder, metavar="BAG", help="folder of a bag; nothing is simulated")
+    replay.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
+    replay.add_argument("--transport", default="auto", help=f"{', '.join(TRANSPORTS)} (rclpy if there, or cyclonedds)")
+    replay.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    replay.set_defaults(run=functools.partial(_replay, parser))
 
 
-def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    _refuse(parser, options)
+def _run(options: argparse.Namespace) -> int:
     with contextlib.closing(open_transport(options.transport)) as transport:
-        if options.replay:
-            return _replay(options, transport)
-        failsafe = Failsafe(options.failsafe, options.timeout, options.wait)
+        failsafe, camera = Failsafe(options.failsafe, options.timeout, options.wait), _camera(options)
         with contextlib.ExitStack() as stack:
             simulation = _simulation(options, stack)
             recorder = stack.enter_context(bag.Recorder(options.record)) if options.record else None
@@ -73,7 +78,7 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
                 lockstep=options.lockstep,
                 failsafe=failsafe,
                 speed=options.speed,
-                camera=_camera(options),
+                camera=camera,
                 recorder=recorder,
                 warn=print_warning,
             )
@@ -85,14 +90,6 @@ def _run(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
         report: dict[str, Any] = vars(node.flown) | {"simulated_s": simulation.ns / 1e9}
         _print(options, report)
     return 0 if lost is None else print_error(lost, 1)
-
-
-def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Raise for options of a flight beside --replay."""
-    for name in vars(options) if options.replay else ():
-        if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
-            option = f"--{name.replace('_', '-')}"
-            raise UserError(f"{option} is given beside --replay, which publishes what the bag holds; leave it out")
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:
@@ -137,22 +134,31 @@ def _camera(options: argparse.Namespace) -> Camera | None:
     return Camera(resolution=(int(width), int(height)), rate=options.camera_hz)
 
 
-def _replay(options: argparse.Namespace, transport: Transport) -> int:
+def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     """Publish a bag at the pace at which it was recorded."""
+    for name in vars(options):
+        if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
+            raise UserError(f"--{name.replace('_', '-')} is an option of flights; leave it out of `replay`")
     check_number("speed", options.speed, above=0)
+    with contextlib.closing(open_transport(options.transport)) as transport:
+        report = _published(options, transport)
+    _print(options, report)
+    return 0
+
+
+def _published(options: argparse.Namespace, transport: Transport) -> dict[str, Any]:
     known = {**topics.OUTPUTS, **topics.COMMANDS}
     publishers: dict[str, Any] = {}
     begin, published, ns = time.monotonic(), 0, 0
     first: int | None = None
-    for name, ns, message in bag.read(options.replay):
+    for name, ns, message in bag.read(options.bag):
         first = ns if first is None else first
         if name not in publishers:
             qos = known.get(name.partition("/")[2], (None, topics.CLOCK.qos))[1]
-            publishers[name] = transport.publisher(topics.Topic(name, type(message), qos))
+            publishers[name] = transport.publisher(topics.Topic(name, message.NAME, qos))
         while (left := begin + (ns - first) / 1e9 / options.speed - time.monotonic()) > 0:
             transport.spin(left)
         publishers[name](message)
         published += 1
     transport.flush(2.0)
-    _print(options, {"published": published, "simulated_s": (ns - (first or 0)) / 1e9})
-    return 0
+    return {"published": published, "simulated_s": (ns - (first or 0)) / 1e9}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,8 +16,6 @@ from jaxdrones.ros2.topics import Topic
 if TYPE_CHECKING:
     from jaxdrones.flights.log import FlightLog
 
-_DTYPES = {"float64": np.float64, "float32": np.float32, "uint8": np.uint8}
-
 
 class Recorded(NamedTuple):
     """One message of a bag."""
@@ -28,35 +25,19 @@ class Recorded(NamedTuple):
     message: msg.Message
 
 
-@functools.cache
-def _typestore() -> Any:
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ImportError('rosbags is not installed; pip install "jaxdrones[ros2]"') from error
-    return get_typestore(Stores.ROS2_JAZZY)
-
-
 def serialize(message: msg.Message) -> bytes:
     """A message as ROS 2 encodes it: CDR, little-endian, with its header of four bytes."""
-    store = _typestore()
+    store = msg.typestore()
 
     def array(field: msg.Field, given: Any) -> np.ndarray:
-        kind = _DTYPES[str(field.kind)]
-        return np.frombuffer(given, kind) if field.kind == "uint8" else np.array(given, kind)
+        return np.frombuffer(given, np.uint8) if field.kind == "uint8" else np.array(given, field.kind)
 
-    return bytes(store.serialize_cdr(msg.encode(message, lambda kind: store.types[kind.NAME], array), message.NAME))
+    return bytes(store.serialize_cdr(msg.encode(message, store.types.__getitem__, array), message.NAME))
 
 
 def deserialize(data: bytes, name: str) -> msg.Message:
-    """The message of the type `name` that bytes of ROS 2 hold.
-
-    Raises:
-        ValueError: a type that is not among `messages.MESSAGES`.
-    """
-    if name not in msg.MESSAGES:
-        raise UserError(f"messages of type {name} are not known (known: {', '.join(sorted(msg.MESSAGES))})")
-    return msg.decode(msg.MESSAGES[name], _typestore().deserialize_cdr(data, name))
+    """The message of the type `name` that bytes of ROS 2 hold."""
+    return msg.decode(name, msg.typestore().deserialize_cdr(data, name))
 
 
 class Recorder:
@@ -72,7 +53,7 @@ class Recorder:
             ValueError: there is something at this path already, or its folder cannot be written.
             ImportError: rosbags is not installed.
         """
-        _typestore()
+        msg.typestore()
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         path = Path(path)
@@ -95,7 +76,7 @@ class Recorder:
         """Write a message of a topic at a simulated time, ns."""
         if topic.name not in self._connections:
             self._connections[topic.name] = self._writer.add_connection(
-                f"/{topic.name}", topic.type.NAME, typestore=_typestore()
+                f"/{topic.name}", topic.type, typestore=msg.typestore()
             )
         self._writer.write(self._connections[topic.name], ns, serialize(message))
 
@@ -111,7 +92,7 @@ def read(path: Path) -> Iterator[Recorded]:
         ValueError: there is no bag at this path, or it is damaged.
         ImportError: rosbags is not installed.
     """
-    _typestore()
+    msg.typestore()
     from rosbags.rosbag2 import Reader
 
     try:

@@ -208,7 +208,7 @@ _COMMANDS: dict[str, Callable[[Any], Command]] = {
 
 def numbers(vector: Any) -> tuple[float, ...]:
     """The components of a point, a vector or a quaternion."""
-    return tuple(getattr(vector, field.name) for field in msg.fields(type(vector)))
+    return tuple(getattr(vector, field.name) for field in msg.fields(vector.NAME))
 
 
 def _finite(values: tuple[float, ...], name: str) -> tuple[float, ...]:

@@ -24,7 +24,6 @@ from jaxdrones.dynamics import downwash, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError
 from jaxdrones.params import repeat
-from jaxdrones.ros2.convert import stamp
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
@@ -105,8 +104,8 @@ class Backend:
         for i, state in enumerate(self._states):
             state.pos, state.vel, state.omega = now.pos[i], now.vel[i], now.omega[i]
             state.quat = now.quat[i][[3, 0, 1, 2]]
-        at = stamp(round(self.time() * _NS))
-        self._clock.publish(self._clock_type(clock=self._time_type(sec=at.sec, nanosec=at.nanosec)))
+        sec, nanosec = divmod(round(self.time() * _NS), _NS)
+        self._clock.publish(self._clock_type(clock=self._time_type(sec=sec, nanosec=nanosec)))
         return self._states
 
     def shutdown(self) -> None:

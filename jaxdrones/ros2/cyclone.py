@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from jaxdrones.errors import UserError, install
+
 try:
     from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
     from cyclonedds.core import DDSException, InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState, WaitSet
@@ -17,9 +19,8 @@ try:
     from cyclonedds.topic import Topic as DdsTopic
     from cyclonedds.util import duration
 except ImportError as error:
-    raise ImportError('cyclonedds is not installed; pip install "jaxdrones[ros2]", or source a ROS 2') from error
+    raise ImportError(f"cyclonedds is not installed; {install('ros2')}, or source a ROS 2") from error
 
-from jaxdrones.errors import UserError
 from jaxdrones.limits import check_at_most
 from jaxdrones.ros2 import idl
 from jaxdrones.ros2 import messages as msg
@@ -147,7 +148,7 @@ class CycloneTransport:
 
     def connect(self, topic: Topic, timeout: float) -> bool:
         """Whether a subscriber is there, after at most `timeout` s, that hears what is published from now on."""
-        return self._connect(self._writers[topic.name], idl.encode(topic.type()), timeout)
+        return self._connect(self._writers[topic.name], idl.encode(msg.message_class(topic.type)()), timeout)
 
     def _connect(self, writer: DataWriter, sample: Any, timeout: float) -> bool:
         """Wait until a reader knows a writer, and not only the writer the reader.
@@ -202,7 +203,7 @@ class CycloneTransport:
         does = "publishes" if publishes else "subscribes to"
         who = f"a peer {does} /{topic.name}"
         if end.type_name != idl.dds_name(topic.type):
-            return f"{who} as {_ros_name(end.type_name)}; its type is {topic.type.NAME}"
+            return f"{who} as {_ros_name(end.type_name)}; its type is {topic.type}"
         if publishes and not published and Policy.Reliability.BestEffort in end.qos:
             return f"{who} as best effort, and the node asks for reliable messages; publish reliably"
         if not publishes and published and not topic.qos.reliable and Policy.Reliability.BestEffort not in end.qos:

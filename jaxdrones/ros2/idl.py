@@ -1,5 +1,6 @@
-"""The messages as types of CycloneDDS, with the names and the encoding that ROS 2 gives them on DDS."""
+"""Message types of CycloneDDS, with the names and the encoding that ROS 2 gives them on DDS."""
 
+import functools
 from typing import Any
 
 from cyclonedds.idl import IdlStruct, make_idl_struct, types
@@ -18,22 +19,19 @@ _KINDS: dict[str, Any] = {
     "float64": types.float64,
     "string": str,
 }
-_types: dict[str, type[IdlStruct]] = {}  # by names on DDS
 _HEADER = {"guid": "uint64", "seq": "int64"}  # of requests and replies in rmw_cyclonedds: who asked, and which time
 
 
-def dds_name(kind: type[msg.Message]) -> str:
+def dds_name(name: str) -> str:
     """The name of a message type on DDS: `geometry_msgs::msg::dds_::Pose_`."""
-    package, _, name = kind.NAME.split("/")
-    return f"{package}::msg::dds_::{name}_"
+    package, _, short = name.split("/")
+    return f"{package}::msg::dds_::{short}_"
 
 
-def idl_type(kind: type[msg.Message]) -> Any:
+@functools.cache
+def idl_type(name: str) -> Any:
     """The type of CycloneDDS for a message type; encoded as plain CDR."""
-    name = dds_name(kind)
-    if name not in _types:
-        _types[name] = _struct(name, {field.name: _idl_field(field) for field in msg.fields(kind)})
-    return _types[name]
+    return _struct(dds_name(name), {field.name: _idl_field(field) for field in msg.fields(name)})
 
 
 def _struct(name: str, fields: dict[str, Any]) -> type[IdlStruct]:
@@ -43,7 +41,7 @@ def _struct(name: str, fields: dict[str, Any]) -> type[IdlStruct]:
 
 
 def _idl_field(field: msg.Field) -> Any:
-    base = _KINDS[field.kind] if isinstance(field.kind, str) else idl_type(field.kind)
+    base = idl_type(field.kind) if field.is_message else _KINDS[field.kind]
     if field.length is None:
         return base
     if field.length:

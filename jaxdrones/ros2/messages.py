@@ -1,235 +1,139 @@
-"""The standard ROS 2 messages that are used here, as plain dataclasses that need no ROS.
+"""The standard ROS 2 messages that are used here, made from the type store of rosbags: `messages.Pose`, and so on.
 
-Fields, their order and their types are those of the `.msg` files of ROS 2 (Humble to Kilted; common_interfaces and
-rcl_interfaces). Numbers are Python numbers, arrays of numbers tuples, and `uint8[]` is bytes.
+Numbers are Python numbers, arrays of numbers tuples, and `uint8[]` is bytes. Fields that are left out are zero, and
+rotations are none. Needs the extra `ros2`.
 """
 
-from typing import Annotated
-
-from jaxdrones.ros2.schema import MESSAGES, Field, Message, decode, encode, fields, message_of
-
-__all__ = ["MESSAGES", "Field", "Message", "decode", "encode", "fields"]  # and the types below
-
-Bool = Annotated[bool, "bool"]
-UInt8 = Annotated[int, "uint8"]
-UInt32 = Annotated[int, "uint32"]
-Int32 = Annotated[int, "int32"]
-Float32 = Annotated[float, "float32"]
-Float64 = Annotated[float, "float64"]
-String = Annotated[str, "string"]
-Bytes = Annotated[bytes, "uint8[]"]
-Float32s = Annotated[tuple[float, ...], "float32[]"]
-Float64s = Annotated[tuple[float, ...], "float64[]"]
-Matrix3 = Annotated[tuple[float, ...], "float64[9]"]
-Matrix34 = Annotated[tuple[float, ...], "float64[12]"]
-Matrix6 = Annotated[tuple[float, ...], "float64[36]"]
-
-
-@message_of("builtin_interfaces")
-class Time(Message):
-    """A time, s and ns."""
-
-    sec: Int32 = 0
-    nanosec: UInt32 = 0
-
-
-@message_of("std_msgs")
-class Header(Message):
-    """When, and in which frame."""
-
-    stamp: Time = Time()
-    frame_id: String = ""
-
-
-@message_of("rosgraph_msgs")
-class Clock(Message):
-    """Simulated time."""
-
-    clock: Time = Time()
-
-
-@message_of("geometry_msgs")
-class Point(Message):
-    """A position, m."""
-
-    x: Float64 = 0.0
-    y: Float64 = 0.0
-    z: Float64 = 0.0
-
-
-@message_of("geometry_msgs")
-class Vector3(Message):
-    """A vector."""
-
-    x: Float64 = 0.0
-    y: Float64 = 0.0
-    z: Float64 = 0.0
-
-
-@message_of("geometry_msgs")
-class Quaternion(Message):
-    """A rotation."""
-
-    x: Float64 = 0.0
-    y: Float64 = 0.0
-    z: Float64 = 0.0
-    w: Float64 = 1.0
-
-
-@message_of("geometry_msgs")
-class Pose(Message):
-    """Position and attitude."""
-
-    position: Point = Point()
-    orientation: Quaternion = Quaternion()
-
-
-@message_of("geometry_msgs")
-class PoseStamped(Message):
-    """A pose at a time, in the frame of its header."""
-
-    header: Header = Header()
-    pose: Pose = Pose()
-
-
-@message_of("geometry_msgs")
-class Twist(Message):
-    """Velocity, m/s, and angular velocity, rad/s."""
-
-    linear: Vector3 = Vector3()
-    angular: Vector3 = Vector3()
-
-
-@message_of("geometry_msgs")
-class TwistStamped(Message):
-    """A twist at a time, in the frame of its header."""
-
-    header: Header = Header()
-    twist: Twist = Twist()
-
-
-@message_of("geometry_msgs")
-class PoseWithCovariance(Message):
-    """A pose with its covariance, rows and columns x, y, z and rotations about them."""
-
-    pose: Pose = Pose()
-    covariance: Matrix6 = (0.0,) * 36
-
-
-@message_of("geometry_msgs")
-class TwistWithCovariance(Message):
-    """A twist with its covariance."""
-
-    twist: Twist = Twist()
-    covariance: Matrix6 = (0.0,) * 36
-
-
-@message_of("nav_msgs")
-class Odometry(Message):
-    """Pose in the frame of the header, twist in the child frame."""
-
-    header: Header = Header()
-    child_frame_id: String = ""
-    pose: PoseWithCovariance = PoseWithCovariance()
-    twist: TwistWithCovariance = TwistWithCovariance()
-
-
-@message_of("sensor_msgs")
-class Imu(Message):
-    """Attitude, angular velocity (rad/s) and specific force (m/s^2) in body axes."""
-
-    header: Header = Header()
-    orientation: Quaternion = Quaternion()
-    orientation_covariance: Matrix3 = (0.0,) * 9
-    angular_velocity: Vector3 = Vector3()
-    angular_velocity_covariance: Matrix3 = (0.0,) * 9
-    linear_acceleration: Vector3 = Vector3()
-    linear_acceleration_covariance: Matrix3 = (0.0,) * 9
-
-
-@message_of("sensor_msgs")
-class BatteryState(Message):
-    """A battery: V, degrees Celsius, A (negative when discharging), A h, and the charge as a share of 1."""
-
-    header: Header = Header()
-    voltage: Float32 = 0.0
-    temperature: Float32 = 0.0
-    current: Float32 = 0.0
-    charge: Float32 = 0.0
-    capacity: Float32 = 0.0
-    design_capacity: Float32 = 0.0
-    percentage: Float32 = 0.0
-    power_supply_status: UInt8 = 0
-    power_supply_health: UInt8 = 0
-    power_supply_technology: UInt8 = 0
-    present: Bool = False
-    cell_voltage: Float32s = ()
-    cell_temperature: Float32s = ()
-    location: String = ""
-    serial_number: String = ""
-
-
-@message_of("sensor_msgs")
-class Image(Message):
-    """Pixels row by row from the upper left one."""
-
-    header: Header = Header()
-    height: UInt32 = 0
-    width: UInt32 = 0
-    encoding: String = ""
-    is_bigendian: UInt8 = 0
-    step: UInt32 = 0
-    data: Bytes = b""
-
-
-@message_of("sensor_msgs")
-class RegionOfInterest(Message):
-    """A part of an image; all of it when zero."""
-
-    x_offset: UInt32 = 0
-    y_offset: UInt32 = 0
-    height: UInt32 = 0
-    width: UInt32 = 0
-    do_rectify: Bool = False
-
-
-@message_of("sensor_msgs")
-class CameraInfo(Message):
-    """The calibration of a camera: distortion `d`, intrinsic `k`, rectification `r` and projection `p`."""
-
-    header: Header = Header()
-    height: UInt32 = 0
-    width: UInt32 = 0
-    distortion_model: String = ""
-    d: Float64s = ()
-    k: Matrix3 = (0.0,) * 9
-    r: Matrix3 = (0.0,) * 9
-    p: Matrix34 = (0.0,) * 12
-    binning_x: UInt32 = 0
-    binning_y: UInt32 = 0
-    roi: RegionOfInterest = RegionOfInterest()
-
-
-@message_of("std_msgs")
-class MultiArrayDimension(Message):
-    """One dimension of an array."""
-
-    label: String = ""
-    size: UInt32 = 0
-    stride: UInt32 = 0
-
-
-@message_of("std_msgs")
-class MultiArrayLayout(Message):
-    """The dimensions of an array."""
-
-    dim: Annotated[tuple[MultiArrayDimension, ...], MultiArrayDimension] = ()
-    data_offset: UInt32 = 0
-
-
-@message_of("std_msgs")
-class Float64MultiArray(Message):
-    """Numbers with the layout of an array."""
-
-    layout: MultiArrayLayout = MultiArrayLayout()
-    data: Float64s = ()
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from jaxdrones.errors import install
+
+MESSAGES = (
+    "builtin_interfaces/msg/Time",
+    "geometry_msgs/msg/Point",
+    "geometry_msgs/msg/Pose",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovariance",
+    "geometry_msgs/msg/Quaternion",
+    "geometry_msgs/msg/Twist",
+    "geometry_msgs/msg/TwistStamped",
+    "geometry_msgs/msg/TwistWithCovariance",
+    "geometry_msgs/msg/Vector3",
+    "nav_msgs/msg/Odometry",
+    "rosgraph_msgs/msg/Clock",
+    "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/CameraInfo",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/RegionOfInterest",
+    "std_msgs/msg/Float64MultiArray",
+    "std_msgs/msg/Header",
+    "std_msgs/msg/MultiArrayDimension",
+    "std_msgs/msg/MultiArrayLayout",
+)
+"""Names of all message types."""
+
+Message = Any
+"""An instance of a message type; `NAME` is its type, such as `geometry_msgs/msg/Pose`."""
+
+_IDENTITY = {("geometry_msgs/msg/Quaternion", "w"): 1.0}  # what the definitions in .msg files give instead of zero
+
+
+class Field(NamedTuple):
+    """One field of a message."""
+
+    name: str
+    kind: str
+    """`float64` and so on, or the name of a message type."""
+    length: int | None = None
+    """Entries of an array; 0 of one of any length; `None` where the field is a single value."""
+
+    @property
+    def is_message(self) -> bool:
+        """Whether the field holds messages."""
+        return "/" in self.kind
+
+
+@functools.cache
+def typestore() -> Any:
+    """The message types of ROS 2 that rosbags knows."""
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError(f"rosbags is not installed; {install('ros2')}") from error
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+@functools.cache
+def fields(name: str) -> tuple[Field, ...]:
+    """The fields of the message type of this name, in their order on the wire."""
+
+    def field(name: str, described: tuple[int, Any]) -> Field:
+        kind, of = described  # 1: number or text, 2: message, 3: array, 4: sequence
+        if kind <= 2:
+            return Field(name, of[0] if kind == 1 else of)
+        return field(name, of[0])._replace(length=of[1] if kind == 3 else 0)
+
+    return tuple(field(*entry) for entry in typestore().fielddefs[name][1])
+
+
+@functools.cache
+def message_class(name: str) -> Any:
+    """The class of the message type of this name, a frozen dataclass."""
+    entries = [(field.name, Any, _IDENTITY.get((name, field.name), _default(field))) for field in fields(name)]
+    return dataclasses.make_dataclass(name.rpartition("/")[2], entries, frozen=True, namespace={"NAME": name})
+
+
+def _default(field: Field) -> Any:
+    numbers: dict[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
+    one = message_class(field.kind)() if field.is_message else numbers.get(field.kind, 0)
+    if field.length is None:
+        return one
+    return b"" if field.kind == "uint8" else (one,) * field.length
+
+
+def __getattr__(name: str) -> Any:
+    for known in MESSAGES:
+        if known.endswith(f"/{name}"):
+            globals()[name] = message_class(known)
+            return globals()[name]
+    raise AttributeError(name)
+
+
+def encode(message: Message, class_of: Callable[[str], Any], array: Callable[[Field, Any], Any]) -> Any:
+    """A message as an instance of another library's class.
+
+    Args:
+        message: the message.
+        class_of: name of a message type -> the other library's class, which takes the fields as keywords.
+        array: (field, tuple or bytes) -> an array of numbers as the other library wants it.
+    """
+
+    def encoded(field: Field) -> Any:
+        given = getattr(message, field.name)
+        if field.is_message:
+            return (
+                encode(given, class_of, array) if field.length is None else [encode(x, class_of, array) for x in given]
+            )
+        return given if field.length is None else array(field, given)
+
+    return class_of(message.NAME)(**{field.name: encoded(field) for field in fields(message.NAME)})
+
+
+def decode(name: str, foreign: Any) -> Message:
+    """A message of the type `name` from an object of another library with its fields."""
+
+    def decoded(field: Field) -> Any:
+        given = getattr(foreign, field.name)
+        if field.is_message:
+            return decode(field.kind, given) if field.length is None else tuple(decode(field.kind, x) for x in given)
+        if field.length is None:
+            return given
+        return bytes(given) if field.kind == "uint8" else tuple(map(float, given))
+
+    return message_class(name)(**{field.name: decoded(field) for field in fields(name)})

@@ -120,8 +120,8 @@ class RclpyTransport:
             look = self._node.get_subscriptions_info_by_topic if published else self._node.get_publishers_info_by_topic
             does = "subscribes to" if published else "publishes"
             for end in look(name):
-                text = f"a peer {does} {name} as {end.topic_type}; its type is {topic.type.NAME}"
-                if end.topic_type != topic.type.NAME and text not in self._said:
+                text = f"a peer {does} {name} as {end.topic_type}; its type is {topic.type}"
+                if end.topic_type != topic.type and text not in self._said:
                     self._said.add(text)
                     found.append(text)
         return found
@@ -134,17 +134,17 @@ class RclpyTransport:
             rclpy.shutdown()
 
 
-def ros_class(kind: type[msg.Message]) -> Any:
+def ros_class(kind: str) -> Any:
     """The class of a message type in the installed ROS 2.
 
     Raises:
         ImportError: its package is not installed.
     """
-    package, _, name = kind.NAME.split("/")
+    package, _, name = kind.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError as error:
-        raise ImportError(f"{kind.NAME} is not there; install the ROS 2 package {package}") from error
+        raise ImportError(f"{kind} is not there; install the ROS 2 package {package}") from error
 
 
 def _trigger() -> Any:
@@ -153,7 +153,7 @@ def _trigger() -> Any:
 
 def _ros_array(field: msg.Field, given: Any) -> Any:
     """An array of numbers as rclpy takes it: a list where the length is fixed, else an `array.array`."""
-    return list(given) if field.length else array.array(_TYPECODES[str(field.kind)], given)
+    return list(given) if field.length else array.array(_TYPECODES[field.kind], given)
 
 
 def _ros_qos(qos: QoS) -> Any:

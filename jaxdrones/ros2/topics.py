@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 
-from jaxdrones.ros2 import messages as msg
-
 WORLD = "world"
 """Frame of positions."""
 STEP_SERVICE = "step"
@@ -37,29 +35,30 @@ class Topic:
     """A topic by its full name without the leading slash."""
 
     name: str
-    type: type[msg.Message]
+    type: str
+    """Name of the message type."""
     qos: QoS
 
 
-CLOCK = Topic("clock", msg.Clock, _STATE)
+CLOCK = Topic("clock", "rosgraph_msgs/msg/Clock", _STATE)
 
 OUTPUTS = {
-    "pose": (msg.PoseStamped, _STATE),
-    "twist": (msg.TwistStamped, _STATE),
-    "odom": (msg.Odometry, _STATE),
-    "imu": (msg.Imu, _STATE),
-    "motors": (msg.Float64MultiArray, _STATE),
-    "battery": (msg.BatteryState, _STATE),
-    "camera/image_raw": (msg.Image, _IMAGE),
-    "camera/camera_info": (msg.CameraInfo, _IMAGE),
+    "pose": ("geometry_msgs/msg/PoseStamped", _STATE),
+    "twist": ("geometry_msgs/msg/TwistStamped", _STATE),
+    "odom": ("nav_msgs/msg/Odometry", _STATE),
+    "imu": ("sensor_msgs/msg/Imu", _STATE),
+    "motors": ("std_msgs/msg/Float64MultiArray", _STATE),
+    "battery": ("sensor_msgs/msg/BatteryState", _STATE),
+    "camera/image_raw": ("sensor_msgs/msg/Image", _IMAGE),
+    "camera/camera_info": ("sensor_msgs/msg/CameraInfo", _IMAGE),
 }
 """What every drone publishes, below its own name."""
 
 COMMANDS = {
-    "cmd_pose": (msg.PoseStamped, _COMMAND),
-    "cmd_vel": (msg.Twist, _COMMAND),
-    "cmd_rates": (msg.Twist, _COMMAND),
-    "cmd_motors": (msg.Float64MultiArray, _COMMAND),
+    "cmd_pose": ("geometry_msgs/msg/PoseStamped", _COMMAND),
+    "cmd_vel": ("geometry_msgs/msg/Twist", _COMMAND),
+    "cmd_rates": ("geometry_msgs/msg/Twist", _COMMAND),
+    "cmd_motors": ("std_msgs/msg/Float64MultiArray", _COMMAND),
 }
 """What every drone listens to, below its own name; the latest message of any of them is flown."""
 

@@ -126,7 +126,7 @@ def wired(monkeypatch):
 
 def test_a_bag_is_replayed_at_its_pace(recorded, wired, capsys):
     path, first = recorded
-    assert main(["ros2", "--replay", str(path), "--json"]) == 0
+    assert main(["ros2", "replay", str(path), "--json"]) == 0
     assert dict(wired.sent) == dict(first.sent)
     assert json.loads(capsys.readouterr().out)["published"] == sum(map(len, first.sent.values()))
     assert wired.now == pytest.approx(0.1, abs=0.01)

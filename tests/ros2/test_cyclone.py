@@ -87,8 +87,8 @@ def test_a_peer_whose_node_is_not_there_is_an_error_in_time(join):
 @pytest.mark.parametrize(
     ("topic", "says"),
     [
-        (Topic("drone_0/cmd_vel", msg.TwistStamped, QoS(10)), "as geometry_msgs/msg/TwistStamped; its type is"),
-        (Topic("drone_0/cmd_vel", msg.Twist, QoS(10, reliable=False)), "as best effort"),
+        (Topic("drone_0/cmd_vel", msg.TwistStamped.NAME, QoS(10)), "as geometry_msgs/msg/TwistStamped; its type is"),
+        (Topic("drone_0/cmd_vel", msg.Twist.NAME, QoS(10, reliable=False)), "as best effort"),
     ],
 )
 def test_the_wrong_end_of_a_topic_is_named(topic, says, join):
@@ -97,7 +97,7 @@ def test_the_wrong_end_of_a_topic_is_named(topic, says, join):
     publish = peer.publisher(topic)
 
     def complained():
-        publish(topic.type())
+        publish(msg.message_class(topic.type)())
         found.extend(node.complaints())
         return bool(found)
 
@@ -252,7 +252,7 @@ def test_a_late_peer_is_heard_and_a_wrong_type_is_named_over_the_network(start, 
     node = start("--duration", "15", "--wait", "0.5", "--timeout", "30", "--json")
     transport = join()
     peer = Peer(transport, 1)
-    publish = transport.publisher(Topic("drone_0/cmd_rates", msg.TwistStamped, QoS(10)))
+    publish = transport.publisher(Topic("drone_0/cmd_rates", msg.TwistStamped.NAME, QoS(10)))
     until(lambda: peer.stamps[0] and peer.stamps[0][-1] > 1_000_000_000, transport, timeout=120)
     publish(msg.TwistStamped())
     commanding(transport, peer, np.array([[0.3, 0.0, 1.0]]), 4.0)

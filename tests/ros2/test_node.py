@@ -14,6 +14,8 @@ from jaxdrones.ros2 import Failsafe, Node, Peer, PeerLost, convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.sensing import Camera
 
+pytestmark = pytest.mark.needs("rosbags")
+
 
 def make_node(wire, n=2, **options):
     warnings = []

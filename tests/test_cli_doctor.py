@@ -11,6 +11,7 @@ from documents import ROOT
 
 import jaxdrones as jd
 from jaxdrones.cli import doctor, machine, main
+from jaxdrones.errors import install
 from jaxdrones.flights import self_test
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -45,7 +46,7 @@ def test_doctor_names_versions_devices_and_every_extra(no_flight, capsys):
     assert set(told["extras"]) >= set(PROJECT["optional-dependencies"]) - {"all", "dev", "docs"}
     for name, extra in told["extras"].items():
         assert extra["present"] or extra["unavailable"] or extra["missing"]
-        assert extra["install"] == f'pip install "jaxdrones[{name}]"'
+        assert extra["install"] == install(name)
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert "self-test  explicit" in out and out.endswith("all is well\n")
@@ -59,7 +60,7 @@ def test_a_missing_extra_is_named_and_not_wrong(no_flight, monkeypatch, capsys):
 
     monkeypatch.setattr(importlib.metadata, "version", version)
     assert main(["doctor"]) == 0
-    assert re.search(r'brax +missing brax: pip install "jaxdrones\[brax\]"', capsys.readouterr().out)
+    assert re.search(r'brax +missing brax: pip install ".*\[brax\]"', capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
@@ -130,3 +131,9 @@ def test_bench_measures_the_plant_a_controller_and_an_environment(capsys):
 def test_bench_refuses_what_is_no_number_of_worlds(capsys):
     assert main(["bench", "--worlds", "0"]) == 2
     assert "worlds is 0" in capsys.readouterr().err
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0 and capsys.readouterr().out == f"jaxdrones {machine.version('jaxdrones')}\n"

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from jaxdrones.cli import main
-from jaxdrones.cli.evaluate import percent, success
+from jaxdrones.cli.report import percent, success
 from jaxdrones.learning import checkpoint
 from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.training import run as run_module
 from jaxdrones.training import trainer
 from jaxdrones.training.run import Run
 
@@ -357,6 +358,18 @@ def test_eval_prints_one_object(trained, capsys):
     assert printed["backend"] == "explicit"
     assert printed["evaluation"]["successes"] is None
     assert set(printed["evaluation"]["final_error_percentiles"]) == {"50", "95", "99"}
+
+
+def test_eval_fails_below_the_success_rate_that_is_given(trained, capsys, monkeypatch):
+    folder, _ = trained
+    command = ["eval", str(folder), "--episodes", "8", "--fail-below"]
+    assert main([*command, "0.9"]) == 2 and "has no criterion of success" in capsys.readouterr().err
+    assert main([*command, "2"]) == 2 and "fail-below is 2" in capsys.readouterr().err
+    report = run_module.report_as_dict
+    measured = {"success": 0.875, "success_interval": (0.5, 0.98)}
+    monkeypatch.setattr(run_module, "report_as_dict", lambda result: report(result) | measured)
+    assert main([*command, "0.9"]) == 1 and "87.5 %, below --fail-below 0.9" in capsys.readouterr().err
+    assert main([*command, "0.875"]) == 0
 
 
 @pytest.mark.slow

@@ -24,13 +24,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxdrones import envs
 from jaxdrones.adapters.session import rewarding
 from jaxdrones.checks import check_whole
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 
 try:
     with contextlib.redirect_stdout(sys.stderr):  # mujoco prints what it could not import
         from brax.envs import base
 except ImportError as error:
-    raise ImportError('brax is not installed; pip install "jaxdrones[brax]"') from error
+    raise ImportError(f"brax is not installed; {install('brax')}") from error
 
 _COLORED = 4  # axes of the images of a team that have colors
 _NEXT = np.uint32(2**32 - 1)  # what the key is folded with for the next episode: no episode has that many steps

@@ -11,13 +11,13 @@ from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import SEEDS, Session, as_env, flat
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import Env
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 from jaxdrones.tasks.task import Task
 
 try:
     import pettingzoo
 except ImportError as error:
-    raise ImportError('pettingzoo is not installed; pip install "jaxdrones[pettingzoo]"') from error
+    raise ImportError(f"pettingzoo is not installed; {install('pettingzoo')}") from error
 
 
 def parallel_env(task: str | Task | Env, **options: Any) -> ParallelEnv:

@@ -9,13 +9,13 @@ import numpy as np
 
 from jaxdrones.adapters import gymnasium
 from jaxdrones.envs import Env
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 from jaxdrones.tasks.task import Task
 
 try:
     from stable_baselines3.common import vec_env
 except ImportError as error:
-    raise ImportError('stable-baselines3 is not installed; pip install "jaxdrones[sb3]"') from error
+    raise ImportError(f"stable-baselines3 is not installed; {install('sb3')}") from error
 
 
 class VecEnv(vec_env.VecEnv):

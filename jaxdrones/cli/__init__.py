@@ -12,6 +12,7 @@ from jaxdrones.cli import (
     explain,
     fit,
     fly,
+    machine,
     names,
     ros2,
     score,
@@ -47,6 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     text = "show the traceback of an error, also of a mistake"
     parser.add_argument("--debug", action="store_true", help=text)
+    parser.add_argument("--version", action="version", version=f"jaxdrones {machine.version('jaxdrones')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
     for command in (fly, train, evaluate, compare, view, fit, score, ros2, explain, names, doctor, bench):
         command.add(commands)

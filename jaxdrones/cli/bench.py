@@ -12,7 +12,7 @@ from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.checks import check_number
 from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
-from jaxdrones.cli.common import as_json
+from jaxdrones.cli.report import as_json
 from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics import drag
 from jaxdrones.engine.explicit import make_step

@@ -3,15 +3,12 @@
 import argparse
 import contextlib
 import errno
-import json
-import math
 import os
 import signal
 import sys
 import threading
 import traceback
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -23,7 +20,8 @@ from jaxdrones.errors import UserError
 DIVERGED, MISTAKE, FAULT, INTERRUPTED = 1, 2, 70, 130
 EXIT_CODES = """exit codes:
     0  done
-    1  a flight or a training diverged, commands ceased, or `doctor` found something wrong
+    1  a flight or a training diverged, commands ceased, success is below `eval --fail-below`, or `doctor` found
+       something wrong
     2  a mistake in what was asked, or in a file of yours: one line says what to do
    70  a fault of jaxdrones, with its traceback: please report it
   130  interrupted"""
@@ -31,29 +29,6 @@ EXIT_CODES = """exit codes:
 _AGAIN = 0.05  # s after which a lost Ctrl-C is repeated
 _MAX_MESSAGE = 1000  # characters
 _DEBUG = {"JAX_DEBUG_NANS", "JAX_DEBUG_INFS"}
-
-_COLUMNS = {  # result: (heading, format)
-    "drone": ("drone", "{}"),
-    "controller": ("controller", "{}"),
-    "rms_error_m": ("rms (m)", "{:.4f}"),
-    "peak_error_m": ("peak (m)", "{:.4f}"),
-    "steady_error_m": ("steady (m)", "{:.4f}"),
-    "rms_error_m_s": ("rms (m/s)", "{:.4f}"),
-    "peak_error_m_s": ("peak (m/s)", "{:.4f}"),
-    "steady_error_m_s": ("steady (m/s)", "{:.4f}"),
-    "settled_after_s": ("settled (s)", "{:.2f}"),
-    "lowest_z_m": ("z min (m)", "{:.4f}"),
-    "highest_z_m": ("z max (m)", "{:.4f}"),
-    "peak_vz_m_s": ("vz max (m/s)", "{:.4f}"),
-    "peak_speed_m_s": ("|v| max (m/s)", "{:.4f}"),
-    "rpm_std": ("RPM std", "{:.1f}"),
-    "t_s": ("t (s)", "{:.2f}"),
-    "pos_m": ("position (m)", "{:.2e}"),
-    "vel_m_s": ("velocity (m/s)", "{:.2e}"),
-    "angle_rad": ("attitude (rad)", "{:.2e}"),
-    "omega_rad_s": ("rates (rad/s)", "{:.2e}"),
-    "rpm": ("rotors (RPM)", "{:.2e}"),
-}
 
 
 class Parser(argparse.ArgumentParser):
@@ -158,19 +133,6 @@ def run_folder(task: str, ending: str = "") -> Path:
     return Path("runs") / (task.rpartition(":")[2] + ending)
 
 
-def as_json(results: dict[str, Any]) -> str:
-    """One line of JSON; numbers that are not finite, which JSON lacks, are null."""
-    return json.dumps(_finite(results), allow_nan=False)
-
-
-def _finite(x):
-    if isinstance(x, dict):
-        return {name: _finite(value) for name, value in x.items()}
-    if isinstance(x, list | tuple):
-        return [_finite(value) for value in x]
-    return None if isinstance(x, float) and not math.isfinite(x) else x
-
-
 def check_writable(file: Path) -> None:
     """Raise unless a file can be written; its folder is made, an old file stays until it is replaced.
 
@@ -196,15 +158,3 @@ def bar(total: int | None, what: str, unit: str, initial: int = 0):
         return contextlib.nullcontext()
     look = dict(leave=False, disable=None, file=sys.stderr, dynamic_ncols=True)
     return tqdm(total=total, desc=what, unit=unit, initial=initial, **look)
-
-
-def table(results: list[dict]) -> str:
-    """Results as text: columns aligned under their headings, one line per drone."""
-    names = list(results[0])
-    rows = [[_COLUMNS[name][0] for name in names]]
-    rows += [
-        ["-" if _finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names]
-        for row in results
-    ]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import as_json, check_writable, folder, table
+from jaxdrones.cli.common import check_writable, folder
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
+from jaxdrones.cli.report import as_json, table
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
@@ -36,7 +37,11 @@ def add(commands) -> None:
         "--controllers", metavar="A,B", help=f"in place of --backends: two or more of {', '.join(CONTROLLERS)}"
     )
     parser.add_argument(
-        "--output", type=folder, metavar="DIR", help="write a figure, and the log of each flight in a folder of its own"
+        "-o",
+        "--output",
+        type=folder,
+        metavar="DIR",
+        help="folder of the figure and the log of each flight (none)",
     )
     parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.names import known_names
 from jaxdrones.cli.settings import REALISTIC_KINDS
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 
 SHELLS = ("bash", "zsh", "fish")
 _KINDS = {  # argument -> kind of the names that it takes
@@ -44,7 +44,7 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
     try:
         import shtab
     except ImportError:
-        raise UserError('shtab is not installed, which writes the script; pip install "jaxdrones[cli]"') from None
+        raise UserError(f"shtab is not installed, which writes the script; {install('cli')}") from None
     names = known_names()
     for action in _actions(root):
         if action.dest == "shell":

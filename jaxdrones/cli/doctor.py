@@ -7,8 +7,8 @@ import shutil
 import time
 from typing import Any
 
-from jaxdrones.cli.common import as_json
-from jaxdrones.errors import UserError
+from jaxdrones.cli.report import as_json
+from jaxdrones.errors import UserError, install
 
 _LEFT_OUT = ("all", "dev", "docs")  # extras that only join others, or are for developers
 _COMPARISONS = {
@@ -99,12 +99,11 @@ def _extra(extra: str, libraries: list[re.Match], wrong: list[str]) -> dict[str,
             missing.append(found["name"])
         else:
             wrong += _unfit(found["name"], found["versions"])
-    install = f'pip install "jaxdrones[{extra}]"'
     return {
         "present": not (missing or unavailable),
         "missing": missing,
         "unavailable": ", ".join(unavailable),
-        "install": install,
+        "install": install(extra),
     }
 
 

@@ -2,15 +2,15 @@
 
 import argparse
 import functools
-import math
 from typing import Any
 
-from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import as_json, folder
+from jaxdrones.checks import check_choice, check_number
+from jaxdrones.cli.common import DIVERGED, folder, print_error
 from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.report import as_json, described, evaluation_table, percent
 from jaxdrones.cli.settings import add_realistic, asked_settings
+from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
-from jaxdrones.training.presets import realism
 
 _FIRST_SEED = 1_000_000  # so that episodes differ from those of the training
 
@@ -44,6 +44,9 @@ def add(commands) -> None:
     parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
     parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
     parser.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
+    parser.add_argument(
+        "--fail-below", type=float, metavar="RATE", help="exit code 1 if the success rate is lower, for example 0.9"
+    )
     parser.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=_evaluate)
@@ -58,6 +61,8 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     check_at_most("episodes", options.episodes, LARGEST_COUNT)
     check_seed("seed", options.seed)
+    if options.fail_below is not None:
+        check_number("fail-below", options.fail_below, above=0, at_most=1)
     check_choice("backend", options.backend, BACKENDS)
     run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
     about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed, "backend": options.backend}
@@ -74,72 +79,14 @@ def _evaluate(options: argparse.Namespace) -> int:
     key = jax.random.key(_FIRST_SEED + options.seed)
     with recipe.env(backend=options.backend) as env:
         report = report_as_dict(evaluate(env, make_policy(env), key, options.episodes))
+    if options.fail_below is not None and report["success"] is None:
+        raise UserError(f"--fail-below {options.fail_below} is given, and the task has no criterion of success")
     if options.json:
         print(as_json(about | {"recipe": recipe.as_dict(), "evaluation": report}))
     else:
         print(title)
         print(evaluation_table(report))
+    if options.fail_below is not None and report["success"] < options.fail_below:
+        rate = percent(report["success"], options.episodes)
+        return print_error(f"the success rate is {rate}, below --fail-below {options.fail_below:g}", DIVERGED)
     return 0
-
-
-def described(recipe) -> str:
-    """The task, the learner and the options that differ from their defaults, such as `hover by bptt`."""
-    options = "".join(f", {name} {x}" for name, x in recipe.options.items())
-    return f"{recipe.task} by {recipe.algorithm}{realism(recipe.realistic)}{options}"
-
-
-def evaluation_table(report: dict) -> str:
-    """The entries of `report_as_dict` as lines of text."""
-    episodes, error = report["episodes"], report["final_error_percentiles"]
-    ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["end_rates"].items()) or "none"
-    others = ", ".join(f"{name} {x:.3g}" for name, x in report["final_metrics"].items() if name not in ("error",))
-    rows = [
-        ["episodes", f"{_counted(report)}, {report['mean_length']:.2f} s long on average"],
-        ["success", success(report)],
-        [
-            "final error",
-            f"median {_length(error['50'])}, 95 % {_length(error['95'])}, 99 % {_length(error['99'])}",
-        ],
-        ["rms error", f"{_length(report['rms_error'])} over the last four fifths"],
-        ["return", f"{report['mean_return']:.2f}"],
-        ["ended early", ends],
-        ["final metrics", others],
-    ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"  {name.ljust(width)}  {text}" for name, text in rows if text)
-
-
-def success(report: dict) -> str:
-    """Success rate, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
-    if report["success"] is None:
-        return "the task has no criterion"
-    episodes, interval = report["episodes"], report["success_interval"]
-    rate = f"{percent(report['success'], episodes)}, {round(report['success'] * episodes):,} of {episodes:,}"
-    if interval is None:
-        return f"{rate}, no interval of one distinct episode"
-    low, high = (100 * x for x in interval)
-    digits = _digits(episodes) + 1
-    return f"{rate}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"
-
-
-def _counted(report: dict) -> str:
-    """The number of episodes, and of distinct ones if some are repetitions."""
-    episodes, distinct = report["episodes"], report["distinct_episodes"]
-    if distinct == episodes:
-        return f"{episodes:,}"
-    repeated = "deterministic: 1 distinct episode" if distinct == 1 else f"{distinct:,} of them distinct"
-    return f"{episodes:,}, {repeated}"
-
-
-def percent(share: float, episodes: int) -> str:
-    """A fraction of the episodes in percent, with enough digits to tell all of them from all but one."""
-    return f"{100 * share:.{_digits(episodes)}f} %"
-
-
-def _digits(episodes: int) -> int:
-    """Decimals of a percentage with which one episode is at least one unit of the last digit."""
-    return max(1, math.ceil(math.log10(episodes)) - 2)
-
-
-def _length(x: float) -> str:
-    return f"{100 * x:.2f} cm" if x < 1 else f"{x:.2f} m"

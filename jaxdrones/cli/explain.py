@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdrones import assets
-from jaxdrones.cli.common import as_json
+from jaxdrones.cli.report import as_json
 from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.envs import TASKS, explain, make
 from jaxdrones.flights.conditions import BACKENDS

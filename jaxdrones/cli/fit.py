@@ -5,7 +5,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxdrones.cli.common import as_json, check_writable, folder, print_warning
+from jaxdrones.cli.common import check_writable, folder, print_warning
+from jaxdrones.cli.report import as_json
 from jaxdrones.errors import install
 
 _FIGURE = "errors.png"
@@ -47,12 +48,14 @@ def add(commands) -> None:
     )
     add_consistency(parser)
     parser.add_argument(
+        "-o",
         "--output",
         type=folder,
         default=Path("runs/fit"),
-        metavar="FOLDER",
+        metavar="DIR",
         help="(runs/fit); no earlier fit is replaced",
     )
+    parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=_fit)
 
@@ -82,11 +85,12 @@ def _fit(options: argparse.Namespace) -> int:
     else:
         print(parameter_table(report))
     files = [URDF, REPORT]
-    try:
-        save_errors(report.errors, options.output / _FIGURE)
-        files.append(_FIGURE)
-    except ImportError as error:
-        print_warning(f"no {_FIGURE}: {error}; {install('cli')}")
+    if not options.no_figure:
+        try:
+            save_errors(report.errors, options.output / _FIGURE)
+            files.append(_FIGURE)
+        except ImportError as error:
+            print_warning(f"no {_FIGURE}: {error}; {install('cli')}")
     if not options.json:
         print(f"{options.output}: {', '.join(files)}")
     return 0
@@ -120,4 +124,4 @@ def parameter_table(report) -> str:
         f"{'' if e.identifiable else '  (not identifiable from these flights)'}"
         for name, e in report.parameters.items()
     ]
-    return "\n".join(lines)
+    return "\n".join(["SI units (kg, m, s, N, rad, V, RPM)", *lines])

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import as_json, check_writable, folder, print_error, run_folder, table
+from jaxdrones.cli.common import check_writable, folder, print_error, run_folder
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.report import as_json, table
 from jaxdrones.cli.settings import parse_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
@@ -82,7 +83,7 @@ def add(commands) -> None:
         help="write the pictures of each drone's camera as PNG and into the log; either backend",
     )
     parser.add_argument(
-        "--output", type=folder, metavar="DIR", help="folder of log and figure (runs/FLIGHT, RUN/flight)"
+        "-o", "--output", type=folder, metavar="DIR", help="folder of log and figure (runs/FLIGHT, RUN/flight)"
     )
     parser.add_argument("--csv", action="store_true", help="write the log as CSV too")
     parser.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM signals too (cf2x, cf2p)")

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from jaxdrones.cli.evaluate import percent
+from jaxdrones.cli.report import percent
 from jaxdrones.visualization.viewer.live import Live
 
 WAIT = 60.0

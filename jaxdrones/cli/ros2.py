@@ -9,7 +9,8 @@ from typing import Any
 
 from jaxdrones import assets
 from jaxdrones.checks import check_choice, check_number, check_positive, check_whole
-from jaxdrones.cli.common import as_json, folder, print_error, print_warning
+from jaxdrones.cli.common import folder, print_error, print_warning
+from jaxdrones.cli.report import as_json
 from jaxdrones.dynamics import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError

@@ -4,8 +4,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import as_json, bar, check_writable, folder
+from jaxdrones.cli.common import bar, check_writable, folder
 from jaxdrones.cli.fit import add_consistency, load_logs
+from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
 
 _NOMINAL = "cf2x"
@@ -25,7 +26,7 @@ def add(commands) -> None:
     parser.add_argument(
         "--vehicle",
         required=True,
-        metavar="NAME|URDF|FOLDER",
+        metavar="NAME|URDF|DIR",
         help="a bundled vehicle, URDF, or folder of `jaxdrones fit`",
     )
     parser.add_argument(

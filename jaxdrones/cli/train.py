@@ -10,9 +10,9 @@ from jaxdrones import assets
 from jaxdrones.cli import hosts
 from jaxdrones.cli.budget import Deadlines, parse_budget
 from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
-from jaxdrones.cli.evaluate import described
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS
+from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.cli.train_runs import episodes_of, folders_of, recipe_of, remaining, runs_of
 from jaxdrones.cli.training import (

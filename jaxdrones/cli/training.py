@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import as_json, bar, print_warning
-from jaxdrones.cli.evaluate import evaluation_table, percent
+from jaxdrones.cli.common import bar, print_warning
+from jaxdrones.cli.report import as_json, evaluation_table, percent
 from jaxdrones.errors import UserError
 from jaxdrones.visualization import learning_curves
 

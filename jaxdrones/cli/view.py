@@ -7,7 +7,8 @@ import zipfile
 from pathlib import Path
 
 from jaxdrones.checks import check_choice, check_whole
-from jaxdrones.cli.common import as_json, check_writable, folder
+from jaxdrones.cli.common import check_writable, folder
+from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
 from jaxdrones.visualization import video

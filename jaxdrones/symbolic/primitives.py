@@ -7,10 +7,12 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+from jaxdrones.errors import install
+
 try:
     import casadi
 except ImportError as error:
-    raise ImportError('jaxdrones.symbolic: casadi is not installed; pip install "jaxdrones[casadi]"') from error
+    raise ImportError(f"jaxdrones.symbolic: casadi is not installed; {install('casadi')}") from error
 
 
 def select(which: Any, *cases: Any) -> Any:

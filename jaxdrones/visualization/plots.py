@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import paths, style
 from jaxdrones.visualization.palette import colors
@@ -47,7 +47,7 @@ def check_matplotlib() -> None:
         import matplotlib  # noqa: F401
     except ImportError:
         raise UserError(
-            'matplotlib is not installed, so no figure can be drawn; pip install "jaxdrones[cli]", or pass --no-figure'
+            f"matplotlib is not installed, so no figure can be drawn; {install('cli')}, or pass --no-figure"
         ) from None
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 from jaxdrones.writing import replaced
 
 SUFFIXES = (".mp4", ".gif")
@@ -27,9 +27,7 @@ def check_video(path: Path) -> None:
         if path.suffix == ".mp4":
             import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
-        raise UserError(
-            f'{error.name} is not installed, so {path} cannot be written; pip install "jaxdrones[video]"'
-        ) from None
+        raise UserError(f"{error.name} is not installed, so {path} cannot be written; {install('video')}") from None
 
 
 def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:

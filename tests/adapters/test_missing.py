@@ -4,14 +4,16 @@ import sys
 
 import pytest
 
+from jaxdrones.errors import install
+
 
 @pytest.mark.parametrize(
     ("adapter", "library", "named"),
     [
-        ("brax", "brax", 'brax is not installed; pip install "jaxdrones[brax]"'),
-        ("pettingzoo", "pettingzoo", 'pettingzoo is not installed; pip install "jaxdrones[pettingzoo]"'),
+        ("brax", "brax", "brax is not installed; " + install("brax")),
+        ("pettingzoo", "pettingzoo", "pettingzoo is not installed; " + install("pettingzoo")),
         ("rllib", "ray", 'RLlib is not installed; pip install "ray[rllib]==2.60.0" torch'),
-        ("sb3", "stable_baselines3", 'stable-baselines3 is not installed; pip install "jaxdrones[sb3]"'),
+        ("sb3", "stable_baselines3", "stable-baselines3 is not installed; " + install("sb3")),
         ("tianshou", "tianshou", "tianshou is not installed; pip install tianshou torch"),
     ],
 )

@@ -117,5 +117,5 @@ def test_an_unknown_kind_of_film_is_refused(tmp_path):
 
 def test_without_ffmpeg_the_error_names_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
-    with pytest.raises(ValueError, match=r'imageio_ffmpeg is not installed.*pip install "jaxdrones\[video\]"'):
+    with pytest.raises(ValueError, match=r'imageio_ffmpeg is not installed.*pip install ".*\[video\]"'):
         video.check_video(tmp_path / "flight.mp4")

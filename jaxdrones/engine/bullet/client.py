@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdrones.checks import check_choice
 from jaxdrones.engine.bullet.surroundings import Surroundings, quiet
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.images import BACK, FRONT, HUB
 
@@ -37,7 +37,7 @@ def import_pybullet() -> ModuleType:
             import pybullet
         except ImportError:
             raise ImportError(
-                'pybullet is not installed; pip install "jaxdrones[bullet]" '
+                f"pybullet is not installed; {install('bullet')} "
                 f"(it has wheels up to CPython 3.11, this is {sys.version_info.major}.{sys.version_info.minor})"
             ) from None
     return pybullet

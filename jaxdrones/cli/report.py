@@ -1,0 +1,118 @@
+"""Results as text: tables, JSON, success rates and evaluations."""
+
+import json
+import math
+from typing import Any
+
+from jaxdrones.training.presets import realism
+
+_COLUMNS = {  # result: (heading, format)
+    "drone": ("drone", "{}"),
+    "controller": ("controller", "{}"),
+    "rms_error_m": ("rms (m)", "{:.4f}"),
+    "peak_error_m": ("peak (m)", "{:.4f}"),
+    "steady_error_m": ("steady (m)", "{:.4f}"),
+    "rms_error_m_s": ("rms (m/s)", "{:.4f}"),
+    "peak_error_m_s": ("peak (m/s)", "{:.4f}"),
+    "steady_error_m_s": ("steady (m/s)", "{:.4f}"),
+    "settled_after_s": ("settled (s)", "{:.2f}"),
+    "lowest_z_m": ("z min (m)", "{:.4f}"),
+    "highest_z_m": ("z max (m)", "{:.4f}"),
+    "peak_vz_m_s": ("vz max (m/s)", "{:.4f}"),
+    "peak_speed_m_s": ("|v| max (m/s)", "{:.4f}"),
+    "rpm_std": ("RPM std", "{:.1f}"),
+    "t_s": ("t (s)", "{:.2f}"),
+    "pos_m": ("position (m)", "{:.2e}"),
+    "vel_m_s": ("velocity (m/s)", "{:.2e}"),
+    "angle_rad": ("attitude (rad)", "{:.2e}"),
+    "omega_rad_s": ("rates (rad/s)", "{:.2e}"),
+    "rpm": ("rotors (RPM)", "{:.2e}"),
+}
+
+
+def as_json(results: dict[str, Any]) -> str:
+    """One line of JSON; numbers that are not finite, which JSON lacks, are null."""
+    return json.dumps(_finite(results), allow_nan=False)
+
+
+def _finite(x):
+    if isinstance(x, dict):
+        return {name: _finite(value) for name, value in x.items()}
+    if isinstance(x, list | tuple):
+        return [_finite(value) for value in x]
+    return None if isinstance(x, float) and not math.isfinite(x) else x
+
+
+def table(results: list[dict]) -> str:
+    """Results as text: columns aligned under their headings, one line per drone."""
+    names = list(results[0])
+    rows = [[_COLUMNS[name][0] for name in names]]
+    rows += [
+        ["-" if _finite(row[name]) is None else _COLUMNS[name][1].format(row[name]) for name in names]
+        for row in results
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+
+
+def described(recipe) -> str:
+    """The task, the learner and the options that differ from their defaults, such as `hover by bptt`."""
+    options = "".join(f", {name} {x}" for name, x in recipe.options.items())
+    return f"{recipe.task} by {recipe.algorithm}{realism(recipe.realistic)}{options}"
+
+
+def evaluation_table(report: dict) -> str:
+    """The entries of `report_as_dict` as lines of text."""
+    episodes, error = report["episodes"], report["final_error_percentiles"]
+    ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["end_rates"].items()) or "none"
+    others = ", ".join(f"{name} {x:.3g}" for name, x in report["final_metrics"].items() if name not in ("error",))
+    rows = [
+        ["episodes", f"{_counted(report)}, {report['mean_length']:.2f} s long on average"],
+        ["success", success(report)],
+        [
+            "final error",
+            f"median {_length(error['50'])}, 95 % {_length(error['95'])}, 99 % {_length(error['99'])}",
+        ],
+        ["rms error", f"{_length(report['rms_error'])} over the last four fifths"],
+        ["return", f"{report['mean_return']:.2f}"],
+        ["ended early", ends],
+        ["final metrics", others],
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"  {name.ljust(width)}  {text}" for name, text in rows if text)
+
+
+def success(report: dict) -> str:
+    """Success rate, count and interval, such as `99.99 %, 9,999 of 10,000, 95 % interval 99.943 to 99.998 %`."""
+    if report["success"] is None:
+        return "the task has no criterion"
+    episodes, interval = report["episodes"], report["success_interval"]
+    rate = f"{percent(report['success'], episodes)}, {round(report['success'] * episodes):,} of {episodes:,}"
+    if interval is None:
+        return f"{rate}, no interval of one distinct episode"
+    low, high = (100 * x for x in interval)
+    digits = _digits(episodes) + 1
+    return f"{rate}, 95 % interval {low:.{digits}f} to {high:.{digits}f} %"
+
+
+def _counted(report: dict) -> str:
+    """The number of episodes, and of distinct ones if some are repetitions."""
+    episodes, distinct = report["episodes"], report["distinct_episodes"]
+    if distinct == episodes:
+        return f"{episodes:,}"
+    repeated = "deterministic: 1 distinct episode" if distinct == 1 else f"{distinct:,} of them distinct"
+    return f"{episodes:,}, {repeated}"
+
+
+def percent(share: float, episodes: int) -> str:
+    """A fraction of the episodes in percent, with enough digits to tell all of them from all but one."""
+    return f"{100 * share:.{_digits(episodes)}f} %"
+
+
+def _digits(episodes: int) -> int:
+    """Decimals of a percentage with which one episode is at least one unit of the last digit."""
+    return max(1, math.ceil(math.log10(episodes)) - 2)
+
+
+def _length(x: float) -> str:
+    return f"{100 * x:.2f} cm" if x < 1 else f"{x:.2f} m"

@@ -11,8 +11,9 @@ from helpers import Keys, mostly_slow
 
 import jaxdrones as jd
 from jaxdrones.envs import AutoReset, make
-from jaxdrones.envs import env as environment
-from jaxdrones.envs.randomize import random_pushes, scaled, sensor_noise, shifted
+from jaxdrones.envs import episode as environment
+from jaxdrones.envs.disturbances import random_pushes
+from jaxdrones.envs.randomize import scaled, sensor_noise, shifted
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
 from jaxdrones.sensing import Scene, Sensor, Sphere
@@ -127,7 +128,8 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
 
     monkeypatch.setattr("jaxdrones.envs.randomize.draw", draw)
     env = make(dataclasses.replace(plain, start=start), noise=noise, disturbance=disturbance)
-    begin, env.begin = env.begin, lambda key: (tell("reset", key), begin(key))[1]
+    begin = env.begin
+    object.__setattr__(env, "begin", lambda key: (tell("reset", key), begin(key))[1])
     _, episode = AutoReset(env).reset(KEY)
     episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
     AutoReset(env).step(KEY, episode, jnp.zeros((1, 4)))

@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.errors import UserError
-
 
 def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[..., Any]:
     """`(needed, *args) -> function(*args)`, whose result matters only where `needed` () is true.
@@ -28,10 +26,7 @@ def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[...
         leaves, structure = jax.tree.flatten(args)
         mapped = jax.tree.leaves(batched[1])
         if not any(mapped):
-            raise UserError(
-                "many worlds are given one and the same key, so that all would get the same result; split the key, "
-                "jax.random.split(key, worlds), and map over the keys"
-            )
+            return function(*args), jax.tree.map(lambda _: False, jax.eval_shape(function, *args))
 
         def of(leaves: list[Array]) -> Any:
             return function(*jax.tree.unflatten(structure, leaves))

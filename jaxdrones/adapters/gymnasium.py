@@ -6,7 +6,7 @@ compiled step; the options are those of `jaxdrones.make`.
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import string
 from collections.abc import Sequence
 from typing import Any
@@ -155,8 +155,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
         if max_episode_steps is not None:
             check_whole("max_episode_steps", max_episode_steps)
-            self.env = copy.copy(self.env)
-            self.env.steps = max_episode_steps
+            self.env = dataclasses.replace(self.env, steps=max_episode_steps)
         pictures.check_mode(render_mode)
         self.autoreset_mode, self.render_mode = _autoreset_mode(autoreset_mode), render_mode
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode, "render_fps": round(1 / self.env.dt)}

@@ -12,7 +12,7 @@ Neither gymnax nor another library is needed.
 
 from __future__ import annotations
 
-import copy
+import dataclasses
 import functools
 from typing import Any
 
@@ -28,7 +28,7 @@ from jaxdrones.adapters.jax_spaces import Spaces, action_table, of_gymnasium
 from jaxdrones.adapters.session import rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs.autoreset import Episode
-from jaxdrones.envs.env import RESET
+from jaxdrones.envs.episode import RESET
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 
@@ -171,9 +171,7 @@ class GymnaxEnv:
         return jnp.reshape(action, (self.env.drones, self.env.action_size))
 
     def _with(self, params: EnvParams) -> envs.Env:
-        env = copy.copy(self.env)
-        env.steps, env.params = params.max_steps_in_episode, params.vehicle
-        return env
+        return dataclasses.replace(self.env, steps=params.max_steps_in_episode, params=params.vehicle)
 
     def _arranged(self, obs: Any) -> Any:
         obs = self._layout.arrange(obs)

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from jaxdrones.adapters.session import begin, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.envs import AutoReset, Env
-from jaxdrones.envs.process import check_process
+from jaxdrones.envs.functions import check_process
 
 
 class Worlds:

@@ -1,16 +1,14 @@
 """Environments: tasks, steps, action types and observations put together."""
 
-from jaxdrones.envs.action import Action
-from jaxdrones.envs.actions import ACTIONS
+from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.autoreset import AutoReset
 from jaxdrones.envs.contract import ContractError, check_env
+from jaxdrones.envs.disturbances import dryden
 from jaxdrones.envs.env import Env
-from jaxdrones.envs.explainer import explain
-from jaxdrones.envs.explanation import Explanation
+from jaxdrones.envs.explanation import Explanation, explain
 from jaxdrones.envs.named_tasks import TASKS
 from jaxdrones.envs.observations import OBSERVATIONS
 from jaxdrones.envs.registry import make
-from jaxdrones.envs.turbulence import dryden
 from jaxdrones.tasks.task import ObservationTerm
 
 __all__ = [

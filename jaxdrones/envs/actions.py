@@ -4,48 +4,68 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_number, check_shape
-from jaxdrones.control import Setpoint, attitude, geometric, pid, rates, velocity
+from jaxdrones.control import Setpoint, attitude, for_team, geometric, pid, rates, velocity
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.envs.action import Action
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.state import State
 
+Command = Callable[[Params, Any, State, Array, Setpoint, float], tuple[Any, Float[Array, "4"]]]
 Entries = tuple[Quantity, ...]
 _AHEAD = "way from the drone to the setpoint"
 
 
+@dataclasses.dataclass(frozen=True)
+class Action:
+    """An action type: functions of one drone."""
+
+    size: int
+    """How many numbers an action of one drone has."""
+    rpm: Command
+    """(params, memory, state, action (size,), setpoint of the task, control period) -> (memory, rotor speeds, RPM)."""
+    init: Callable[[], Any] = lambda: None
+    """() -> memory of one drone at the start of an episode."""
+    for_vehicle: Callable[[Params], Action] | None = None
+    """Nominal parameters of the team -> the action type for this vehicle; `None` where it is the same for all."""
+    entries: Callable[[Params], tuple[Quantity, ...]] | None = None
+    """Nominal parameters of one drone -> what each number stands for, for `jaxdrones.explain`."""
+    name: str = ""
+    """The name by which an environment knows the action type; `jaxdrones.make` sets it."""
+
+    def team_memory(self, n: int) -> Any:
+        """The memory of a team of n drones at the start of an episode."""
+        return for_team(self.init(), n)
+
+    def fitted(self, params: Params) -> Action:
+        """The action type for this vehicle."""
+        return self if self.for_vehicle is None else dataclasses.replace(self.for_vehicle(params), name=self.name)
+
+
 def rpm(near_hover: float | None = None) -> Action:
     """Four rotor speeds: -1 is standstill, 0 hover speed, 1 full speed; or hover speed times 1 +- `near_hover`."""
-    _check_share("near_hover", near_hover)
-
-    def command(params, memory, state, action, setpoint, dt):
-        return memory, _rotor_speed(params, action, near_hover)
-
-    def entries(params: Params) -> Entries:
-        return tuple(Quantity(f"speed of rotor {i}", "RPM", values=_speeds(params, near_hover)) for i in range(4))
-
-    return Action(4, command, entries=entries)
+    return _rotor_speeds([f"speed of rotor {i}" for i in range(4)], near_hover)
 
 
 def one_d_rpm(near_hover: float | None = 0.05) -> Action:
     """One speed for all rotors; the default range of 5 % about hover is that of gym-pybullet-drones (2021)."""
-    _check_share("near_hover", near_hover)
+    return _rotor_speeds(["speed of all rotors"], near_hover)
 
+
+def _rotor_speeds(names: list[str], near_hover: float | None) -> Action:
     def command(params, memory, state, action, setpoint, dt):
         return memory, jnp.broadcast_to(_rotor_speed(params, action, near_hover), (4,))
 
     def entries(params: Params) -> Entries:
-        return (Quantity("speed of all rotors", "RPM", values=_speeds(params, near_hover)),)
+        return tuple(Quantity(name, "RPM", values=_speeds(params, near_hover)) for name in names)
 
-    return Action(1, command, entries=entries)
+    return Action(len(names), command, entries=entries)
 
 
 def thrust_and_torques(torque_share: float = 0.05) -> Action:
@@ -53,7 +73,6 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
 
     As in gym-pybullet-drones (2021), they are allocated to rotors without an upper limit, and then limited.
     """
-    _check_share("torque_share", torque_share)
 
     def limits(params: Params) -> Array:
         return torque_share * jnp.stack([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
@@ -71,7 +90,6 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
 
 def angular_acceleration(largest: tuple[float, float, float] = (100.0, 100.0, 10.0)) -> Action:
     """A speed of all rotors (-1 standstill, 0 hover, 1 full), and angular accelerations up to `largest` in hover."""
-    _check_about_axes("largest", largest, "rad/s^2")
 
     def command(params, memory, state, action, setpoint, dt):
         x, y, _ = params.rotor_pos.T
@@ -89,7 +107,6 @@ def angular_acceleration(largest: tuple[float, float, float] = (100.0, 100.0, 10
 
 def one_d_thrust(share: float = 0.05) -> Action:
     """Collective thrust, the weight times 1 +- `share`."""
-    _check_share("share", share)
 
     def command(params, memory, state, action, setpoint, dt):
         thrust = params.weight * (1 + share * action[0])
@@ -128,7 +145,6 @@ def one_d_velocity() -> Action:
 
 def position(step: float = 0.1) -> Action:
     """A position up to `step` (m) away along each axis."""
-    check_number("step", step, "m", above=0)
 
     def target(params, state, action):
         return Setpoint.at(state.pos + step * action)
@@ -138,7 +154,6 @@ def position(step: float = 0.1) -> Action:
 
 def one_d_position(step: float = 0.1) -> Action:
     """A position up to `step` (m) above or below."""
-    check_number("step", step, "m", above=0)
 
     def target(params, state, action):
         return Setpoint.at(state.pos + jnp.stack([0 * action[0], 0 * action[0], step * action[0]]))
@@ -151,7 +166,6 @@ def destination(max_step: float = 1.0) -> Action:
 
     The setpoint is on the straight line there, at most `max_step` (m) ahead of the drone.
     """
-    check_number("max_step", max_step, "m", above=0)
 
     def target(params, state, action):
         away = action - state.pos
@@ -186,7 +200,6 @@ def pid_gains() -> Action:
 
 def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -> Action:
     """Collective thrust (-1 none, 0 the weight, 1 the largest) and body rates up to `max_rate` (rad/s)."""
-    _check_about_axes("max_rate", max_rate, "rad/s")
 
     def command(params, memory, state, action, setpoint, dt):
         omega = jnp.array(max_rate, action.dtype) * action[1:]
@@ -200,7 +213,6 @@ def thrust_and_rates(max_rate: tuple[float, float, float] = (10.0, 10.0, 5.0)) -
 
 def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
     """Collective thrust as above, roll and pitch up to `max_tilt` (degrees), yaw up to half a turn."""
-    check_number("max_tilt", max_tilt, "degrees", above=0, at_most=180)
 
     def command(params, memory, state, action, setpoint, dt):
         limits = jnp.array([jnp.radians(max_tilt), jnp.radians(max_tilt), jnp.pi], action.dtype)
@@ -238,17 +250,6 @@ def _setpoint(
     return flown_by(pid)
 
 
-def _check_share(name: str, share: float | None) -> None:
-    if share is not None:
-        check_number(name, share, above=0, at_most=1)
-
-
-def _check_about_axes(name: str, values: tuple[float, float, float], unit: str) -> None:
-    check_shape(name, values, (3,), f"about x, y and z, {unit}")
-    for value in values:
-        check_number(f"an entry of {name}", value, unit, above=0)
-
-
 def _about_axes(name: str, unit: str, largest: Iterable) -> Entries:
     """Three numbers about the axes of the body, of which an action of 1 is the largest."""
     axes = zip("xyz", map(float, largest), strict=True)
@@ -267,9 +268,9 @@ def _thrust(low: Array | float, zero: Array, high: Array) -> Entries:
 
 
 def _rotor_speed(params: Params, action: Array, near_hover: float | None) -> Array:
-    if near_hover is not None:
-        return params.hover_rpm * (1 + near_hover * action)
-    return _from_hover(action, params.hover_rpm, params.max_rpm)
+    if near_hover is None:
+        return _from_hover(action, params.hover_rpm, params.max_rpm)
+    return params.hover_rpm * (1 + near_hover * action)
 
 
 def _collective(params: Params, action: Array) -> Array:

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.where_needed import where_needed
-from jaxdrones.envs.env import RESET, Env, Obs
-from jaxdrones.envs.vision import observation, renewed_images
+from jaxdrones.envs.env import Env, Obs
+from jaxdrones.envs.episode import RESET
+from jaxdrones.envs.vision import observation
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.tasks.task import World
 
@@ -72,7 +73,7 @@ class AutoReset:
             lambda new, old: old if new is old else jnp.where(ended, new, old), (fresh_obs, fresh), (vector, episode)
         )
         if self.env.vision:
-            episode = episode.replace(world=self.env.with_images(renewed_images, key, episode.world, ended))
+            episode = episode.replace(world=self.env.with_images("renewed", key, episode.world, ended))
         return observation(vector, episode.world), episode
 
     @property

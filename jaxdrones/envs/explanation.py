@@ -1,13 +1,27 @@
-"""What an environment is, in words and tables for people and as plain entries for machines."""
+"""What an environment observes, commands, rewards and simulates, as tables for people and as data for machines."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from jaxdrones.quantity import Quantity
+import jax
+import numpy as np
 
+from jaxdrones.checks import shown
+from jaxdrones.engine.step import HostStep
+from jaxdrones.engine.wrenches import describe
+from jaxdrones.envs.env import Env
+from jaxdrones.errors import UserError
+from jaxdrones.params import Params
+from jaxdrones.quantity import Quantity, description
+from jaxdrones.sensing import Scene
+from jaxdrones.tasks.task import ObservationTerm
+
+_STANDARD_METRICS = {"error": "Distance from the target, m.", "speed": "Speed, m/s."}
+_UNKNOWN = "?"  # the unit of a number that a term does not describe
 _NUMBERS = (
     "A number is in its unit; where -1, 0 and 1 stand for something else, the last columns say for what.\n"
     "Numbers beyond the range are clipped."
@@ -83,6 +97,143 @@ class Explanation:
         return "\n\n".join(sections)
 
     __repr__ = __str__
+
+
+def explain(env: Env) -> Explanation:
+    """What every number of the observation and action of an environment is, what is rewarded, and what is simulated.
+
+    Args:
+        env: environment of `jaxdrones.make`.
+
+    Returns:
+        An object whose text is a readable table (`print(jaxdrones.explain(env))`), and whose `as_dict()` is for
+        machines.
+
+    Raises:
+        ValueError: something else than an environment, or a term that describes more or fewer numbers than it has.
+    """
+    if not isinstance(env, Env):
+        raise UserError(f"explain was given {shown(env)}; give an environment, for example jaxdrones.make('hover')")
+    task = env.task
+    drone = jax.tree.map(lambda x: x[0], env.params)
+    action = _action_quantities(env, drone)
+    return Explanation(
+        task={
+            "name": task.name,
+            "summary": task.summary,
+            "team": f"{env.drones} x {env.vehicle}",
+            "time": f"{task.duration:g} s at {1 / env.dt:g} control steps per second: {env.steps} control steps",
+            "start": description(task.start),
+            "target": description(task.target),
+            "success": description(task.success) if task.success else "no criterion",
+        },
+        observation=tuple(_observed(env, action)),
+        images={
+            name: f"{space.shape} {np.dtype(space.dtype)}, {number(space.low)} to {number(space.high)}: {space.meaning}"
+            for name, space in env.image_spaces.items()
+        },
+        action=tuple(Entry(env.action.name or "own", quantity, -1.0, 1.0) for quantity in action),
+        rewards=tuple(Part(name, description(term), scale) for name, (scale, term) in task.rewards.items()),
+        metrics=_conditions(_STANDARD_METRICS | {name: description(metric) for name, metric in task.metrics.items()}),
+        terminations=_conditions(
+            {
+                name: f"{description(condition)} {'Success' if name in task.success_terminations else 'Failure'}."
+                for name, condition in task.terminations.items()
+            }
+        ),
+        truncations=_conditions(
+            {"time": f"The time is up: {env.steps} control steps."}
+            | {name: f"{description(condition)} Failure." for name, condition in task.truncations.items()}
+        ),
+        physics=_physics(env),
+        vehicle=_vehicle(env, drone),
+    )
+
+
+def _observed(env: Env, action: tuple[Quantity, ...]) -> Iterable[Entry]:
+    bounds = iter(env.observation_bound.tolist())
+    for i, (term, size) in enumerate(zip(env.terms, env.term_sizes, strict=True)):
+        name = term.name or f"term {i}"
+        for quantity in _quantities(term, name, size, env.drones, action):
+            bound = next(bounds)
+            yield Entry(name, quantity, -bound, bound)
+
+
+def _quantities(
+    term: ObservationTerm, name: str, size: int, drones: int, action: tuple[Quantity, ...]
+) -> tuple[Quantity, ...]:
+    described = term.entries(drones, action) if callable(term.entries) else term.entries
+    return _checked(f"the observation term {name}", described, size)
+
+
+def _action_quantities(env: Env, drone: Params) -> tuple[Quantity, ...]:
+    described = env.action.entries(drone) if env.action.entries else ()
+    return _checked(f"the action type {env.action.name}".strip(), described, env.action_size)
+
+
+def _checked(what: str, described: tuple[Quantity, ...], size: int) -> tuple[Quantity, ...]:
+    """The quantities of a term or action type, one for each of its numbers; unknown ones where it describes none."""
+    if not described:
+        return tuple(Quantity(f"number {i}", _UNKNOWN, _UNKNOWN) for i in range(size))
+    if len(described) != size:
+        raise UserError(f"{what} describes {len(described)} numbers and has {size}; give entries=(...) of {size}")
+    return described
+
+
+def _conditions(meanings: Mapping[str, str]) -> tuple[Part, ...]:
+    return tuple(Part(name, meaning) for name, meaning in meanings.items())
+
+
+def _physics(env: Env) -> dict[str, str]:
+    step, physics = env.physics, env.physics.physics
+    facts = {
+        "backend": "bullet" if isinstance(step, HostStep) else "explicit",
+        "integrator": step.integrator,
+        "rates": f"{1 / env.dt:g} control steps per second of {step.substeps} physics steps of {1000 * step.dt:.4g} ms",
+        "rotors": describe([physics.rotors]),
+        "effects": describe(physics.effects),
+        "pair effects": describe(physics.pairs),
+        "team effects": describe(physics.team_effects),
+        "models": ", ".join(model.name for model in physics.models) or "none",
+        "scene": _scene(env.scene),
+        "sensors": ", ".join(sensor.name for sensor in env.sensors) or "none",
+        "cameras": str(env.vision) if env.vision else "none",
+        "delay": " to ".join(f"{x * env.dt:.4g}" for x in sorted({*env.delay_steps})) + " s between action and command",
+        "noise": _said(env.noise, "none"),
+        "disturbance": _said(env.disturbance, "none"),
+        "drawn per episode": "; ".join(_said(one, "a randomization of its own") for one in env.draws) or "nothing",
+    }
+    return facts
+
+
+def _said(function: Any, otherwise: str) -> str:
+    return (description(function) if function is not None else "") or otherwise
+
+
+def _scene(scene: Any) -> str:
+    if not isinstance(scene, Scene):
+        return "drawn for every episode"
+    ground = "the ground at z = 0" if scene.ground else "no ground"
+    return f"{scene.count} obstacles and {ground}" if scene.has_obstacles else ground
+
+
+def _vehicle(env: Env, drone: Params) -> dict[str, str]:
+    def of(x: Any, unit: str) -> str:
+        return f"{', '.join(number(float(y)) for y in np.ravel(x))} {unit}".strip()
+
+    alike = all(np.all(np.asarray(x) == np.asarray(x)[:1]) for x in jax.tree.leaves(env.params))
+    ratio = float(drone.max_thrust / drone.weight)
+    return {
+        "name": env.vehicle + ("" if alike else "; the numbers are those of drone 0, others of the team differ"),
+        "mass": of(drone.mass, "kg"),
+        "inertia": of(drone.inertia, "kg m^2 about body x, y, z"),
+        "arm": of(drone.arm, "m"),
+        "rotor speeds": f"{of(drone.hover_rpm, 'RPM')} to hover, {of(drone.max_rpm, 'RPM')} at most",
+        "highest thrust": f"{number(ratio)} times the weight" if math.isfinite(ratio) else "without a limit",
+        "highest speed": of(drone.max_speed, "m/s"),
+        "rotor lag": f"{of(drone.rotor_rise_time, 's')} up, {of(drone.rotor_fall_time, 's')} down, where rotors lag",
+        "collision": f"cylinder, radius {of(drone.collision_radius, 'm')}, height {of(drone.collision_height, 'm')}",
+    }
 
 
 def number(x: float) -> str:

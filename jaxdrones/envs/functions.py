@@ -1,7 +1,8 @@
-"""Checks of what the functions of a user return: those of a task, before an episode is compiled, and a policy."""
+"""Checks of the functions of users (of tasks, scenes and policies) and of the process that calls them."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from jaxdrones.checks import shown
 from jaxdrones.control import Setpoint
+from jaxdrones.envs.actions import Action
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -18,7 +20,43 @@ from jaxdrones.state import State
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 from jaxdrones.user_code import place
 
+DrawScene = Callable[[jax.Array], Scene]
+"""(key) -> the scene of an episode."""
 _NUMBERS = "biuf"  # kinds of dtypes
+_processes: set[int] = set()  # in which environments were made
+
+
+def check_process() -> None:
+    """Raise in a process that was forked from one in which environments were made, where JAX would hang.
+
+    Raises:
+        RuntimeError: this is such a process; says how to start another one.
+    """
+    if os.getpid() not in _processes:
+        if _processes:
+            raise RuntimeError(
+                f"process {os.getpid()} was forked from process {next(iter(_processes))}, in which JAX runs, and JAX "
+                "hangs in a forked process; start processes by 'spawn', for example "
+                "gymnasium.vector.AsyncVectorEnv(..., context='spawn')"
+            )
+        _processes.add(os.getpid())
+
+
+def scene_example(scene: Scene | DrawScene) -> Scene:
+    """The scene, or the shapes and types of one if it is drawn.
+
+    Raises:
+        ValueError: it is neither a scene nor a function that draws one.
+    """
+    if isinstance(scene, Scene):
+        return scene
+    if not callable(scene):
+        raise UserError(f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
+    example = jax.eval_shape(scene, jax.random.key(0))
+    if not isinstance(example, Scene):
+        returned = shown(scene(jax.random.key(0)))
+        raise UserError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
+    return example
 
 
 def _is_own(function: Any) -> bool:
@@ -226,3 +264,25 @@ def _where(what: str, function: Any) -> str:
     """What a function is of a task, and where it is defined."""
     where = place(function)
     return f"{where}: {what}" if where else what
+
+
+_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
+_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
+
+
+def check_controller(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:
+    """Raise if the controller of an action type would be called too seldom, or if the rotors lag too much."""
+    if action.for_vehicle is None:
+        return
+    if dt > _MAX_PERIOD * (1 + 1e-6):
+        raise UserError(
+            f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
+            f"{1 / _MAX_PERIOD:g} or more"
+        )
+    time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
+    if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
+        raise UserError(
+            f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
+            f"{_MAX_ROTOR_TIME} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
+            "action type that commands rotors, thrust and torques, or rates"
+        )

@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.tasks.task import ObservationTerm, Task, World, norm
 
@@ -159,7 +161,7 @@ def neighbors(count: int) -> ObservationTerm:
 
     entries: list[Quantity] = []
     for i in range(count):
-        which = "nearest drone" if i == 0 else f"drone nearest but {i}"
+        which = f"{i + 1}-th nearest drone" if i else "nearest drone"
         entries += quantities(f"position of the {which}", "m", "world")
         entries += quantities(f"velocity of the {which}", "m/s", "world")
     return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=f"neighbors({count})")
@@ -199,6 +201,28 @@ def bounds(terms: Sequence[ObservationTerm], widths: Sequence[int]) -> np.ndarra
     return np.concatenate(columns).astype(np.float32)
 
 
+class PrivilegedObservation(PyTreeNode):
+    """Observation of a team that no sensor provides."""
+
+    obs: Array
+    """(n, d) the vector that would be observed without noise."""
+    params: Array
+    """(n, e) deviations of the drawn parameters from their nominal values, as shares of the largest nominal one."""
+
+
+def deviations(params: Params, nominal: Params, drawn: Sequence[bool]) -> Float[Array, "n e"]:
+    """Deviations of the drawn leaves of a team's parameters from their nominal values, side by side."""
+    n = len(nominal.mass)
+    leaves = zip(jax.tree.leaves(params), jax.tree.leaves(nominal), drawn, strict=True)
+    columns = [jnp.reshape(_deviation(value, own), (n, -1)) for value, own, is_drawn in leaves if is_drawn]
+    return jnp.concatenate([jnp.zeros((n, 0)), *columns], axis=-1)
+
+
+def _deviation(value: Array, nominal: Array) -> Array:
+    largest = jnp.max(jnp.abs(nominal))
+    return (value - nominal) / jnp.where(largest > 0, largest, 1)
+
+
 def _clip(x: Array, bound: float | tuple[float, ...]) -> Array:
     limit = jnp.broadcast_to(jnp.asarray(bound, x.dtype), x.shape[-1:])[None]
     return jnp.clip(x, -limit, limit)
@@ -217,7 +241,7 @@ _TURN = math.pi + 1e-6
 _KINEMATICS = (
     (_MAX_DISTANCE,) * 3 + (_UNIT,) * 4 + (_TURN,) * 3 + (_MAX_SPEED,) * 3 + (_MAX_RATE,) * 3 + (_MAX_RPM,) * 4
 )
-_KINEMATICS_2X = (_MAX_DISTANCE,) * 3 + (_TURN,) * 3 + (_MAX_SPEED,) * 3 + (_MAX_RATE,) * 3
+_KINEMATICS_2X = _KINEMATICS[:3] + _KINEMATICS[7:16]
 
 _POSITION = quantities("position", "m", "world")
 _VELOCITY = quantities("velocity", "m/s", "world")
@@ -234,10 +258,6 @@ _NORMALIZED = (
     *quantities("velocity, seen up to 1 m/s", "m/s", "world", "z", (-3.0, 0.0, 3.0)),
     *quantities("direction of the angular velocity", "-", "world"),
 )
-
-
-def _others(drones: int, action: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
-    return tuple(Quantity(f"whether drone {i} is within 10 m") for i in range(drones))
 
 
 OBSERVATIONS: dict[str, ObservationTerm] = {
@@ -269,7 +289,9 @@ OBSERVATIONS: dict[str, ObservationTerm] = {
         kinematics_2x, _KINEMATICS_2X, entries=(*_POSITION, *_RPY, *_VELOCITY, *_OMEGA_WORLD)
     ),
     "normalized_kinematics": ObservationTerm(normalized_kinematics, _UNIT, entries=_NORMALIZED),
-    "adjacency": ObservationTerm(adjacency, 1.0, entries=_others),
+    "adjacency": ObservationTerm(
+        adjacency, 1.0, entries=lambda n, _: tuple(Quantity(f"whether drone {i} is within 10 m") for i in range(n))
+    ),
     "last_action": last_actions(1),
     "last_actions_2x": last_actions(15),
     "neighbors": neighbors(2),

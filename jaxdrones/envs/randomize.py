@@ -1,7 +1,6 @@
-"""Domain randomization: parameters drawn per episode, sensor noise, wind and random pushes. All compose."""
+"""Domain randomization: parameters, wind and delay that are drawn for every episode, and sensor noise. All compose."""
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,7 +10,7 @@ from jaxtyping import Array
 
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
-from jaxdrones.checks import POSITIVE, check_choice, check_number
+from jaxdrones.checks import POSITIVE, check_callable, check_choice, check_number, check_sequence, shown
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -24,43 +23,6 @@ Randomization = Callable[[jax.Array, Params], Params]
 """(key, params) of one drone -> its parameters in this episode."""
 Noise = Callable[[jax.Array, State], State]
 """(key, state) of a team -> the state as its sensors show it."""
-Disturbance = Callable[[jax.Array, Params, float], Params]
-"""(key, params, control period) of a team -> its parameters with the surroundings of the next control step."""
-
-
-@dataclasses.dataclass(frozen=True)
-class DisturbanceWithMemory:
-    """A disturbance that depends on what it did before; its memory is `params.aux[name]`."""
-
-    name: str
-    """Key of `Params.aux`."""
-    init: Callable[[jax.Array, Params], Any]
-    """`init(key, params)`: the memory of one drone at the start of an episode, a pytree of arrays."""
-    advance: Disturbance
-    """`advance(key, params, control period)` of a team: its parameters with new surroundings and a new memory."""
-    text: str
-    """What it does, for people."""
-
-    def __post_init__(self):
-        object.__setattr__(self, "__doc__", self.text)
-
-    def __call__(self, key: jax.Array, params: Params, dt: float) -> Params:
-        """The parameters of a team with the surroundings of the next control step."""
-        if self.name not in params.aux:
-            raise UserError(
-                f"params.aux lacks {self.name!r}, the memory of a disturbance; start from its start(key, params)"
-            )
-        return self.advance(key, params, dt)
-
-    def start(self, key: jax.Array, params: Params) -> Params:
-        """The parameters of one drone with the memory at the start of an episode."""
-        return params.replace(aux=params.aux | {self.name: self.init(key, params)})
-
-    def nominal(self, params: Params) -> Params:
-        """The parameters of a team with a memory of zeros: the place for it."""
-        keys = jax.random.split(jax.random.key(0), len(params.mass))
-        shapes = jax.eval_shape(jax.vmap(self.init), keys, params)
-        return params.replace(aux=params.aux | {self.name: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)})
 
 
 def _check_range(field: str, low: float, high: float) -> None:
@@ -118,23 +80,6 @@ def constant_wind(speed: float) -> Randomization:
     return described(f"wind U(-{speed:g}, {speed:g}) m/s along x and y, a quarter of it along z", randomize)
 
 
-def prepared(
-    disturbance: Disturbance | None, delay: tuple[float, float], params: Params, randomize: Sequence[Randomization]
-) -> tuple[Params, tuple[Randomization, ...]]:
-    """Nominal parameters of a team and randomizations, with the memory of a disturbance and the delay that is drawn.
-
-    `delay` is the shortest and the longest, control steps; if they differ, the nominal one is their mean.
-    """
-    randomize = tuple(randomize)
-    if isinstance(disturbance, DisturbanceWithMemory):
-        start = described(f"start of: {disturbance.text}", functools.partial(disturbance.start))
-        params, randomize = disturbance.nominal(params), (*randomize, start)
-    if delay[0] < delay[1]:
-        mean = jnp.full_like(params.mass, sum(delay) / 2)
-        params, randomize = params.replace(aux=params.aux | {DELAY: mean}), (*randomize, drawn_delay(*delay))
-    return params, randomize
-
-
 @dataclasses.dataclass(frozen=True)
 class AnyVehicle:
     """Any quadrotor that could be built, of 20 g to 3 kg where no other masses are given (`jaxdrones.vehicles`).
@@ -175,6 +120,41 @@ def nominal_params(randomize: Sequence[Randomization], params: Params) -> Params
 def scaling_params(randomize: Sequence[Randomization], drawn: Params, nominal: Params) -> Params:
     """What starts and actions are scaled by: the nominal parameters, or the drawn ones where a vehicle is drawn."""
     return drawn if any(isinstance(one, AnyVehicle) for one in randomize) else nominal
+
+
+_EXAMPLE = "scaled('mass', 0.9, 1.1)"
+
+
+def all_randomizations(
+    any_vehicle: bool, task: Sequence[Randomization], given: Sequence[Randomization], vehicle: Any
+) -> tuple[Randomization, ...]:
+    """All randomizations of an environment; first those that draw whole vehicles, which the others then change."""
+    preset: list[Randomization] = [AnyVehicle()] if any_vehicle else []
+    chosen: list[Randomization] = [
+        *preset,
+        *task,
+        *check_sequence("randomize", given, _EXAMPLE),
+    ]
+    for function in chosen:
+        check_callable("randomize", function, _EXAMPLE)
+    whole = [one for one in chosen if isinstance(one, AnyVehicle)]
+    rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
+    if len(whole) > 1 or (whole and vehicle is not None):
+        other = "another AnyVehicle" if len(whole) > 1 else f"vehicle={shown(vehicle)}"
+        raise UserError(f"{other} is given, but every episode draws a vehicle already; leave out one of them")
+    return (*whole, *rest)
+
+
+def delay_bounds(delay: float | Sequence[float], duration: float) -> tuple[float, float]:
+    """The shortest and the longest delay, s."""
+    bounds = tuple(delay) if isinstance(delay, tuple | list) else (delay, delay)
+    if len(bounds) != 2:
+        raise UserError(f"delay is {shown(delay)}; give a number, or the shortest and the longest of an episode")
+    for bound in bounds:
+        check_number("delay", bound, "s, less than an episode", at_least=0, below=duration)
+    if bounds[0] > bounds[1]:
+        raise UserError(f"delay is {shown(delay)}; give the shortest first")
+    return bounds
 
 
 def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> Params:
@@ -218,32 +198,6 @@ def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, om
     return described(f"normal: {pos:g} m, {vel:g} m/s, {angle:g} rad and {omega:g} rad/s (standard deviations)", noise)
 
 
-def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) -> Disturbance:
-    """External forces of U(-force, force) (share of the weight) along each axis, at random times.
-
-    One begins every `interval` seconds and lasts `duration` seconds on average, both with exponential distributions.
-
-    Raises:
-        ValueError: a negative force, or times that are not positive.
-    """
-    check_number("force of a push", force, "share of the weight", at_least=0)
-    check_number("interval", interval, "s", above=0, infinite=True)
-    check_number("duration", duration, "s", above=0, infinite=True)
-
-    def disturbance(key: jax.Array, params: Params, dt: float) -> Params:
-        n = len(params.mass)
-        u = jax.random.uniform(key, (n, 4), params.external_force.dtype)
-        fresh = force * params.weight[:, None] * (2 * u[:, 1:] - 1)
-        begins, ends = u[:, :1] < dt / interval, u[:, :1] > 1 - dt / duration
-        return params.replace(external_force=jnp.where(begins, fresh, jnp.where(ends, 0, params.external_force)))
-
-    return described(
-        f"pushes of U(-{force:g}, {force:g}) of the weight along each axis, every {interval:g} s for {duration:g} s on "
-        "average",
-        disturbance,
-    )
-
-
 def drawn_delay(shortest: float, longest: float) -> Randomization:
     """Delay between action and command U(shortest, longest), control steps, constant in an episode: `params.aux`."""
 
@@ -254,9 +208,14 @@ def drawn_delay(shortest: float, longest: float) -> Randomization:
     return described(f"delay U({shortest:g}, {longest:g}) control steps between action and command", randomize)
 
 
-def delay_of(params: Params, bounds: tuple[float, float]) -> float | Array:
-    """The delay of an episode, control steps: of each drone (n,) if it is drawn between bounds, else a number."""
-    return params.aux[DELAY] if bounds[0] < bounds[1] else bounds[1]
+def with_delay(params: Params, delay: float) -> Params:
+    """Parameters of a team with a nominal delay, control steps."""
+    return params.replace(aux=params.aux | {DELAY: jnp.full_like(params.mass, delay)})
+
+
+def delay_of(params: Params) -> Array:
+    """(n,) the delay that an episode has drawn, control steps."""
+    return params.aux[DELAY]
 
 
 def delayed(actions: Array, steps: float | Array) -> Array:

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, cast
 
 from jaxdrones.checks import (
+    check_callable,
     check_choice,
     check_finite,
+    check_params,
     check_positive,
     check_sequence,
     check_switch,
@@ -34,25 +36,23 @@ from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import TeamEffect
-from jaxdrones.envs.action import Action, check_loop
-from jaxdrones.envs.actions import ACTIONS
-from jaxdrones.envs.arguments import check_randomizations
-from jaxdrones.envs.construction import remembered
+from jaxdrones.envs.actions import ACTIONS, Action
+from jaxdrones.envs.disturbances import Disturbance
 from jaxdrones.envs.env import Env
+from jaxdrones.envs.functions import DrawScene, check_controller, check_process, scene_example
 from jaxdrones.envs.named_tasks import make_task
 from jaxdrones.envs.observations import OBSERVATIONS, reading
-from jaxdrones.envs.process import check_process
 from jaxdrones.envs.randomize import (
     REALISTIC_DELAY,
     REALISTIC_RANDOMIZATION,
     AnyVehicle,
-    Disturbance,
     Noise,
     Randomization,
+    all_randomizations,
+    delay_bounds,
     nominal_params,
     sensor_noise,
 )
-from jaxdrones.envs.surroundings import DrawScene, are_solid
 from jaxdrones.envs.vision import Vision, make_vision
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params, repeat
@@ -64,7 +64,6 @@ from jaxdrones.urdf import load_params
 BACKENDS = ("explicit", "bullet")
 
 
-@remembered
 def make(
     task: str | Task | Callable[..., Task],
     *,
@@ -141,29 +140,29 @@ def make(
     preset = _REALISTIC if realistic else _PLAIN
     if randomize is None and realistic != "any":
         randomize = preset["randomize"]
-    randomize = _randomizations(task, realistic == "any", randomize or (), vehicle)
+    randomize = all_randomizations(realistic == "any", task.randomize, randomize or (), vehicle)
     vehicle = "cf2x" if vehicle is None else vehicle
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
     check_finite("vehicle", nominal)
+    check_params(nominal)
     nominal = nominal_params(randomize, nominal)
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
+    if noise is not None:
+        check_callable("noise", noise, "sensor_noise()")
     if disturbance is not None:
+        check_callable("disturbance", disturbance, "random_pushes(0.3)")
         effects = [*effects, external_force]
     pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
     lagging = inspect.unwrap(cast(Callable, rotors)) is inspect.unwrap(lagging_rotors)  # also inside `failing`
     action = _action(task.action if action is None else action, nominal, lagging, dt)
     sensors = check_sensors(sensors)
     physics: dict[str, Any] = dict(
-        effects=effects,
-        pairs=pairs,
-        team_effects=team_effects,
-        models=models,
-        rotors=rotors,
-        dt=dt / substeps,
-        substeps=substeps,
+        effects=effects, pairs=pairs, team_effects=team_effects, models=models, rotors=rotors
     )
+    physics |= dict(dt=dt / substeps, substeps=substeps)
     scene = task.scene if scene is None else scene
+    example = scene_example(scene)
     step: Step
     if backend == "bullet":
         from jaxdrones.engine import bullet  # needs an optional library
@@ -174,7 +173,8 @@ def make(
     else:
         if "ground" in task.contact:
             physics["effects"] = [*physics["effects"], ground_contact]
-        if are_solid(scene, task) and not Physics(physics["effects"]).takes_scene:
+        solid = example.has_obstacles and ("obstacles" in task.contact or not task.obstacles_terminate)
+        if solid and not Physics(physics["effects"]).takes_scene:
             physics["effects"] = [*physics["effects"], obstacle_contact]
         if "drones" in task.contact:
             physics["pairs"] = [*pairs, drone_contact]
@@ -182,25 +182,32 @@ def make(
 
     observation = task.observation if observation is None else observation
     known = _known_terms(task, sensors)
-    observation = check_sequence("observation", observation, "'position_error'")
-    return Env(
+    made = Env(
         task,
         nominal,
         step,
         dt=dt,
         action=action,
-        observation=[_named("observation", term, known) for term in observation],
+        terms=_terms(observation, known),
         randomize=randomize,
         noise=preset["noise"] if noise is None else noise,
         disturbance=disturbance,
-        delay=preset["delay"] if delay is None else delay,
+        delay=delay_bounds(preset["delay"] if delay is None else delay, task.duration),
         vision=_vision(task, step, vision, camera, dt, scene),
         sensors=sensors,
         scene=scene,
         vehicle=_name(vehicle, randomize),
     )
+    if not 0 < made.steps < _MAX_STEPS:
+        raise UserError(
+            f"duration is {task.duration} s, {task.duration / dt:.3g} control steps of {dt:.4g} s; give 1 to "
+            f"{_MAX_STEPS:.0e}"
+        )
+    assert made.term_sizes  # checks the functions of the task
+    return made
 
 
+_MAX_STEPS = 1e9  # control steps of an episode, which are counted by an integer of 32 bits
 _PLAIN: dict[str, Any] = dict(rotors="instant", effects=(), randomize=(), noise=None, delay=0.0)
 _REALISTIC: dict[str, Any] = dict(
     rotors="lagging", effects=("drag",), randomize=REALISTIC_RANDOMIZATION, noise=sensor_noise(), delay=REALISTIC_DELAY
@@ -210,18 +217,17 @@ _REALISTIC: dict[str, Any] = dict(
 _OWN_OPTIONS = {name for name in inspect.signature(make).parameters if name not in ("task", "options")}
 
 
-def _randomizations(
-    task: Task, any_vehicle: bool, given: Sequence[Randomization], vehicle: Any
-) -> tuple[Randomization, ...]:
-    """All randomizations of an environment; first those that draw whole vehicles, which the others then change."""
-    preset: list[Randomization] = [AnyVehicle()] if any_vehicle else []
-    chosen: list[Randomization] = [*preset, *task.randomize, *check_randomizations(given)]
-    whole = [one for one in chosen if isinstance(one, AnyVehicle)]
-    rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
-    if len(whole) > 1 or (whole and vehicle is not None):
-        other = "another AnyVehicle" if len(whole) > 1 else f"vehicle={shown(vehicle)}"
-        raise UserError(f"{other} is given, but every episode draws a vehicle already; leave out one of them")
-    return (*whole, *rest)
+def _terms(observation: Sequence[str | ObservationTerm], known: dict[str, ObservationTerm]) -> tuple:
+    names = check_sequence("observation", observation, "'position_error'")
+    terms = tuple(_named("observation", term, known) for term in names)
+    if not terms:
+        raise UserError("observation is empty; name at least one observation term")
+    for term in terms:
+        if not isinstance(term, ObservationTerm):
+            raise UserError(
+                f"observation: {shown(term)} is not an observation term; give one or a name of OBSERVATIONS"
+            )
+    return terms
 
 
 def _name(vehicle: str | os.PathLike | Params, randomize: Sequence[Randomization]) -> str:
@@ -256,7 +262,7 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
         raise UserError(
             f"action is {shown(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
         )
-    check_loop(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
+    check_controller(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
     return dataclasses.replace(kind, name=action if isinstance(action, str) else kind.name).fitted(nominal)
 
 
@@ -271,7 +277,12 @@ def _known_terms(task: Task, sensors: Sequence[Sensor]) -> dict[str, Observation
 
 
 def _vision(
-    task: Task, step: Step, images: Sequence[str] | None, camera: Camera | None, dt: float, scene: Scene | DrawScene
+    task: Task,
+    step: Step,
+    images: Sequence[str] | None,
+    camera: Camera | None,
+    dt: float,
+    scene: Scene | DrawScene,
 ) -> Vision | None:
     """The vision of an environment; `None` where no image is asked for."""
     images = check_sequence("vision", task.vision if images is None else images, "'depth'")

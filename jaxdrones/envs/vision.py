@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones.accelerate.where_due import where_due
 from jaxdrones.checks import check_choice
 from jaxdrones.engine.step import HostStep, Step, is_traced
-from jaxdrones.envs.exposures import where_due
-from jaxdrones.envs.surroundings import DrawScene
+from jaxdrones.envs.functions import DrawScene
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene, render
@@ -85,7 +85,7 @@ class Vision:
             images = self._where(due, _PIXELS, key, world, poses[0])
         return world.replace(images=images, poses=poses[1:])
 
-    def renewed(self, ended: Array, key: Any, world: World) -> World:
+    def renewed(self, key: Any, world: World, ended: Array) -> World:
         """The world with the images of a start where an episode has ended."""
         pose = _pose(world.drones)
         poses = jnp.where(ended, pose[None], world.poses)
@@ -125,21 +125,6 @@ class Vision:
 def observation(vector: Float[Array, "n d"], world: World) -> Any:
     """An observation: its vector, or a dictionary of `state` and the images of the world if there are any."""
     return {"state": vector, **world.images} if world.images else vector
-
-
-def first_images(env: Any, key: Any, world: World) -> World:
-    """`Vision.first` of an environment."""
-    return env.vision.first(key, world)
-
-
-def next_images(env: Any, key: Any, world: World) -> World:
-    """`Vision.next` of an environment."""
-    return env.vision.next(key, world)
-
-
-def renewed_images(env: Any, key: Any, world: World, ended: Array) -> World:
-    """`Vision.renewed` of an environment."""
-    return env.vision.renewed(ended, key, world)
 
 
 def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, scene: Scene | DrawScene) -> Vision:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxdrones.envs import AutoReset, Env
 from jaxdrones.envs.autoreset import Episode
 from jaxdrones.envs.env import Obs
-from jaxdrones.envs.privileged import PrivilegedObservation
+from jaxdrones.envs.observations import PrivilegedObservation
 from jaxdrones.learning import sharding
 from jaxdrones.learning.layers import expand
 from jaxdrones.learning.networks import Policy, set_zero

@@ -26,20 +26,3 @@ def jit(function: Callable, **arguments: Any) -> Any:
 def is_tracing() -> bool:
     """Whether the caller runs inside a function that JAX is tracing to compile it."""
     return isinstance(jax.numpy.zeros(()) + 0, jax.core.Tracer)
-
-
-class Static:
-    """An object as an argument of a compiled function, which is compiled again when an attribute of it was set."""
-
-    def __init__(self, value: Any):
-        self.value = value
-        self._attributes = dict(vars(value))
-
-    def __hash__(self) -> int:
-        return id(self.value)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Static) or self.value is not other.value:
-            return False
-        mine, others = self._attributes, other._attributes
-        return mine.keys() == others.keys() and all(mine[name] is others[name] for name in mine)

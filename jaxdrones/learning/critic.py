@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
-from jaxdrones.envs.privileged import PrivilegedObservation
+from jaxdrones.envs.observations import PrivilegedObservation
 from jaxdrones.learning.layers import make_network
 from jaxdrones.learning.networks import Policy, apply, example_observation, init_params
 from jaxdrones.learning.normalize import map_state_vector, state_vector

@@ -73,7 +73,7 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, PyTreeNode):
-        outcomes = _compiled_outcomes()(compilation.Static(env), policy, keys)
+        outcomes = _compiled_outcomes()(env, policy, keys)
     else:
         outcomes = jax.jit(functools.partial(_outcomes, env, policy))(keys)
     return _report(env, jax.tree.map(np.asarray, outcomes))
@@ -107,7 +107,7 @@ def check_episodes(env: Env, episodes: int) -> None:
 
 @functools.cache
 def _compiled_outcomes() -> Callable:
-    return compilation.jit(lambda env, policy, keys: _outcomes(env.value, policy, keys), static_argnums=0)
+    return compilation.jit(_outcomes, static_argnums=0)
 
 
 def _outcomes(env: Env, policy: AnyPolicy, keys: jax.Array) -> dict:

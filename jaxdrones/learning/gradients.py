@@ -16,7 +16,6 @@ surface: a depth jumps at the edge of an obstacle, and the derivative does not s
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, get_args
@@ -70,15 +69,15 @@ class GradientConfig(Config):
 
 def with_gradient(env: Env, config: GradientConfig) -> Env:
     """The environment whose physics and images are differentiated as the settings say."""
-    changed = copy.copy(env)
+    changed: dict[str, Any] = {}
     if config.gradient == "surrogate":
-        changed.physics = SurrogateStep(env.physics, config.surrogate or make_step(dt=env.dt))
+        changed["physics"] = SurrogateStep(env.physics, config.surrogate or make_step(dt=env.dt))
     if config.gradient == "point_mass":
-        changed.physics = SurrogateStep(env.physics, point_mass(env.dt))
+        changed["physics"] = SurrogateStep(env.physics, point_mass(env.dt))
     if env.vision and not config.image_gradient:
         render = env.vision.render
-        changed.vision = dataclasses.replace(env.vision, render=lambda *seen: render(*jax.lax.stop_gradient(seen)))
-    return changed
+        changed["vision"] = dataclasses.replace(env.vision, render=lambda *seen: render(*jax.lax.stop_gradient(seen)))
+    return dataclasses.replace(env, **changed) if changed else env
 
 
 def gradient_between_steps(config: GradientConfig) -> Callable[[Any], Any]:

@@ -144,15 +144,15 @@ def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, t
 def _programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple[Callable, Callable]:
     """The compiled `init` and `advance` of an environment and settings."""
     try:
-        return _cached_programs(init, update, compilation.Static(env), config)
+        return _cached_programs(init, update, env, config)
     except TypeError:  # settings that cannot be hashed, such as arrays
-        return _cached_programs.__wrapped__(init, update, compilation.Static(env), config)
+        return _cached_programs.__wrapped__(init, update, env, config)
 
 
 @functools.lru_cache(maxsize=8)
-def _cached_programs(init: Callable, update: Callable, env: compilation.Static, config: Any) -> tuple:
-    start = compilation.jit(lambda key: init(key, env.value, config))
-    return start, compilation.jit(functools.partial(advance, update, env.value, config))
+def _cached_programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple:
+    start = compilation.jit(lambda key: init(key, env, config))
+    return start, compilation.jit(functools.partial(advance, update, env, config))
 
 
 def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result:

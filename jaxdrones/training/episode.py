@@ -15,7 +15,6 @@ from jaxdrones.engine.legs import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
-from jaxdrones.learning import compilation
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -166,7 +165,7 @@ def fly_episode(
     if isinstance(env.physics, HostStep):
         decide, fly = jax.jit(decide), loop
     elif isinstance(policy, PyTreeNode):  # an argument, so that other policies of its shape need no other program
-        fly = functools.partial(_compiled_leg(), compilation.Static(env), policy)
+        fly = functools.partial(_compiled_leg(), env, policy)
     else:
         fly = jax.jit(functools.partial(_leg, env, policy))
     params, scene = jax.device_get((start.params, start.scene))
@@ -209,7 +208,7 @@ def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tu
 
 @functools.cache
 def _compiled_leg() -> Callable:
-    return jax.jit(lambda env, policy, carry, keys: _leg(env.value, policy, carry, keys), static_argnums=0)
+    return jax.jit(_leg, static_argnums=0)
 
 
 def _success(env: Env, drones: State, metrics: dict[str, np.ndarray], ends: dict[str, np.ndarray]) -> bool | None:

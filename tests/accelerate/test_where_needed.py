@@ -35,6 +35,8 @@ def test_derivatives_are_those_of_the_function_where_it_is_needed_and_zero_elsew
             np.testing.assert_allclose(jax.vmap(f)(X, needed), jnp.where(needed, expected, 0), rtol=1e-12)
 
 
-def test_many_worlds_that_are_given_the_same_key_are_refused():
-    with pytest.raises(ValueError, match=r"one and the same key.*split the key"):
-        jax.vmap(where_needed(jax.random.normal), (0, None))(X > 3, jax.random.key(0))
+def test_worlds_with_one_key_get_one_result():
+    key = jax.random.key(0)
+    np.testing.assert_array_equal(
+        jax.vmap(where_needed(jax.random.normal), (0, None))(X > 3, key), jnp.full(len(X), jax.random.normal(key))
+    )

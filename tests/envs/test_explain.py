@@ -11,8 +11,9 @@ from helpers import mostly_slow
 
 import jaxdrones as jd
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS, ObservationTerm, explain, make
-from jaxdrones.envs.action import Action
-from jaxdrones.envs.randomize import random_pushes, scaled, sensor_noise
+from jaxdrones.envs.actions import Action
+from jaxdrones.envs.disturbances import random_pushes
+from jaxdrones.envs.randomize import scaled, sensor_noise
 from jaxdrones.quantity import Quantity, description
 from jaxdrones.sensing import lidar, multi_ranger, optical_flow, time_of_flight
 from jaxdrones.tasks.hover import hover

@@ -7,13 +7,13 @@ import pytest
 from helpers import assert_close
 
 import jaxdrones as jd
-from jaxdrones.envs import Env, make
+from jaxdrones.envs import episode, make
+from jaxdrones.envs.disturbances import random_pushes
 from jaxdrones.envs.randomize import (
     constant_wind,
     delayed,
     draw,
     drawn_leaves,
-    random_pushes,
     scaled,
     sensor_noise,
     shifted,
@@ -92,7 +92,7 @@ def test_every_episode_draws_a_delay_of_its_own_and_flies_with_it():
     @jax.vmap
     def first_speeds(key):
         _, world = env.reset(key)
-        _, rpm = Env._command(env, None, world, jnp.full((2, 4), 0.5))
+        _, rpm = episode.command(env, None, world, jnp.full((2, 4), 0.5))
         return world.params.aux["delay"], rpm[:, 0]
 
     delay, speed = first_speeds(jax.random.split(KEY, 200))

@@ -73,7 +73,7 @@ def replayed(name: str):
     step = Replay(arrays["state"])
     terms = [OBSERVATIONS[name] for name in task.observation]
     dt = about["physics_steps_per_record"] / about["physics_freq_hz"]
-    env = Env(task, params, step, dt=dt, action=action, observation=terms)
+    env = Env(task, params, step, dt=dt, action=action.fitted(params), terms=tuple(terms))
     obs, world = env.reset(jax.random.key(0))
     answers = [(obs,)]
     for row in arrays["action"]:

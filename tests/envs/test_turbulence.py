@@ -11,7 +11,7 @@ from helpers import assert_finite, assert_same_kind
 
 import jaxdrones as jd
 from jaxdrones.envs import make
-from jaxdrones.envs.turbulence import scales
+from jaxdrones.envs.disturbances import scales
 
 KEY = jax.random.key(0)
 AXES = "uvw"

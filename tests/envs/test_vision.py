@@ -10,7 +10,7 @@ import pytest
 
 import jaxdrones as jd
 from jaxdrones.envs import TASKS, AutoReset, check_env, make
-from jaxdrones.envs.env import RESET
+from jaxdrones.envs.episode import RESET
 from jaxdrones.sensing import Box, Scene, Sphere
 
 KEY = jax.random.key(4)

@@ -79,7 +79,7 @@ def lift(starts=(0.0,), drones=1, noise=None, **changes):
         success_terminations=("done",),
     )
     nominal = envs.make("hover", drones=drones).params
-    terms = dict(observation=[OBSERVATIONS["position"]], action=ACTIONS["rpm"]())
+    terms = dict(terms=(OBSERVATIONS["position"],), action=ACTIONS["rpm"]())
     return Env(dataclasses.replace(task, **changes), nominal, Lift(), dt=0.1, noise=noise, **terms)
 
 

@@ -107,16 +107,12 @@ def test_train_compiles_itself_once_for_all_keys_and_equal_settings():
 
 
 @pytest.mark.slow
-def test_train_and_evaluate_notice_that_an_attribute_of_the_environment_was_set():
+def test_evaluate_notices_that_a_field_of_the_environment_was_replaced():
     env = envs.make("hover")
     policy = Policy.init(KEY, env, (4,))
     for steps in (20, 10):
-        env.steps = steps
+        env = dataclasses.replace(env, steps=steps)
         np.testing.assert_allclose(evaluate(env, policy, KEY, episodes=2).mean_length, steps * env.dt, rtol=1e-6)
-    toy, rewards = DoubleIntegrator(), []
-    for toy.steps in (50, 2):  # of which four are flown
-        rewards.append(bptt.train(KEY, toy, SMALL[bptt]).history["reward"])
-    assert not np.array_equal(*rewards)
 
 
 @pytest.mark.slow

@@ -84,7 +84,7 @@ def learn(image: str, seeing: bool = True, key: jax.Array = KEY):
     """Reports on 200 episodes before and after training."""
     with jd.make(look_at_the_ball(), backend="bullet", vision=(image,), action=climb_and_turn()) as env:
         if not seeing:
-            env.vision = Blindfold(**vars(env.vision))
+            env = dataclasses.replace(env, vision=Blindfold(**vars(env.vision)))
         config = ppo.Config(updates=30, worlds=64, horizon=15, gamma=0.95, gae_lambda=0.95)
         trained = ppo.train(key, env, config).policy
         untrained = Policy.init(key, env, config.hidden_sizes)

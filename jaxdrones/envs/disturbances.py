@@ -1,20 +1,96 @@
-"""Dryden turbulence near the ground (MIL-F-8785C, 3.7.2 and 3.7.3)."""
+"""Disturbances, which change wind or external force during an episode: random pushes and Dryden turbulence."""
 
+from __future__ import annotations
+
+import dataclasses
+import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_number
-from jaxdrones.envs.randomize import DisturbanceWithMemory
+from jaxdrones.envs.randomize import Randomization
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
+from jaxdrones.quantity import described
 
 _FOOT = 0.3048  # m
 _LOWEST, _HIGHEST = 10 * _FOOT, 1000 * _FOOT  # m, range of the specification's low-altitude model
 _ROUGHNESS, _REFERENCE = 0.15 * _FOOT, 20 * _FOOT  # m, roughness length and reference height of the mean wind
 _SQRT3 = math.sqrt(3.0)
 _TERMS = 40  # terms of a series for arguments up to 1
+
+Disturbance = Callable[[jax.Array, Params, float], Params]
+"""(key, params, control period) of a team -> its parameters with the surroundings of the next control step."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DisturbanceWithMemory:
+    """A disturbance that depends on what it did before; its memory is `params.aux[name]`."""
+
+    name: str
+    """Key of `Params.aux`."""
+    init: Callable[[jax.Array, Params], Any]
+    """`init(key, params)`: the memory of one drone at the start of an episode, a pytree of arrays."""
+    advance: Disturbance
+    """`advance(key, params, control period)` of a team: its parameters with new surroundings and a new memory."""
+    text: str
+    """What it does, for people."""
+
+    def __post_init__(self):
+        object.__setattr__(self, "__doc__", self.text)
+
+    def __call__(self, key: jax.Array, params: Params, dt: float) -> Params:
+        """The parameters of a team with the surroundings of the next control step."""
+        if self.name not in params.aux:
+            raise UserError(
+                f"params.aux lacks {self.name!r}, the memory of a disturbance; start from its start(key, params)"
+            )
+        return self.advance(key, params, dt)
+
+    def start(self, key: jax.Array, params: Params) -> Params:
+        """The parameters of one drone with the memory at the start of an episode."""
+        return params.replace(aux=params.aux | {self.name: self.init(key, params)})
+
+    def nominal(self, params: Params) -> Params:
+        """The parameters of a team with a memory of zeros: the place for it."""
+        keys = jax.random.split(jax.random.key(0), len(params.mass))
+        shapes = jax.eval_shape(jax.vmap(self.init), keys, params)
+        return params.replace(aux=params.aux | {self.name: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)})
+
+    def starting(self) -> Randomization:
+        """`start` as a randomization."""
+        return described(f"start of: {self.text}", functools.partial(self.start))
+
+
+def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) -> Disturbance:
+    """External forces of U(-force, force) (share of the weight) along each axis, at random times.
+
+    One begins every `interval` seconds and lasts `duration` seconds on average, both with exponential distributions.
+
+    Raises:
+        ValueError: a negative force, or times that are not positive.
+    """
+    check_number("force of a push", force, "share of the weight", at_least=0)
+    check_number("interval", interval, "s", above=0, infinite=True)
+    check_number("duration", duration, "s", above=0, infinite=True)
+
+    def disturbance(key: jax.Array, params: Params, dt: float) -> Params:
+        n = len(params.mass)
+        u = jax.random.uniform(key, (n, 4), params.external_force.dtype)
+        fresh = force * params.weight[:, None] * (2 * u[:, 1:] - 1)
+        begins, ends = u[:, :1] < dt / interval, u[:, :1] > 1 - dt / duration
+        return params.replace(external_force=jnp.where(begins, fresh, jnp.where(ends, 0, params.external_force)))
+
+    return described(
+        f"pushes of U(-{force:g}, {force:g}) of the weight along each axis, every {interval:g} s for {duration:g} s on "
+        "average",
+        disturbance,
+    )
 
 
 def dryden(speed: float, altitude: float = 6.096, airspeed: float | None = None) -> DisturbanceWithMemory:

@@ -1,0 +1,128 @@
+"""Phases of an episode: the start, the command of a control step, and its outcome. `env` is an `Env`."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdrones.engine.step import HostStep
+from jaxdrones.envs import randomize
+from jaxdrones.envs.observations import observe
+from jaxdrones.sensing import Scene
+from jaxdrones.sensing.sensor import hold_between, init_sensors, measure_sensors
+from jaxdrones.state import State
+from jaxdrones.tasks.task import World
+
+DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE, VISION = range(8)
+"""Random streams: what a key is folded with, so that only the draws that are used cost time."""
+
+Key = Any  # a random key; `None` where nothing is drawn
+
+
+def start(env: Any, key: jax.Array) -> World:
+    """The world at the start of an episode, before the first measurement."""
+    params = randomize.draw(env.draws, jax.random.fold_in(key, RANDOMIZE), env.params)
+    scene = env.scene if isinstance(env.scene, Scene) else env.scene(jax.random.fold_in(key, SCENE))
+    known = randomize.scaling_params(env.randomize, params, env.params)
+    drones, variables = env.task.begin(jax.random.fold_in(key, START), known, scene)
+    history = max(math.ceil(env.delay_steps[1]) + 1, *(term.history for term in env.terms))
+    return World(
+        params=params,
+        drones=env.physics.init(params, drones),
+        variables=variables,
+        memory=env.action.team_memory(env.drones),
+        actions=jnp.zeros((env.drones, history, env.action_size), drones.pos.dtype),
+        step=jnp.zeros((), jnp.int32),
+        dt=env.dt,
+        scene=scene,
+    )
+
+
+def first_world(env: Any, key: jax.Array) -> World:
+    """The world at the start of an episode, with the first readings."""
+    world = start(env, key)
+    return _first_readings(env, key, world, state_rate(env, world, world.drones.rpm))
+
+
+def first_observation(env: Any, key: jax.Array, world: World, rate: State | None) -> tuple[Array, World]:
+    """The first observation, and the world with the first readings."""
+    world = _first_readings(env, key, world, rate)
+    return _noisy_observation(env, key, world), world
+
+
+def _first_readings(env: Any, key: jax.Array, world: World, rate: State | None) -> World:
+    if rate is None:
+        return world
+    init_key, measure_key = jax.random.split(jax.random.fold_in(key, SENSORS))
+    world = world.replace(sensors=init_sensors(env.sensors, init_key, world.params))
+    return _measured(env, measure_key, world, rate)
+
+
+def _measured(env: Any, key: jax.Array, world: World, rate: State) -> World:
+    """The world with new readings of the sensors."""
+    after = measure_sensors(env.sensors, key, world.params, world.drones, rate, world.scene, world.sensors)
+    sensors, readings = hold_between(env.sensors, world.step, env.dt, (world.sensors, world.readings), after)
+    return world.replace(sensors=sensors, readings=readings)
+
+
+def state_rate(env: Any, world: World, rpm: Array) -> State | None:
+    """The time derivative of the state for the sensors, if there are any."""
+    if not env.sensors:
+        return None
+    return env.physics.rate(world.params, world.drones, rpm, scene_for_step(env, world))
+
+
+def scene_for_step(env: Any, world: World) -> Scene | None:
+    """The scene as an argument of the step; `None` if the step needs none or was built with it."""
+    if isinstance(env.physics, HostStep):
+        return None if isinstance(env.scene, Scene) else world.scene
+    return env.physics.physics.seen(world.scene)
+
+
+def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Array]:
+    """The world with the new action and disturbance, and the commanded rotor speeds."""
+    action = jnp.clip(jnp.asarray(action, world.actions.dtype), -1, 1)
+    actions = jnp.concatenate([world.actions[:, 1:], action[:, None]], axis=1)
+    params = world.params
+    if env.disturbance:
+        params = env.disturbance(jax.random.fold_in(key, DISTURBANCE), params, env.dt)
+    world = world.replace(actions=actions, params=params)
+
+    def of_drone(params, memory, state, action, setpoint):
+        return env.action.rpm(params, memory, state, action, setpoint, env.dt)
+
+    delay = randomize.delay_of(params) if env.draws_delay else env.delay_steps[1]
+    known = randomize.scaling_params(env.randomize, params, env.params)
+    delayed, target = randomize.delayed(actions, delay), env.task.target_now(world)
+    memory, rpm = jax.vmap(of_drone)(known, world.memory, world.drones, delayed, target)
+    return world.replace(memory=memory), rpm
+
+
+def outcome(env: Any, key: Key, world: World, rate: State | None):
+    """What `step` returns, from the world with the state after it."""
+    task = env.task
+    world = world.replace(step=world.step + 1)
+    if rate is not None:
+        world = _measured(env, jax.random.fold_in(key, SENSORS), world, rate)
+    world = world.replace(variables=task.advance(task, world))
+    rewards = {name: scale * term(task, world) for name, (scale, term) in task.rewards.items()}
+    terminations, truncations = (
+        {name: jnp.any(condition(task, world)) for name, condition in conditions.items()}
+        for conditions in (task.terminations, task.truncations)
+    )
+    terminated = functools.reduce(jnp.logical_or, terminations.values(), jnp.zeros((), bool))
+    truncated = functools.reduce(jnp.logical_or, truncations.values(), world.step >= env.steps)
+    info = dict(rewards=rewards, metrics=task.measure(world), terminations=terminations, truncations=truncations)
+    obs = _noisy_observation(env, key, world)
+    return obs, world, sum(rewards.values()), terminated, truncated, info
+
+
+def _noisy_observation(env: Any, key: Key, world: World) -> Array:
+    if env.noise:
+        world = world.replace(drones=env.noise(jax.random.fold_in(key, NOISE), world.drones))
+    return observe(env.terms, env.task, world)

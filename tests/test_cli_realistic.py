@@ -46,7 +46,7 @@ def test_a_run_on_any_vehicle_says_so_and_is_evaluated_and_flown_on_any_vehicle(
     assert main([*TRAIN, "--realistic", "any", *output]) == 0
     printed = capsys.readouterr()
     assert "hover by bptt, realistic, any vehicle, duration 0.2: " in printed.out
-    assert "no settings are known" not in printed.err
+    assert "no tuned settings" not in printed.err
     assert Run(folder).recipe().realistic == "any" and Run(folder).recipe().env().vehicle == "any vehicle"
 
     printed = said(capsys, "eval", str(folder), "--episodes", "4")

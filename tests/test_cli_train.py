@@ -243,7 +243,7 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     arguments = ["train", "hover", *SMALL, "--algo", "shac", "--budget", "0.001s", "--episodes", "8", "--seeds", "2"]
     assert main([*arguments, "--seed", "3", "--json", "--output", str(tmp_path)]) == 0
     captured = capsys.readouterr()
-    assert "warning: compiling took all of --budget 0.001s, so one update is made" in captured.err
+    assert "warning: compiling took all of --budget 0.001s; one update is made, --resume continues it" in captured.err
     printed = json.loads(captured.out)
     assert [report["seed"] for report in printed["seeds"]] == [3, 4] and printed["best_seed"] in (3, 4)
     assert all(report["updates"] == 1 for report in printed["seeds"])  # the least, when there is no time

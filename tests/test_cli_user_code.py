@@ -11,7 +11,7 @@ from documents import ROOT, blocks
 
 from jaxdrones import assets
 from jaxdrones.cli import main
-from jaxdrones.cli.training import warn_of_failure
+from jaxdrones.cli.train_output import warn_of_failure
 from jaxdrones.envs import TASKS
 from jaxdrones.training import trainer
 from jaxdrones.training.presets import default_algorithm, settings_known
@@ -150,7 +150,7 @@ def test_a_training_without_known_settings_says_so_before_it_starts(task, warned
     small = ["--set", "worlds=2", "--set", "horizon=2", "--set", "duration=0.1"]
     assert main(["train", task, *small, "--no-figure", "--output", str(tmp_path)]) == 130
     said = capsys.readouterr().err
-    assert (f"warning: no settings are known with which bptt masters {task}; it may fail" in said) == warned
+    assert (f"warning: there are no tuned settings for bptt on {task}; if it fails" in said) == warned
     assert said.count("\n") == 1 + warned
 
 

@@ -47,7 +47,7 @@ def _page(name: str, pictured: bool, results: str) -> str:
 def _training(name: str) -> str:
     algorithm = default_algorithm(name)
     known = settings_known(name, algorithm)
-    return f"jaxdrones train {name}{'' if known else '   # no settings are known with which it is mastered'}"
+    return f"jaxdrones train {name}{'' if known else '   # there are no tuned settings'}"
 
 
 def _measured(name: str, results: str) -> str:

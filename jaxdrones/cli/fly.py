@@ -132,7 +132,7 @@ def _fly_example(options: argparse.Namespace) -> int:
     _check_files(options, output)
     example = FLIGHTS[options.flight]
     title = f"{options.flight}: {example.summary}"
-    with live_server(options) as live:
+    with live_server(options.live, options.json) as live:
         conditions = dict(backend=options.backend, obstacles=options.obstacles, gui=options.gui)
         record = fly_options(options, **conditions, watch=live.add if live else None)
     files = _write(record, options, output, title, example.panels)
@@ -160,7 +160,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
         policy = run.policy(env=env)
         _check_files(options, output)
         title = f"{recipe.task}: {env.task.summary} ({recipe.algorithm}, {options.backend})"
-        with live_server(options, title) as live:
+        with live_server(options.live, options.json, title) as live:
             on_progress = report or (lambda fraction: None)
             episode = fly_episode(env, policy, jax.random.key(seed), on_progress, live.add if live else None)
     conditions = EpisodeConditions(

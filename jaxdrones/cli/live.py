@@ -20,20 +20,20 @@ def add_live(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 @contextlib.contextmanager
-def live_server(options: argparse.Namespace, title: str | None = None) -> Iterator[Live | None]:
-    """A context with a server whose address is printed; with `None` unless --live is given.
+def live_server(port: int | None, quiet: bool, title: str | None = None) -> Iterator[Live | None]:
+    """A context with a server whose address is printed, on stderr if `quiet`; with `None` without a port.
 
     Raises:
         ValueError: the port is taken.
     """
-    if options.live is None:
+    if port is None:
         yield None
         return
 
     def say(line: str) -> None:
-        print(line, file=sys.stderr if options.json else sys.stdout, flush=True)
+        print(line, file=sys.stderr if quiet else sys.stdout, flush=True)
 
-    with Live(options.live, title, WAIT, say) as live:
+    with Live(port, title, WAIT, say) as live:
         say(f"open {live.url} in a browser on this machine")
         yield live
 

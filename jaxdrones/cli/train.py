@@ -2,34 +2,39 @@
 
 import argparse
 import contextlib
+import io
+import shutil
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 from jaxdrones import assets
-from jaxdrones.cli import hosts
-from jaxdrones.cli.budget import Deadlines, parse_budget
 from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS
 from jaxdrones.cli.report import described
-from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
-from jaxdrones.cli.train_runs import episodes_of, folders_of, recipe_of, remaining, runs_of
-from jaxdrones.cli.training import (
+from jaxdrones.cli.settings import add_realistic, user_mistakes
+from jaxdrones.cli.train_output import (
+    Deadlines,
     ProgressDisplay,
     draw_curves,
-    merge_budget,
     quiet,
     remaining_best,
     show_results,
     warn_of_unknown_settings,
 )
+from jaxdrones.cli.train_request import Request, remaining
 from jaxdrones.envs import TASKS
 from jaxdrones.errors import UserError
-from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 from jaxdrones.visualization import plots
 
-_MAX_SEEDS = 1000
+_HOSTS_HELP = (
+    "All devices share the worlds. A CPU counts as N devices with\n"
+    "XLA_FLAGS=--xla_force_host_platform_device_count=N. On several hosts, start the same command on each, with a\n"
+    "different --host. Host 0 writes the files; to --resume, each host needs a copy of the folder:\n"
+    "  jaxdrones train hover --hosts 2 --host 0 --coordinator 127.0.0.1:9911"
+)
 
 
 def add(commands) -> None:
@@ -56,7 +61,7 @@ def add(commands) -> None:
         "A run of a task or vehicle of your own keeps the text of its file, and flies that text when it is resumed,\n"
         "evaluated or flown: open runs of people you trust alone.",
         epilog="JAX_COMPILATION_CACHE_DIR=folder keeps compiled programs, so that the next training starts sooner.\n\n"
-        + hosts.HELP,
+        + _HOSTS_HELP,
         allow_abbrev=False,
     )
     parser.add_argument(
@@ -94,13 +99,42 @@ def add(commands) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
     add_live(parser, "show an episode in the browser after every evaluation, and the learning curve")
-    hosts.add_options(parser)
+    parser.add_argument("--hosts", type=int, metavar="N", help="number of processes that train together (1)")
+    parser.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
+    parser.add_argument(
+        "--coordinator", metavar="ADDRESS:PORT", help="address of host 0, and a port that is free there"
+    )
     parser.add_argument("--no-figure", action="store_true", help="draw no learning curves; needs no matplotlib")
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
-    parser.set_defaults(run=hosts.on_hosts(_train))
+    parser.set_defaults(run=_on_hosts)
+
+
+def _on_hosts(options: argparse.Namespace) -> int:
+    """Train on one host or several; all but the first print nothing and write to a temporary folder."""
+    hosts = (options.hosts, options.host, options.coordinator)
+    if hosts == (None, None, None):
+        return _train(options)
+    if None in hosts:
+        raise UserError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
+    if options.live is not None:
+        raise UserError("--live is given with --hosts, whose trainings are not shown; leave one of them out")
+    from jaxdrones.training import distributed
+
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(distributed.join_hosts(*hosts))
+        if options.host > 0:
+            stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
+            copy = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
+            output = options.output or run_folder(options.task)
+            if options.resume and output.is_dir():
+                shutil.copytree(output, copy)
+            options.output, options.no_figure = copy, True
+        distributed.wait_for_hosts("copied")
+        return _train(options)
 
 
 def _train(options: argparse.Namespace) -> int:
+    """Parse the request, lock its folders, and train."""
     from jaxdrones.training import loop
     from jaxdrones.training.distributed import fail_together
     from jaxdrones.training.lock import locked
@@ -112,93 +146,64 @@ def _train(options: argparse.Namespace) -> int:
         with fail_together():
             if not options.no_figure:
                 plots.check_matplotlib()
-            output = options.output or run_folder(options.task)
-            _check_numbers(options)
-            updates, seconds = parse_budget(options.budget)
-            asked = merge_budget("updates", asked_settings(options), updates, seconds)
-            for folder in folders_of(options, output):
+            request = Request.of(options)
+            for folder in dict.fromkeys((request.output, *request.folders.values())):
                 stack.enter_context(locked(folder, print_warning))
-            runs = runs_of(options, output)
-            with user_mistakes(asked, options.task):
-                recipe = recipe_of(options, runs, output, asked, seconds)
-                trainer = Trainer(recipe, episodes_of(options, runs))
-            resumed = [run for run in runs.values() if run.started and options.resume]
-            for run in resumed:
-                loop.check_resumable(trainer, run)
-            for run in (*runs.values(), Run(output)):
+            runs = request.runs()
+            with user_mistakes(request.settings, request.task):
+                trainer = Trainer(request.recipe(runs), request.episodes_of(runs))
+            for run in runs.values():
+                if run.started and request.resume:
+                    loop.check_resumable(trainer, run)
+            for run in (*runs.values(), Run(request.output)):
                 trainer.prepare(run)
-        return _train_runs(options, runs, output, trainer, Deadlines(options, begin, seconds, len(runs)))
+        return _train_runs(request, runs, trainer, Deadlines(request, begin))
 
 
-def _train_runs(options: argparse.Namespace, runs: dict, output: Path, trainer: Any, deadlines: Deadlines) -> int:
+def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines) -> int:
     """Train every run in its locked folder, and print the results."""
     from jaxdrones.learning import Diverged
     from jaxdrones.training import loop
     from jaxdrones.training.presets import settings_known
     from jaxdrones.training.run import Run
 
-    recipe, print_line = trainer.recipe, quiet if options.json else print
-    known = settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any")
-    if not options.resume and not known:
+    recipe, print_line = trainer.recipe, quiet if request.json else print
+    if not request.resume and not settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any"):
         warn_of_unknown_settings(recipe)
-    print_line(f"{_headline(recipe)}; compiling")
+    config, what = recipe.config, described(recipe)
+    print_line(f"{what}: {config.worlds} worlds x {config.horizon} control steps an update; compiling")
     trainer.compile()
-    made = {
-        seed: run.sidecar_entry("state", "update") if options.resume and run.started else 0
-        for seed, run in runs.items()
-    }
+    started = [run for run in runs.values() if request.resume and run.started]
+    made = max((run.sidecar_entry("state", "update") for run in started), default=0)
     deadlines.start()
-    total = recipe.config.updates if deadlines.seconds is None else None
-    so_far = f", {max(made.values())} of them made" * (max(made.values()) > 0)
+    total = config.updates if request.seconds is None else None
+    so_far = f", {made} of them made" * (made > 0)
     print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total or 'as many as the time allows'}{so_far}")
-    if not options.resume:
-        for run in (*runs.values(), Run(output)):
+    if not request.resume:
+        for run in (*runs.values(), Run(request.output)):
             run.clear()
 
-    with live_server(options) as live:
-        for seed, run in remaining(runs, recipe.config.updates, deadlines.seconds).items():
-            display = ProgressDisplay(
-                total, f"seed {seed}" if len(runs) > 1 else "training", trainer.episodes, print_line
-            )
+    with live_server(request.live, request.json) as live:
+        for seed, run in remaining(runs, config.updates, request.seconds).items():
+            label = f"seed {seed}" if len(runs) > 1 else "training"
+            display = ProgressDisplay(total, label, trainer.episodes, print_line)
             on_progress = display.update
             if live:
-                what = described(recipe) + f", seed {seed}" * (len(runs) > 1)
-                on_progress = LiveTraining(live, trainer, run, what, on_progress).update
+                title = what + f", seed {seed}" * (len(runs) > 1)
+                on_progress = LiveTraining(live, trainer, run, title, on_progress).update
             try:
                 with display:
                     loop.train(trainer, run, seed, on_progress, deadlines.next())
             except KeyboardInterrupt:
                 if not (run.folder / "last.json").exists():
                     return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
-                draw_curves(options, {seed: run}, run.folder)
+                draw_curves(request, {seed: run}, run.folder)
                 where = f"interrupted at update {run.sidecar_entry('last', 'update')}; {remaining_best(run)}"
-                if not run.started:
-                    return print_error(where, INTERRUPTED)
-                again = f"jaxdrones train {options.task} --output {output} --resume"
-                again += f" --seeds {options.seeds}" * (options.seeds > 1) + f" --seed {min(runs)}" * (min(runs) > 0)
-                return print_error(f"{where}; continue with: {again}", INTERRUPTED)
+                return print_error(where + f"; continue with: {request.again}" * run.started, INTERRUPTED)
             except Diverged as error:
-                draw_curves(options, {seed: run}, run.folder)
-                return print_error(
-                    f"training diverged: {error}, for example --set learning_rate=1e-3; {remaining_best(run)}", 1
-                )
-    code = show_results(options, runs, output)
+                draw_curves(request, {seed: run}, run.folder)
+                advice = f"{error}, for example --set learning_rate=1e-3; {remaining_best(run)}"
+                return print_error(f"training diverged: {advice}", 1)
+    code = show_results(request, runs)
     deadlines.warn_if_missed()
     return code
-
-
-def _headline(recipe) -> str:
-    config = recipe.config
-    what = described(recipe)
-    return f"{what}: {config.worlds} worlds x {config.horizon} control steps an update"
-
-
-def _check_numbers(options: argparse.Namespace) -> None:
-    check_at_most("seeds", options.seeds, _MAX_SEEDS)
-    if options.seed is not None:
-        check_seed("seed", options.seed)
-        check_seed("the last seed", options.seed + options.seeds - 1)
-    if options.episodes is not None:
-        check_at_most("episodes", options.episodes, LARGEST_COUNT)
-    if options.resume and options.overwrite:
-        raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")

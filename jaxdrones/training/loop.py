@@ -23,7 +23,7 @@ from jaxdrones.training.plan import EVALUATIONS, IN_A_ROW, STOPPING_EVALUATIONS,
 from jaxdrones.training.progress import Progress
 from jaxdrones.training.run import Run, report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM, Score, best_of, score_of
-from jaxdrones.training.trainer import MAX_CALL, BaseTrainer, Trainer
+from jaxdrones.training.trainer import MAX_CALL, Trainer
 
 _CALL_SECONDS = 0.3  # aimed at for one call of the compiled program, during which Ctrl-C has to wait
 _SAVE_SECONDS = 30.0  # longest time between two training states on disk
@@ -33,7 +33,7 @@ OnProgress = Callable[[int, dict[str, float]], None]
 """(number of updates made, newest metrics) -> None: shows progress."""
 
 
-def train(trainer: BaseTrainer, run: Run, seed: int, on_progress: OnProgress, deadline: float | None = None) -> None:
+def train(trainer: Trainer, run: Run, seed: int, on_progress: OnProgress, deadline: float | None = None) -> None:
     """Train one seed to the end, from the start or from the state that the run holds; evaluate the best policy.
 
     Args:
@@ -88,7 +88,7 @@ def _load(trainer: Trainer, run: Run) -> Any:
 class _Loop:
     """The training of one seed: its state, and the results so far."""
 
-    def __init__(self, trainer: BaseTrainer, run: Run, seed: int, deadline: float | None = None):
+    def __init__(self, trainer: Trainer, run: Run, seed: int, deadline: float | None = None):
         """Start a training, or continue the one that the run holds."""
         self.trainer, self.run, self.seed = trainer, run, seed
         self.key = jax.random.key(seed)
@@ -100,7 +100,6 @@ class _Loop:
         self.seconds, self.update = 0.0, 0
         self.plan: TimePlan | None = None
         if run.started:
-            assert isinstance(trainer, Trainer)
             self.state = sharding.shard_state(trainer.mesh, _load(trainer, run))
             self.update = int(self.state.step)
             about, best = run.sidecar("state"), run.sidecar_entry("best", "score")
@@ -193,7 +192,7 @@ class _Loop:
         self.run.save_policy("last", state.policy, **about)
         progress = {"seconds": self.seconds, "evaluation_seconds": self.last_evaluation_seconds}
         progress |= {"highest_success": self.highest_success, "reached": self.reached}
-        self.trainer.save(self.run, state, **about, **progress)
+        self.run.save_state(state, **about, **progress)
 
     def finish(self) -> None:
         """Evaluate the best policy, in other episodes than those that chose it, and write the report."""

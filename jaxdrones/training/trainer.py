@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 import time
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
-from jaxdrones.learning.evaluation import Report, check_episodes, compile_evaluation
+from jaxdrones.learning.evaluation import check_episodes, compile_evaluation
 from jaxdrones.limits import check_memory
 from jaxdrones.training import algorithms
 from jaxdrones.training.plan import check_stop_at
@@ -27,49 +23,7 @@ MAX_CALL = 64
 _DISK_FACTOR = 4  # the disk must have space for so many training states
 
 
-class BaseTrainer(abc.ABC):
-    """What the loop of a training asks of a learner, whichever library it is of."""
-
-    recipe: Recipe
-    episodes: int
-    """Number of episodes of an evaluation."""
-    env: Env
-    """The environment to evaluate in."""
-    mesh: Mesh
-    """The devices that share a state."""
-    metrics: list[str]
-    """Names of the metrics of an update."""
-    compile_seconds: float
-    """Seconds that `compile` took."""
-    evaluate: Callable[[Any, jax.Array], Report]
-    """The compiled evaluation of a policy with a random key; `compile` sets it."""
-
-    @abc.abstractmethod
-    def compile(self) -> None:
-        """Compile the programs."""
-
-    @abc.abstractmethod
-    def prepare(self, run: Run) -> None:
-        """Make the folder of a run and check that its files can be written.
-
-        Raises:
-            OSError: they cannot be written.
-        """
-
-    @abc.abstractmethod
-    def start(self, key: jax.Array) -> Any:
-        """The training state before the first update, which has at least `policy`."""
-
-    @abc.abstractmethod
-    def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
-        """Make at most `MAX_CALL` updates in one call: the state after them, and (updates,) of every metric."""
-
-    @abc.abstractmethod
-    def save(self, run: Run, state: Any, **about: Any) -> None:
-        """Write what a training can continue from, with entries of its description."""
-
-
-class Trainer(BaseTrainer):
+class Trainer:
     """The compiled programs of a recipe; all seeds share them, and all devices of all hosts share the worlds."""
 
     def __init__(self, recipe: Recipe, episodes: int = 1000):
@@ -124,10 +78,6 @@ class Trainer(BaseTrainer):
         total = jnp.asarray(self.recipe.config.updates, jnp.int32)
         state, metrics = self._advance(state, jnp.asarray(updates, jnp.int32), total)
         return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
-
-    def save(self, run: Run, state: Any, **about: Any) -> None:
-        """Write the training state, with entries of its description."""
-        run.save_state(state, **about)
 
     def _check_memory(self) -> None:
         """Raise if the worlds, with their observations and actions in an update, need more memory than there is."""

@@ -1,23 +1,23 @@
-"""Arguments, progress and results of a training at the shell."""
+"""Progress, deadlines and results of `jaxdrones train`."""
 
-import argparse
 import contextlib
 import math
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.common import bar, print_warning
 from jaxdrones.cli.report import as_json, evaluation_table, percent
-from jaxdrones.errors import UserError
+from jaxdrones.cli.train_request import Request
 from jaxdrones.visualization import learning_curves
 
 
 def warn_of_unknown_settings(recipe) -> None:
-    """Say that no settings are known with which a learner masters a task."""
+    """Warn that there are no tuned settings for a learner on a task."""
     task = recipe.task + " on any vehicle" * (recipe.realistic == "any")
     print_warning(
-        f"no settings are known with which {recipe.algorithm} masters {task}; it may fail, then try "
+        f"there are no tuned settings for {recipe.algorithm} on {task}; if it fails, try "
         "another --algo, --set learning_rate=... or horizon=..., or a longer --budget"
     )
 
@@ -36,26 +36,42 @@ def warn_of_failure(run, report: dict[str, Any]) -> None:
         print_warning(f"{run.folder}: the best policy succeeds in 0 of {episodes:,} episodes; {advice}")
 
 
-def merge_budget(name: str, changes: dict[str, Any], number: int | None, seconds: float | None) -> dict[str, Any]:
-    """The settings together with the number that --budget gives for one of them.
-
-    Raises:
-        ValueError: --set gives that one too.
-    """
-    if name in changes and (number is not None or seconds is not None):
-        raise UserError(f"--set {name}={changes[name]} is given beside --budget; give one of them")
-    return changes if number is None else changes | {name: number}
+_FIGURE_SECONDS = 2.0  # to draw the learning curves
+_TOLERANCE = 1.1  # times the budget from which on it was missed
 
 
-def check_free(run, overwrite: bool) -> None:
-    """Raise if files of another run would be replaced without --overwrite."""
-    if overwrite or not run.files:
-        return
-    if run.finished:
-        what, again = "a finished training", "train it longer with --resume --budget N, " if run.started else ""
-    else:
-        what, again = "a training that did not finish", "continue it with --resume, " if run.started else ""
-    raise UserError(f"{run.folder} holds {what}; {again}replace it with --overwrite, or choose another --output")
+class Deadlines:
+    """Deadlines of the seeds, which share the time of --budget evenly."""
+
+    def __init__(self, request: Request, begin: float):
+        """Prepare; the command began at the time `begin` of `time.perf_counter`, s."""
+        self.seconds, self._text, self._begin = request.seconds, request.budget, begin
+        self._end = begin + request.seeds * (request.seconds or 0.0)
+        self._figure = _FIGURE_SECONDS * request.figure
+        self._left = request.seeds
+
+    def start(self) -> None:
+        """Say so if compiling took the time of a whole run."""
+        if self.seconds is not None and time.perf_counter() - self._begin > self.seconds:
+            print_warning(f"compiling took all of --budget {self._text}; one update is made, --resume continues it")
+
+    def next(self) -> float | None:
+        """The time of `time.perf_counter` at which the next training has to be over, s; `None` without a limit."""
+        if self.seconds is None:
+            return None
+        now = time.perf_counter()
+        deadline = now + (self._end - self._figure - now) / self._left
+        self._left -= 1
+        return deadline
+
+    def warn_if_missed(self) -> None:
+        """Say so if everything took longer than the budget."""
+        spent, budget = time.perf_counter() - self._begin, self._end - self._begin
+        if self.seconds is not None and spent > _TOLERANCE * budget + 1:
+            print_warning(
+                f"everything took {spent:.0f} s, more than {budget:.0f} s by --budget {self._text}: compiling, one "
+                "update and three evaluations are the least; give a longer --budget or fewer --episodes"
+            )
 
 
 class ProgressDisplay(contextlib.ExitStack):
@@ -118,11 +134,11 @@ def remaining_best(run) -> str:
     return f"{run.folder / 'best'}.msgpack is the best policy, of update {run.sidecar_entry('best', 'update')}"
 
 
-def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[Path]:
+def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
     """Draw the learning curves, unless --no-figure is given."""
     from jaxdrones.learning.evaluation import wilson_interval
 
-    if options.no_figure:
+    if not request.figure:
         return []
     histories = {f"seed {seed}": run.history() for seed, run in runs.items()}
     kept = {f"seed {seed}": run.sidecar_entry("best", "update") for seed, run in runs.items()}
@@ -134,17 +150,17 @@ def draw_curves(options: argparse.Namespace, runs: dict, folder: Path) -> list[P
     return [folder / "curve.png"]
 
 
-def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
+def show_results(request: Request, runs: dict) -> int:
     """Draw learning curves, choose the best seed, and print the results.
 
     Args:
-        options: options of the command line.
+        request: request, whose folder gets the figure and, with several seeds, the best policy.
         runs: run of each seed.
-        output: folder for the figure and, with several seeds, for the best policy.
     """
     from jaxdrones.training.run import Run
     from jaxdrones.training.selection import best_of, score_of
 
+    output = request.output
     reports = {seed: run.report() for seed, run in runs.items()}
     evaluations = [report["evaluation"] for report in reports.values()]
     scores = [score_of(evaluation["success"], evaluation["mean_return"]) for evaluation in evaluations]
@@ -155,8 +171,8 @@ def show_results(options: argparse.Namespace, runs: dict, output: Path) -> int:
         Run(output).remove_report()  # that of an earlier best seed
         Run(output).save_policy("best", run.policy(), **about)
         Run(output).save_report({"run_id": about["run_id"], "best_seed": best, "seeds": list(reports.values())})
-    files = [output / "best.msgpack", output / "report.json", *draw_curves(options, runs, output)]
-    if options.json:
+    files = [output / "best.msgpack", output / "report.json", *draw_curves(request, runs, output)]
+    if request.json:
         result = {"task": run.recipe().task, "output": str(output), "best_seed": best, "seeds": list(reports.values())}
         print(as_json(result | {"files": list(map(str, files))}))
         warn_of_failure(run, reports[best])

@@ -1,0 +1,240 @@
+"""The request of `jaxdrones train`: its options, parsed and checked once, and the runs and the recipe that follow."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from jaxdrones.cli.common import run_folder
+from jaxdrones.cli.settings import asked_settings
+from jaxdrones.errors import UserError
+from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
+
+_MAX_SEEDS = 1000
+_MAX_SECONDS = 3.6e6
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """A training as it was requested; `None` stands for an option that was left out."""
+
+    task: str
+    algorithm: str | None
+    realistic: bool | str
+    settings: dict[str, Any]
+    """Settings of the learner, with the `updates` of --budget, and options of the environment."""
+    stop_at: float | None
+    episodes: int | None
+    budget: str | None
+    seconds: float | None
+    """Time per run that --budget gives, s."""
+    seeds: int
+    seed: int | None
+    output: Path
+    resume: bool
+    overwrite: bool
+    live: int | None
+    figure: bool
+    json: bool
+
+    @classmethod
+    def of(cls, options: argparse.Namespace) -> Request:
+        """The request of a command line.
+
+        Raises:
+            UserError: options that are out of range or contradict each other.
+        """
+        check_at_most("seeds", options.seeds, _MAX_SEEDS)
+        if options.seed is not None:
+            check_seed("seed", options.seed)
+            check_seed("the last seed", options.seed + options.seeds - 1)
+        if options.episodes is not None:
+            check_at_most("episodes", options.episodes, LARGEST_COUNT)
+        if options.resume and options.overwrite:
+            raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")
+        updates, seconds = parse_budget(options.budget)
+        settings = asked_settings(options)
+        if "updates" in settings and options.budget is not None:
+            raise UserError(f"--set updates={settings['updates']} is given beside --budget; give one of them")
+        return cls(
+            task=options.task,
+            algorithm=options.algo,
+            settings=settings if updates is None else settings | {"updates": updates},
+            seconds=seconds,
+            output=options.output or run_folder(options.task),
+            figure=not options.no_figure,
+            **{
+                name: getattr(options, name) for name in ("realistic", "stop_at", "episodes", "budget", "seeds", "seed")
+            },
+            **{name: getattr(options, name) for name in ("resume", "overwrite", "live", "json")},
+        )
+
+    @property
+    def folders(self) -> dict[int, Path]:
+        """The folder of each seed; of one seed that of the command."""
+        first = self.seed or 0
+        if self.seeds == 1:
+            return {first: self.output}
+        return {seed: self.output / f"seed-{seed}" for seed in range(first, first + self.seeds)}
+
+    @property
+    def again(self) -> str:
+        """The command that continues this training."""
+        command = f"jaxdrones train {self.task} --output {self.output} --resume"
+        first = min(self.folders)
+        return command + f" --seeds {self.seeds}" * (self.seeds > 1) + f" --seed {first}" * (first > 0)
+
+    def runs(self) -> dict:
+        """The run of each seed.
+
+        Raises:
+            UserError: there is nothing to continue.
+        """
+        from jaxdrones.training.run import Run
+
+        run = Run(self.output)
+        if self.seeds > 1:
+            if self.resume and run.started:
+                raise UserError(f"{self.output} holds the training of one seed; leave out --seeds to --resume it")
+            return {seed: Run(folder) for seed, folder in self.folders.items()}
+        if self.resume and not run.started:
+            raise _nothing_to_resume(run)
+        return {run.sidecar_entry("state", "seed") if self.resume else self.seed or 0: run}
+
+    def recipe(self, runs: dict):
+        """The recipe of the runs: that of a training that is continued, or the requested one."""
+        return self._resumed_recipe(runs) if self.resume else self._new_recipe(runs)
+
+    def episodes_of(self, runs: dict) -> int:
+        """Episodes of an evaluation; a resumed run keeps their number, so that its evaluations remain comparable."""
+        started = (run.sidecar_entry("state", "episodes") for run in runs.values() if run.started and self.resume)
+        return next(started, 1000 if self.episodes is None else self.episodes)
+
+    def _new_recipe(self, runs: dict):
+        from jaxdrones.training.presets import default_algorithm
+        from jaxdrones.training.recipe import Recipe
+        from jaxdrones.training.run import Run
+
+        algorithm = default_algorithm(self.task) if self.algorithm is None else self.algorithm
+        recipe = Recipe.of(self.task, algorithm, self.realistic, **self.settings)
+        for run in (*runs.values(), Run(self.output)):
+            if run.files and not self.overwrite:
+                raise _not_free(run)
+        return dataclasses.replace(recipe, stop_at=self.stop_at)
+
+    def _resumed_recipe(self, runs: dict):
+        """The recipe of the runs with the requested number of updates; all other settings have to be the same."""
+        from jaxdrones.training import user_files
+        from jaxdrones.training.recipe import Recipe
+
+        started = [run for run in runs.values() if run.started]
+        if not started:
+            raise _nothing_to_resume(next(iter(runs.values())))
+        for run in started:
+            for name in ("best", "state", *["last"] * (run.folder / "last.json").exists()):
+                run.verify(name)
+        recipes = [Recipe.from_dict(run.sidecar_entry("state", "recipe")) for run in started]
+        folder, recipe = started[0].folder, max(recipes, key=lambda recipe: recipe.config.updates)
+        had = {"task": recipe.task, "algo": recipe.algorithm, "realistic": recipe.realistic}
+        had |= vars(recipe.config) | recipe.options | {"episodes": started[0].sidecar_entry("state", "episodes")}
+        task, files = user_files.take_task(self.task, recipe.files)
+        settings, vehicle = user_files.take_vehicle(self.settings, recipe.files)
+        user_files.check_unchanged(folder, recipe.files, files | vehicle)
+        given = {"algo": self.algorithm, "realistic": self.realistic or None, "episodes": self.episodes}
+        wanted = {"task": task, **settings} | {name: x for name, x in given.items() if x is not None}
+        if self.seed is not None and self.seeds == 1:
+            had, wanted = had | {"seed": next(iter(runs))}, wanted | {"seed": self.seed}
+        updates = wanted.pop("updates", None)
+        for name, x in wanted.items():
+            if had.get(name) != x:
+                raise UserError(
+                    f"{folder} was started with {name} {had.get(name)}, not {x}; leave {name} out to --resume"
+                )
+        finished = len(started) == len(runs) and all(run.finished and _is_complete(run) for run in started)
+        total = _total(recipe.config.updates, updates, self.budget is not None, finished)
+        if finished and self.seconds is None and total == recipe.config.updates:
+            raise UserError(
+                f"{folder} is trained to the end, {total} updates; train it longer with --budget N or 60s, or "
+                "replace it with --overwrite instead of --resume"
+            )
+        stop_at = recipe.stop_at if self.stop_at is None else self.stop_at
+        return dataclasses.replace(recipe, config=dataclasses.replace(recipe.config, updates=total), stop_at=stop_at)
+
+
+def parse_budget(text: str | None) -> tuple[int | None, float | None]:
+    """The number of updates, or the seconds, that --budget gives; the other is `None`."""
+    if text is None:
+        return None, None
+    try:
+        if text[-1:] in _UNITS:
+            seconds = float(text[:-1]) * _UNITS[text[-1]]
+            if 0 < seconds <= _MAX_SECONDS:
+                return None, seconds
+        elif 0 < int(text) <= LARGEST_COUNT:
+            return int(text), None
+    except ValueError:
+        pass
+    raise UserError(
+        f"--budget is {text!r}; give updates, for example 300, or a time up to 1000h, for example 60s, 5m or 2h"
+    )
+
+
+def remaining(runs: dict, updates: int, seconds: float | None) -> dict:
+    """The runs to train: all, or without those that are finished if nothing more is requested.
+
+    Args:
+        runs: run of each seed.
+        updates: requested number of updates.
+        seconds: requested time, s.
+    """
+    longer = seconds is not None or updates > max((_updates(run) for run in runs.values() if run.started), default=0)
+    return {seed: run for seed, run in runs.items() if longer or not (run.finished and _is_complete(run))}
+
+
+def _updates(run) -> int:
+    """Number of updates that the training of a run was to make, or after which it stopped early."""
+    return run.sidecar_entry("state", "recipe")["config"]["updates"]
+
+
+def _is_complete(run) -> bool:
+    return run.started and run.sidecar_entry("state", "update") >= _updates(run)
+
+
+def _nothing_to_resume(run) -> UserError:
+    several = "give --seeds N, or " if list(run.folder.glob("seed-*/state.json")) else ""
+    return UserError(f"{run.folder} holds no training to continue; {several}leave out --resume")
+
+
+def _not_free(run) -> UserError:
+    if run.finished:
+        what, again = "a finished training", "train it longer with --resume --budget N, " if run.started else ""
+    else:
+        what, again = "a training that did not finish", "continue it with --resume, " if run.started else ""
+    return UserError(f"{run.folder} holds {what}; {again}replace it with --overwrite, or choose another --output")
+
+
+def _total(had: int, requested: int | None, more: bool, finished: bool) -> int:
+    """Total number of updates of a run that is resumed.
+
+    Args:
+        had: total number of updates so far.
+        requested: requested number of updates.
+        more: whether it is added to those of a finished run, as with --budget; otherwise, as with --set, it is the
+            total.
+        finished: whether all updates so far were made.
+    """
+    if requested is None:
+        return had
+    check_at_most("updates", requested, LARGEST_COUNT)
+    if more and finished:
+        requested += had
+    elif requested < had or (more and requested != had):
+        raise UserError(
+            f"the run was started with updates {had}, not {requested}; leave updates out to --resume, or give a larger "
+            "number by --set updates=N"
+        )
+    check_at_most("updates", requested, LARGEST_COUNT)
+    return requested

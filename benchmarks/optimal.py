@@ -45,7 +45,7 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         results += [{"controller": name, "curve": row[0], "period": row[1], **fly(*row)} for row in rows]
     twin = None
     if importlib.util.find_spec("casadi"):
-        from jaxdrones.symbolic.mpc import SOLVERS
+        from jaxdrones.optimal.mpc import SOLVERS
 
         start = time.perf_counter()
         twin = {"seconds": (model(), time.perf_counter() - start)[1]}
@@ -120,14 +120,14 @@ def rms(difference, hz: int) -> float:
 
 @functools.cache
 def model():
-    from jaxdrones.symbolic import casadi_model
+    from jaxdrones.optimal.twin import casadi_model
 
     return casadi_model("cf2x", [jd.drag])
 
 
 def by_mpc(solver: str, seconds: float, curve: str, period: float) -> dict[str, float]:
     """Error of a flight by CasADi, and the times of its solver."""
-    from jaxdrones.symbolic import Mpc
+    from jaxdrones.optimal.mpc import Mpc
 
     dt, length = 1 / MPC_HZ, round(seconds * MPC_HZ)
     mpc, team, step = Mpc(model(), dt, solver=solver), jd.repeat(jd.load_params("cf2x"), 1), step_at(MPC_HZ)

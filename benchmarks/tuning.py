@@ -1,4 +1,4 @@
-"""How much closer does a vehicle follow curves with the gains that `jd.control.tune` finds?
+"""How much closer does a vehicle follow curves with the gains that `jd.optimal.tune` finds?
 
 A vehicle with lagging rotors and drag flies three curves that are not among those of the tuning, and to a place 0.7 m
 away, with a controller at 500 Hz, for 8 s each. It starts with the motion of the curve, level. Before: with the gains
@@ -64,7 +64,7 @@ def params_of(vehicle: str) -> jd.Params:
 def row(controller: str, params: jd.Params, quick: bool) -> dict:
     before = tuning.start(CONTROLLERS[controller], params)
     begin = time.perf_counter(), time.process_time()
-    after = jax.block_until_ready(jd.control.tune(params, controller, **(dict(iterations=2) if quick else {})))
+    after = jax.block_until_ready(jd.optimal.tune(params, controller, **(dict(iterations=2) if quick else {})))
     seconds, cpu_seconds = time.perf_counter() - begin[0], time.process_time() - begin[1]
     errors = functools.partial(flown_errors, CONTROLLERS[controller])
     return {

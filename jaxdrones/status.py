@@ -32,7 +32,7 @@ class Status(enum.IntEnum):
 _SENTENCES = {
     Status.OK: "A solution was found.",
     Status.NOT_CONVERGED: "The solver did not converge to a finite solution.",
-    Status.INVALID_STATE: "The state or a set-point is not finite, so nothing was planned.",
+    Status.INVALID_STATE: "The state or a set-point is not finite or not flyable, so nothing was planned.",
 }
 
 

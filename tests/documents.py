@@ -19,7 +19,7 @@ _NEEDS = {  # words in a block -> the library without which it does not run
     r"\bbullet\b": "pybullet",
     r"\bpettingzoo\b": "pettingzoo",
     r"\bbrax\b": "brax",
-    r"\bsymbolic\b|\bmpc\b": "casadi",
+    r"\btwin\b|\bmpc\b": "casadi",
     r"\bsb3\b": "stable_baselines3",
     r"\brllib\b": "ray",
 }

@@ -34,7 +34,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("dynamics",), ("control",), ("sensing",), ("accelerate",)),
     (("engine",), ("tasks",)),
     (("optimal",),),
-    (("envs",), ("flights",), ("symbolic",)),
+    (("envs",), ("flights",)),
     (("adapters",), ("learning",), ("ros2",), ("visualization",)),
     (("training",),),
     (("cli",),),
@@ -124,11 +124,6 @@ def test_what_jax_does_not_promise_to_keep_is_touched_in_one_file():
 
 
 PHYSICS = [f for f in FILES if top(f) in ("dynamics", "control", "rotation", "vector", "state", "params", "wrench")]
-
-
-def test_only_tune_reaches_up_by_name():
-    files = [str(f.relative_to(PACKAGE)) for f in FILES if 'import_module("jaxdrones' in f.read_text()]
-    assert files == ["control/__init__.py"]
 
 
 def test_physics_knows_no_compiler():

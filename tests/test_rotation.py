@@ -186,7 +186,7 @@ def test_angles_of_states_of_both_backends_are_right():
 def test_angles_of_the_symbolic_twin_are_right():
     import casadi
 
-    from jaxdrones.symbolic.interpreter import on_symbols
+    from jaxdrones.optimal.interpreter import on_symbols
 
     (q,), rpy = on_symbols(rotation.to_rpy, q=jnp.zeros(4))
     quats = attitudes(10_000, 100)

@@ -41,6 +41,11 @@ def materialize_shared(function: Callable) -> Callable:
     return materialized
 
 
+def recomputed(function: Callable) -> Callable:
+    """The same function, which a backward pass computes again: faster than storing more than its arguments."""
+    return jax.checkpoint(materialize_shared(function))
+
+
 def store_shared(function: Callable) -> Callable:
     """The same function, for the inside of a single kernel: what its expressions share, and is not cheap, is stored."""
     return _store_shared(function, _MIN_SAVED_IN_KERNEL)

@@ -6,7 +6,7 @@ control step tells in all its physics steps which drones cannot touch anything, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -53,54 +53,57 @@ class FreeBalls(NamedTuple):
         return jax.vmap(is_inside)(*self, params, state)
 
 
-def contact_of_team(contact: Callable, params: Params, state: State, scene: Scene, free: FreeBalls | None) -> Wrench:
-    """Contact with obstacles of every drone of a team.
+class NearObstacles:
+    """Contact with obstacles in the physics steps of a control step, for drones that leave their free balls.
 
-    Args:
-        contact: effect that declares it, such as `obstacle_contact`.
-        params: of a team of n drones.
-        state: of the team.
-        scene: obstacles.
-        free: balls without obstacles. Of many worlds, only those are computed in which a drone is not in its ball;
-            all, if left out.
+    Of many worlds, only those are computed in which a drone is not in its ball.
     """
 
-    def on_all(params: Params, state: State, scene: Scene) -> Wrench:
-        return jax.vmap(with_scene(contact, scene))(params, state)
+    def __init__(self, contacts: Sequence[Callable], state: State, scene: Scene):
+        """Find the free balls.
 
-    if free is None:
-        return on_all(params, state, scene)
-    still = jax.lax.stop_gradient((params, state))
-    return where_needed(on_all, _ONE_IN)(~jnp.all(free.hold(*still)), params, state, scene)
+        Args:
+            contacts: effects that declare contact with obstacles, such as `obstacle_contact`.
+            state: of the team at the start of the control step.
+            scene: obstacles.
+        """
+        self._contacts, self._scene, self._free = contacts, scene, FreeBalls.about(state, scene)
 
+    def contact(self, params: Params, state: State) -> Wrench:
+        """The wrench of the obstacles on every drone of a team."""
 
-def stopped_by_obstacles(params: Params, before: State, after: State, scene: Scene, free: FreeBalls) -> State:
-    """The team at the end of a physics step in which no drone passed through an obstacle, however fast it is.
+        def on_all(params: Params, state: State, scene: Scene) -> Wrench:
+            first, *others = (jax.vmap(with_scene(f, scene))(params, state) for f in self._contacts)
+            return sum(others, first)
 
-    Compliant contact yields, and knows only where a drone is at the start of a step. So the way of every step is swept.
+        still = jax.lax.stop_gradient((params, state))
+        return where_needed(on_all, _ONE_IN)(~jnp.all(self._free.hold(*still)), params, state, self._scene)
 
-    Args:
-        params: of a team of n drones.
-        before: the team at the start of the step.
-        after: the team at its end, if nothing is in the way.
-        scene: obstacles.
-        free: balls without obstacles; the way of a drone from one point of its ball to another one is free.
-    """
+    def stopped(self, params: Params, before: State, after: State) -> State:
+        """The team at the end of a physics step in which no drone passes through an obstacle, at any speed.
 
-    def find(params: Params, before: State, after: State, scene: Scene) -> tuple[Array, Array]:
-        kinds = merged(scene.shapes(before.pos.dtype))
+        Compliant contact yields, and depends on the start of a step alone. So the path of every step is swept.
 
-        def of_drone(params: Params, before: State, after: State) -> tuple[Array, Array]:
-            start, end = _core(params, before), _core(params, after)
-            normals, heights = planes(kinds, start, end)
-            return normals, heights - normals @ (end.center - after.pos)  # of the center of mass
+        Args:
+            params: of a team of n drones.
+            before: the team at the start of the step.
+            after: the team at its end, if nothing is in the way.
+        """
 
-        return jax.vmap(of_drone)(params, before, after)
+        def find(params: Params, before: State, after: State, scene: Scene) -> tuple[Array, Array]:
+            kinds = merged(scene.shapes(before.pos.dtype))
 
-    still = jax.lax.stop_gradient((params, before, after, scene))
-    free_way = free.hold(*still[:2]) & free.hold(still[0], still[2])
-    normals, heights = where_needed(find, _ONE_IN)(~jnp.all(free_way), *still)
-    return jax.vmap(stop_at)(after, normals, heights)
+            def of_drone(params: Params, before: State, after: State) -> tuple[Array, Array]:
+                start, end = _core(params, before), _core(params, after)
+                normals, heights = planes(kinds, start, end)
+                return normals, heights - normals @ (end.center - after.pos)  # of the center of mass
+
+            return jax.vmap(of_drone)(params, before, after)
+
+        still = jax.lax.stop_gradient((params, before, after, self._scene))
+        free = self._free.hold(*still[:2]) & self._free.hold(still[0], still[2])
+        normals, heights = where_needed(find, _ONE_IN)(~jnp.all(free), *still)
+        return jax.vmap(stop_at)(after, normals, heights)
 
 
 def _core(params: Params, state: State) -> Disc:

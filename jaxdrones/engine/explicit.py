@@ -10,15 +10,15 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.accelerate.shared import materialize_shared
+from jaxdrones.accelerate.shared import recomputed
 from jaxdrones.checks import check_positive, check_whole
 from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.contact import LARGEST_STEP
 from jaxdrones.dynamics.integrators import Integrator
 from jaxdrones.dynamics.rotors import limited
-from jaxdrones.engine.clearance import FreeBalls, stopped_by_obstacles
+from jaxdrones.engine.clearance import NearObstacles
 from jaxdrones.engine.neighbors import NeighborGrid
-from jaxdrones.engine.physics import Physics, Rotors, check_functions
+from jaxdrones.engine.physics import Contact, Physics, Rotors, check_functions
 from jaxdrones.engine.step import Step, is_traced
 from jaxdrones.engine.team import check_command, check_values
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
@@ -75,9 +75,9 @@ def _derivative_of(physics: Physics) -> Derivative:
         state: State,
         command: Float[Array, "n 4"],
         scene: Scene,
-        free: FreeBalls | None = None,
+        contact: Contact | None = None,
     ) -> State:
-        loads = physics.loads(params, state, command, scene, free)
+        loads = physics.loads(params, state, command, scene, contact)
         acc, omega_rate = jax.vmap(newton_euler)(params, loads.state, loads.wrench)
         still = jax.tree.map(jnp.zeros_like, state)
         return still.replace(
@@ -159,23 +159,20 @@ class ExplicitStep(Step):
         self._text = f"{self.integrator} at {1 / (dt * substeps):.4g} Hz x {substeps}, {physics}"
         derivative = _derivative_of(physics)
 
-        def substep(params: Params, state: State, command: jax.Array, scene: Scene, free: FreeBalls | None) -> State:
-            start = physics.at_speed(params, state, command)
-            end = integrator(lambda s: derivative(params, s, command, scene, free), start, dt)
-            return end if free is None else stopped_by_obstacles(params, start, end, scene, free)
-
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
             command = check_command(params, state, rpm)
             state = state.replace(rpm=jax.vmap(limited)(params, state.rpm))
-            free = FreeBalls.about(state, scene) if physics.touches(scene) else None
+            near = NearObstacles(physics.contacts("obstacles"), state, scene) if physics.touches(scene) else None
 
-            # Recomputing a substep in a backward pass is faster than storing more of it than the state at its start.
-            @jax.checkpoint
-            def advance(state: State, _: None) -> tuple[State, None]:
-                after = materialize_shared(lambda state, command: substep(params, state, command, scene, free))
-                return after(state, command), None
+            @recomputed
+            def substep(state: State, command: jax.Array) -> State:
+                start = physics.at_speed(params, state, command)
+                end = integrator(lambda s: derivative(params, s, command, scene, near and near.contact), start, dt)
+                return near.stopped(params, start, end) if near else end
 
-            return advance(state, None)[0] if substeps == 1 else jax.lax.scan(advance, state, length=substeps)[0]
+            if substeps == 1:
+                return substep(state, command)
+            return jax.lax.scan(lambda state, _: (substep(state, command), None), state, length=substeps)[0]
 
         def rate(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
             command = check_command(params, state, rpm)

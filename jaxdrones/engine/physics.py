@@ -14,7 +14,6 @@ from jaxdrones.checks import check_arguments, check_sequence, takes_scene, with_
 from jaxdrones.dynamics import Model, instant_rotors
 from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench, with_rotor_speed
-from jaxdrones.engine.clearance import FreeBalls, contact_of_team
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
 from jaxdrones.errors import UserError
@@ -24,6 +23,9 @@ from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
 Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
+
+Contact = Callable[[Params, State], Wrench]
+"""`(params, state)` of a team of n drones -> wrench of obstacles on each."""
 
 _EXAMPLE = {"effects": "drag", "pairs": "downwash", "rotors": "instant_rotors", "integrator": "rk4"}
 _ARGUMENTS = {
@@ -116,9 +118,9 @@ class Physics:
         state: State,
         command: Float[Array, "n 4"],
         scene: Scene,
-        free: FreeBalls | None = None,
+        contact: Contact | None = None,
     ) -> Loads:
-        """Rotor speeds and everything that acts on a team; where a drone is in its free ball it touches no obstacle.
+        """Rotor speeds and everything that acts on a team; arguments are those of `wrench` and the commanded speeds.
 
         Raises:
             ValueError: the state lacks that of a model, or a function returns something of another type.
@@ -126,7 +128,7 @@ class Physics:
         rpm, rpm_rate = self.rotor_speed(params, state, command)
         state = state.replace(rpm=rpm)
         aux_rate = {model.name: model.team_rate(params, state, command) for model in self.models}
-        wrench = self.wrench(params, state, scene, free) + jax.vmap(rotor_reaction)(params, state, rpm_rate)
+        wrench = self.wrench(params, state, scene, contact) + jax.vmap(rotor_reaction)(params, state, rpm_rate)
         return Loads(state, wrench, rpm_rate, aux_rate)
 
     def rotor_speed(
@@ -149,8 +151,15 @@ class Physics:
         speed, _ = self.rotor_speed(params, state, command)
         return state if speed is state.rpm else jax.vmap(with_rotor_speed)(params, state, speed)
 
-    def wrench(self, params: Params, state: State, scene: Scene, free: FreeBalls | None = None) -> Wrench:
-        """The sum of the rotors' aerodynamic wrench and of all effects, one row per drone."""
+    def wrench(self, params: Params, state: State, scene: Scene, contact: Contact | None = None) -> Wrench:
+        """The sum of the rotors' aerodynamic wrench and of all effects, one row per drone.
+
+        Args:
+            params: of a team of n drones.
+            state: of the team.
+            scene: obstacles and ground.
+            contact: the contact of the team with obstacles, if it is computed in a faster way.
+        """
         contacts = self.contacts("obstacles")
         effects = [effect for effect in self.effects if effect not in contacts]
 
@@ -159,8 +168,10 @@ class Physics:
             return sum(own, rotor_wrench(params, state))
 
         wrench = jax.vmap(alone)(params, state)
-        for contact in contacts if scene.has_obstacles else ():
-            wrench += contact_of_team(contact, params, state, scene, free)
+        if contact is not None:
+            wrench += contact(params, state)
+        elif scene.has_obstacles:
+            wrench = sum((jax.vmap(with_scene(f, scene))(params, state) for f in contacts), wrench)
         of_team = (check_wrench("team_effects", f, f(params, state), len(state.pos)) for f in self.team_effects)
         wrench = sum(of_team, wrench)
         state = side_by_side(state) if self.contacts("drones") else state

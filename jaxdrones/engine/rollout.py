@@ -1,6 +1,7 @@
 """Many steps in one program."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -23,6 +24,8 @@ from jaxdrones.state import State
 
 Advance = Callable[[Params, State, jax.Array], State]
 Control = Callable[[Params, Any, State, jax.Array], tuple[Any, jax.Array]]
+
+_LEG = 1 / 30  # s: a leg for each picture of a screen
 
 
 def rollout(
@@ -65,16 +68,11 @@ def rollout(
     if isinstance(step, HostStep) and checkpoint is not None:
         raise UserError("checkpoint is given and the bullet backend has no backward pass; leave it out")
     if isinstance(step, HostStep) and not is_traced((params, state, memory)):
-        return _loop(step, control, params, state, memory, length)
-
-    def advance(carry: tuple[Any, State], k: jax.Array) -> tuple[tuple[Any, State], State]:
-        memory, state = carry
-        memory, rpm = _commanded(control, params, memory, state, k)
-        state = step(params, state, rpm)
-        return (memory, state), state
+        (states,) = legs(step, control, params, state, memory, length, length)
+        return jax.tree.map(lambda x: jnp.asarray(x[-1]), states), states
 
     def fly(carry: tuple[Any, State], ks: jax.Array) -> tuple[tuple[Any, State], State]:
-        return jax.lax.scan(advance, carry, ks)
+        return jax.lax.scan(functools.partial(_advance, step, control, params), carry, ks)
 
     ks = jnp.arange(length)
     if checkpoint is None:
@@ -83,8 +81,49 @@ def rollout(
     check_whole("checkpoint", checkpoint)
     if length % checkpoint:
         raise UserError(f"length is {length}; give a multiple of checkpoint, {checkpoint}")
-    (_, final), legs = jax.lax.scan(jax.checkpoint(fly), (memory, state), ks.reshape(-1, checkpoint))
-    return final, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), legs)
+    (_, final), parts = jax.lax.scan(jax.checkpoint(fly), (memory, state), ks.reshape(-1, checkpoint))
+    return final, jax.tree.map(lambda x: x.reshape(length, *x.shape[2:]), parts)
+
+
+def leg_length(dt: float) -> int:
+    """Control steps of `dt` seconds in a leg of about a thirtieth of a second; at least one."""
+    return max(1, round(_LEG / dt))
+
+
+def legs(
+    step: Step, control: Control, params: Params, state: State, memory: Any, length: int, leg: int
+) -> Iterator[State]:
+    """Fly `length` control steps as `rollout` does, `leg` of them at a time; the last leg may be shorter.
+
+    Yields:
+        The state after every control step of a leg: arrays (leg, n, ...) on the host.
+    """
+    carry = memory, step.init(params, state)
+    if isinstance(step, HostStep):  # is faster called than called back
+        control, states = jax.jit(control), []
+        for k in range(length):
+            carry, state = _advance(step, control, params, carry, k)
+            states.append(state)
+            if len(states) == leg or k == length - 1:
+                yield jax.tree.map(lambda *x: np.stack(x), *states)
+                states = []
+        return
+
+    @jax.jit
+    def fly(params: Params, carry: tuple[Any, State], first: jax.Array) -> tuple[tuple[Any, State], State]:
+        return jax.lax.scan(functools.partial(_advance, step, control, params), carry, first + jnp.arange(leg))
+
+    for first in range(0, length, leg):
+        carry, states = fly(params, carry, jnp.asarray(first))
+        yield jax.tree.map(lambda x, left=length - first: np.asarray(x)[:left], states)
+
+
+def _advance(
+    step: Advance, control: Control, params: Params, carry: tuple[Any, State], k: Any
+) -> tuple[tuple[Any, State], State]:
+    memory, rpm = _commanded(control, params, *carry, k)
+    state = step(params, carry[1], rpm)
+    return (memory, state), state
 
 
 def _commanded(control: Control, params: Params, memory: Any, state: State, k: Any) -> tuple[Any, jax.Array]:
@@ -100,16 +139,3 @@ def _commanded(control: Control, params: Params, memory: Any, state: State, k: A
             "return (memory, rpm) with memory of the same structure"
         )
     return answer[0], answer[1]
-
-
-def _loop(
-    step: HostStep, control: Control, params: Params, state: State, memory: Any, length: int
-) -> tuple[State, State]:
-    """The same in Python: a step on the host is faster called than called back."""
-    control = jax.jit(control)
-    states = []
-    for k in range(length):
-        memory, rpm = _commanded(control, params, memory, state, k)
-        state = step(params, state, rpm)
-        states.append(state)
-    return state, jax.tree.map(lambda *leaves: np.stack(leaves), *states)

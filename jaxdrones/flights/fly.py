@@ -10,8 +10,7 @@ import numpy as np
 from jaxdrones.control import Setpoint, velocity
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.engine.explicit import make_step
-from jaxdrones.engine.legs import leg_length, legs
-from jaxdrones.engine.rollout import Control
+from jaxdrones.engine.rollout import Control, leg_length, legs
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.controllers import controller_of

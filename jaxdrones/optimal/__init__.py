@@ -3,7 +3,8 @@
 Each module has `settings(step, ...)`, `init(settings, params, state)` (of `mppi` also with a random key) and
 `control(settings, params, memory, state, setpoints, dt=...) -> (memory, rpm)`, all of one drone; `setpoints` holds the
 target at the present and the next `settings.horizon` control steps. A team, or many worlds, is `jax.vmap`.
-`tune` finds the gains of the controllers of `jaxdrones.control` for a vehicle.
+`tune` finds the gains of the controllers of `jaxdrones.control` for a vehicle. `twin.casadi_model` makes the physics a
+function of CasADi, and `mpc.Mpc` follows setpoints with it; both need the extra `casadi`.
 """
 
 from jaxdrones.optimal import ilqr, lqr, mppi

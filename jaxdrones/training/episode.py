@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.engine.legs import leg_length
+from jaxdrones.engine.rollout import leg_length
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions

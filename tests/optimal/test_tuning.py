@@ -10,8 +10,8 @@ from closed_loop import make_step
 
 import jaxdrones
 from jaxdrones import State
-from jaxdrones.control import CONTROLLERS, for_team, rates, tune
-from jaxdrones.optimal import tuning
+from jaxdrones.control import CONTROLLERS, for_team, rates
+from jaxdrones.optimal import tune, tuning
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, SHAPES, setpoint_on
 
 HZ = 500

@@ -21,7 +21,7 @@ FIELDS = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
 
 
 def twin(*args, **options):
-    from jaxdrones.symbolic import casadi_model
+    from jaxdrones.optimal.twin import casadi_model
 
     return casadi_model(*args, **options)
 
@@ -151,9 +151,8 @@ def test_what_has_no_counterpart_is_named():
 
 
 def test_a_library_that_is_not_installed_is_named_with_its_extra(monkeypatch):
-    for name in list(sys.modules):
-        if name.startswith("jaxdrones.symbolic") or name == "casadi":
-            monkeypatch.delitem(sys.modules, name)
+    for name in "twin", "mpc", "interpreter", "primitives":
+        monkeypatch.delitem(sys.modules, f"jaxdrones.optimal.{name}", raising=False)
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(ImportError, match=r"casadi is not installed; pip install "):
         twin("cf2x")

@@ -18,11 +18,11 @@ from jaxdrones.engine.explicit import make_derivative
 from jaxdrones.engine.physics import Physics, Rotors
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.errors import UserError
+from jaxdrones.optimal.interpreter import on_symbols
+from jaxdrones.optimal.primitives import casadi
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-from jaxdrones.symbolic.interpreter import on_symbols
-from jaxdrones.symbolic.primitives import casadi
 from jaxdrones.urdf import load_params
 
 _BARE = Scene()

@@ -12,14 +12,14 @@ from jaxdrones.checks import check_choice, check_number, check_positive, check_s
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.optimal.coordinates import tracking_error
+from jaxdrones.optimal.interpreter import on_symbols
+from jaxdrones.optimal.primitives import casadi
 from jaxdrones.optimal.problem import Weights, reference
 from jaxdrones.optimal.problem import weights as default_weights
+from jaxdrones.optimal.twin import CasadiModel
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.status import PlanningError, Status, check_on_failure, is_finite
-from jaxdrones.symbolic.interpreter import on_symbols
-from jaxdrones.symbolic.model import CasadiModel
-from jaxdrones.symbolic.primitives import casadi
 
 SOLVERS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 100, "mu_init": 1e-3}},
@@ -30,6 +30,7 @@ SOLVERS: dict[str, dict[str, Any]] = {
 Ipopt is given the Gauss-Newton Hessian; fatrop, which takes none, has the exact one, and uses the structure in time.
 """
 
+_LARGEST = 1e3  # m, m/s, rad/s; solvers may never return from a state that is farther from its targets
 _INSIDE = 1e-6  # distance of the bounds from the limits of the motors, over the largest rotor speed
 
 
@@ -162,7 +163,7 @@ class Mpc:
         check_single(self.model.params, state)
         check_shape("setpoints.pos", setpoints.pos, (self.horizon + 1, 3), "this and the next H control steps")
         check_on_failure(on_failure, params, state, setpoints)
-        if is_finite((state, setpoints)):
+        if _is_flyable(state, setpoints):
             self._plan = self._solved(state, setpoints, params)
             self.status = Status.NOT_CONVERGED if self._plan is None else Status.OK
         else:
@@ -211,6 +212,12 @@ class Mpc:
         """Forget the last plan and command, before another flight."""
         self._plan = None
         self._held = np.full(4, min(self._unit, float(self.model.params.max_rpm)))
+
+
+def _is_flyable(state: State, setpoints: Setpoint) -> bool:
+    """Whether all numbers are finite, and errors and velocities small enough for a solver."""
+    sizes = jax.device_get((state.pos[None] - setpoints.pos, state.vel, state.omega))
+    return bool(is_finite((state, setpoints))) and max(np.abs(x).max() for x in sizes) <= _LARGEST
 
 
 def _moving(model: CasadiModel) -> np.ndarray:

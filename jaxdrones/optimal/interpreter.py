@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.compiler import CALLS, Equation, is_literal
-from jaxdrones.symbolic.primitives import ELEMENTWISE, REDUCTIONS, casadi, select
+from jaxdrones.optimal.primitives import ELEMENTWISE, REDUCTIONS, casadi, select
 
 _MOVES = frozenset(  # primitives whose results hold their inputs' numbers in other places
     "broadcast_in_dim concatenate copy gather pad reshape rev slice split squeeze stack transpose "
@@ -95,7 +95,7 @@ def _evaluate_equation(equation: Equation, inputs: list[np.ndarray]) -> list[np.
     raise NotImplementedError(
         f"the traced program has the primitive {name!r}, which has no counterpart in CasADi here; write the effect or "
         "model without it (loops of a length that depends on values, sorting and searching have none), or, if it is a "
-        "function of each number, add it to jaxdrones.symbolic.primitives.ELEMENTWISE"
+        "function of each number, add it to jaxdrones.optimal.primitives.ELEMENTWISE"
     )
 
 

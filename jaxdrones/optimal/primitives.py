@@ -12,7 +12,7 @@ from jaxdrones.errors import install
 try:
     import casadi
 except ImportError as error:
-    raise ImportError(f"jaxdrones.symbolic: casadi is not installed; {install('casadi')}") from error
+    raise ImportError(f"jaxdrones.optimal: casadi is not installed; {install('casadi')}") from error
 
 
 def select(which: Any, *cases: Any) -> Any:

@@ -20,13 +20,13 @@ DT = 1 / 40
 
 @functools.cache
 def model(**options):
-    from jaxdrones.symbolic import casadi_model
+    from jaxdrones.optimal.twin import casadi_model
 
     return casadi_model("cf2x", [jd.drag], **options)
 
 
 def controller(horizon=20, solver="ipopt", **options):
-    from jaxdrones.symbolic import Mpc
+    from jaxdrones.optimal.mpc import Mpc
 
     return Mpc(model(**options), DT, horizon=horizon, solver=solver)
 
@@ -63,7 +63,8 @@ def test_a_state_that_is_not_finite_or_a_plan_that_does_not_converge_gives_the_l
     for unlucky, target, status in (
         (lost, near, Status.INVALID_STATE),
         (state, near.replace(yaw=near.yaw.at[1].set(jnp.inf)), Status.INVALID_STATE),
-        (state.replace(omega=jnp.full(3, 1e12)), near, Status.NOT_CONVERGED),
+        (state.replace(omega=jnp.full(3, 1e12)), near, Status.INVALID_STATE),
+        (state.replace(omega=jnp.full(3, 900.0)), near, Status.NOT_CONVERGED),
     ):
         assert np.array_equal(mpc(unlucky, target), first) and mpc.status == status
         with pytest.raises(PlanningError, match=status.sentence) as error:
@@ -76,7 +77,8 @@ def test_a_state_that_is_not_finite_or_a_plan_that_does_not_converge_gives_the_l
 
 @pytest.mark.slow
 def test_what_does_not_fit_is_refused():
-    from jaxdrones.symbolic import Mpc, casadi_model
+    from jaxdrones.optimal.mpc import Mpc
+    from jaxdrones.optimal.twin import casadi_model
 
     team = jd.repeat(jd.load_params("cf2x"), 2)
     with pytest.raises(ValueError, match=r"unknown solver 'acados' \(known: fatrop, ipopt\)"):

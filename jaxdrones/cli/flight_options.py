@@ -15,22 +15,23 @@ from jaxdrones.urdf import load_params
 
 def add_conditions(parser: argparse.ArgumentParser) -> None:
     """Add the options of a flight but its name."""
-    parser.add_argument("--drones", type=int, metavar="N", help="number of drones")
-    parser.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
-    parser.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
-    parser.add_argument("--controller", help=f"{', '.join(CONTROLLERS)} (the vehicle's own)")
-    parser.add_argument(
+    group = parser.add_argument_group("flight")
+    group.add_argument("--drones", type=int, metavar="N", help="number of drones")
+    group.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
+    group.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
+    group.add_argument("--controller", help=f"{', '.join(CONTROLLERS)} (the vehicle's own)")
+    group.add_argument(
         "--feedforward",
         action=argparse.BooleanOptionalAction,
         default=None,
         help="whether the controller receives velocity and acceleration of the target (all do but pid, which receives "
         "them in a comparison of controllers)",
     )
-    parser.add_argument("--control-hz", type=int, metavar="HZ", help="control rate; physics runs at 240 Hz or above")
-    parser.add_argument("--duration", type=float, metavar="S", help="simulated time in seconds")
-    parser.add_argument("--rotors", default="instant", help=f"{', '.join(ROTORS)} (instant)")
-    parser.add_argument("--integrator", default="semi_implicit_euler", help=f"{', '.join(INTEGRATORS)}")
-    parser.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
+    group.add_argument("--control-hz", type=int, metavar="HZ", help="control rate; physics runs at 240 Hz or above")
+    group.add_argument("--duration", type=float, metavar="S", help="simulated time in seconds")
+    group.add_argument("--rotors", default="instant", help=f"{', '.join(ROTORS)} (instant)")
+    group.add_argument("--integrator", default="semi_implicit_euler", help=f"{', '.join(INTEGRATORS)}")
+    group.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
 
 
 def fly_options(options: argparse.Namespace, **more: Any) -> FlightLog:

@@ -53,42 +53,46 @@ def add(commands) -> None:
     )
     parser.add_argument("flight", metavar="FLIGHT", nargs="?", help=", ".join(FLIGHTS))
     add_conditions(parser)
-    parser.add_argument(
+    policy = parser.add_argument_group("policy")
+    bullet = parser.add_argument_group("backend")
+    shown = parser.add_argument_group("films and pictures")
+    files = parser.add_argument_group("files and output")
+    policy.add_argument(
         "--policy",
         type=folder,
         metavar="RUN",
         help="in place of FLIGHT: a folder of `jaxdrones train`, or file.py:name, whose code is executed",
     )
-    parser.add_argument("--task", metavar="TASK", help="with --policy file.py:name: the task to fly")
-    parser.add_argument(
+    policy.add_argument("--task", metavar="TASK", help="with --policy file.py:name: the task to fly")
+    policy.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="NAME=VALUE",
         help="with --policy file.py:name: option of the environment (action, observation, ...)",
     )
-    parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
-    parser.add_argument(
+    bullet.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
+    bullet.add_argument(
         "--obstacles", action="store_true", help="add the obstacles of gym-pybullet-drones (2021) (bullet)"
     )
-    parser.add_argument("--gui", action="store_true", help="show Bullet's window, with motor sliders (bullet)")
-    parser.add_argument("--video", type=folder, metavar="FILE", help="film the flight as .mp4 or .gif; either backend")
-    parser.add_argument(
+    bullet.add_argument("--gui", action="store_true", help="show Bullet's window, with motor sliders (bullet)")
+    shown.add_argument("--video", type=folder, metavar="FILE", help="film the flight as .mp4 or .gif; either backend")
+    shown.add_argument(
         "--renderer", help=f"of the film: {', '.join(films.RENDERERS)} (page where Chromium is installed, else jax)"
     )
-    add_live(parser, "show the flight in the browser while it is flown, in real time")
-    parser.add_argument(
+    add_live(shown, "show the flight in the browser while it is flown, in real time")
+    shown.add_argument(
         "--cameras",
         action="store_true",
         help="write the pictures of each drone's camera as PNG and into the log; either backend",
     )
-    parser.add_argument(
+    files.add_argument(
         "-o", "--output", type=folder, metavar="DIR", help="folder of log and figure (runs/FLIGHT, RUN/flight)"
     )
-    parser.add_argument("--csv", action="store_true", help="write the log as CSV too")
-    parser.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM signals too (cf2x, cf2p)")
-    parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    files.add_argument("--csv", action="store_true", help="write the log as CSV too")
+    files.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM signals too (cf2x, cf2p)")
+    files.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
+    files.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     parser.set_defaults(run=functools.partial(_fly, parser))
 
 

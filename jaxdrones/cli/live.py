@@ -13,7 +13,7 @@ WAIT = 60.0
 """How long a flight waits for the first viewer, s."""
 
 
-def add_live(parser: argparse.ArgumentParser, what: str) -> None:
+def add_live(parser: argparse._ActionsContainer, what: str) -> None:
     """Add the option, which gives the port: 0, which is any free one, where it is given alone."""
     text = f"{what}; prints the address, which only this machine reaches (at a free PORT)"
     parser.add_argument("--live", type=int, nargs="?", const=0, metavar="PORT", help=text)

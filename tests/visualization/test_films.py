@@ -84,15 +84,22 @@ def test_an_obstacle_hides_the_trail_behind_it(record, lens):
     assert patch(overlay.draw(bare, wall, lens, row, 0.0), pixel, 2).max() == 0
 
 
-def test_the_clock_goes(film):
+def test_the_clock_goes(record, lens):
+    overlay = Overlay(record, "", 1.0)
+    bare, depth = np.zeros((SIZE[1], SIZE[0], 3), np.uint8), np.full((SIZE[1], SIZE[0]), 1e3)
+    film = [overlay.draw(bare, depth, lens, 0, time) for time in (0.0, 0.5, 1.0)]
     corner = [frame[-50:, -130:].astype(int) for frame in film]
     assert all(np.abs(a - b).max() > 100 for a, b in itertools.pairwise(corner))
 
 
-def test_drones_cast_shadows_on_the_ground(record, film, lens):
+def test_drones_cast_shadows_on_the_ground(record):
     """Where the shadow of a drone falls it is darker than in other frames, unless something is drawn over it."""
+    size = (SIZE[0] // 2, SIZE[1] // 2)
+    shot = shots.shoot(record, FPS, size[0] / size[1])
+    film = list(drawn_film.frames(record, "", FPS, size))
     pos = record.pos[row_at(record, 5)]
     spots = pos - np.array(drawn_film.SUN) * pos[:, 2:] / drawn_film.SUN[2]
+    lens = Lens(shot.eyes[0], shot.targets[0], shots.FIELD_OF_VIEW, size)
     pixels = np.round(lens.project(spots)[0]).astype(int)
     brightness = np.array([[frame[y, x].mean() for x, y in pixels] for frame in film])
     assert (brightness[5] < 0.8 * brightness.max(axis=0)).sum() >= 3

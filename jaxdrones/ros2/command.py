@@ -1,4 +1,4 @@
-"""What a drone is told to do, and the rotor speeds that follow from it."""
+"""Commands of a drone, and the rotor speeds that fly them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Command(flax.struct.PyTreeNode):
 
 
 class Memory(flax.struct.PyTreeNode):
-    """What the control of one drone keeps between steps."""
+    """State of the control of one drone between steps."""
 
     controller: Any
     """Memory of the controller of positions and velocities."""

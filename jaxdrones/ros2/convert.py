@@ -76,7 +76,7 @@ def motors(rpm: ArrayLike) -> msg.Float64MultiArray:
 
 
 def _battery(reading: dict[str, float], header: msg.Header) -> msg.BatteryState:
-    """Readings of a battery; what it does not tell is NaN, as the message asks for."""
+    """Readings of a battery; unknown ones are NaN, as the message asks for."""
     unknown = math.nan
     charge, capacity = (reading.get(name, unknown) / _AMPERE_HOUR for name in ("charge", "capacity"))
     readings = {
@@ -151,7 +151,7 @@ def to_body(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 class Refused(UserError):
-    """A message that commands nothing; errors of one `kind` differ in the values alone."""
+    """An invalid message; errors of one `kind` differ in their values only."""
 
     def __init__(self, field: str, found: str, advice: str):
         super().__init__(f"its {field} {found}; {advice}")

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_positive, check_switch
+from jaxdrones.checks import check_positive
 from jaxdrones.dynamics import downwash, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError
@@ -67,7 +67,6 @@ class Backend:
         self.dt = float(_parameter(node, "dt", 0.0005))
         check_positive("sim.jaxdrones.dt", self.dt, "s")
         with_downwash = _parameter(node, "downwash", True)
-        check_switch("sim.jaxdrones.downwash", with_downwash)
         vehicle = load_params(_parameter(node, "vehicle", "cf2x"))
         self._params = repeat(vehicle, len(names))
         self._order = _rotors_of_motors(np.asarray(vehicle.rotor_pos))

@@ -1,4 +1,4 @@
-"""What a drone does once nobody commands it any more."""
+"""The failsafe: what a drone does without commands."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Failsafe:
     """`hover`: stay where the last position command was, or else where the drone is. `land`: sink to the ground there
     and stop the rotors. `stop`: end the flight with an error."""
     timeout: float = 1.0
-    """Longest time between commands, s."""
+    """Seconds without a command before the failsafe acts."""
     wait: float = 30.0
-    """Longest time until the first command, s."""
+    """Seconds until the first command before the failsafe acts."""
 
     def __post_init__(self):
         check_choice("failsafe", self.action, ACTIONS)
@@ -44,29 +44,29 @@ class Failsafe:
 
 
 class Watch:
-    """Whether one drone, or who steps a flight in lockstep, is still heard of."""
+    """A timer of commands to one drone, or of steps in lockstep."""
 
     def __init__(self, failsafe: Failsafe, now: float):
         self._failsafe, self._heard, self._ever, self.lost = failsafe, now, False, False
 
     def hear(self, now: float) -> bool:
-        """Note a sign of life; returns whether it was lost before."""
+        """Restart the timer; returns whether it had run out."""
         was_lost, self.lost, self._heard, self._ever = self.lost, False, now, True
         return was_lost
 
     def lose(self, now: float) -> bool:
-        """Whether it has been silent for too long, told once."""
+        """Whether the timer has run out since the last call."""
         news = not self.lost and self.remaining(now) <= 0
         self.lost = self.lost or news
         return news
 
     def remaining(self, now: float) -> float:
-        """Time until it counts as lost, s."""
+        """Time that is left, s."""
         return self._heard + self.limit - now
 
     @property
     def limit(self) -> float:
-        """Silence that is allowed, s."""
+        """Duration of the timer, s."""
         return self._failsafe.timeout if self._ever else self._failsafe.wait
 
 

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Hashable
 from typing import Any
 
-from jaxdrones.checks import check_number, check_positive
 from jaxdrones.ros2 import convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2.bag import Recorder
@@ -44,7 +43,7 @@ def _silent(text: str) -> None:
 
 
 class Node:
-    """Publishes what a team does, and has it fly what it hears.
+    """Publishes the state of a team and flies the commands that it receives.
 
     In real time the flight follows the clock. In lockstep it advances by one control step whenever the service
     `topics.STEP_SERVICE` is called, and answers once the messages of that step are published.
@@ -71,16 +70,12 @@ class Node:
             lockstep: whether the flight waits for the step service.
             failsafe: what happens without commands; they are a stream, each to be repeated within the timeout. In
                 lockstep it is the calls of the step service that must not cease.
-            speed: simulated time over real time, where the clock paces the flight.
+            speed: real-time factor, where the clock paces the flight.
             camera: on every drone; at its `rate`, or every control step. Without it there are no images.
             recorder: where all messages are written.
             warn: called with a line of text when something is wrong and the flight goes on.
             clock: time, s.
-
-        Raises:
-            ValueError: a speed that is not positive.
         """
-        check_positive("speed", speed, "")
         self._flight, self._transport, self._lockstep = simulation, transport, lockstep
         self._failsafe = failsafe or Failsafe()
         self._speed, self._camera, self._recorder = speed, camera, recorder
@@ -109,10 +104,7 @@ class Node:
 
         Raises:
             PeerLost: commands ceased or have a wrong type, and the failsafe is to stop.
-            ValueError: a duration that is negative.
         """
-        if duration is not None:
-            check_number("duration", duration, "s", at_least=0)
         steps = None if duration is None else round(duration * self._flight.control_hz)
         now = self._clock()
         self._watches = [Watch(self._failsafe, now) for _ in self._watches]

@@ -1,4 +1,4 @@
-"""The other end of the topics: who commands a team, in Python and without ROS."""
+"""A client that commands a team over its topics, in Python and without ROS."""
 
 from __future__ import annotations
 

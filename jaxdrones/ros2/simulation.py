@@ -11,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_callable, check_choice, check_whole
 from jaxdrones.control import pid
 from jaxdrones.dynamics.rigid_body import specific_force
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.params import Params
 from jaxdrones.ros2 import command as commands
-from jaxdrones.ros2.command import CONTROLLERS, Command, Mode
+from jaxdrones.ros2.command import Command, Mode
 from jaxdrones.ros2.convert import Measurement
 from jaxdrones.sensing import Camera, Scene, render
 from jaxdrones.state import State
@@ -42,7 +41,7 @@ class Simulation:
         battery: Battery | None = None,
         scene: Scene | None = None,
     ):
-        """Start a flight; every drone is told to stay where it is.
+        """Start a flight; every drone is commanded to stay where it is.
 
         Args:
             step: of either backend, whose calls last one control period.
@@ -50,17 +49,10 @@ class Simulation:
             state: of the team at the start.
             control_hz: control steps per second.
             controller: of positions and velocities, a name of `CONTROLLERS`; the vehicle's own when left out.
-            battery: what the battery of one drone says, read from its state; without it no battery is published.
-            scene: what stands around; that of the step when left out, and nothing in images of the explicit backend.
-
-        Raises:
-            ValueError: an unknown controller, or a control rate that is no whole number of at least 1.
+            battery: readings of the battery of one drone, from its state; none are published when left out.
+            scene: obstacles; those of the step when left out, and none in images of the explicit backend.
         """
-        check_whole("control_hz", control_hz)
-        if battery is not None:
-            check_callable("battery", battery, "lambda params, state: {'voltage': state.aux['voltage']}")
         self.controller = controller or ("pid" if pid.fits(params) else "geometric")
-        check_choice("controller", self.controller, CONTROLLERS)
         self.params, self.control_hz, self.steps = params, control_hz, 0
         self.state = step.init(params, jax.tree.map(jnp.asarray, state))
         self._step, self._scene = step, scene

@@ -254,9 +254,29 @@ def test_seeds_share_a_program_and_the_best_of_them_is_flown(tmp_path, capsys):
     assert "hover by shac" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
+    """Options of the command line override those of the file."""
+    (tmp_path / "sweep.toml").write_text(
+        'task = "hover"\nbudget = 2\nepisodes = 4\nno-figure = true\n[sweep]\nhorizon = [2, 4]\n'
+        "[set]\nworlds = 4\nhidden_sizes = [8]\nduration = 0.2\n"
+    )
+    command = ["train", "--config", str(tmp_path / "sweep.toml"), "--budget", "1", "--output", str(tmp_path / "run")]
+    assert main(command) == 0
+    for horizon in (2, 4):
+        run = Run(tmp_path / "run" / f"horizon={horizon}")
+        assert run.recipe().config.horizon == horizon and run.recipe().config.hidden_sizes == (8,)
+        assert [row["update"] for row in run.history()] == [1]
+    assert "hover by bptt, duration 0.2, horizon=2: 4 worlds x 2 control steps" in capsys.readouterr().out
+    assert main(command) == 2 and "horizon=2 holds a finished training" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["train", "hover", "--sweep", "horizon"], "give NAME=VALUE,VALUE"),
+        (["train", "hover", "--sweep", "horizon=2,3", "--set", "horizon=2"], "given by --set and by --sweep"),
+        (["train", "hover", "--config", "none.toml"], "--config none.toml cannot be read"),
         (["train", "hoover"], "unknown task 'hoover'; did you mean 'hover'"),
         (["train", "hover", "--algo", "pppo"], "unknown algorithm 'pppo'; did you mean 'ppo'"),
         (["train", "hover", "--set", "wrlds=3"], "unknown setting 'wrlds'; did you mean 'worlds'"),

@@ -20,7 +20,7 @@ from jaxdrones.cli import (
     view,
 )
 from jaxdrones.cli.common import EXIT_CODES, Parser, lasting_interrupts, print_failure
-from jaxdrones.cli.settings import task_first
+from jaxdrones.cli.settings import task_first, with_config
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,13 +29,14 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         The exit code, see `EXIT_CODES`.
     """
-    parser = _parser()
-    options = parser.parse_args(task_first(sys.argv[1:] if arguments is None else arguments))
+    parser, debug = _parser(), False
     try:
+        options = parser.parse_args(task_first(with_config(sys.argv[1:] if arguments is None else arguments)))
+        debug = options.debug
         with lasting_interrupts():
             return options.run(options)
     except BaseException as error:
-        return print_failure(error, options.debug)
+        return print_failure(error, debug)
 
 
 def _parser() -> argparse.ArgumentParser:

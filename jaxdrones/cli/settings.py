@@ -5,6 +5,8 @@ import ast
 import contextlib
 import inspect
 import itertools
+import tomllib
+from pathlib import Path
 from typing import Any
 
 from jaxdrones.envs import TASKS
@@ -47,6 +49,37 @@ def task_first(arguments: list[str]) -> list[str]:
         if option == "--realistic" and (word in TASKS or is_reference(word)):
             arguments[i : i + 2] = word, option
     return arguments
+
+
+def with_config(arguments: list[str]) -> list[str]:
+    """The arguments of `train` with the options of `--config FILE`, which those of the command line override.
+
+    Raises:
+        UserError: the file is missing or is not TOML.
+    """
+    command = next((i for i, word in enumerate(arguments) if not word.startswith("-")), None)
+    if command is None or arguments[command] != "train" or "--config" not in arguments[:-1]:
+        return arguments
+    i = arguments.index("--config")
+    file, rest = Path(arguments[i + 1]), [*arguments[:i], *arguments[i + 2 :]]
+    try:
+        entries = tomllib.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"--config {file} cannot be read: {error}") from None
+    task = [entries.pop("task")] if "task" in entries else []
+    options = []
+    for name, x in entries.items():
+        if isinstance(x, dict):  # set and sweep
+            options += [f"--{name}={key}={_listed(value) if name == 'sweep' else value}" for key, value in x.items()]
+        elif x is not False:
+            options.append(f"--{name}" if x is True else f"--{name}={x}")
+    first = next((k for k in range(command + 1, len(rest)) if rest[k].startswith("-")), len(rest))
+    return [*rest[:first], *task, *options, *rest[first:]]
+
+
+def _listed(values: list[Any]) -> str:
+    """Values as --sweep takes them."""
+    return ",".join(map(str, values))
 
 
 def parse_settings(texts: list[str]) -> dict[str, Any]:

@@ -92,6 +92,20 @@ def add(commands) -> None:
         metavar="NAME=VALUE",
         help="setting of the learner (worlds, horizon, learning_rate) or of the environment (vehicle, period, drones)",
     )
+    parser.add_argument(
+        "--sweep",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE,VALUE",
+        help="train once for each value of a setting, such as learning_rate=1e-3,3e-3, each in a folder of its own in "
+        "the folder of the run; several sweeps train all combinations",
+    )
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        help="TOML file of options by their long names, such as seeds = 3, with tables [set] and [sweep]; options of "
+        "the command line override it",
+    )
     parser.add_argument("--episodes", type=int, metavar="N", help="episodes of every evaluation (1000)")
     parser.add_argument("--output", type=folder, metavar="DIR", help="folder of the run (runs/TASK)")
     parser.add_argument(
@@ -134,19 +148,32 @@ def _on_hosts(options: argparse.Namespace) -> int:
 
 
 def _train(options: argparse.Namespace) -> int:
-    """Parse the request, lock its folders, and train."""
+    """Parse the request, and train each row of its sweep."""
+    from jaxdrones.training.distributed import fail_together
+
+    begin = time.perf_counter()
+    with fail_together():
+        if not options.no_figure:
+            plots.check_matplotlib()
+        requests = Request.of(options).swept(options.sweep)
+    for request in requests:
+        code = _train_row(request, begin)
+        if code:
+            return code
+        begin = time.perf_counter()
+    return 0
+
+
+def _train_row(request: Request, begin: float) -> int:
+    """Lock the folders of a request, and train."""
     from jaxdrones.training import loop
     from jaxdrones.training.distributed import fail_together
     from jaxdrones.training.lock import locked
     from jaxdrones.training.run import Run
     from jaxdrones.training.trainer import Trainer
 
-    begin = time.perf_counter()
     with contextlib.ExitStack() as stack:
         with fail_together():
-            if not options.no_figure:
-                plots.check_matplotlib()
-            request = Request.of(options)
             for folder in dict.fromkeys((request.output, *request.folders.values())):
                 stack.enter_context(locked(folder, print_warning))
             runs = request.runs()
@@ -170,7 +197,7 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
     recipe, print_line = trainer.recipe, quiet if request.json else print
     if not request.resume and not settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any"):
         warn_of_unknown_settings(recipe)
-    config, what = recipe.config, described(recipe)
+    config, what = recipe.config, described(recipe) + f", {request.row}" * bool(request.row)
     print_line(f"{what}: {config.worlds} worlds x {config.horizon} control steps an update; compiling")
     trainer.compile()
     started = [run for run in runs.values() if request.resume and run.started]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,8 @@ class Request:
     live: int | None
     figure: bool
     json: bool
+    row: str = ""
+    """Settings of --sweep, for titles."""
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> Request:
@@ -71,6 +75,28 @@ class Request:
             },
             **{name: getattr(options, name) for name in ("resume", "overwrite", "live", "json")},
         )
+
+    def swept(self, sweep: list[str]) -> list[Request]:
+        """A request for each combination of the values of --sweep, each with a folder of its own.
+
+        Raises:
+            UserError: a sweep is not NAME=VALUE,VALUE,..., or --set gives its name too.
+        """
+        rows = [parse_sweep(text) for text in sweep]
+        for name, _ in rows:
+            if name in self.settings:
+                raise UserError(f"{name} is given by --set and by --sweep; give one of them")
+        if not rows:
+            return [self]
+        names = [name for name, _ in rows]
+        requests = []
+        for values in itertools.product(*(values for _, values in rows)):
+            settings = dict(zip(names, values, strict=True))
+            row = ",".join(f"{name}={x}".replace(" ", "").replace("/", "-") for name, x in settings.items())
+            requests.append(
+                dataclasses.replace(self, settings=self.settings | settings, output=self.output / row, row=row)
+            )
+        return requests
 
     @property
     def folders(self) -> dict[int, Path]:
@@ -162,6 +188,18 @@ class Request:
             )
         stop_at = recipe.stop_at if self.stop_at is None else self.stop_at
         return dataclasses.replace(recipe, config=dataclasses.replace(recipe.config, updates=total), stop_at=stop_at)
+
+
+def parse_sweep(text: str) -> tuple[str, list[Any]]:
+    """The name and the values that `--sweep NAME=VALUE,VALUE` gives."""
+    name, _, values = text.partition("=")
+    try:
+        parsed = list(ast.literal_eval(f"[{values}]"))
+    except (ValueError, SyntaxError):
+        parsed = values.split(",")
+    if not name or not parsed or "" in parsed:
+        raise UserError(f"--sweep is {text!r}; give NAME=VALUE,VALUE, for example learning_rate=1e-3,3e-3")
+    return name, parsed
 
 
 def parse_budget(text: str | None) -> tuple[int | None, float | None]:

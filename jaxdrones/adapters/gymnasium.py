@@ -108,7 +108,7 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
-    """Many worlds in one compiled step; where an episode ends, the next one begins in the same step unless told else.
+    """Many worlds in one compiled step; where an episode ends, the next one begins in the same step by default.
 
     `infos` has arrays of what the infos of one world have, and of `name` a mask `_name`, of which worlds it is valid.
     World i, reset with `seed`, starts like a `GymnasiumEnv` that is reset with `seed + i`. If an episode ended and the
@@ -259,7 +259,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     def _infos(self, info: dict[str, Any], ended: Any) -> dict[str, Any]:
         """The infos with gymnasium's masks: `_name` says of which worlds `name` is valid."""
-        last, infos = info["last"], _masked(info["last"], info["goes_on"])
+        last, infos = info["last"], _masked(info["last"], info["not_reset"])
         if "final_obs" in info and (not self._numpy or ended.any()):
             final = _masked(last | {"episode": _masked(info["episode"], ended)}, ended)
             infos |= _masked({"final_obs": info["final_obs"], "final_info": final}, ended)

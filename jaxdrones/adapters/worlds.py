@@ -1,4 +1,4 @@
-"""Many worlds in one compiled step, each of which starts episodes by itself, or when it is told to."""
+"""Many worlds in one compiled step, which start their next episodes by themselves or on request."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Worlds:
     ) -> tuple[Any, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
         """One control step: observations, rewards of the teams, terminated, truncated and info.
 
-        Where a mask is false, a world stands still: it keeps its observation, and the rest is of no meaning.
+        Where a mask is false, a world stands still: it keeps its observation, and its other results are undefined.
         """
         check_process()
         if mask is None:
@@ -81,10 +81,10 @@ class Worlds:
         last = flat(info)
         if self.env.drones == 1:
             last = {name: x[:, 0] if x.ndim > 1 else x for name, x in last.items()}
-        result = {"last": last, "goes_on": ~ended}
+        result = {"last": last, "not_reset": ~ended}
         if self.mode is AutoresetMode.SAME_STEP:
             ended = terminated | truncated
-            result["goes_on"] = ~ended
+            result["not_reset"] = ~ended
             result["episode"] = {"r": self._rewarding(info["episode"]["return"]), "l": info["episode"]["length"]}
             result["final_obs"] = self.layout.arrange(info["final_obs"], 1)
         elif self.mode is AutoresetMode.NEXT_STEP:

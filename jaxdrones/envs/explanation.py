@@ -199,14 +199,14 @@ def _physics(env: Env) -> dict[str, str]:
         "sensors": ", ".join(sensor.name for sensor in env.sensors) or "none",
         "cameras": str(env.vision) if env.vision else "none",
         "delay": " to ".join(f"{x * env.dt:.4g}" for x in sorted({*env.delay_steps})) + " s between action and command",
-        "noise": _said(env.noise, "none"),
-        "disturbance": _said(env.disturbance, "none"),
-        "drawn per episode": "; ".join(_said(one, "a randomization of its own") for one in env.draws) or "nothing",
+        "noise": _text(env.noise, "none"),
+        "disturbance": _text(env.disturbance, "none"),
+        "drawn per episode": "; ".join(_text(one, "a randomization of its own") for one in env.draws) or "nothing",
     }
     return facts
 
 
-def _said(function: Any, otherwise: str) -> str:
+def _text(function: Any, otherwise: str) -> str:
     return (description(function) if function is not None else "") or otherwise
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
+from jaxdrones.checks import check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
@@ -39,7 +39,6 @@ camera = Camera(resolution=(32, 24), field_of_view=60.0)
 _TOUCHED = shaping.variable("touched", "One if the drone has touched another one or the ground.")
 
 
-@check_keywords
 def follow(
     drones: int = 2, distance: float = 1.5, size: float = 1.5, period: float = 12.0, duration: float = 12.0
 ) -> Task:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
+from jaxdrones.checks import check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
@@ -44,7 +44,6 @@ _METRICS = {
 }
 
 
-@check_keywords
 def forest(
     drones: int = 1,
     speed: float = 3.0,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_keywords, check_number, check_switch, check_whole, shown
+from jaxdrones.checks import check_number, check_switch, check_whole, shown
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -56,14 +56,13 @@ _POLE_ENTRIES = tuple(
 )
 
 
-@check_keywords
 def gates(
     drones: int = 1, level: int = 0, duration: float = 12.0, random_start: bool = False, start_spread: float = 0.0
 ) -> Task:
     """One lap through four gates.
 
-    Gates and poles are obstacles of the scene: solid in Bullet, visible to cameras, and hit as `sensing.collisions`
-    tells. Another scene may be given that begins with four gates, such as one of `sensing.track`.
+    Gates and poles are obstacles of the scene: solid in Bullet, visible to cameras, and hit as in
+    `sensing.collisions`. Another scene may be given that begins with four gates, such as one of `sensing.track`.
 
     Args:
         drones: number of drones, at most 5; they start 0.5 m apart in y and do not observe each other.

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_keywords, check_whole
+from jaxdrones.checks import check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.quantity import described
 from jaxdrones.tasks.starts import above_ground
@@ -38,14 +38,12 @@ Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]
 Criterion = Callable[[Mapping[str, Array], float], Array]
 
 
-@check_keywords
 def hover(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Equation 12: the negative squared distance from (0, 0, 1)."""
     summary, success = "hover at z = 1 m (equation 12)", _of_one(drones)
     return _task_2021("hover-2021", summary, drones, start_spread, _at(0.0, 0.0, 1.0), _squared_distance, success)
 
 
-@check_keywords
 def takeoff(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Get off the ground: -5 below 2 cm, else -1 / (10 z)."""
 
@@ -59,7 +57,6 @@ def takeoff(drones: int = 1, start_spread: float = 0.0) -> Task:
     return _task_2021("takeoff", summary, drones, start_spread, target, cost, _high, metrics=metrics)
 
 
-@check_keywords
 def fly_through_gate(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Follow a point that moves through the gate at (0, -1, 0.75) in the five seconds of an episode.
 
@@ -80,7 +77,6 @@ def fly_through_gate(drones: int = 1, start_spread: float = 0.0) -> Task:
     return _task_2021("fly-through-gate", summary, drones, start_spread, target, cost, None)
 
 
-@check_keywords
 def tune(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m.
 
@@ -100,7 +96,6 @@ def tune(drones: int = 1, start_spread: float = 0.0) -> Task:
     return dataclasses.replace(task, action="pid_gains")
 
 
-@check_keywords
 def leader_follower(drones: int = 2, start_spread: float = 0.0) -> Task:
     """Equation 13: the leader, drone 0, hovers at (0, 0, 0.5); the others are to be as high as the leader."""
 
@@ -114,7 +109,6 @@ def leader_follower(drones: int = 2, start_spread: float = 0.0) -> Task:
     return _task_2021("leader-follower", summary, drones, start_spread, _at_height(0.5), cost, minimum=2)
 
 
-@check_keywords
 def flock(drones: int = 2, start_spread: float = 0.0) -> Task:
     """The first drone hovers at (0, 0, 1); every other one is to be as high as the one before it."""
 
@@ -128,7 +122,6 @@ def flock(drones: int = 2, start_spread: float = 0.0) -> Task:
     return _task_2021("flock", summary, drones, start_spread, _at_height(1.0), cost, minimum=2)
 
 
-@check_keywords
 def meetup(drones: int = 2, start_spread: float = 0.0) -> Task:
     """Drone i and drone n - 1 - i meet; the reward is the negative squared distance between them."""
 
@@ -145,14 +138,12 @@ def meetup(drones: int = 2, start_spread: float = 0.0) -> Task:
     return dataclasses.replace(task, action="velocity", contact=("ground", "drones"))
 
 
-@check_keywords
 def hover_2x(drones: int = 1, start_spread: float = 0.0) -> Task:
     """Hover at (0, 0, 1), rewarded by max(0, 2 - d^4)."""
     target, success = _at(0.0, 0.0, 1.0), _of_one(drones)
     return _task_2x("hover-2x", "hover at z = 1 m, bounded reward", drones, start_spread, target, 1.5, success)
 
 
-@check_keywords
 def multi_hover(drones: int = 2, start_spread: float = 0.0) -> Task:
     """Drone i hovers 1 / (i + 1) m above its start; the reward of (2.x) is the sum over the team."""
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_keywords, check_number, check_positive, check_whole
+from jaxdrones.checks import check_number, check_positive, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -25,7 +25,6 @@ _SOFT = 0.6  # m/s
 SETTLED = 2.0  # s: how long a drone has to hover in the end
 
 
-@check_keywords
 def hover(
     drones: int = 1,
     reach: float = 1.0,
@@ -75,7 +74,6 @@ def hover(
     )
 
 
-@check_keywords
 def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Task:
     """Start upside down, thrown and tumbling: level out at once, then fly back. Reports the altitude lost."""
     check_whole("number of drones of recovery", drones)
@@ -119,7 +117,6 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
     )
 
 
-@check_keywords
 def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task:
     """Land on the pad at the origin softly, and come to rest level."""
     check_whole("number of drones of landing", drones)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_keywords, check_number, check_whole
+from jaxdrones.checks import check_number, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
@@ -38,7 +38,6 @@ _METRICS = {
 }
 
 
-@check_keywords
 def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float = 8.0) -> Task:
     """Drones on a ring in a room exchange places, and touch neither each other nor walls or pillars.
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.checks import check_keywords, check_whole
+from jaxdrones.checks import check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -19,7 +19,6 @@ HEIGHT = 2.0  # m
 _MIN_SPACING = 0.6  # m between neighboring places on the ring
 
 
-@check_keywords
 def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
     """Drones on a ring exchange places: each flies the same number of places on, and keeps clear of the others.
 

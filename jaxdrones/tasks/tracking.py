@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.checks import check_choice, check_keywords, check_number, check_positive, check_switch, check_whole
+from jaxdrones.checks import check_choice, check_number, check_positive, check_switch, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -23,7 +23,6 @@ _CAUGHT_UP = 1.0  # s: from then on the error counts
 _MIN_PERIOD = 0.1  # s; a period in which a circle of 1 m radius is flown at 63 m/s
 
 
-@check_keywords
 def tracking(
     drones: int = 1,
     curve: str = "figure-eight",

@@ -86,7 +86,6 @@ EPISODES = mostly_slow(
     names(kind="rl_episode"),
     quick=[
         "rl_main_HoverAviary_pid_121",
-        "rl_main_MultiHoverAviary_one_d_rpm_21",
         "rl_paper_HoverAviary_one_d_pid_11",
         "rl_paper_LeaderFollowerAviary_one_d_rpm_11",
         "rl_paper_TuneAviary_tun_11",

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_finite, assert_same_kind
+from helpers import assert_finite, assert_same_kind, mostly_slow
 
 import jaxdrones as jd
 from jaxdrones.envs import make
@@ -58,7 +58,7 @@ def test_intensities_are_those_of_the_specification(case):
     np.testing.assert_allclose(gusts(*case).std(axis=(0, 1)), [horizontal, horizontal, 0.1 * speed], rtol=0.03)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", mostly_slow(CASES, [CASES[1]]))
 def test_spectra_are_those_of_the_specification(case):
     """10 %, in ten bands from 8 periods in a window up to the highest frequency, half of the sampling rate.
 

@@ -68,6 +68,7 @@ def forest(
     """
     check_whole("number of drones of forest", drones)
     check_number("speed", speed, "m/s", above=0, at_most=_MAX_SPEED)
+    check_number("density", density, "trees per m^2", at_least=0)
     check_positive("length", length, "m")
     check_number("width", width, "m", above=_SPACING * (drones + 1))
     if duration is None:

@@ -187,19 +187,30 @@ def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], h
         raise UserError(f"{name}: {called} takes {signature}; {wanted}{hint}") from None
 
 
-def takes_scene(function: Callable) -> bool:
-    """Whether a function has a parameter named `scene`, with or without a default, that is not bound by `partial`."""
+def takes(function: Callable, name: str) -> bool:
+    """Whether a function has a parameter of this name, with or without a default, that is not bound by `partial`."""
     try:
-        parameter = inspect.signature(function).parameters.get("scene")
+        parameter = inspect.signature(function).parameters.get(name)
     except (TypeError, ValueError):
         return False
-    is_bound = isinstance(function, functools.partial) and "scene" in function.keywords
+    is_bound = isinstance(function, functools.partial) and name in function.keywords
     return parameter is not None and parameter.kind in _BY_NAME and not is_bound
+
+
+def takes_scene(function: Callable) -> bool:
+    """Whether a function has a parameter named `scene`."""
+    return takes(function, "scene")
+
+
+def bind(function: Callable, **values: Any) -> Callable:
+    """The function with those of the values bound for which it has a parameter."""
+    bound = {name: value for name, value in values.items() if takes(function, name)}
+    return functools.partial(function, **bound) if bound else function
 
 
 def with_scene(function: Callable, scene: Any) -> Callable:
     """The function with its parameter `scene` bound; the function itself if it takes no scene."""
-    return functools.partial(function, scene=scene) if takes_scene(function) else function
+    return bind(function, scene=scene)
 
 
 def check_keywords(function: Function) -> Function:

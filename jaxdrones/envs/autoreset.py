@@ -33,15 +33,21 @@ class AutoReset:
     and `episode`: `return` (n,) and `length` () so far, which are those of the whole episode where it ended.
     """
 
-    def __init__(self, env: Env):
-        self.env = env
+    def __init__(self, env: Env, progress: Array | None = None):
+        """Add automatic resets to an environment.
+
+        Args:
+            env: environment.
+            progress: () progress of training in [0, 1], for a task with a curriculum.
+        """
+        self.env, self._progress = env, () if progress is None else (progress,)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.env!r}>"
 
     def reset(self, key: jax.Array) -> tuple[Obs, Episode]:
         """Start the first episode."""
-        obs, world = self.env.reset(key)
+        obs, world = self.env.reset(key, *self._progress)
         return obs, Episode(world, jnp.zeros(self.env.drones, world.drones.pos.dtype), jnp.zeros((), jnp.int32))
 
     def step(
@@ -83,5 +89,5 @@ class AutoReset:
 
     def _fresh(self, key: jax.Array) -> tuple[Array, World]:
         """A reset, without images and without the fields that are the same in every episode."""
-        obs, world = self.env.begin(key)
+        obs, world = self.env.begin(key, *self._progress)
         return obs, world.replace(**dict.fromkeys(self._kept))

@@ -167,21 +167,25 @@ class Env:
         leaves = zip(jax.tree.leaves(self.params), self._drawn, strict=True)
         return sum(leaf.size for leaf, drawn in leaves if drawn) // self.drones
 
-    def reset(self, key: jax.Array) -> tuple[Obs, World]:
+    def reset(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Obs, World]:
         """The first observation, and the world at the start of an episode.
+
+        Args:
+            key: random key.
+            progress: progress of training in [0, 1], for a task with a curriculum.
 
         Raises:
             ValueError: `key` is not one random key.
         """
-        obs, world = self.begin(key)
+        obs, world = self.begin(key, progress)
         if self.vision:
             world = self.with_images("first", key, world)
         return observation(obs, world), world
 
-    def begin(self, key: jax.Array) -> tuple[Float[Array, "n d"], World]:
+    def begin(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Float[Array, "n d"], World]:
         """The same as `reset`, but without images."""
         check_key("key", key)
-        world = self.compiled(episode.start)(key)
+        world = self.compiled(episode.start)(key, progress)
         rate = episode.state_rate(self, world, world.drones.rpm)
         return self.compiled(episode.first_observation)(key, world, rate)
 

@@ -24,12 +24,12 @@ DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE, VISION = range(8)
 Key = Any  # a random key; `None` where nothing is drawn
 
 
-def start(env: Any, key: jax.Array) -> World:
+def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
     """The world at the start of an episode, before the first measurement."""
     params = randomize.draw(env.draws, jax.random.fold_in(key, RANDOMIZE), env.params)
     scene = env.scene if isinstance(env.scene, Scene) else env.scene(jax.random.fold_in(key, SCENE))
     known = randomize.scaling_params(env.randomize, params, env.params)
-    drones, variables = env.task.begin(jax.random.fold_in(key, START), known, scene)
+    drones, variables = env.task.begin(jax.random.fold_in(key, START), known, scene, progress)
     history = max(math.ceil(env.delay_steps[1]) + 1, *(term.history for term in env.terms))
     return World(
         params=params,

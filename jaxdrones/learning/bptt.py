@@ -39,7 +39,8 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> resul
 def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.TrainState, dict[str, Array]]:
     """Simulate a trajectory of all worlds and make one step along the gradient of its rewards."""
     key, restart_key, collect_key = jax.random.split(state.key, 3)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
+    progress = collect.progress_of(env, config, state.step)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)
     env = with_gradient(env, config)
     between_steps = gradient_between_steps(config)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.checks import takes
 from jaxdrones.envs import AutoReset, Env
 from jaxdrones.envs.autoreset import Episode
 from jaxdrones.envs.env import Obs
@@ -89,7 +90,7 @@ def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
     return Worlds(episodes, obs, jnp.ones(count, bool), none, none, hidden_state)
 
 
-def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) -> Worlds:
+def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0, progress: Array | None = None) -> Worlds:
     """Start a new episode in every world whose episode has ended, and in the others with a given probability.
 
     Args:
@@ -98,11 +99,12 @@ def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0) ->
         worlds: worlds.
         fraction: probability of a new episode in a world whose episode has not ended; above zero, the worlds do not
             all reach the same time of their episodes together.
+        progress: progress of training, see `progress_of`.
     """
     start_key, choice_key = jax.random.split(key)
     count = len(worlds.done)
     chosen = worlds.done | jax.random.bernoulli(choice_key, fraction, (count,))
-    obs, episodes = jax.vmap(AutoReset(env).reset)(jax.random.split(start_key, count))
+    obs, episodes = jax.vmap(AutoReset(env, progress).reset)(jax.random.split(start_key, count))
     hidden_state = jax.tree.map(jnp.zeros_like, worlds.hidden_state)
     fresh = worlds.replace(episodes=episodes, obs=obs, done=jnp.zeros_like(chosen), hidden_state=hidden_state)
     return _select(chosen, fresh, worlds)
@@ -117,6 +119,7 @@ def collect(
     reset: bool = True,
     between_steps: Callable[[Worlds], Worlds] = lambda worlds: worlds,
     privileged: bool = False,
+    progress: Array | None = None,
 ) -> tuple[Worlds, Trajectory]:
     """Simulate all worlds for some control steps; with `jax.set_mesh` each device simulates its share of them.
 
@@ -131,11 +134,14 @@ def collect(
             all later steps are marked by `was_done`, until `restart` starts a new episode.
         between_steps: function that is applied to the worlds between steps, to change their gradient.
         privileged: whether to record privileged observations.
+        progress: progress of training, see `progress_of`.
     """
     privileged_of = jax.vmap(env.privileged_observation) if privileged else lambda worlds: None
-    step = jax.vmap((AutoReset(env) if reset else _NoReset(env)).step)
 
-    def control_step(act: Act, index: Array, worlds: Worlds, key: jax.Array) -> tuple[Worlds, Trajectory]:
+    def control_step(
+        act: Act, index: Array, progress: Array | None, worlds: Worlds, key: jax.Array
+    ) -> tuple[Worlds, Trajectory]:
+        step = jax.vmap((AutoReset(env, progress) if reset else _NoReset(env)).step)
         act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
         worlds = between_steps(worlds)
         hidden_state, action, extras = act(act_keys, worlds.hidden_state, worlds.obs)
@@ -163,16 +169,30 @@ def collect(
         after = worlds.replace(episodes=episodes, obs=obs, done=worlds.done | ended, hidden_state=hidden_state)
         return _select(worlds.done, worlds, after), recorded  # without this, a lost drone would fly on to infinity
 
-    def control_steps(act: Act, keys: jax.Array, index: Array, worlds: Worlds) -> tuple[Worlds, Trajectory]:
-        return jax.lax.scan(functools.partial(control_step, act, index), worlds, keys)
+    def control_steps(
+        act: Act, keys: jax.Array, progress: Array | None, index: Array, worlds: Worlds
+    ) -> tuple[Worlds, Trajectory]:
+        return jax.lax.scan(functools.partial(control_step, act, index, progress), worlds, keys)
 
     control_steps = sharding.map_worlds(
         control_steps,
-        (sharding.REPLICATED, sharding.REPLICATED, sharding.WORLDS, sharding.WORLDS),
+        (sharding.REPLICATED, sharding.REPLICATED, sharding.REPLICATED, sharding.WORLDS, sharding.WORLDS),
         (sharding.WORLDS, sharding.STEPS),
     )
     act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
-    return control_steps(act, jax.random.split(key, length), jnp.arange(len(worlds.done)), worlds)
+    return control_steps(act, jax.random.split(key, length), progress, jnp.arange(len(worlds.done)), worlds)
+
+
+def progress_of(env: Env, config: Any, step: Array) -> Array | None:
+    """Progress of training in [0, 1] for a task with a curriculum; `None` for other tasks.
+
+    Args:
+        env: environment.
+        config: settings of a learner, of which `updates` counts.
+        step: () updates made.
+    """
+    task = getattr(env, "task", None)
+    return (step / config.updates).astype(jnp.float32) if task and takes(task.start, "progress") else None
 
 
 def deterministic(policy: Policy) -> Act:

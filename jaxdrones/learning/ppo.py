@@ -145,11 +145,12 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Collect a trajectory of all worlds, then make some epochs of gradient steps on it."""
     key, restart_key, collect_key, critic_key, optimize_key = jax.random.split(state.key, 5)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
+    progress = collect.progress_of(env, config, state.step)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)
 
     act = jax.tree_util.Partial(explore, state.policy, state.log_std)
     after, trajectory = collect.collect(
-        collect_key, env, act, worlds, config.horizon, privileged=config.privileged_critic
+        collect_key, env, act, worlds, config.horizon, privileged=config.privileged_critic, progress=progress
     )
     batch = batch_of(critic_key, config, state, worlds.hidden_state, trajectory)
     (params, log_std, critic), opt_state, metrics = _optimize(optimize_key, config, state, batch)

@@ -87,7 +87,8 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Simulate a trajectory of all worlds, make one step of the policy along its gradient, then fit the critic."""
     key, restart_key, collect_key, critic_key = jax.random.split(state.key, 4)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction)
+    progress = collect.progress_of(env, config, state.step)
+    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)
     env = with_gradient(env, config)
     between_steps = gradient_between_steps(config)
     weight = jnp.minimum(state.step / (config.terminal_value_warmup * config.updates), 1)

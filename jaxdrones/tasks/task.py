@@ -14,15 +14,14 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation, vector
 from jaxdrones.checks import (
+    bind,
     check_arguments,
     check_choice,
     check_number,
-    check_positive,
     check_sequence,
     check_switch,
     check_whole,
     shown,
-    with_scene,
 )
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
@@ -119,7 +118,8 @@ class Task:
     duration: float
     """Time after which an episode is truncated, s."""
     start: Callable[..., tuple[State, Any]]
-    """(key, params) or (key, params, scene) -> the team at the start, and the task's variables."""
+    """(key, params) -> the team at the start, and the task's variables. Optional parameters are `scene` and `progress`,
+    the progress of training in [0, 1], which is 1 outside of training."""
     target: Callable[[Any, Array], Setpoint]
     """(variables, time in s) -> where every drone should be; the time may be later than now."""
     rewards: Mapping[str, tuple[float, Term]]
@@ -169,8 +169,8 @@ class Task:
             if not isinstance(x := getattr(self, name), kind) or x == "":
                 raise UserError(f"{name} of the task is {shown(x)}; give {'a text' if kind is str else 'a Camera'}")
         check_whole(f"number of drones of {self.name}", self.drones)
-        check_positive("duration", self.duration, "s")
-        check_positive("control_hz", self.control_hz, "1/s")
+        check_number("duration", self.duration, "s", above=0)
+        check_number("control_hz", self.control_hz, "1/s", above=0)
         check_whole("substeps", self.substeps)
         check_whole("extra_steps", self.extra_steps, minimum=0)
         check_switch("obstacles_terminate", self.obstacles_terminate)
@@ -188,7 +188,7 @@ class Task:
 
     def _check_functions(self) -> None:
         """Raise unless the functions of the task are functions of so many arguments."""
-        _check_function("start", with_scene(self.start, None), ("key", "params"))
+        _check_function("start", bind(self.start, scene=None, progress=1.0), ("key", "params"))
         _check_function("target", self.target, ("variables", "time"))
         _check_function("advance", self.advance, _OF_A_WORLD)
         _check_function("success", self.advance if self.success is None else self.success, ("metrics", "dt"))
@@ -207,9 +207,9 @@ class Task:
         if not isinstance(self.scene, Scene):
             _check_function("scene", self.scene, ("key",))
 
-    def begin(self, key: jax.Array, params: Params, scene: Scene) -> tuple[State, Any]:
+    def begin(self, key: jax.Array, params: Params, scene: Scene, progress: Any = 1.0) -> tuple[State, Any]:
         """The team at the start of an episode in a scene, and the task's variables."""
-        return with_scene(self.start, scene)(key, params)
+        return bind(self.start, scene=scene, progress=jnp.asarray(progress, jnp.float32))(key, params)
 
     def measure(self, world: World) -> dict[str, Float[Array, " n"]]:
         """All metrics by name; the task's own metrics replace standard ones of the same name."""

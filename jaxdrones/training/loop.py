@@ -16,14 +16,14 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.result import PATIENCE, Diverged, check_gradients
+from jaxdrones.learning.result import MAX_CALL, PATIENCE, Diverged, check_gradients
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.training import distributed
 from jaxdrones.training.plan import EVALUATIONS, IN_A_ROW, STOPPING_EVALUATIONS, TimePlan, next_evaluation
 from jaxdrones.training.progress import Progress
 from jaxdrones.training.run import Run, report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM, Score, best_of, score_of
-from jaxdrones.training.trainer import MAX_CALL, Trainer
+from jaxdrones.training.trainer import Trainer
 
 _CALL_SECONDS = 0.3  # aimed at for one call of the compiled program, during which Ctrl-C has to wait
 _SAVE_SECONDS = 30.0  # longest time between two training states on disk

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from typing import Any
 
@@ -12,14 +11,13 @@ import numpy as np
 
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.evaluation import check_episodes, compile_evaluation
+from jaxdrones.learning.result import advance
 from jaxdrones.limits import check_memory
 from jaxdrones.training import algorithms
 from jaxdrones.training.plan import check_stop_at
 from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.run import Run, size_of
 
-MAX_CALL = 64
-"""Largest number of updates in one call of `Trainer.advance`."""
 _DISK_FACTOR = 4  # the disk must have space for so many training states
 
 
@@ -46,7 +44,7 @@ class Trainer:
         check_episodes(self.env, episodes)
         check_stop_at(recipe.stop_at, self.env.task.success is not None, episodes)
         self._check_memory()
-        self.metrics = sorted(jax.eval_shape(self._update, self.shapes)[1])
+        self.metrics = sorted(jax.eval_shape(self._updates, self.shapes, 1, recipe.config.updates)[1])
 
     def compile(self) -> None:
         """Compile the programs."""
@@ -91,21 +89,6 @@ class Trainer:
     def _init(self, key: jax.Array):
         return self.learner.init(key, self.practice_env, self.recipe.config)
 
-    def _update(self, state, total=None):
-        config = self.recipe.config
-        if total is not None:
-            config = dataclasses.replace(config, updates=total)
-        return self.learner.update(self.practice_env, config, state)
-
     def _updates(self, state, count, total):
         """Make `count` updates of a training of `total` updates; both may change without compiling again."""
-        metrics = jax.tree.map(
-            lambda x: jnp.zeros((MAX_CALL, *x.shape), x.dtype), jax.eval_shape(self._update, state)[1]
-        )
-
-        def update(i, carry):
-            state, metrics = carry
-            state, new = self._update(state, total)
-            return state, jax.tree.map(lambda all, x: all.at[i].set(x), metrics, new)
-
-        return jax.lax.fori_loop(0, count, update, (state, metrics))
+        return advance(self.learner.update, self.practice_env, self.recipe.config, state, count, total)

@@ -73,7 +73,7 @@ def test_a_training_that_is_killed_twice_has_the_numbers_of_one_that_was_not(tra
 
 def test_a_training_goes_on_without_a_row_or_an_evaluation_twice(trainer, whole, tmp_path, monkeypatch):
     """Killed before its state is written, it makes these updates again; their rows are not there twice."""
-    run, save = Run(tmp_path), Trainer.save
+    run, save = Run(tmp_path), Run.save_state
     saves = itertools.count(1)
 
     def killed(self, *arguments, **about):
@@ -81,7 +81,7 @@ def test_a_training_goes_on_without_a_row_or_an_evaluation_twice(trainer, whole,
             raise Killed
         save(self, *arguments, **about)
 
-    monkeypatch.setattr(Trainer, "save", killed)
+    monkeypatch.setattr(Run, "save_state", killed)
     with pytest.raises(Killed):
         loop.train(trainer, run, 3, lambda *_: None)
     monkeypatch.undo()

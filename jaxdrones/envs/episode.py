@@ -103,7 +103,9 @@ def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Arr
     return world.replace(memory=memory), rpm
 
 
-def outcome(env: Any, key: Key, world: World, rate: State | None):
+def outcome(
+    env: Any, key: Key, world: World, rate: State | None
+) -> tuple[Array, World, Array, Array, Array, dict[str, Any]]:
     """What `step` returns, from the world with the state after it."""
     task = env.task
     world = world.replace(step=world.step + 1)

@@ -156,7 +156,7 @@ def make(
     pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
     lagging = inspect.unwrap(cast(Callable, rotors)) is inspect.unwrap(lagging_rotors)  # also inside `failing`
     action = _action(task.action if action is None else action, nominal, lagging, dt)
-    sensors = check_sensors(sensors)
+    sensors = check_sensors(sensors, dt)
     physics: dict[str, Any] = dict(
         effects=effects, pairs=pairs, team_effects=team_effects, models=models, rotors=rotors
     )

@@ -15,9 +15,9 @@ from jaxdrones.training.trainer import Trainer
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_a_learner_defines_what_training_needs(name):
     module = learner(name)
-    assert list(inspect.signature(module.init).parameters) == ["key", "env", "config"]
+    assert list(inspect.signature(module.init).parameters) == ["key", "env", "config", "network"]
     assert list(inspect.signature(module.update).parameters) == ["env", "config", "state"]
-    assert list(inspect.signature(module.train).parameters) == ["key", "env", "config"]
+    assert list(inspect.signature(module.train).parameters) == ["key", "env", "config", "network", "callback", "state"]
     config = module.Config()
     for setting in ("updates", "worlds", "horizon"):
         assert getattr(config, setting) >= 1

@@ -257,5 +257,5 @@ def test_without_pybullet_the_error_names_the_extra_and_the_python_limit(monkeyp
     monkeypatch.delitem(sys.modules, "pybullet", raising=False)
     monkeypatch.setattr(sys, "path", [])
     monkeypatch.setattr(sys, "path_importer_cache", {})
-    with pytest.raises(ImportError, match=r"jaxdrones\[bullet\].*CPython 3\.11"):
+    with pytest.raises(ImportError, match=r"pip install .*\[bullet\]\".*CPython 3\.11"):
         bullet.make_step()

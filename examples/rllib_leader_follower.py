@@ -90,7 +90,7 @@ class TeamRunner(MultiAgentEnvRunner):
     """An EnvRunner in which many worlds, the policies and the exploration are one compiled program."""
 
     def make_env(self):
-        self.team, self.horizon = self.config.env_config["env"], self.config.rollout_fragment_length
+        self.team, self.horizon = RECIPE.env(), self.config.rollout_fragment_length
         self.env, self.num_envs = MultiAgentEnv(self.team), self.config.num_envs_per_env_runner
         self.env.observation_space = gymnasium.spaces.Dict(dict.fromkeys(self.env.agents, SPACE))
         self.env.action_space = gymnasium.spaces.Dict(self.env.action_spaces)
@@ -166,7 +166,7 @@ def build(env, seed, updates, worlds, horizon):
         name: RLModuleSpec(CentralizedCritic, observation_space=SPACE, action_space=actions, model_config=own)
         for name, actions in MultiAgentEnv(env).action_spaces.items()
     }
-    config = PPOConfig().environment(MultiAgentEnv, env_config={"env": env}, disable_env_checking=True)
+    config = PPOConfig().environment(MultiAgentEnv, disable_env_checking=True)
     config.env_runners(env_runner_cls=TeamRunner, num_env_runners=0)
     config.env_runners(num_envs_per_env_runner=worlds, rollout_fragment_length=horizon)
     config.learners(num_learners=0, learner_class=AnnealingLearner, learner_config_dict={"steps": updates * steps})

@@ -19,7 +19,7 @@ from jaxdrones.dynamics.contact import contact_radius, rim, stop_at
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.distances import merged
-from jaxdrones.sensing.sweep import Disc, planes
+from jaxdrones.sensing.sweep import Disc, Planes, planes
 from jaxdrones.state import State
 from jaxdrones.vector import dot, safe_sqrt
 from jaxdrones.wrench import Wrench
@@ -82,7 +82,9 @@ class NearObstacles:
     def stopped(self, params: Params, before: State, after: State) -> State:
         """The team at the end of a physics step in which no drone passes through an obstacle, at any speed.
 
-        Compliant contact yields, and depends on the start of a step alone. So the path of every step is swept.
+        Compliant contact yields, and depends on the start of a step alone. So the path of every step is swept. The
+        planes that stop a drone are constants of the gradient: it is exact for a drone and flat obstacles, leaves out
+        how the normal of a round obstacle turns, and takes obstacles that move for resting ones.
 
         Args:
             params: of a team of n drones.
@@ -90,20 +92,19 @@ class NearObstacles:
             after: the team at its end, if nothing is in the way.
         """
 
-        def find(params: Params, before: State, after: State, scene: Scene) -> tuple[Array, Array]:
+        def find(params: Params, before: State, after: State, scene: Scene) -> Planes:
             kinds = merged(scene.shapes(before.pos.dtype))
+            start, end = jax.vmap(_core)(params, before), jax.vmap(_core)(params, after)
+            return jax.vmap(lambda *way: planes(kinds, *way))(start, end)
 
-            def of_drone(params: Params, before: State, after: State) -> tuple[Array, Array]:
-                start, end = _core(params, before), _core(params, after)
-                normals, heights = planes(kinds, start, end)
-                return normals, heights - normals @ (end.center - after.pos)  # of the center of mass
-
-            return jax.vmap(of_drone)(params, before, after)
+        def stop(params: Params, state: State, planes: Planes) -> State:
+            core = _core(params, state)
+            below = [dot(normal, state.pos) - core.lowest(normal) for normal in planes.normals]
+            return stop_at(state, planes.normals, planes.heights + jnp.stack(below))
 
         still = jax.lax.stop_gradient((params, before, after, self._scene))
         free = self._free.hold(*still[:2]) & self._free.hold(still[0], still[2])
-        normals, heights = where_needed(find, _ONE_IN)(~jnp.all(free), *still)
-        return jax.vmap(stop_at)(after, normals, heights)
+        return jax.vmap(stop)(params, after, where_needed(find, _ONE_IN)(~jnp.all(free), *still))
 
 
 def _core(params: Params, state: State) -> Disc:

@@ -72,7 +72,7 @@ class Planes(NamedTuple):
     normals: Float[Array, "planes 3"]
     """Unit normals away from the obstacles, world; zero for no plane."""
     heights: Float[Array, " planes"]
-    """Least heights of the disc's center along the normals, m."""
+    """Of the planes over the origin, m."""
 
 
 def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
@@ -87,9 +87,9 @@ def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
     def look(found: tuple[Planes, Point, Array], obstacle: Obstacle, _: Any) -> tuple[Planes, Point, Array]:
         known, center, count = found
         approach = _approach(obstacle, start, end)
-        normal = approach.normal
-        height = approach.height + dot(normal, end.center) - end.lowest(normal)  # of the center, where they touch
-        behind = jnp.where(approach.touches, jnp.maximum(height - dot(normal, center), 0), 0)
+        normal, height = approach.normal, approach.height
+        lowest = end._replace(center=center).lowest(normal)
+        behind = jnp.where(approach.touches, jnp.maximum(height - lowest, 0), 0)
         here = (jnp.arange(_PLANES) == count) & (behind > 0)
         after = Planes(jnp.where(here[:, None], normal[None], known.normals), jnp.where(here, height, known.heights))
         return after, center + behind * normal, count + (behind > 0)

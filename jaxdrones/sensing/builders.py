@@ -1,6 +1,6 @@
-"""Scenes to fly in: forests, rooms, tracks of gates, the obstacles of gym-pybullet-drones (2021).
+"""Forests, rooms, gate tracks and the obstacles of gym-pybullet-drones (2021).
 
-Random scenes have arrays of the same shapes for every key, so that one compiled program serves any number of worlds.
+Random scenes have the same array shapes for every key, so one compiled program serves any number of worlds.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _BOX_EDGE = (0.3, 1.0)  # m
 BEAMS = 4
 """Boxes of a gate."""
 _MAX_TREES = 10_000
-_HEIGHT_OF_FLIGHT = 1.5  # m; height of the points that are kept free unless others are given
+_HEIGHT_OF_FLIGHT = 1.5  # m; default height of the points to keep free
 
 
 def forest(
@@ -42,14 +42,14 @@ def forest(
     keep_free: ArrayLike | None = None,
     clearance: float = 1.5,
 ) -> Scene:
-    """A forest: trees at random places of a strip from x = 0 to `length`, and from y = -`width`/2 to `width`/2.
+    """Random forest on a strip from x = 0 to `length` and from y = -`width`/2 to `width`/2.
 
-    Places are uniform and independent, as in the forests of Karaman and Frazzoli (2012); trees may overlap. Those that
-    are too close to a point that is to be kept free are left out.
+    Places are uniform and independent, as in the forests of Karaman and Frazzoli (2012); trees may overlap. Trees
+    within `clearance` of a point of `keep_free` are left out.
 
     Args:
         key: random key; the same key gives the same forest.
-        density: trees per m^2, before some are left out; of two numbers, it is U(first, second) in every forest.
+        density: trees per m^2, before some are left out; a pair of numbers is the range of a uniform distribution.
         length: of the strip, m.
         width: of the strip, m.
         radius: of the trunks, U(first, second), m.
@@ -57,9 +57,9 @@ def forest(
         tilt: largest tilt of a trunk, U(0, tilt) about a random level axis, degrees; below 90.
         spheres: number of balls, of radius U(0.2, 0.5) m, anywhere up to `height`.
         boxes: number of boxes, with edges of U(0.3, 1) m and any heading, anywhere up to `height`.
-        keep_free: (k, 3) points that are at least `clearance` from every obstacle, m; the two ends of the strip's
-            center line, at a height of 1.5 m, when left out.
-        clearance: distance of obstacles from the points that are kept free, m.
+        keep_free: (k, 3) points to keep free of obstacles, m; by default the two ends of the strip's center line, at
+            a height of 1.5 m.
+        clearance: smallest distance of an obstacle from those points, m.
 
     Raises:
         ValueError: no random key, or more than 10,000 trees.
@@ -94,9 +94,9 @@ def room(
     clearance: float = 0.5,
     wall: float = 0.2,
 ) -> Scene:
-    """A room about the origin: four walls and a ceiling, with pillars and clutter at random places.
+    """Room centered at the origin: four walls, a ceiling, random pillars and clutter.
 
-    What is too close to a point that is to be kept free is left out.
+    Pillars and clutter within `clearance` of a point of `keep_free` are left out.
 
     Args:
         size: inner length, width and height, m.
@@ -105,8 +105,8 @@ def room(
         spheres: number of balls, of radius U(0.2, 0.5) m.
         boxes: number of boxes, with edges of U(0.3, 1) m and any heading.
         radius: of the pillars, U(first, second), m.
-        keep_free: (k, 3) points that are at least `clearance` from pillars and clutter, m.
-        clearance: distance of pillars and clutter from the points that are kept free, m.
+        keep_free: (k, 3) points to keep free of pillars and clutter, m.
+        clearance: smallest distance of pillars and clutter from those points, m.
         wall: thickness of walls and ceiling, m.
 
     Raises:
@@ -138,7 +138,7 @@ def room(
 
 
 def track(gates: ArrayLike, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:
-    """Gates at given poses, made of four boxes each, in the order of the poses.
+    """Gates at given poses, four boxes each, in the order of the poses.
 
     Args:
         gates: (k, 4) x, y, z of the center of the opening (m) and heading in which it is crossed (rad).
@@ -181,10 +181,10 @@ def gate(pos: ArrayLike, yaw: ArrayLike = 0.0, opening: float = 0.4, frame: floa
 
 
 def obstacles_2021() -> Scene:
-    """Counterparts of the default obstacles of gym-pybullet-drones (2021), at their places and of their size.
+    """Default obstacles of gym-pybullet-drones (2021), made of boxes and spheres.
 
     They are the walls of a courtyard around the origin, a duck at (-0.5, -0.5), a cube of 1 m at (-0.5, -2.5) and a
-    ball of 1 m at (0, 2), all made of boxes and spheres.
+    ball of 1 m at (0, 2).
     """
     wall = (0.55, 0.3, 0.25, 1.0)
     return Scene.of(
@@ -207,7 +207,7 @@ def _points(points: ArrayLike) -> Float[Array, "k 3"]:
 def _trunks(
     key: jax.Array, count: int, corners: Float[Array, "2 3"], radius: tuple[float, float], tilt: float = 0.0
 ) -> Cylinder:
-    """Cylinders at random places between two corners, which reach from the ground to the height of the second one."""
+    """Vertical cylinders at random places between two corners, from the ground to the height of the second corner."""
     place_key, radius_key, tilt_key, axis_key = jax.random.split(key, 4)
     height = corners[1, 2]
     foot = _random_places(place_key, count, corners) * jnp.array([[1, 1, 0]])

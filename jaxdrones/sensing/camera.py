@@ -1,4 +1,4 @@
-"""The camera of a drone and the noise of its depth, for both backends."""
+"""Camera of a drone and depth noise, for both backends."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from jaxdrones.vector import along_z, cross, unit
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A pinhole camera on every drone of a team, fixed to the body unless it is `levelled`.
+    """Pinhole camera on every drone of a team, fixed to the body unless `levelled`.
 
-    A camera looks along its own x axis, with y to the left and z up in the image, as a body does.
+    The camera's x axis is the viewing direction; y points left and z up in the image, as in the body frame.
     """
 
     resolution: tuple[int, int] = (64, 48)
@@ -31,26 +31,26 @@ class Camera:
     field_of_view: float = 60.0
     """Vertical field of view, degrees."""
     aspect: float | None = None
-    """Width over height of the view; that of the resolution, which makes square pixels, when left out."""
+    """Width over height of the view. The default is that of the resolution, which gives square pixels."""
     principal_point: tuple[float, float] = (0.0, 0.0)
-    """Where the optical axis meets the image, pixels to the right of and below the middle of the image."""
+    """Principal point, pixels to the right of and below the image center."""
     offset: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
     """(3,) position of the eye relative to the center of mass, m, body axes; world axes if the camera is levelled.
     `None`: one arm of the drone above the center of mass."""
     orientation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     """(4,) unit quaternion (x, y, z, w), camera to body."""
     levelled: bool = False
-    """Whether the camera looks along the body's x axis with the world's z axis up in the image, whatever the roll."""
+    """Whether the camera points along the body's x axis with the world's z axis up in the image, whatever the roll."""
     near: float | None = 0.05
-    """Smallest depth that is visible, m. `None`: the arm of the drone."""
+    """Smallest visible depth, m. `None`: the arm of the drone."""
     far: float = 1000.0
-    """Largest depth that is visible, m; also the depth of a pixel that shows nothing."""
+    """Largest visible depth, m; also the depth of an empty pixel."""
     rate: float | None = None
-    """Images per second; one every control step when left out."""
+    """Images per second. The default is one every control step."""
     latency: float = 0.0
     """Age of an image when it is observed for the first time, s."""
     sees_self: bool = False
-    """Whether the drone that carries the camera is visible."""
+    """Whether the drone with the camera is visible."""
     noise: Any = None
     """A model of the noise of the depth in environments, a `jaxdrones.sensing.DepthNoise` or another object with a
     method `apply(key, depth, camera) -> depth`."""
@@ -85,11 +85,11 @@ class Camera:
         return vertical * (width / height if self.aspect is None else self.aspect), vertical
 
     def pose(self, params: Params, state: State) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """Where the camera of one drone is and how it is turned.
+        """Position and axes of the camera of one drone.
 
         Returns:
-            Position of the eye (3,), m, world; and the directions (3, 3) that are forward, left and up in the image,
-            one in each row, world. Those of a levelled camera have no value where the body's x axis is vertical.
+            Position of the eye (3,), m, world; and the forward, left and up directions of the image as rows of a
+            (3, 3) matrix, world. The directions of a levelled camera are undefined where the body's x axis is vertical.
         """
         arm = along_z(params.arm)
         offset = arm if self.offset is None else jnp.asarray(self.offset, arm.dtype)
@@ -110,36 +110,36 @@ class Camera:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DepthNoise:
-    """A stereo camera: depth = focal length times baseline / disparity, and the disparity is known imperfectly.
+    """Depth noise of a stereo camera: depth = focal length times baseline / disparity.
 
-    A disparity with a standard deviation has a depth with one that grows with the square of the depth. The order is
-    that of a camera: scatter, rounding of the disparity, the limits of depth, missing pixels. Pixels that show nothing
-    stay at `far`.
+    Noise of the disparity gives a standard deviation of the depth that grows with the square of the depth. The order
+    is that of a camera: scatter, rounding of the disparity, limits of the depth, missing pixels. Empty pixels stay at
+    `far`.
     """
 
     spread: float = 0.0
     """Standard deviation of the depth at 1 m, m; at z m it is z^2 times as large. About 0.002 for stereo cameras of
     5 cm baseline and 640 pixels a row (a tenth of a pixel)."""
     constant_spread: float = 0.0
-    """Standard deviation that does not depend on the depth, m, added in quadrature."""
+    """Standard deviation independent of the depth, m, added in quadrature."""
     disparity_step: float = 0.0
-    """Step in which 1 / depth is known, 1/m; zero for none. Of a stereo camera it is the step of the disparity, pixels,
+    """Resolution of 1 / depth, 1/m; zero for none. For a stereo camera it is the resolution of the disparity (pixels)
     over focal length (pixels) times baseline (m)."""
     dropout: float = 0.0
-    """Share of the pixels that have no value."""
+    """Fraction of the pixels without a value."""
     missing: str = "zero"
-    """What such a pixel reads: `zero`, as in most drivers, or `far`."""
+    """Value of a missing pixel: `zero`, as in most drivers, or `far`."""
 
     def apply(self, key: jax.Array, depth: Float[Array, "*images h w"], camera: Camera) -> Float[Array, "*images h w"]:
-        """The depth that such a camera reads, m.
+        """Depth with noise, m.
 
-        The gradient with respect to the true depth is that of the scatter; rounding passes it on unchanged, as its own
-        is zero almost everywhere. Missing pixels have none.
+        The gradient with respect to the true depth is that of the scatter. Rounding has a straight-through gradient.
+        Missing pixels have a zero gradient.
 
         Args:
-            key: random key of these images.
+            key: random key.
             depth: true depth, m.
-            camera: that took them; its `far` is the depth of a pixel that shows nothing.
+            camera: camera of the images; its `far` is the depth of an empty pixel.
         """
         scatter_key, dropout_key = jax.random.split(key)
         far = jnp.asarray(camera.far, depth.dtype)
@@ -158,13 +158,13 @@ class DepthNoise:
         return noisy
 
     def _rounded(self, depth: Array, far: Array) -> Array:
-        """Depths whose inverse is a whole number of steps, the nearest ones; `far` where that number is zero."""
+        """Depth with its inverse rounded to whole steps; `far` where that is zero."""
         steps = jnp.round(1 / (jnp.maximum(depth, jnp.finfo(depth.dtype).tiny) * self.disparity_step))
         return jnp.where(steps > 0, jnp.minimum(1 / (jnp.maximum(steps, 1) * self.disparity_step), far), far)
 
 
 camera_2021 = Camera(levelled=True, aspect=1.0, principal_point=(0.5, -0.5), offset=None, near=None)
-"""The camera of gym-pybullet-drones (2021), whose pixels are not square. Its renderer looks through the lower left
+"""The camera of gym-pybullet-drones (2021), whose pixels are not square. Its renderer samples the lower left
 corners of the pixels in place of their centers."""
 
 

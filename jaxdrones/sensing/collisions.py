@@ -1,4 +1,4 @@
-"""Collision flags: which drones touch something. They depend on the poses alone and are the same on every backend."""
+"""Collision flags of a team; they depend on poses alone and are the same on every backend."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from jaxdrones.state import State
 from jaxdrones.vector import dot, safe_sqrt, unit
 
 _MARGIN = 1e-3  # m; a drone at rest is 0.01 mm (Bullet) or 1.5 mm (`ground_contact`) inside the ground
-_ROUNDING = 1e-3  # m: what is looked at reaches a little farther than what can be touched
+_ROUNDING = 1e-3  # m: the search reaches a little farther than contact
 _PROJECTIONS = 8  # of random pairs of cf2x within 0.2 m 0.5 % then touch up to 6 mm too early
 _BARE = Scene()
 
 
 class Collisions(PyTreeNode):
-    """What each drone of a team touches."""
+    """Contacts of each drone of a team with the ground, other drones and obstacles."""
 
     ground: Array
     """(n,) bool."""
@@ -36,16 +36,16 @@ class Collisions(PyTreeNode):
 
 
 def collisions(params: Params, state: State, scene: Scene = _BARE, margin: ArrayLike = _MARGIN) -> Collisions:
-    """Find which drones of a team touch the ground, another drone or an obstacle.
+    """Compute which drones of a team touch the ground, another drone or an obstacle.
 
-    A drone is its collision cylinder. The `balls` that touch in either backend lie inside it; they reach its faces and
-    its rim but not its edges.
+    A drone is its collision cylinder. The contact `balls` of both backends lie inside it; they reach its faces and rim,
+    not its edges.
 
     Args:
         params: of a team of n drones.
         state: of the team; only its poses matter.
         scene: of the world.
-        margin: gap that still counts as touching, m.
+        margin: largest gap that counts as contact, m.
 
     Raises:
         ValueError: a wrong shape, a mesh or URDF file in the scene, or a negative margin.
@@ -102,10 +102,10 @@ def _touch_any(bodies: Cylinder, obstacles: Obstacle, margin: ArrayLike) -> Bool
 
 
 def _gap(body: Cylinder, obstacle: Obstacle) -> Float[Array, ""]:
-    """The distance of a drone from the core of an obstacle, m; not positive if they overlap.
+    """Distance of a drone from the core of an obstacle, m; not positive if they overlap.
 
-    It is the widest gap along any of some directions, which bounds the distance from below: the directions along which
-    such bodies mostly are apart, and that between the nearest points, which alternating projections find.
+    It is the widest gap along a set of candidate directions, a lower bound of the distance: the usual separating
+    directions of such bodies, and that between the nearest points, found by alternating projections.
     """
     center = obstacle.to_local(body.pos)
     axis = rotation.rotate_inverse(obstacle.quat, rotation.z_axis(body.quat))

@@ -1,4 +1,4 @@
-"""Distances of points from the surfaces of solids, and where these are nearest."""
+"""Signed distances and nearest points of solids."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from jaxdrones.vector import along_z
 
 
 class Surface(PyTreeNode):
-    """The point of a surface that is nearest to some point."""
+    """Nearest point of a surface to a query point."""
 
     distance: Array
-    """() signed distance of that point from the surface, m; negative inside. Infinity where there is no surface."""
+    """() signed distance of the query point, m; negative inside. Infinity where there is no surface."""
     point: Array
     """(3,) the nearest point of the surface, m, world; infinity where there is none."""
     normal: Array
@@ -30,7 +30,7 @@ class Surface(PyTreeNode):
 
 
 class Solid(Rounded, kw_only=True):
-    """Boxes, spheres, cylinders and capsules in the same arrays, so that one program serves all of them."""
+    """Box, sphere, cylinder or capsule in one representation."""
 
     half: Any = None
     """(3,) half of the core's extents along x, y and z, m."""
@@ -41,9 +41,9 @@ class Solid(Rounded, kw_only=True):
 
 
 def merged(kinds: list[Any]) -> list[Any]:
-    """Obstacles of several kinds, each with a leading axis, in fewer arrays; in the same order.
+    """Merge obstacles of several kinds, each with a leading axis, into fewer arrays, in the same order.
 
-    A program that looks at one array after another so compiles faster.
+    Fewer arrays compile faster.
     """
     rounded = [jax.vmap(_as_solid)(kind) for kind in kinds if isinstance(kind, Rounded)]
     others = [kind for kind in kinds if not isinstance(kind, Rounded)]
@@ -83,19 +83,19 @@ def nearest_of(kinds: list[Any], ground: bool, point: Point) -> Surface:
 
 
 def touched_of(kinds: list[Any], points: Float[Array, "m 3"], within: Number) -> Surface:
-    """The nearest surface of each of some points near each other, as far as it is nearer than `within`.
+    """Nearest surface to each of several points close together, where it is nearer than `within`.
 
     Args:
         kinds: obstacles, each kind with a leading axis; at least one kind.
         points: m, world.
-        within: m; where nothing is nearer, the surface is that of any obstacle.
+        within: m; where nothing is nearer, the result is the surface of an arbitrary obstacle.
     """
     surfaces = [_touched_of_kind(kind, points, within) for kind in kinds]
     return functools.reduce(jax.vmap(_nearer), surfaces)
 
 
 def as_floats(x: ArrayLike) -> Array:
-    """An array of real numbers, in the precision that it has."""
+    """Real array in its own precision."""
     x = jnp.asarray(x)
     return x.astype(jnp.result_type(x, 1.0))
 
@@ -121,8 +121,8 @@ def _nearest_of_kind(kind: Any, point: Point) -> Surface:
 def _nearest_obstacle(kind: Any, point: Point) -> Any:
     """The obstacle of a kind that is nearest to a point.
 
-    It is chosen by its index. The gradient of a minimum looks for the number that equals it, and finds none where a
-    compiler rounds that number in two ways.
+    It is chosen by its index: the gradient of a minimum compares for equality, which fails where a compiler rounds the
+    same number in two ways.
     """
     index = jnp.argmin(jax.lax.stop_gradient(_distances(kind, point)))
     return jax.tree.map(lambda x: x[index], kind)
@@ -134,10 +134,9 @@ def _touched_of_kind(kind: Any, points: Float[Array, "m 3"], within: Number) -> 
 
 
 def _nearest_within(kind: Any, points: Float[Array, "m 3"], within: Number) -> Int[Array, " m"]:
-    """The index of the obstacle that is nearest to each point; any, where none is nearer than `within`.
+    """Index of the nearest obstacle to each point; arbitrary where none is nearer than `within`.
 
-    A distance changes by no more than the way that a point is moved. So all obstacles that matter are found by their
-    distances from the center of the points, and only those are looked at: of many obstacles, mostly none.
+    Distances are 1-Lipschitz, so a distance from the center of the points rules out most obstacles.
     """
     center = jnp.mean(points, axis=0)
     reach = within + jnp.max(jax.vmap(length)(points - center[None]))
@@ -154,16 +153,14 @@ def _nearest_within(kind: Any, points: Float[Array, "m 3"], within: Number) -> I
 
 
 def fold_near(kind: Any, point: Point, reach: Number, look: Callable[[Any, Any, Any], Any], found: Any) -> Any:
-    """Look at those obstacles of a kind whose surface is nearer to a point than `reach`, the nearest first.
-
-    Of many obstacles these are mostly none. There is no gradient.
+    """Fold a function over the obstacles of a kind within `reach` of a point, the nearest first; no gradient.
 
     Args:
         kind: obstacles with a leading axis.
         point: m, world.
         reach: m.
-        look: `look(found, obstacle, index)` returns what is found with one obstacle more.
-        found: what is found without any.
+        look: `look(found, obstacle, index)` returns the next value of `found`.
+        found: initial value.
     """
     kind, point, reach = jax.lax.stop_gradient((kind, point, reach))
 

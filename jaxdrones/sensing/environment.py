@@ -1,4 +1,4 @@
-"""Barometer and magnetometer: the height and the heading that the Earth gives."""
+"""Barometer and magnetometer."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ EUROPE = (0.0, 21.5, -43.0)
 
 
 def barometer(errors: Noise = BMP388, rate: float = 50.0, name: str = "barometer") -> Sensor:
-    """The height above the origin by the pressure of the air; its reading is (1,), m.
+    """Barometer; its reading (1,) is the height above the origin by air pressure, m.
 
     Args:
         errors: in m; 1 Pa is 0.083 m at sea level. Wind and rotors disturb a real barometer by more.
-        rate: measurements per second; control steps of the environment are as frequent or a multiple of it.
-        name: by which observation terms ask for the reading.
+        rate: measurements per second; the control rate of the environment is a multiple of it.
+        name: name of the reading in observation terms.
     """
     entries = (Quantity("height measured", "m", "world"),)
     return _noisy(name, errors, rate, 1, lambda state: state.pos[2:], entries)
@@ -46,13 +46,13 @@ def magnetometer(
     rate: float = 20.0,
     name: str = "magnetometer",
 ) -> Sensor:
-    """The magnetic field in body axes; its reading is (3,), uT.
+    """Magnetometer; its reading (3,) is the magnetic field in body axes, uT.
 
     Args:
         errors: in uT.
         field: (3,) magnetic field, uT, world.
-        rate: measurements per second; control steps of the environment are as frequent or a multiple of it.
-        name: by which observation terms ask for the reading.
+        rate: measurements per second; the control rate of the environment is a multiple of it.
+        name: name of the reading in observation terms.
     """
 
     def true(state: State) -> jax.Array:
@@ -69,7 +69,7 @@ def _noisy(
     true: Callable[[State], jax.Array],
     entries: tuple[Quantity, ...],
 ) -> Sensor:
-    """A sensor of `true(state)`, (size,), with errors."""
+    """Sensor of `true(state)`, (size,), with errors."""
 
     def init(key: jax.Array, params: Params) -> Errors:
         return errors.init(key, (size,), params.mass.dtype)

@@ -1,4 +1,4 @@
-"""The state of a drone as its own filter knows it, from an IMU and motion capture."""
+"""On-board state estimation from an IMU and motion capture."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ROUNDING = 1e-6  # of a number of periods
 
 
 class Sample(PyTreeNode):
-    """What is measured: the IMU's means over the period before an instant, and the pose at the instant."""
+    """One set of measurements: the IMU's means over the period before an instant, and the pose at the instant."""
 
     gyro: Array
     """(3,) rad/s, body."""
@@ -41,10 +41,10 @@ class Sample(PyTreeNode):
 
 
 class Memory(PyTreeNode):
-    """What the sensor `state_estimate` remembers."""
+    """Memory of the sensor `state_estimate`."""
 
     estimate: kalman.Estimate
-    """As of the pose that arrived last, or was due."""
+    """Estimate at the instant of the last pose that arrived or was due."""
     imu: dict[str, Errors]
     """Errors of the IMU."""
     samples: Sample
@@ -58,7 +58,7 @@ class Memory(PyTreeNode):
 
 
 def imu_noise(part: ImuPart) -> kalman.ImuNoise:
-    """The noise that the filter expects of an IMU; a Gauss-Markov bias is taken for a random walk."""
+    """Noise model of an IMU for the filter; a Gauss-Markov bias becomes a random walk."""
     densities = part.gyro.density, part.acc.density, part.gyro.bias_walk, part.acc.bias_walk
     return kalman.ImuNoise(*(jnp.asarray(density, float) for density in densities))
 
@@ -72,24 +72,24 @@ def state_estimate(
     start: tuple[float, float, float] = (0.001, 0.02, 0.01),
     name: str = "state_estimate",
 ) -> Sensor:
-    """The state that an error-state Kalman filter knows; its reading is a `State` for policies and controllers.
+    """State estimate of an error-state Kalman filter; its reading is a `State` for policies and controllers.
 
-    The filter, `jaxdrones.sensing.kalman`, fuses an IMU in the center of mass with motion capture. The IMU integrates
-    over its period, as those of flight controllers do. The filter lives in the past, at the instant of the poses that
-    arrive, and the IMU's samples since then bring its estimate to the present.
-    The reading's `rpm` is that of the drone, as telemetry knows it, and its `aux` is empty. The memory's `estimate` has
-    the covariance. The filter knows nothing of errors of scale, saturation, or poses whose errors are not white.
+    The filter, `jaxdrones.sensing.kalman`, fuses an IMU at the center of mass with motion capture. The IMU integrates
+    over its period, as in flight controllers. Poses arrive late: the filter updates at their instant, and the IMU's
+    samples since then propagate its estimate to the present.
+    The reading's `rpm` is that of the drone, as in telemetry, and its `aux` is empty. The memory's `estimate` has the
+    covariance. The filter does not model scale errors, saturation, or colored noise of poses.
 
     Args:
         part: errors of the IMU.
         system: rate, delay, dropouts and noise of the poses; rate and delay are multiples of the IMU's period.
-        rate: of the IMU and of the estimates, 1/s; control steps of the environment are as frequent or a multiple.
-        attitude: whether the attitude of the poses is used, or the position alone.
+        rate: of the IMU and of the estimates, 1/s; the control rate of the environment is a multiple of it.
+        attitude: whether to use the attitude of the poses, or the position alone.
         start: standard deviations of the first estimate's position (m), velocity (m/s) and angle (rad).
-        name: by which observation terms ask for the reading.
+        name: name of the reading in observation terms.
 
     Raises:
-        ValueError: poses without noise, or a rate or delay of the poses that is no multiple of the IMU's period.
+        ValueError: poses without noise, or with a rate or delay that is not a multiple of the IMU's period.
     """
     check_number(f"pos_noise of {name}", system.pos_noise, "m", above=0)
     if attitude:
@@ -136,7 +136,7 @@ def state_estimate(
         return after, seen(now, state, read, true)
 
     def begin(key: jax.Array, state: State) -> kalman.Estimate:
-        """The first estimate: the truth with errors."""
+        """First estimate: the true state with errors."""
         dtype = state.pos.dtype
         deviation = jnp.repeat(jnp.asarray([*start, part.gyro.bias, part.acc.bias], dtype), 3)
         error = deviation[:9] * jax.random.normal(key, (9,), dtype)
@@ -144,7 +144,7 @@ def state_estimate(
         return kalman.init(state.pos + error[kalman.POS], state.vel + error[kalman.VEL], quat, deviation)
 
     def advanced(estimate: kalman.Estimate, samples: Sample, gravity: Array) -> kalman.Estimate:
-        """The estimate one period later, with the pose of then if it arrived."""
+        """Estimate one period later, with that pose if it arrived."""
         now = jax.tree.map(lambda x: x[0], samples)
         predicted = kalman.predict(imu_noise(part), estimate, now.gyro, now.acc, gravity, dt)
         updated = kalman.update_position(predicted, now.pos, system.pos_noise)
@@ -163,13 +163,13 @@ def state_estimate(
 
 
 def seen(now: kalman.Estimate, state: State, read: dict[str, Array], true: dict[str, Array]) -> State:
-    """The state as the filter knows it; body rates are those of the gyroscope, less the bias that it is taken to have.
+    """Estimated state; body rates are those of the gyroscope, less its estimated bias.
 
     Args:
-        now: estimate of the present.
-        state: the true one.
-        read: what the IMU reads; its error, of a mean over the period, is taken for that at the instant.
-        true: what a unit without errors reads.
+        now: present estimate.
+        state: true state.
+        read: reading of the IMU; its error, of a mean over the period, is taken for that at the instant.
+        true: reading without errors.
     """
     omega = state.omega + (read["gyro"] - true["gyro"]) - now.gyro_bias
     return State(now.pos, now.quat, now.vel, omega, state.rpm)
@@ -180,7 +180,7 @@ def _chosen(condition: Array, a: Any, b: Any) -> Any:
 
 
 def _whole(name: str, what: str, periods: float, given: str, rate: float, at_least: int) -> int:
-    """A number of periods of the IMU that has to be whole."""
+    """Number of periods of the IMU as an integer; raise where it is not whole."""
     whole = round(periods)
     if whole < at_least or abs(periods - whole) > _ROUNDING * max(periods, 1):
         raise UserError(

@@ -1,4 +1,4 @@
-"""Obstacles that are read from files; only Bullet can show them and let drones touch them."""
+"""Obstacles from mesh and URDF files, for the Bullet backend only."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxdrones.sensing.shapes import GREY, LENGTHS, Box
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class File:
-    """A solid from a file, at a fixed place; of plain numbers, as Bullet reads it once."""
+    """Static solid from a file; its numbers are concrete, as Bullet reads them once."""
 
     path: str | Path
     pos: tuple[float, ...]
@@ -40,7 +40,7 @@ class File:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mesh(File):
-    """A triangle mesh (.obj, .stl, .dae), of which Bullet lets drones touch the convex hull."""
+    """Triangle mesh (.obj, .stl, .dae); Bullet collides with its convex hull."""
 
     scale: float = 1.0
     """Length of the file's unit, m."""
@@ -50,7 +50,7 @@ class Mesh(File):
         check_positive("scale of Mesh", self.scale, "m")
 
     def bounding_box(self) -> Box:
-        """The smallest box along the mesh's own axes that holds it: an obstacle for both backends.
+        """Bounding box along the mesh's own axes: an obstacle for both backends.
 
         Raises:
             ValueError: the file is neither .obj nor .stl, or holds no points.
@@ -64,7 +64,7 @@ class Mesh(File):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Urdf(File):
-    """A body from a URDF, which keeps its own colors."""
+    """Body from a URDF, with its own colors."""
 
 
 _THINNEST = 1e-3  # m: a flat mesh becomes a thin box
@@ -73,7 +73,7 @@ _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("at
 
 
 def _points(path: Path) -> np.ndarray:
-    """The corners (k, 3) of a mesh, in units of its file."""
+    """Corners (k, 3) of a mesh, in units of its file."""
     data, kind = path.read_bytes(), path.suffix.lower()
     if kind not in (".obj", ".stl"):
         raise UserError(f"{path}: the bounding box of {kind or 'such a'} file is not known; give an .obj or .stl")

@@ -23,12 +23,12 @@ def length(v: Float[Array, " n"]) -> Number:
 
 
 def signed_distance(beyond: Float[Array, " n"]) -> Number:
-    """Signed distance from a product of intervals, of how far each coordinate is beyond its interval."""
+    """Signed distance from a product of intervals, given the excess of each coordinate beyond its interval."""
     return length(jnp.maximum(beyond, 0)) + jnp.minimum(jnp.max(beyond), 0)
 
 
 def outward(beyond: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The gradient of `signed_distance`, of unit length also on faces and edges."""
+    """Gradient of `signed_distance`, of unit length also on faces and edges."""
     outside = jnp.maximum(beyond, 0)
     distance = length(outside)
     to_face = jnp.arange(len(beyond)) == jnp.argmax(beyond)
@@ -36,7 +36,7 @@ def outward(beyond: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def direction(v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The direction of v; the first axis where v is zero."""
+    """Unit vector along v; the first axis where v is zero."""
     size = length(v)
     first = jnp.arange(len(v)) == 0
     return jnp.where(size > 0, v / jnp.where(size > 0, size, 1), first)
@@ -50,14 +50,14 @@ def around_z(center: Point, axis: Point) -> list[Point]:
 
 
 def between_planes(origin: Array, direction: Array, half: Array) -> Interval:
-    """Where lines are between two planes at +-`half`."""
+    """Interval of lines between two planes at +-`half`."""
     per_unit = 1 / nonzero(direction)
     middle, reach = -origin * per_unit, half * jnp.abs(per_unit)
     return middle - reach, middle + reach
 
 
 def within_radius(origin: Components, direction: Components, radius: Number) -> Interval:
-    """Where lines are within `radius` of zero; the empty interval [inf, -inf] where they are never."""
+    """Interval of lines within `radius` of zero; the empty interval [inf, -inf] for a miss."""
     square = _product(direction, direction)
     divisor = nonzero(square)
     per_square = 1 / divisor
@@ -79,6 +79,6 @@ def _product(a: Components, b: Components) -> Array:
 
 
 def nonzero(x: Array) -> Array:
-    """The same number, but no smaller than one whose inverse has finite derivatives."""
+    """Clamp a number away from zero, so that its inverse has finite derivatives."""
     smallest = jnp.finfo(x.dtype).tiny ** 0.25
     return jnp.where(jnp.abs(x) < smallest, smallest, x)

@@ -26,17 +26,17 @@ from jaxdrones.vector import along_z, cross, unit
 HUB, FRONT, BACK = (0.15, 0.15, 0.2, 1.0), (0.8, 0.15, 0.1, 1.0), (0.35, 0.35, 0.4, 1.0)
 """Red, green, blue and opacity of a drone's hub and of the discs of its front and back rotors, on both backends."""
 ROTORS = 4
-_PHOTO_NEAR = 0.02  # m, smallest depth that is visible in a photograph
-_NARROW = 32  # pixels: images that are narrower are computed as one long row, as short rows leave vectors half empty
+_PHOTO_NEAR = 0.02  # m, smallest visible depth in a photograph
+_NARROW = 32  # pixels: narrower images are computed as one long row, as short rows leave vectors half empty
 
 
 class Images(PyTreeNode):
-    """What the cameras of n drones see; arrays have leading axes over drones, rows and columns."""
+    """Images of the cameras of n drones; arrays have leading axes over drones, rows and columns."""
 
     rgb: Array
     """(n, h, w, 4) uint8: red, green, blue, opacity."""
     depth: Array
-    """(n, h, w) depth along the viewing axis, m; `far` where nothing is visible."""
+    """(n, h, w) depth along the viewing axis, m; `far` for empty pixels."""
     segmentation: Array
     """(n, h, w) int32: -1 nothing, 0 ground, 1 + i drone i, 1 + n + j obstacle j."""
 
@@ -45,13 +45,12 @@ _DEFAULT = Camera()
 
 
 def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT) -> Images:
-    """Render what the camera on every drone of a team sees.
+    """Render the camera of every drone of a team.
 
-    Boxes, spheres, cylinders, capsules, the ground and the drones (a hub and four rotor discs each) are met by a ray
-    for each pixel, so that the cost grows with pixels times solids. The depth is differentiable in the poses and in the
-    scene: its gradient is that of the surface that is visible, and knows nothing of a silhouette that moves over a
-    pixel. What is nearer than `near` is seen at `near`, also from inside. What is not needed of the images costs
-    nothing under `jax.jit`.
+    One ray a pixel is intersected with boxes, spheres, cylinders, capsules, the ground and the drones (a hub and four
+    rotor discs each), so the cost grows with pixels times solids. The depth is differentiable in the poses and in the
+    scene: its gradient is that of the visible surface, without the contribution of moving silhouettes. Surfaces nearer
+    than `near` are seen at `near`, also from inside. Under `jax.jit` unused images cost nothing.
 
     Args:
         scene: of one world.
@@ -81,7 +80,7 @@ def photograph(
     target: ArrayLike,
     camera: Camera = _DEFAULT,
 ) -> UInt8[Array, "h w 3"]:
-    """A picture of a team from a place in the world, upright: the colors of `view`, which explains the arguments."""
+    """Color image of `view`, with the same arguments."""
     return view(scene, params, state, eye, target, camera).rgb[..., :3]
 
 
@@ -94,17 +93,16 @@ def view(
     camera: Camera = _DEFAULT,
     colors: Float[ArrayLike, "n 3"] | None = None,
 ) -> Images:
-    """Images of a team from a place in the world, upright, without an axis over drones.
+    """Upright images of a team from a fixed point in the world, without an axis over drones.
 
     Args:
         scene: of one world.
         params: of a team of n drones.
         state: of the team; only its poses matter.
-        eye: (3,) where the camera is, m, world; not right above or below the target.
-        target: (3,) what is in the middle of the picture, m, world.
-        camera: of which the lens matters, not where it is mounted.
-        colors: red, green and blue of every drone, 0 to 1; their rotors are lighter behind. All drones look alike when
-            left out.
+        eye: (3,) position of the camera, m, world; not right above or below the target.
+        target: (3,) center of the picture, m, world.
+        camera: lens of the camera; its mounting is ignored.
+        colors: red, green and blue of every drone, 0 to 1; rear rotors are lighter. By default all drones look alike.
 
     Raises:
         ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
@@ -121,18 +119,18 @@ def view(
 
 
 class _Surroundings(NamedTuple):
-    """All that cameras may see."""
+    """Solids visible to cameras, with their colors and labels."""
 
     kinds: list[Any]
     """Solids, kind by kind."""
     active: Array
-    """(k,) bool, which of all solids are there."""
+    """(k,) bool, active solids."""
     owner: Array
-    """(k,) the drone that a solid is a part of; -1 for others."""
+    """(k,) drone of each solid; -1 for others."""
     colors: Array
     """(k, 3) red, green, blue."""
     labels: Array
-    """(k + 1,) int32: of the segmentation; the last one is nothing."""
+    """(k + 1,) int32: labels of the segmentation; the last one is for empty pixels."""
     ground: int | None
     """Index of the ground, if there is one."""
 
@@ -174,7 +172,7 @@ def _surroundings(
 
 
 def _picture(camera: Camera, view: View, around: _Surroundings, seen: Bool[Array, " k"]) -> Images:
-    """The images of one camera, which sees some of the solids; without an axis over drones."""
+    """Images of one camera, without an axis over drones."""
     seen_kinds = jnp.split(seen, np.cumsum([len(kind.pos) for kind in around.kinds])[:-1])
     depths = depth(view, around.kinds, seen_kinds)
     still, solids, still_depths = jax.lax.stop_gradient((view, around.kinds, depths))
@@ -199,7 +197,7 @@ def _render(scene: Scene, params: Params, state: State, camera: Camera) -> Image
 
 
 def view_of(camera: Camera, params: Params, state: State) -> View:
-    """The rays of the camera on one drone."""
+    """Rays of the camera of one drone."""
     return _view(camera, *camera.pose(params, state), camera.near_of(params))
 
 
@@ -224,7 +222,7 @@ def _view(camera: Camera, eye: Float[Array, "3"], axes: Float[Array, "3 3"], nea
 
 
 def drone_solids(params: Params, state: State, tints: ArrayLike | None = None) -> list[Obstacle]:
-    """The visible parts of n drones: n hubs, and 4 n rotor discs, red in front, or in the tints (n, 3) of drones."""
+    """Visible parts of n drones: n hubs, and 4 n rotor discs, red in front, or in the tints (n, 3) of drones."""
     if tints is None:
         paints = jnp.asarray([HUB, FRONT, BACK])[:, None]
     else:

@@ -1,4 +1,4 @@
-"""Inertial measurement units: accelerometer and gyroscope, with the errors of named parts."""
+"""Inertial measurement units: accelerometer and gyroscope, with errors of named parts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _DEGREE = math.pi / 180
 
 @dataclasses.dataclass(frozen=True)
 class ImuPart:
-    """The errors of an inertial measurement unit."""
+    """Errors of an inertial measurement unit."""
 
     acc: Noise
     """Of the accelerometer, m/s^2."""
@@ -57,16 +57,16 @@ def imu(
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     name: str = "imu",
 ) -> Sensor:
-    """An inertial measurement unit; its reading is `acc` (3,), specific force, m/s^2, and `gyro` (3,), rad/s, body.
+    """Inertial measurement unit; its reading is `acc` (3,), specific force, m/s^2, and `gyro` (3,), rad/s, body.
 
-    What is read is the motion at the instant, without the unit's low-pass filter, so white noise has the density of the
-    part and the deviation density times sqrt(`rate`).
+    Readings are instantaneous, without the unit's low-pass filter: white noise has the density of the part and the
+    standard deviation density times sqrt(`rate`).
 
     Args:
         part: the errors.
-        rate: measurements per second; control steps of the environment are as frequent or a multiple of it.
+        rate: measurements per second; the control rate of the environment is a multiple of it.
         offset: (3,) of the unit from the center of mass, m, body.
-        name: by which observation terms ask for the reading.
+        name: name of the reading in observation terms.
     """
     at_center = not np.any(np.asarray(offset))
 
@@ -83,7 +83,7 @@ def imu(
 
 
 def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:
-    """The errors of a unit at the start of an episode: of `acc` and of `gyro`."""
+    """Initial errors of a unit in an episode: of `acc` and of `gyro`."""
     keys = dict(zip(("acc", "gyro"), jax.random.split(key), strict=True))
     return {name: getattr(part, name).init(keys[name], (3,), params.mass.dtype) for name in keys}
 
@@ -91,7 +91,7 @@ def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:
 def read(
     part: ImuPart, key: jax.Array, errors: dict[str, Errors], true: dict[str, Array], dt: float
 ) -> tuple[dict[str, Errors], dict[str, Array]]:
-    """The errors of this measurement of a unit, and the reading of the motion `true`.
+    """Errors and reading of one measurement.
 
     Args:
         part: the unit.
@@ -108,14 +108,14 @@ def read(
 def mean_motion(
     params: Params, quat: Float[Array, "4"], vel: Float[Array, "3"], state: State, dt: float
 ) -> dict[str, Array]:
-    """What a unit without errors reads on average over a step, as one that integrates: `acc` and `gyro`, body.
+    """Mean ideal reading over a step, as of a unit that integrates: `acc` and `gyro`, body.
 
-    The step's turn and gain of velocity by means of these, with `acc` in the axes of its middle, are exact.
+    Rotation and change of velocity over the step follow exactly from these means, with `acc` in the axes of mid-step.
 
     Args:
         params: of the drone.
-        quat: (4,) attitude at the begin of the step.
-        vel: (3,) velocity at the begin of the step, m/s, world.
+        quat: (4,) attitude at the start of the step.
+        vel: (3,) velocity at the start of the step, m/s, world.
         state: at the end.
         dt: length of the step, s.
     """
@@ -128,7 +128,7 @@ def mean_motion(
 
 
 def motion(params: Params, state: State, rate: State, offset: Float[Array, "3"] | None = None) -> dict[str, Array]:
-    """What a unit without errors reads: `acc` R^T (a - g) + dw/dt x r + w x (w x r), m/s^2, and `gyro` w, rad/s, body.
+    """Ideal reading: `acc` R^T (a - g) + dw/dt x r + w x (w x r), m/s^2, and `gyro` w, rad/s, body.
 
     Args:
         params: of the drone.

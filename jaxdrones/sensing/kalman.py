@@ -1,8 +1,8 @@
-"""An error-state Kalman filter: attitude, velocity and position of a drone from its IMU and measurements of its pose.
+"""Error-state Kalman filter of attitude, velocity and position from an IMU and pose measurements.
 
-The nominal state is moved by the IMU; the filter knows the covariance of the error, which is (15,): position (m) and
-velocity (m/s) in world axes, the rotation (rad) from the estimated to the true body in body axes, and the biases of
-gyroscope (rad/s) and accelerometer (m/s^2). Solà, "Quaternion kinematics for the error-state Kalman filter", 2017,
+The IMU propagates the nominal state. The error state (15,) is position (m) and velocity (m/s) in world axes, the
+rotation (rad) from the estimated to the true body in body axes, and the biases of gyroscope (rad/s) and accelerometer
+(m/s^2); the filter keeps its covariance. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017,
 sections 5 and 6.
 """
 
@@ -20,7 +20,7 @@ POS, VEL, ANGLE, GYRO_BIAS, ACC_BIAS = (slice(3 * k, 3 * k + 3) for k in range(5
 
 
 class Estimate(PyTreeNode):
-    """What the filter knows of one drone."""
+    """Nominal state and error covariance of one drone."""
 
     pos: Array
     """(3,) m, world."""
@@ -37,7 +37,7 @@ class Estimate(PyTreeNode):
 
 
 class ImuNoise(PyTreeNode):
-    """Densities of the noise that the filter expects of an IMU; scalars, or (3,) one for each axis."""
+    """Noise densities of an IMU; scalars, or (3,) one for each axis."""
 
     gyro: Array
     """White noise of the gyroscope, rad/s/sqrt(Hz)."""
@@ -52,7 +52,7 @@ class ImuNoise(PyTreeNode):
 def init(
     pos: Float[Array, "3"], vel: Float[Array, "3"], quat: Float[Array, "4"], deviation: Float[Array, "15"]
 ) -> Estimate:
-    """An estimate without correlations, and with biases of zero.
+    """Initial estimate, without correlations and with zero biases.
 
     Args:
         pos: m, world.
@@ -72,13 +72,13 @@ def predict(
     gravity: Float[Array, ""],
     dt: float | Array,
 ) -> Estimate:
-    """The estimate a time step later, with the errors that the IMU adds.
+    """Propagate the estimate and its covariance by one time step.
 
     Args:
         noise: of the IMU.
-        estimate: at the begin of the step.
-        gyro: mean reading in the step, rad/s, body; the mean of the readings at its begin and end will do.
-        acc: mean reading in the step, specific force, m/s^2, in the body axes of the middle of the step.
+        estimate: at the start of the step.
+        gyro: mean reading in the step, rad/s, body; the mean of the readings at its start and end will do.
+        acc: mean reading in the step, specific force, m/s^2, in the body axes of mid-step.
         gravity: m/s^2.
         dt: time step, s.
     """
@@ -106,7 +106,7 @@ def predict(
 def move(
     estimate: Estimate, gyro: Float[Array, "3"], acc: Float[Array, "3"], gravity: Float[Array, ""], dt: float | Array
 ) -> Estimate:
-    """The estimate a time step later, with its old covariance; arguments are those of `predict`."""
+    """Propagate the nominal state alone; arguments are those of `predict`."""
     turn = (gyro - estimate.gyro_bias) * dt
     middle = rotation.multiply(estimate.quat, rotation.exp(turn / 2))
     gained = (rotation.rotate(middle, acc - estimate.acc_bias) - along_z(gravity)) * dt
@@ -120,11 +120,11 @@ def move(
 def update(
     estimate: Estimate, residual: Float[Array, " k"], jacobian: Float[Array, "k 15"], cov: Float[Array, "k k"]
 ) -> Estimate:
-    """The estimate after a measurement; the covariance in Joseph's form.
+    """Update the estimate with a measurement; the covariance is in Joseph's form.
 
     Args:
         estimate: before it.
-        residual: what was measured less what was expected.
+        residual: measured less expected value.
         jacobian: derivative of the measurement with respect to the error.
         cov: covariance of the measurement's noise.
     """
@@ -149,13 +149,13 @@ def update(
 def update_position(
     estimate: Estimate, pos: Float[Array, "3"], deviation: float | Array, offset: Float[Array, "3"] | None = None
 ) -> Estimate:
-    """The estimate after a measurement of the position.
+    """Update the estimate with a measurement of the position.
 
     Args:
         estimate: before it.
         pos: m, world.
         deviation: standard deviation of each axis, m.
-        offset: (3,) of the point that is measured from the IMU, m, body; none when left out.
+        offset: (3,) measured point relative to the IMU, m, body; zero by default.
     """
     eye = jnp.eye(3, dtype=pos.dtype)
     offset = jnp.zeros_like(pos) if offset is None else offset
@@ -166,13 +166,13 @@ def update_position(
 
 
 def update_attitude(estimate: Estimate, quat: Float[Array, "4"], deviation: float | Array) -> Estimate:
-    """The estimate after a measurement of the attitude, of this standard deviation about each axis, rad."""
+    """Update the estimate with a measured attitude, with this standard deviation about each axis, rad."""
     jacobian = jnp.zeros((3, 15), quat.dtype).at[:, ANGLE].set(jnp.eye(3, dtype=quat.dtype))
     return update(estimate, angle(estimate.quat, quat), jacobian, deviation**2 * jnp.eye(3, dtype=quat.dtype))
 
 
 def update_height(estimate: Estimate, height: Float[Array, ""], deviation: float | Array) -> Estimate:
-    """The estimate after a measurement of the height, m, of this standard deviation."""
+    """Update the estimate with a measured height, with this standard deviation, m."""
     jacobian = jnp.zeros((1, 15), height.dtype).at[0, 2].set(1)
     return update(estimate, (height - estimate.pos[2])[None], jacobian, deviation**2 * jnp.eye(1, dtype=height.dtype))
 
@@ -180,7 +180,7 @@ def update_height(estimate: Estimate, height: Float[Array, ""], deviation: float
 def update_direction(
     estimate: Estimate, measured: Float[Array, "3"], world: Float[Array, "3"], deviation: float | Array
 ) -> Estimate:
-    """The estimate after a measurement of a vector that is known in world axes, for example the magnetic field.
+    """Update the estimate with a measured vector of known world direction, for example the magnetic field.
 
     Args:
         estimate: before it.
@@ -201,7 +201,7 @@ def error(
     gyro_bias: Float[Array, "3"],
     acc_bias: Float[Array, "3"],
 ) -> Float[Array, "15"]:
-    """The true state less the estimated one, in the order of the covariance."""
+    """True state less estimated state, in the order of the covariance."""
     return jnp.concatenate(
         [
             pos - estimate.pos,
@@ -214,12 +214,12 @@ def error(
 
 
 def angle(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "3"]:
-    """The rotation from attitude a to attitude b as a vector, rad, in the axes of a."""
+    """Rotation vector from attitude a to attitude b, rad, in the axes of a."""
     return rotation.log(rotation.multiply(rotation.conjugate(a), b))
 
 
 def _skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The matrix of v x."""
+    """Matrix of v x."""
     x, y, z = v
     zero = jnp.zeros_like(x)
     return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])

@@ -1,4 +1,4 @@
-"""Motion capture: the pose of a drone as cameras around it see it, late and with gaps."""
+"""Motion capture, with noise, delay and dropouts."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from jaxdrones.state import State
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MotionCaptureSystem:
-    """How often, how late and how well poses are measured."""
+    """Rate, delay, dropouts and noise of a motion capture system."""
 
     rate: float = 100.0
     """Poses per second."""
     delay: float = 0.0
     """Age of a pose when it arrives, s."""
     dropout: float = 0.0
-    """Share of the poses that do not arrive."""
+    """Fraction of lost poses."""
     pos_noise: float = 0.0
     """Standard deviation of each coordinate, m."""
     angle_noise: float = 0.0
@@ -35,14 +35,14 @@ class MotionCaptureSystem:
     def noisy(
         self, key: jax.Array, pos: Float[Array, "3"], quat: Float[Array, "4"]
     ) -> tuple[Float[Array, "3"], Float[Array, "4"]]:
-        """The pose with errors."""
+        """Pose with noise."""
         pos_key, angle_key = jax.random.split(key)
         pos = pos + self.pos_noise * jax.random.normal(pos_key, (3,), pos.dtype)
         turn = self.angle_noise * jax.random.normal(angle_key, (3,), quat.dtype)
         return pos, rotation.multiply(quat, rotation.exp(turn))
 
     def arrives(self, key: jax.Array) -> Array:
-        """Whether a pose arrives at all."""
+        """Whether a pose arrives."""
         return jax.random.bernoulli(key, 1 - self.dropout)
 
 
@@ -53,15 +53,14 @@ degrees in NanoBench's flights (docs/sensors.md). The delay is assumed."""
 
 
 def motion_capture(system: MotionCaptureSystem = VICON, name: str = "motion_capture") -> Sensor:
-    """The pose from outside; its reading is `pos` (3,), m, world, `quat` (4,), body to world, and `fresh`.
+    """Motion capture; its reading is `pos` (3,), m, world, `quat` (4,), body to world, and `fresh`.
 
-    `fresh` () tells whether a pose arrived; where none did, the last one stays. Between two poses that were measured, a
-    delay that is no multiple of their period reads a mean of the two. Before its start the drone is taken to have been
-    where it starts.
+    `fresh` () is true where a pose arrived; otherwise the last pose stays. A delay that is not a multiple of the period
+    reads a mean of two measured poses. Before the start the drone rests at its initial pose.
 
     Args:
-        system: rate, delay, dropouts and noise; control steps of the environment are as frequent or a multiple of it.
-        name: by which observation terms ask for the reading.
+        system: rate, delay, dropouts and noise; the control rate of the environment is a multiple of its rate.
+        name: name of the reading in observation terms.
     """
     periods = system.delay * system.rate
     late = math.ceil(periods - 1e-6)

@@ -1,4 +1,4 @@
-"""Errors of a sensor's channels, in the terms of an Allan deviation: white noise, bias instability, random walk."""
+"""Sensor errors in terms of the Allan deviation: white noise, bias instability, random walk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PEAK = 0.61736  # the largest Allan deviation of a Gauss-Markov process over it
 
 
 class Errors(PyTreeNode):
-    """What a channel's error remembers from one measurement to the next; arrays of the reading's shape."""
+    """Error state of a channel between measurements; arrays of the reading's shape."""
 
     turn_on: Array
     """The bias since power-on, in units of the reading."""
@@ -29,7 +29,7 @@ class Errors(PyTreeNode):
     walk: Array
     """The random walk of the bias, in units of the reading."""
     scale: Array
-    """The error of the scale factor; a reading of 1 becomes 1 + `scale`."""
+    """Scale factor error: a reading of 1 becomes 1 + `scale`."""
 
     @property
     def bias(self) -> Array:
@@ -39,11 +39,11 @@ class Errors(PyTreeNode):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Noise:
-    """The errors of each channel of a sensor that reads in some unit u; channels are independent.
+    """Error model of the channels of a sensor with readings in a unit u; channels are independent.
 
     The names are those of IEEE 952 and of Kalibr's noise model. A data sheet's noise density is a one-sided spectral
-    density, and by the letter of that the Allan deviation of white noise is smaller by a root of 2; as is customary,
-    the number is taken for `density`, and the noise of a part is rather too large than too small.
+    density, for which the Allan deviation of white noise is strictly smaller by a factor of sqrt(2). As is customary,
+    the number is used as `density`, which overestimates the noise of a part.
     """
 
     density: float = 0.0
@@ -51,15 +51,15 @@ class Noise:
     instability: float = 0.0
     """Bias instability B, u: the Allan deviation of the bias is at most 0.664 B, which it is at 1.89 `correlation`."""
     correlation: float = 100.0
-    """Correlation time of the Gauss-Markov process that stands for the bias instability, s."""
+    """Correlation time of the Gauss-Markov process of the bias instability, s."""
     random_walk: float = 0.0
     """Random walk K of the bias, u/s/sqrt(Hz): its Allan deviation over t seconds is K sqrt(t / 3)."""
     turn_on: float = 0.0
-    """Standard deviation of the bias that is drawn at the start of an episode, u."""
+    """Standard deviation of the bias at the start of an episode, u."""
     scale: float = 0.0
-    """Standard deviation of the scale factor's error, which is drawn at the start of an episode."""
+    """Standard deviation of the scale factor error at the start of an episode."""
     limit: float = math.inf
-    """The largest reading, u, at which a channel saturates."""
+    """Largest reading, at which a channel saturates, u."""
 
     @property
     def drift(self) -> float:
@@ -68,7 +68,7 @@ class Noise:
 
     @property
     def bias_walk(self) -> float:
-        """Density of the noise that drives the bias, u/s/sqrt(Hz): the random walk that a filter takes it for."""
+        """Density of the noise that drives the bias, u/s/sqrt(Hz): its random walk in a filter."""
         return math.hypot(self.random_walk, self.drift * math.sqrt(2 / self.correlation))
 
     @property
@@ -77,7 +77,7 @@ class Noise:
         return math.hypot(self.turn_on, self.drift)
 
     def init(self, key: jax.Array, shape: tuple[int, ...], dtype: DTypeLike) -> Errors:
-        """The errors at the start of an episode.
+        """Errors at the start of an episode.
 
         Args:
             key: random key.
@@ -90,12 +90,12 @@ class Noise:
     def measure(
         self, key: jax.Array, errors: Errors, true: Float[Array, "*shape"], dt: float
     ) -> tuple[Errors, Float[Array, "*shape"]]:
-        """The errors of this measurement, and the reading.
+        """Errors and reading of one measurement.
 
         Args:
             key: random key of this measurement.
             errors: of the previous measurement.
-            true: what is measured, u.
+            true: true value, u.
             dt: time between measurements, s.
         """
         white, driven, step = (jax.random.normal(k, true.shape, true.dtype) for k in jax.random.split(key, 3))
@@ -108,7 +108,7 @@ class Noise:
         return errors, jnp.clip(reading, -self.limit, self.limit)
 
     def allan_deviation(self, time: ArrayLike) -> np.ndarray:
-        """The Allan deviation of the readings of something that does not move, u.
+        """Theoretical Allan deviation of the readings at rest, u.
 
         White noise, Gauss-Markov process and random walk add in quadrature (IEEE 952, annex C).
 
@@ -123,10 +123,10 @@ class Noise:
 
 
 def allan_deviation(readings: ArrayLike, dt: float, samples: int) -> np.ndarray:
-    """The overlapping Allan deviation of readings, in units of a reading.
+    """Overlapping Allan deviation of readings, in units of a reading.
 
     Args:
-        readings: (n, ...) readings of something that does not move; further axes are channels.
+        readings: (n, ...) readings at rest; further axes are channels.
         dt: time between readings, s.
         samples: number of readings in an average; the averaging time is `samples` times `dt`, s.
 

@@ -1,7 +1,7 @@
-"""Rays through a scene, range finders and optical flow; other drones are not seen.
+"""Ray casts, range finders and optical flow; other drones are invisible to them.
 
-The defaults are the rates and ranges of the named devices, without noise, which data sheets give for one surface and
-one light only.
+The defaults are the rates and ranges of the named devices, without noise: data sheets give it for one surface and one
+light only.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from jaxdrones.vector import components
 _MULTI_RANGER = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)])
 _DOWN = np.array([(0, 0, -1)])
 _IDENTITY = (0.0, 0.0, 0.0, 1.0)
-_NEAREST_FLOW = 0.08  # m: the PMW3901 sees nothing sharp below
+_NEAREST_FLOW = 0.08  # m: the PMW3901 is out of focus below
 
 
 def ray(scene: Scene, origin: ArrayLike, direction: ArrayLike) -> Float[Array, ""]:
-    """Distance along a ray to the first surface of a scene that it hits, m; zero where it starts inside.
+    """Distance along a ray to the first surface of a scene, m; zero where it starts inside.
 
     It is differentiable in the ray and in the scene.
 
     Args:
         scene: of one world.
         origin: (3,) m, world; for many rays use `jax.vmap`.
-        direction: (3,) unit vector, world. If it has another length, the distance is in multiples of that length.
+        direction: (3,) unit vector, world. For another length, the distance is in multiples of that length.
 
     Returns:
-        () m; infinity, with a zero gradient, where nothing is hit.
+        () m; infinity, with a zero gradient, for a miss.
 
     Raises:
         ValueError: a wrong shape, or a mesh or URDF file in the scene.
@@ -84,16 +84,16 @@ def range_finder(
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     orientation: tuple[float, float, float, float] = _IDENTITY,
 ) -> Sensor:
-    """A device that measures along some rays; its reading (...) are the ranges, m, at most `max_range`.
+    """Range finder with one or more beams; its reading (...) are the ranges, m, at most `max_range`.
 
     Args:
-        name: by which observation terms ask for the reading.
+        name: name of the reading in observation terms.
         directions: (..., 3) directions of the rays, of any length, in the axes of the device, x forward, y left, z up.
-        max_range: m; also the reading where nothing is nearer.
-        rate: measurements per second; one every control step when left out.
+        max_range: m; also the reading for a miss.
+        rate: measurements per second; by default one every control step.
         noise: standard deviation of a range, m.
-        dropout: share of the ranges that are missing and read `max_range`.
-        offset: (3,) where the rays start, relative to the center of mass, m, body axes.
+        dropout: fraction of missing ranges, which read `max_range`.
+        offset: (3,) origin of the rays relative to the center of mass, m, body axes.
         orientation: (4,) unit quaternion (x, y, z, w), device to body.
     """
     directions = np.asarray(directions, float)
@@ -127,7 +127,7 @@ def range_finder(
 def multi_ranger(max_range: float = 4.0, rate: float | None = 10.0, noise: float = 0.0, dropout: float = 0.0) -> Sensor:
     """Ranges (5,) to the front, back, left, right and up, m: the Multi-ranger deck of the Crazyflie, five VL53L1x.
 
-    Arguments are as for `range_finder`; the deck's driver asks ten times per second.
+    Arguments are as for `range_finder`; the deck's driver reads at 10 Hz.
     """
     return range_finder("multi_ranger", _MULTI_RANGER, max_range=max_range, rate=rate, noise=noise, dropout=dropout)
 
@@ -148,9 +148,9 @@ def lidar(
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     orientation: tuple[float, float, float, float] = _IDENTITY,
 ) -> Sensor:
-    """Ranges (beams,) all around in the device's x-y plane, counterclockwise from its x axis, m.
+    """Lidar; its reading (beams,) are ranges in its x-y plane, counterclockwise from its x axis, m.
 
-    All rays of a scan are taken at once. Arguments are as for `range_finder`.
+    A scan is instantaneous. Arguments are as for `range_finder`.
     """
     angle = 2 * np.pi / beams * np.arange(beams)
     around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
@@ -197,16 +197,16 @@ def time_of_flight(
 
 
 def optical_flow(rate: float | None = 100.0, noise: float = 0.0, dropout: float = 0.0) -> Sensor:
-    """Angular velocity (2,) at which what is below moves backward and to the right, rad/s: the PMW3901.
+    """Optical flow sensor, the PMW3901; its reading (2,) is the flow backward and to the right, rad/s.
 
-    With the velocity v and the body rates w, in body axes, and the range d along the body's -z axis it is
-    (v_x / d - w_y, v_y / d + w_x); a range below 0.08 m counts as that. Times 35 pixels / 0.717 rad it is what the
-    Crazyflie counts per second (its `mm_flow.c`).
+    With the velocity v and the body rates w, in body axes, and the range d along the body's -z axis, the flow is
+    (v_x / d - w_y, v_y / d + w_x); ranges are clamped to at least 0.08 m. Times 35 pixels / 0.717 rad it is the
+    Crazyflie's count per second (its `mm_flow.c`).
 
     Args:
-        rate: measurements per second; one every control step when left out.
+        rate: measurements per second; by default one every control step.
         noise: standard deviation, rad/s.
-        dropout: share of the measurements that are missing and read zero.
+        dropout: fraction of missing measurements, which read zero.
     """
 
     def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: None):

@@ -1,4 +1,4 @@
-"""The surroundings as data: a ground plane and obstacles that do not move, for every backend, sensor and camera."""
+"""Scene of a ground plane and static obstacles, for every backend, sensor and camera."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ KINDS: dict[str, type[Obstacle]] = {"boxes": Box, "spheres": Sphere, "cylinders"
 
 
 class Scene(PyTreeNode, kw_only=True):
-    """Obstacles, and a ground plane at z = 0 unless left out. `Scene.of` builds one.
+    """Static obstacles, and by default a ground plane at z = 0. `Scene.of` builds one.
 
-    Obstacles are numbered kind by kind: boxes, spheres, cylinders, capsules, meshes, URDF files; within a kind as they
-    were given.
+    Obstacles are numbered kind by kind: boxes, spheres, cylinders, capsules, meshes, URDF files; within a kind in the
+    order of the arguments.
     """
 
     boxes: Box | None = None
@@ -61,12 +61,12 @@ class Scene(PyTreeNode, kw_only=True):
 
     @classmethod
     def of(cls, *obstacles: Obstacle | File, ground: bool = True) -> Scene:
-        """A scene of obstacles of any kind.
+        """Build a scene of obstacles of any kind.
 
         Args:
-            obstacles: `Box`, `Sphere`, `Cylinder` and `Capsule`, each a single obstacle or many of them. Of many the
-                arrays have leading axes, and an array without them is shared by all. They may be traced. `Mesh` and
-                `Urdf` are for Bullet alone.
+            obstacles: `Box`, `Sphere`, `Cylinder` and `Capsule`, each a single obstacle or many of them with leading
+                axes; an array without leading axes is shared by all. Arrays may be traced. `Mesh` and `Urdf` are for
+                Bullet alone.
             ground: whether there is a ground plane at z = 0.
 
         Raises:
@@ -88,12 +88,12 @@ class Scene(PyTreeNode, kw_only=True):
 
     @property
     def has_obstacles(self) -> bool:
-        """Whether there is anything but the ground; known before the program runs."""
+        """Whether there are obstacles; static."""
         return any(getattr(self, name) is not None for name in KINDS) or bool(self.meshes or self.urdfs)
 
     @property
     def count(self) -> int:
-        """Number of obstacles; known before the program runs."""
+        """Number of obstacles; static."""
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
         return sum(len(stack.pos) for stack in stacks) + len(self.meshes) + len(self.urdfs)
 
@@ -105,25 +105,24 @@ class Scene(PyTreeNode, kw_only=True):
 
     @property
     def numbered(self) -> dict[int, Any]:
-        """Single obstacles that are active, by their numbers; of a scene with values."""
+        """Active obstacles by their numbers; the scene must be concrete."""
         return {i: solid for i, solid in enumerate(self.obstacles) if isinstance(solid, File) or solid.active}
 
     def shapes(self, dtype: DTypeLike) -> list[Obstacle]:
-        """The kinds of obstacles in the scene, each with a leading axis over its obstacles, as arrays of this type."""
+        """Obstacles of each kind, with a leading axis, as arrays of this type."""
         stacks = [stack for name in KINDS if (stack := getattr(self, name)) is not None]
         return [_as_arrays(stack, dtype) for stack in stacks]
 
     def distance(self, point: ArrayLike) -> Array:
         """Signed distance of a point from the nearest surface, m; negative inside an obstacle or underground.
 
-        It is differentiable in the point and in the scene. Of obstacles that overlap, the one in which the point is
-        deepest counts.
+        It is differentiable in the point and in the scene. Where obstacles overlap, the deepest one counts.
 
         Args:
             point: (3,) m, world; for many points use `jax.vmap`.
 
         Returns:
-            () m; infinity in a scene without anything.
+            () m; infinity in an empty scene.
 
         Raises:
             ValueError: a wrong shape, or a mesh or URDF file in the scene.
@@ -132,9 +131,9 @@ class Scene(PyTreeNode, kw_only=True):
         return distance_of(self.shapes(point.dtype), self.ground, point)
 
     def nearest(self, point: ArrayLike) -> Surface:
-        """The nearest surface: its signed distance, its point and its outward normal there, also from inside.
+        """Nearest surface: signed distance, nearest point and outward normal, also from inside.
 
-        It is differentiable in the point and in the scene. Where several surfaces are equally near, it is one of them.
+        It is differentiable in the point and in the scene. Ties are broken arbitrarily.
 
         Args:
             point: (3,) m, world; for many points use `jax.vmap`.
@@ -146,13 +145,13 @@ class Scene(PyTreeNode, kw_only=True):
         return nearest_of(self.shapes(point.dtype), self.ground, point)
 
     def touched(self, points: Float[Array, "m 3"], within: Number) -> Surface:
-        """The nearest surface of an obstacle for each of some points of one body.
+        """Nearest obstacle surface for each of several points of one body.
 
-        It is found faster than by `nearest`, as only obstacles within reach of the body are looked at.
+        Faster than `nearest`: only obstacles within reach of the body are considered.
 
         Args:
             points: m, world, near each other.
-            within: m; where no obstacle is nearer to a point, the surface is that of any obstacle.
+            within: m; where no obstacle is nearer to a point, the surface is that of an arbitrary obstacle.
 
         Raises:
             ValueError: there is no obstacle, a wrong shape, or a mesh or URDF file in the scene.
@@ -167,12 +166,12 @@ class Scene(PyTreeNode, kw_only=True):
         return self.distance(point) < 0
 
     def padded(self, **capacity: int) -> Scene:
-        """The same scene in arrays of given lengths, filled up with obstacles that are not active.
+        """Pad the arrays of a scene to given lengths with inactive obstacles.
 
-        Worlds with different numbers of obstacles so have one structure, and can be stacked and mapped.
+        Worlds with different numbers of obstacles then have one structure, and can be stacked and mapped.
 
         Args:
-            capacity: length of the arrays by their names, for example `boxes=8, cylinders=30`.
+            capacity: length of the arrays by name, for example `boxes=8, cylinders=30`.
 
         Raises:
             ValueError: an unknown kind, or more obstacles than the array holds.
@@ -199,12 +198,7 @@ class Scene(PyTreeNode, kw_only=True):
 
 
 def check_scene(scene: Any, files: bool = False) -> None:
-    """Raise unless `scene` is the scene of one world, without meshes and URDF files unless those are allowed.
-
-    Args:
-        scene: what was given.
-        files: whether meshes and URDF files are allowed.
-    """
+    """Raise unless `scene` is the scene of one world; meshes and URDF files need `files`."""
     if not isinstance(scene, Scene):
         raise UserError(
             f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)"
@@ -224,32 +218,32 @@ def check_scene(scene: Any, files: bool = False) -> None:
 
 
 def _as_arrays(obstacles: Obstacle, dtype: DTypeLike) -> Obstacle:
-    """The same obstacles, with numbers of this type and a mask."""
+    """Obstacles with arrays of this type and a mask."""
     active = jnp.asarray(_mask(obstacles), bool)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), obstacles.replace(active=None)).replace(active=active)
 
 
 def _mask(obstacles: Obstacle) -> Any:
-    """Which of many obstacles are there."""
+    """Mask of the active obstacles."""
     return jnp.ones(len(obstacles.pos), bool) if obstacles.active is None else obstacles.active
 
 
 def _inactive(kind: type[Obstacle], count: int) -> Obstacle:
-    """Obstacles of a kind that are not there, with a leading axis."""
+    """Inactive obstacles of a kind, with a leading axis."""
     own = {field.name for field in dataclasses.fields(kind)} - {field.name for field in dataclasses.fields(Obstacle)}
     sizes: dict[str, Any] = {name: jnp.ones(LENGTHS.get(name, ())) for name in own}
     return _rows(kind(pos=jnp.zeros((count, 3)), active=False, **sizes))
 
 
 def _joined(rows: list[Any]) -> Any:
-    """All obstacles of some arrays in one; with a mask if one of them has it."""
+    """Concatenated obstacles; with a mask if any has one."""
     if any(row.active is not None for row in rows):
         rows = [row.replace(active=_mask(row)) for row in rows]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
 
 
 def _rows(obstacle: Obstacle) -> Obstacle:
-    """One obstacle or many as arrays with one leading axis, checked where they have values."""
+    """One obstacle or many as arrays with one leading axis; concrete values are validated."""
     kind = type(obstacle).__name__
     arrays: dict[str, Array] = {}
     for name, value in vars(obstacle).items():

@@ -1,4 +1,4 @@
-"""Sensors: what a drone measures of its own motion and of its surroundings."""
+"""Sensors of a drone: interface, initialization and measurement."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.scene import Scene
 from jaxdrones.state import State
 
-_ROUNDING = 1e-4  # of a measurement; a rate that divides that of the control steps is met in spite of rounding
+_ROUNDING = 1e-4  # of a measurement; tolerance for rounding of a rate that divides the control rate
 
 
 def no_memory(key: jax.Array, params: Params) -> None:
-    """The memory of a sensor whose readings depend on the present alone: none."""
+    """Empty memory, for sensors without one."""
     return None
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """A device on every drone of a team: an IMU, a range finder, a barometer.
+    """Sensor on every drone of a team, for example an IMU, a range finder or a barometer.
 
-    Both functions are about one drone and are mapped over the team.
+    Both functions are written for one drone and mapped over the team.
     """
 
     name: str
-    """The name by which observation terms ask for the reading, for example `imu`."""
+    """Name of the reading in observation terms, for example `imu`."""
     measure: Callable[..., Any]
     """`measure(key, params, state, rate, scene, memory) -> (memory, reading)`.
 
-    key: a random key for the noise of this one measurement, of this drone.
+    key: random key of this measurement of this drone.
     params: constants of the drone.
     state: its state, with `pos` (3,) and so on; units and frames as in `State`.
-    rate: the time derivative of its state, a `State` as well: `rate.vel` (3,) is the acceleration of the center of
-        mass, m/s^2, world, and `rate.omega` (3,) the angular acceleration, rad/s^2, body.
-    scene: the `Scene` of the world, the same for all drones.
-    memory: what `init` or the previous measurement returned.
+    rate: time derivative of its state, also a `State`: `rate.vel` (3,) is the acceleration of the center of mass,
+        m/s^2, world, and `rate.omega` (3,) the angular acceleration, rad/s^2, body.
+    scene: `Scene` of the world, shared by all drones.
+    memory: result of `init` or of the previous measurement.
 
-    The memory that is returned has the shapes and types of the one that is given. The reading is an array or any
-    pytree of arrays; its units and frames are the sensor's to document.
+    The returned memory has the shapes and types of the argument. The reading is an array or any pytree of arrays; the
+    sensor documents its units and frames.
     """
     init: Callable[..., Any] = no_memory
-    """`init(key, params) -> memory`: the memory at the start of an episode, a pytree of arrays of one drone."""
+    """`init(key, params) -> memory`: memory of one drone at the start of an episode, a pytree of arrays."""
     bound: float = np.inf
-    """The largest absolute value that a reading can have, in units of the reading."""
+    """Largest absolute value of a reading, in its units."""
     rate: float | None = None
-    """Measurements per second, between which the reading stays; one every control step when left out."""
+    """Measurements per second; the reading is held in between. The default is one every control step."""
     entries: tuple[Quantity, ...] = ()
-    """What each number of the flattened reading stands for, for `jaxdrones.explain`; none where it does not say."""
+    """Description of each entry of the flattened reading, for `jaxdrones.explain`; optional."""
     clocked: bool = False
-    """Whether it counts on exactly 1 / `rate` between measurements, as what integrates over time does. An environment
-    then refuses a rate that does not divide that of its control steps."""
+    """Whether the sensor requires exactly 1 / `rate` between measurements, for example because it integrates. An
+    environment then rejects a rate that does not divide its control rate."""
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
@@ -75,12 +75,12 @@ class Sensor:
             raise UserError(f"sensor {self.name!r} is clocked, but has no rate; give rate in measurements per second")
 
     def is_due(self, step: jax.Array, dt: float) -> jax.Array:
-        """Whether there is a measurement after so many control steps of an episode.
+        """Whether there is a measurement at a control step.
 
-        The k-th one is in the first step that does not begin before k / rate.
+        The k-th measurement is in the first step at or after k / rate.
 
         Args:
-            step: () number of control steps since the start.
+            step: () number of control steps since the start of the episode.
             dt: control period, s.
         """
         if self.rate is None or self.rate * dt >= 1:
@@ -90,7 +90,7 @@ class Sensor:
 
 
 def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[Sensor, ...]:
-    """The sensors of a team; raises if one is none, two have the same name, or one does not fit steps of `dt` s."""
+    """Validate the sensors of a team: types, unique names, and rates that fit control steps of `dt` s."""
     if isinstance(sensors, Sensor):
         raise UserError(f"sensors is the single sensor {sensors.name!r}; give a sequence, for example (sensor,)")
     sensors = check_sequence("sensors", sensors, "sensor")
@@ -118,15 +118,15 @@ def _check_clocks(sensors: Sequence[Sensor], dt: float) -> None:
 
 
 def init_sensors(sensors: Sequence[Sensor], key: jax.Array, params: Params) -> dict[str, Any]:
-    """The memories of the sensors of a team at the start of an episode.
+    """Memories of the sensors of a team at the start of an episode.
 
     Args:
-        sensors: with names that differ.
+        sensors: with unique names.
         key: a random key.
         params: of a team of n drones.
 
     Returns:
-        Memories by the sensors' names; every leaf has a leading axis of n drones.
+        Memories by sensor name; every leaf has a leading axis of n drones.
     """
     n = len(params.mass)
     keys = jax.random.split(key, (len(sensors), n))
@@ -145,19 +145,19 @@ def measure_sensors(
     """One measurement of every sensor of a team.
 
     Args:
-        sensors: with names that differ.
+        sensors: with unique names.
         key: a random key.
         params: of a team of n drones.
         state: of the team.
         rate: the time derivative of `state`, as `step.rate` returns it.
         scene: of the world.
-        memories: by the sensors' names, as `init_sensors` or the previous measurement returned them.
+        memories: by sensor name, from `init_sensors` or the previous measurement.
 
     Returns:
-        Memories and readings by the sensors' names; every leaf has a leading axis of n drones.
+        Memories and readings by sensor name; every leaf has a leading axis of n drones.
 
     Raises:
-        ValueError: a sensor returned something else than its memory and a reading made of arrays.
+        ValueError: a sensor did not return its memory and a reading made of arrays.
     """
     n = len(params.mass)
     keys = jax.random.split(key, (len(sensors), n))
@@ -176,14 +176,14 @@ def measure_sensors(
 def hold_between(
     sensors: Sequence[Sensor], step: jax.Array, dt: float, before: tuple[Any, Any], after: tuple[Any, Any]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The memories and readings of sensors that measure at rates of their own.
+    """Hold memories and readings between the measurements of sensors with their own rates.
 
     Args:
-        sensors: with names that differ.
+        sensors: with unique names.
         step: () number of control steps since the start of the episode.
         dt: control period, s.
         before: memories and readings before this step; without readings every sensor measures.
-        after: those after a measurement of every sensor at this step.
+        after: memories and readings if every sensor measures at this step.
     """
     if not before[1]:
         return after
@@ -200,7 +200,7 @@ def hold_between(
 
 
 def _checked(sensor: Sensor, memory: Any, result: Any) -> tuple[Any, Any]:
-    """The memory and the reading that a sensor returned for one drone, or an error if they are not that."""
+    """Validated memory and reading of a sensor of one drone."""
     called = f"measure of sensor {sensor.name!r}"
     if not isinstance(result, tuple) or len(result) != 2:
         raise UserError(f"{called} returned {shown(result)}; return the two values (memory, reading)")
@@ -222,5 +222,5 @@ def _types(tree: Any) -> tuple:
 
 
 def _described(tree: Any) -> str:
-    """The shapes and types of a memory, for an error."""
+    """Shapes and types of a memory, for error messages."""
     return str(jax.tree.map(lambda leaf: f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}", tree))

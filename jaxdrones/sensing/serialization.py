@@ -1,4 +1,4 @@
-"""A scene as JSON, for logs and pages."""
+"""Scenes as JSON."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ _CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS.values(), Me
 
 
 def scene_to_dict(scene: Scene) -> dict[str, Any]:
-    """The scene of one world as entries of a JSON object; obstacles that are not active are left out.
+    """Convert the scene of one world to a JSON object; inactive obstacles are left out.
 
     Args:
-        scene: with values, not traced.
+        scene: concrete, not traced.
 
     Returns:
-        `ground`, whether there is a ground plane, and `obstacles`, a list with an object for each: its `kind`, such as
-        `Box`, and its fields by their names.
+        `ground`, whether there is a ground plane, and `obstacles`, a list of objects with the `kind` (such as `Box`)
+        and the fields of each obstacle.
     """
     return {"ground": scene.ground, "obstacles": [_to_dict(solid) for solid in scene.numbered.values()]}
 
 
 def scene_from_dict(entries: dict[str, Any]) -> Scene:
-    """The scene of which `scene_to_dict` made these entries; obstacles are in the order of their numbers."""
+    """Inverse of `scene_to_dict`; obstacles are in the order of their numbers."""
     obstacles = []
     for entry in entries["obstacles"]:
         fields = {name: tuple(x) if isinstance(x, list) else x for name, x in entry.items() if name != "kind"}

@@ -1,4 +1,4 @@
-"""Colors of an image: Lambert's law under one sun, a checkered ground, and a sky."""
+"""Shading: Lambert's law under one sun, a checkered ground, and a sky."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxdrones.vector import safe_sqrt
 
 SUN = (-0.48, 0.36, 0.8)
 """Unit vector towards the sun, world: behind and to the left of a drone that flies along x."""
-_AMBIENT = 0.45  # share of the light that comes from everywhere
+_AMBIENT = 0.45  # share of ambient light
 _TILE = 0.5  # m
 _DARK, _BRIGHT = (0.42, 0.46, 0.42), (0.62, 0.66, 0.60)  # red, green, blue of the tiles
 _HORIZON, _ZENITH = (0.82, 0.88, 0.95), (0.35, 0.55, 0.85)
@@ -28,10 +28,10 @@ def shade(
 
     Args:
         view: rays.
-        solids: what can be seen.
+        solids: visible solids.
         colors: of every solid, 0 to 1.
         ground: index of the ground among the solids, if there is one.
-        index: of the solid that each pixel sees.
+        index: solid of each pixel.
         depth: of its surface, m.
     """
     normal = -normals(view, solids, index, depth)  # towards the camera
@@ -53,22 +53,22 @@ def shade(
 
 
 def _mixed(a: tuple[float, float, float], b: tuple[float, float, float], share: Float[Array, "h w"]) -> Array:
-    """(h, w, 3) colors between a, where the share is 0, and b, where it is 1."""
+    """(h, w, 3) linear interpolation between colors a and b."""
     first, second = jnp.asarray(a, share.dtype), jnp.asarray(b, share.dtype)
     return first[None, None] + share[..., None] * (second - first)[None, None]
 
 
 def _footprint(view: View, depth: Float[Array, "h w"], rays: list[Array]) -> Float[Array, "h w"]:
-    """Edge of the patch of ground that a pixel covers, m; larger where it is seen at a grazing angle."""
+    """Edge of a pixel's footprint on the ground, m; larger at grazing angles."""
     return depth * view.pixel * _length(rays) / jnp.maximum(jnp.abs(rays[2]), 1e-3)
 
 
 def _checkered(x: Array, y: Array, footprint: Array) -> Array:
-    """0 and 1 on the tiles of a checkered ground, averaged over the footprint of a pixel, so that nothing flickers."""
+    """0 and 1 on the tiles of a checkered ground, averaged over the footprint of a pixel against flicker."""
     width = footprint / _TILE + 1e-3
 
     def wave(s: Array) -> Array:
-        """The mean of a square wave of -1 and 1 over the footprint: the difference of a triangle wave."""
+        """Mean of a square wave of -1 and 1 over the footprint: the difference of a triangle wave."""
         low, high = ((s + side * width / 2) / 2 for side in (-1, 1))
         return 2 * (_triangle(high) - _triangle(low)) / width
 
@@ -76,7 +76,7 @@ def _checkered(x: Array, y: Array, footprint: Array) -> Array:
 
 
 def _triangle(s: Array) -> Array:
-    """A wave of period 1 that rises from 0 to 1/2 and falls back, with slopes of 1 and -1."""
+    """Triangle wave of period 1 from 0 to 1/2."""
     return 0.5 - jnp.abs(s - jnp.floor(s) - 0.5)
 
 

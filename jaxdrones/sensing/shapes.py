@@ -1,4 +1,4 @@
-"""The kinds of obstacles, and the geometry of each: distances, rays, extents.
+"""Kinds of obstacles and their geometry: distances, rays, extents.
 
 An obstacle is convex: all points within `rounding` of a core. A sphere is a rounded point and a capsule a rounded line
 segment; a box and a cylinder are their own cores. All methods are about a single obstacle, in its own frame.
@@ -38,7 +38,7 @@ LENGTHS = {"pos": 3, "quat": 4, "color": 4, "size": 3}
 
 
 class Obstacle(PyTreeNode, kw_only=True):
-    """A solid that does not move, or many of one kind, with leading axes on the arrays."""
+    """Static convex solid, or many of one kind with leading axes on the arrays."""
 
     pos: Any
     """(3,) position of the center, m, world."""
@@ -47,8 +47,8 @@ class Obstacle(PyTreeNode, kw_only=True):
     color: Any = GREY
     """(4,) red, green, blue, opacity, each 0 to 1."""
     active: Any = None
-    """() bool: whether the obstacle is there; it is when left out. One that is not keeps its number, and nothing sees
-    or touches it."""
+    """() bool: whether the obstacle is active; `None` means active. An inactive one keeps its number and is invisible
+    to cameras, sensors and contact."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -70,34 +70,34 @@ class Obstacle(PyTreeNode, kw_only=True):
         raise NotImplementedError
 
     def outward(self, point: Point) -> Point:
-        """Outward unit normal of the surface where it is nearest to a point: the gradient of the distance.
+        """Outward unit normal at the nearest point of the surface: the gradient of the distance.
 
-        Where several points of the surface are equally near, it is that of one of them.
+        Ties are broken arbitrarily.
         """
         raise NotImplementedError
 
     def interval(self, origin: Components, direction: Components) -> Interval:
-        """The multiples of `direction`, first and last, at which lines through `origin` are inside.
+        """Interval of lines `origin` + t `direction` inside the obstacle: first and last t.
 
-        The first one is larger than the last one where a line misses the obstacle.
+        The first is larger than the last for a miss.
         """
         raise NotImplementedError
 
     def normals(self, point: Components) -> Components:
-        """Vectors of any length that point outward, of many points that are on the surface."""
+        """Outward normals of any length at points on the surface."""
         raise NotImplementedError
 
     def nearest(self, point: Point) -> Point:
-        """The point of the core that is nearest to a point, m."""
+        """Nearest point of the core to a point, m."""
         raise NotImplementedError
 
     def extent(self, direction: Point) -> Number:
-        """How far the core extends from its center along a unit vector, m: its support function."""
+        """Support function of the core: its extent from its center along a unit vector, m."""
         raise NotImplementedError
 
 
 class Rounded(Obstacle, kw_only=True):
-    """An obstacle whose core is a box or a cylinder about `pos`, possibly of no width."""
+    """Obstacle with a core that is a box or cylinder centered at `pos`, possibly of zero width."""
 
     @property
     def half(self) -> Any:
@@ -114,7 +114,7 @@ class Rounded(Obstacle, kw_only=True):
         return signed_distance(self._beyond(point)) - self.rounding
 
     def outward(self, point: Point) -> Point:
-        """Outward unit normal of the surface where it is nearest to a point."""
+        """Outward unit normal at the nearest point of the surface."""
         side = jnp.where(point < 0, -1, 1).astype(point.dtype)
         normal = outward(self._beyond(point))
 
@@ -126,7 +126,7 @@ class Rounded(Obstacle, kw_only=True):
         return _either(self.is_round, of_cylinder, lambda: side * normal)
 
     def nearest(self, point: Point) -> Point:
-        """The point of the core that is nearest to a point, m."""
+        """Nearest point of the core to a point, m."""
         inside = jnp.clip(point, -self.half, self.half)
 
         def of_cylinder() -> Point:
@@ -138,7 +138,7 @@ class Rounded(Obstacle, kw_only=True):
         return _either(self.is_round, of_cylinder, lambda: inside)
 
     def extent(self, direction: Point) -> Number:
-        """How far the core extends from its center along a unit vector, m."""
+        """Extent of the core from its center along a unit vector, m."""
         across, _, along = components(self.half)
         return _either(
             self.is_round,
@@ -147,7 +147,7 @@ class Rounded(Obstacle, kw_only=True):
         )
 
     def _beyond(self, point: Point) -> Array:
-        """How far a point is beyond the core along x, y and z, or beyond its radius and its ends, m."""
+        """Excess of a point beyond the core along x, y and z, or beyond its radius and ends, m."""
 
         def of_cylinder() -> Array:
             radial = length(point[:2]) - self.half[0]
@@ -157,7 +157,7 @@ class Rounded(Obstacle, kw_only=True):
 
 
 class Box(Rounded, kw_only=True):
-    """A cuboid about `pos`."""
+    """Cuboid centered at `pos`."""
 
     size: Any
     """(3,) edge lengths along x, y and z, m."""
@@ -168,20 +168,20 @@ class Box(Rounded, kw_only=True):
         return self.size / 2
 
     def interval(self, origin: Components, direction: Components) -> Interval:
-        """Where lines are between all three pairs of faces."""
+        """Intersection of the intervals between the three pairs of faces."""
         faces = zip(origin, direction, components(self.size / 2), strict=True)
         first, last = zip(*(between_planes(*face) for face in faces), strict=True)
         return functools.reduce(jnp.maximum, first), functools.reduce(jnp.minimum, last)
 
     def normals(self, point: Components) -> Components:
-        """The normal of the face that a point is on."""
+        """Normal of the face under each point."""
         x, y, z = (p / half for p, half in zip(point, components(self.size / 2), strict=True))
         largest = functools.reduce(jnp.maximum, map(jnp.abs, (x, y, z)))
         return [jnp.where(jnp.abs(p) == largest, p, 0) for p in (x, y, z)]
 
 
 class Sphere(Rounded, kw_only=True):
-    """A ball about `pos`."""
+    """Ball centered at `pos`."""
 
     radius: Any
     """() m."""
@@ -197,7 +197,7 @@ class Sphere(Rounded, kw_only=True):
         return jnp.zeros_like(self.pos)
 
     def interval(self, origin: Components, direction: Components) -> Interval:
-        """Where lines are within the radius."""
+        """Interval of lines within the radius."""
         return within_radius(origin, direction, self.radius)
 
     def normals(self, point: Components) -> Components:
@@ -206,7 +206,7 @@ class Sphere(Rounded, kw_only=True):
 
 
 class Cylinder(Rounded, kw_only=True):
-    """A cylinder about `pos`, with its axis along its own z."""
+    """Cylinder centered at `pos`, with its axis along its own z."""
 
     radius: Any
     """() m."""
@@ -221,7 +221,7 @@ class Cylinder(Rounded, kw_only=True):
         return jnp.stack([self.radius, self.radius, self.height / 2])
 
     def interval(self, origin: Components, direction: Components) -> Interval:
-        """Where lines are within the radius and between the two ends."""
+        """Interval of lines within the radius and between the two ends."""
         first, last = within_radius(origin[:2], direction[:2], self.radius)
         bottom, top = between_planes(origin[2], direction[2], self.height / 2)
         return jnp.maximum(first, bottom), jnp.minimum(last, top)
@@ -234,7 +234,7 @@ class Cylinder(Rounded, kw_only=True):
 
 
 class Capsule(Rounded, kw_only=True):
-    """A cylinder about `pos`, with its axis along its own z, and half a ball on either end."""
+    """Cylinder centered at `pos`, with its axis along its own z, and half a ball on either end."""
 
     radius: Any
     """() m."""
@@ -253,7 +253,7 @@ class Capsule(Rounded, kw_only=True):
         return jnp.stack([zero, zero, self.height / 2])
 
     def interval(self, origin: Components, direction: Components) -> Interval:
-        """Where lines are in the cylinder or in a ball: one interval, as the capsule is convex."""
+        """Interval of lines in the cylinder or a ball: one interval, as the capsule is convex."""
         x, y, z = origin
         cylinder = Cylinder(pos=self.pos, radius=self.radius, height=self.height)
         parts = [
@@ -272,7 +272,7 @@ class Capsule(Rounded, kw_only=True):
 
 
 def _either(condition: Any, a: Callable[[], Array], b: Callable[[], Array]) -> Array:
-    """One of two results; both are computed only where the condition is an array."""
+    """Result of one of two functions; both are called only where the condition is an array."""
     if isinstance(condition, bool):
         return a() if condition else b()
     return jnp.where(condition, a(), b())

@@ -1,8 +1,8 @@
-"""The way of a body past obstacles: what it meets, and the planes that it does not cross.
+"""Continuous collision detection: sweep of a body past obstacles, and separating planes.
 
-A body is a disc that is rounded by a ball. It moves along a straight line, advanced by steps in which it provably
-touches nothing: where the gap to a convex obstacle is g along the normal n, and the way leads w = -way . n against it,
-nothing is touched on a further share g/w of the way (conservative advancement; Mirtich, 1996). Then it turns.
+A body is a disc that is rounded by a ball. It moves along a straight line by conservative advancement (Mirtich, 1996):
+where the gap to a convex obstacle is g along the normal n, and the displacement d closes it by w = -d . n, the
+fraction g/w of the displacement is free of contact. Then it rotates.
 No function here has a gradient.
 """
 
@@ -26,7 +26,7 @@ _PLANES = 3  # of a body: a corner has three faces
 
 
 class Disc(NamedTuple):
-    """A disc that is rounded by a ball."""
+    """Disc that is rounded by a ball."""
 
     center: Point
     """m, world."""
@@ -39,12 +39,12 @@ class Disc(NamedTuple):
 
     @classmethod
     def of(cls, pos: Point, quat: Float[Array, "4"], offset: Number, ring: Number, rounding: Number) -> Disc:
-        """The disc of a drone at a pose, whose center is `offset` (m) above the center of mass."""
+        """Disc of a drone at a pose, with its center `offset` (m) above the center of mass."""
         axis = rotation.z_axis(quat)
         return cls(pos + offset * axis, axis, ring, rounding)
 
     def nearest(self, point: Point) -> Point:
-        """The point of the disc, without its rounding, that is nearest to another one."""
+        """Nearest point of the disc, without its rounding, to a point."""
         offset = point - self.center
         radial = offset - dot(offset, self.axis) * self.axis
         return self.center + radial * jnp.minimum(1, self.ring / jnp.maximum(length(radial), 1e-9))
@@ -56,32 +56,32 @@ class Disc(NamedTuple):
 
 
 class Approach(NamedTuple):
-    """How a moving disc approaches an obstacle."""
+    """Contact flag and separating plane of a moving disc and an obstacle."""
 
     touches: Bool[Array, ""]
-    """Whether it touches the obstacle on its way or at its end."""
+    """Whether the disc touches the obstacle during the motion."""
     normal: Point
-    """Unit normal of a plane between both before they touch, away from the obstacle, world."""
+    """Unit normal of a separating plane before contact, away from the obstacle, world."""
     height: Number
-    """Of the plane over the origin, m."""
+    """Offset of the plane from the origin, m."""
 
 
 class Planes(NamedTuple):
-    """Planes between a disc and what it would move into."""
+    """Separating planes of a disc and the obstacles in its way."""
 
     normals: Float[Array, "planes 3"]
     """Unit normals away from the obstacles, world; zero for no plane."""
     heights: Float[Array, " planes"]
-    """Of the planes over the origin, m."""
+    """Offsets of the planes from the origin, m."""
 
 
 def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
-    """The planes that a disc would cross on its way, one of each obstacle, for up to three obstacles, nearest first.
+    """Separating planes that a moving disc would cross, for up to three obstacles, nearest first.
 
     Args:
         kinds: obstacles, each kind with a leading axis.
-        start: the disc at the start of its way.
-        end: the disc at the end, if nothing is in the way.
+        start: the disc before the motion.
+        end: the disc after an unobstructed motion.
     """
 
     def look(found: tuple[Planes, Point, Array], obstacle: Obstacle, _: Any) -> tuple[Planes, Point, Array]:
@@ -102,7 +102,7 @@ def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
 
 
 def meets(kinds: list[Any], start: Disc, end: Disc) -> Bool[Array, ""]:
-    """Whether a disc touches any obstacle on its way; arguments are those of `planes`."""
+    """Whether a moving disc touches any obstacle; arguments are those of `planes`."""
 
     def look(touches: Array, obstacle: Obstacle, _: Any) -> Array:
         return touches | _approach(obstacle, start, end).touches
@@ -114,15 +114,15 @@ def meets(kinds: list[Any], start: Disc, end: Disc) -> Bool[Array, ""]:
 
 
 def _reach(start: Disc, end: Disc) -> tuple[Point, Number]:
-    """A ball that holds the disc on all of its way: center and radius, m."""
+    """Bounding ball of the disc's motion: center and radius, m."""
     return (start.center + end.center) / 2, length(end.center - start.center) / 2 + end.ring + end.rounding
 
 
 def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> Approach:
-    """The approach to one obstacle, in whose axes it is computed: with the attitude of the start, then that of the end.
+    """Approach to one obstacle, computed in its axes: first with the initial attitude, then with the final one.
 
-    The plane is the last one with the attitude of the start, because a thin obstacle has its other side nearer as soon
-    as the disc is more than half through.
+    The plane is the last one with the initial attitude, because the other side of a thin obstacle is nearer as soon as
+    the disc is more than half through.
     """
     start, end = _in_axes(obstacle, start), _in_axes(obstacle, end)
     way = end.center - start.center

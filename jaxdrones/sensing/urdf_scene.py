@@ -1,4 +1,4 @@
-"""A scene from the links of a URDF: what collides there stands around here."""
+"""Scenes from the collision elements of a URDF."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def from_urdf(
     quat: ArrayLike = (0.0, 0.0, 0.0, 1.0),
     ground: bool = True,
 ) -> Scene:
-    """The boxes, spheres, cylinders and capsules of the links of a URDF as obstacles that do not move.
+    """Load the boxes, spheres, cylinders and capsules of a URDF as static obstacles.
 
-    They are its `collision` elements, in the color of the link's first `visual`. Joints stand at zero. A mesh becomes a
-    `Mesh`, which only Bullet reads; `Mesh.bounding_box` makes a box of it.
+    They are its `collision` elements, in the color of the link's first `visual`. Joints are at zero. A mesh becomes a
+    `Mesh`, for Bullet alone; `Mesh.bounding_box` makes a box of it.
 
     Args:
         path: of the URDF.
@@ -41,7 +41,7 @@ def from_urdf(
         ground: whether there is a ground plane at z = 0, too.
 
     Raises:
-        ValueError: there is no such file, it is no URDF, or it holds a shape or a number that a scene has no word for.
+        ValueError: a missing file, a file that is not a URDF, or an unsupported shape or number.
     """
     file = Path(path)
     if not file.is_file():
@@ -73,7 +73,7 @@ def from_urdf(
 
 
 def _places(file: Path, robot: ET.Element, links: dict[str, ET.Element], root: Pose) -> dict[str, Pose]:
-    """The pose of every link in the world."""
+    """Pose of every link in the world."""
     joints: dict[str, tuple[str, Pose]] = {}
     for joint in robot.findall("joint"):
         ends = [end.get("link", "") for tag in ("parent", "child") if (end := joint.find(tag)) is not None]
@@ -97,7 +97,7 @@ def _places(file: Path, robot: ET.Element, links: dict[str, ET.Element], root: P
 
 
 def _obstacle(file: Path, collision: ET.Element, pose: Pose, color: tuple[float, ...]) -> Any:
-    """The obstacle of one collision element."""
+    """Obstacle of one collision element."""
     shape = next(iter(geometry), None) if (geometry := collision.find("geometry")) is not None else None
     common: dict[str, Any] = dict(pos=pose[0], quat=pose[1], color=color)
 
@@ -124,7 +124,7 @@ def _obstacle(file: Path, collision: ET.Element, pose: Pose, color: tuple[float,
 
 
 def _pose(file: Path, element: ET.Element) -> Pose:
-    """The pose that the `origin` of a joint or a collision says."""
+    """Pose in the `origin` element of a joint or a collision."""
     origin = element.find("origin")
     if origin is None:
         return _ORIGIN
@@ -133,13 +133,13 @@ def _pose(file: Path, element: ET.Element) -> Pose:
 
 
 def _in_parent(parent: Pose, pose: Pose) -> Pose:
-    """A pose that is given in a frame, in that frame's parent."""
+    """Transform a pose from a frame to its parent."""
     pos, quat = (jnp.asarray(x, float) for x in pose)
     return parent[0] + rotation.rotate(parent[1], pos), rotation.multiply(parent[1], quat)
 
 
 def _numbers(file: Path, element: ET.Element | None, name: str, count: int, default: str | None) -> list[float]:
-    """The numbers that an attribute holds."""
+    """Numbers of an attribute."""
     text = default if element is None else element.get(name, default)
     try:
         numbers = [float(word) for word in (text or "").split()]

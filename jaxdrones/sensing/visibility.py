@@ -1,9 +1,8 @@
-"""What each pixel of a camera sees: an analytic ray for every pixel, against all solids.
+"""Ray casting: depth, solid and normal of every pixel by analytic rays.
 
-Each quantity of an image is a pass over the solids that keeps one number per pixel, so that a compiler can turn it into
-a loop over pixels without intermediate arrays: the depth of the nearest surface, then the index of the solid that it
-belongs to. The gradient of the depth is that of the surface that is visible; where the silhouette of a solid moves over
-a pixel, the depth jumps, and the gradient does not know.
+Each quantity of an image is a pass over the solids with one number per pixel, which compiles to a loop over pixels
+without intermediate arrays: the depth of the nearest surface, then the index of its solid. The gradient of the depth is
+that of the visible surface. It has no contribution of silhouettes, where the depth jumps.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from jaxdrones.sensing.geometry import Components, Interval, nonzero
 from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import components, safe_sqrt
 
-_UNROLL = 2  # solids per turn of the loop; all of them in one turn would make compilers keep each one's image
-_SLACK = 1e-4  # share by which the view is taken wider and solids larger than they are, for rounding
+_UNROLL = 2  # solids per iteration; with all in one iteration compilers keep the image of each
+_SLACK = 1e-4  # relative margin for rounding by which the view and the solids are enlarged
 _SIDES = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [-1, 0, 0], [1, 0, 0]])
-"""Normals out of what a camera sees, of the left, right, upper, lower, near and far side, in camera axes; the former
+"""Outward normals of the left, right, upper, lower, near and far side of the view frustum, in camera axes; the first
 four are those of a view without width and height, of which each unit adds `_WIDTH` or `_HEIGHT`."""
 _WIDTH = np.array([[-1, 0, 0]] * 2 + [[0, 0, 0]] * 4)
 _HEIGHT = np.array([[0, 0, 0]] * 2 + [[-1, 0, 0]] * 2 + [[0, 0, 0]] * 2)
@@ -37,9 +36,9 @@ _NEAR, _FAR = np.array([0, 0, 0, 0, 1, 0]), np.array([0, 0, 0, 0, 0, 1])
 
 @jax.custom_batching.custom_vmap
 def largest_of_worlds(count: Array) -> Array:
-    """The same number; of many worlds, by `jax.vmap`, the largest of theirs.
+    """Identity; under `jax.vmap` the maximum over the worlds.
 
-    A loop of so many turns is one loop for all worlds.
+    As a trip count it gives one loop for all worlds.
     """
     return count
 
@@ -50,9 +49,9 @@ def _largest(worlds: int, batched: list[bool], count: Array) -> tuple[Array, boo
 
 
 class View(PyTreeNode):
-    """Where a camera is and the rays of its pixels; the ray of a pixel is axes^T (1, u, v).
+    """Pose of a camera and rays of its pixels; the ray of a pixel is axes^T (1, u, v).
 
-    The pixels are those of an image of h rows and w columns, or of such an image as one row.
+    The image has h rows and w columns, or is one row of h w pixels.
     """
 
     eye: Array
@@ -60,9 +59,9 @@ class View(PyTreeNode):
     axes: Array
     """(3, 3) forward, left and up, one in each row, world."""
     u: Array
-    """(1, w) how far the ray of a pixel goes to the left for every meter forward."""
+    """(1, w) tangent of a pixel's ray to the left."""
     v: Array
-    """(h, 1) or, of one row, (1, w) how far the ray of a pixel goes up for every meter forward."""
+    """(h, 1), or (1, w) for one row: tangent of a pixel's ray upward."""
     pixel: Array
     """() height of a pixel at 1 m, m."""
     near: Array
@@ -72,7 +71,7 @@ class View(PyTreeNode):
 
 
 class Placed(PyTreeNode):
-    """Solids of one kind as a camera sees them; arrays have a leading axis over solids."""
+    """Solids of one kind in camera coordinates; arrays have a leading axis over solids."""
 
     solid: Obstacle
     origin: Array
@@ -81,13 +80,13 @@ class Placed(PyTreeNode):
     """(3, 3) forward, left and up of the camera in the frame of the solid, one in each row."""
 
     def interval(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Depths at which the rays of pixels are inside, first and last."""
+        """First and last depth of each pixel's ray inside the solid."""
         forward, left, up = (components(axis) for axis in components(self.axes))
         direction = [x + u * y + v * z for x, y, z in zip(forward, left, up, strict=True)]
         return self.solid.interval(components(self.origin), direction)
 
     def in_view(self, view: View) -> Array:
-        """Whether a part of the solid may be where the camera looks: not all of it beyond one side of the view."""
+        """Whether the solid may intersect the view frustum: not all of it is beyond one side."""
         width, height = ((1 + _SLACK) * jnp.max(jnp.abs(x)) for x in (view.u, view.v))
         # Constants become arrays of JAX first: 0.10 mixes up those of NumPy where a process changes jax_enable_x64.
         constants = (jnp.asarray(x, view.far.dtype) for x in (_SIDES, _WIDTH, _HEIGHT, _NEAR, _FAR))
@@ -110,7 +109,7 @@ class Placed(PyTreeNode):
 
 
 class Ground(PyTreeNode):
-    """All points below z = 0, as a solid."""
+    """Half space below z = 0 as a solid."""
 
     pos: Array
     """(3,) zero."""
@@ -119,7 +118,7 @@ class Ground(PyTreeNode):
 
     @classmethod
     def of(cls, dtype: DTypeLike) -> Ground:
-        """The ground as the only solid of its kind: with a leading axis of length 1."""
+        """Ground with a leading axis of length 1."""
         return cls(jnp.zeros((1, 3), dtype), jnp.array([[0, 0, 0, 1]], dtype))
 
     rounding = 0.0
@@ -138,7 +137,7 @@ class Ground(PyTreeNode):
         return [zero, zero, jnp.ones_like(zero)]
 
     def interval(self, origin: Components, direction: Components) -> Interval:
-        """Where lines are underground."""
+        """Interval of lines underground."""
         z, climb = origin[2], nonzero(direction[2])
         crossing = -z / climb
         return jnp.where(climb < 0, crossing, -jnp.inf), jnp.where(climb < 0, jnp.inf, crossing)
@@ -149,7 +148,7 @@ Solids = list[Obstacle | Ground]
 
 
 def _placed(view: View, solids: Any) -> Placed:
-    """Solids of one kind as a camera sees them."""
+    """Solids of one kind in camera coordinates."""
 
     def one(solid: Any) -> Placed:
         to_local = jax.vmap(functools.partial(rotation.rotate_inverse, solid.quat))
@@ -160,12 +159,12 @@ def _placed(view: View, solids: Any) -> Placed:
 
 @jax.custom_jvp
 def depth(view: View, solids: Solids, active: list[Array]) -> Float[Array, "h w"]:
-    """Depth along the viewing axis of what each pixel sees, m; `far` where it sees nothing.
+    """Depth of each pixel along the viewing axis, m; `far` for empty pixels.
 
     Args:
         view: rays.
-        solids: what can be seen.
-        active: for each kind (k,) bool, which solids are there.
+        solids: visible solids.
+        active: (k,) bool for each kind, the active solids.
     """
 
     def nearer(depth: Array, solid: Placed, active: Array, index: Array) -> Array:
@@ -175,10 +174,10 @@ def depth(view: View, solids: Solids, active: list[Array]) -> Float[Array, "h w"
 
 
 def visible(view: View, solids: Solids, active: list[Array]) -> Int[Array, "h w"]:
-    """Index of the solid that each pixel sees; the number of solids where it sees none.
+    """Index of each pixel's solid; the number of solids for empty pixels.
 
-    Surfaces whose depths differ by less than a share of 1e-5 (in float64, 1e-14) may be mistaken for each other: a pass
-    keeps one number, so the last bits of a depth are replaced by the index of its solid.
+    Surfaces with depths within a relative 1e-5 (in float64, 1e-14) may be confused: a pass keeps one number, so the
+    last bits of a depth are replaced by the index of its solid.
     """
     count = sum(len(kind.pos) for kind in solids)
     mask = (1 << count.bit_length()) - 1
@@ -199,8 +198,8 @@ def normals(view: View, solids: Solids, index: Int[Array, "h w"], depth: Float[A
 
     Args:
         view: rays.
-        solids: what can be seen.
-        index: of the solid that each pixel sees.
+        solids: visible solids.
+        index: solid of each pixel.
         depth: of its surface, m.
     """
     active = [jnp.ones(len(kind.pos), bool) for kind in solids]
@@ -216,14 +215,14 @@ def normals(view: View, solids: Solids, index: Int[Array, "h w"], depth: Float[A
 
 
 def _first_hit(view: View, solid: Placed, active: Array) -> Array:
-    """Depth at which the rays of pixels are inside of a solid for the first time; infinity where they never are."""
+    """Depth at which each pixel's ray enters a solid; infinity for a miss."""
     first, last = solid.interval(view.u, view.v)
     first = jnp.maximum(first, view.near)
     return jnp.where((last >= first) & active, first, jnp.inf)
 
 
 def _pass(function: Callable[..., Array], start: Array, view: View, solids: Solids, active: list[Array]) -> Array:
-    """Apply `(image, solid, whether it is active, its index) -> image` for the solids in view, one after the other."""
+    """Fold `(image, solid, active, index) -> image` over the solids in view."""
     image, count = start, 0
     for kind, mask in zip(solids, active, strict=True):
         placed, size = _placed(view, kind), len(mask)
@@ -248,7 +247,7 @@ def _pass(function: Callable[..., Array], start: Array, view: View, solids: Soli
 
 @functools.partial(depth.defjvp, symbolic_zeros=True)
 def _depth_jvp(primals: tuple[View, Solids, list], tangents: tuple[View, Solids, list]) -> tuple[Array, Array]:
-    """A pixel's depth where the camera and the solids move: it stays in the tangent plane of the visible surface.
+    """Tangent of a pixel's depth as camera and solids move: it stays in the tangent plane of the visible surface.
 
     With X = depth (1, u, v) on that plane, and W the plane's normal scaled so that W . (1, u, v) = 1, a displacement d
     of the plane relative to the camera, in camera axes, changes the depth by W . d.
@@ -274,7 +273,7 @@ def _depth_jvp(primals: tuple[View, Solids, list], tangents: tuple[View, Solids,
 
 
 def _rate_of_solids(view: View, solids: Any, changed: Any, index: Int[Array, "h w"]) -> Float[Array, "h w"]:
-    """Rate of a pixel's depth where the solids of one kind change; zero where another kind is visible."""
+    """Tangent of a pixel's depth with respect to the solids of one kind; zero where another kind is visible."""
     changed = jax.tree.map(_instantiated, changed, solids, is_leaf=lambda x: isinstance(x, SymbolicZero))
     placed, tangents = jax.jvp(functools.partial(_placed, view), (solids,), (changed,))
 

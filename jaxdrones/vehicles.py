@@ -1,14 +1,15 @@
-"""Random realistic quadrotors of 20 g to 3 kg: a size is drawn, and scaling laws give the other parameters.
+"""Random realistic quadrotors of 20 g to 3 kg: a mass is drawn, and scaling laws give the other parameters.
 
-A scaling law gives the median for a vehicle of this size. A drawn parameter is the median times a log-normal factor,
+A scaling law gives the median for a vehicle of this mass. A drawn parameter is the median times a log-normal factor,
 truncated to the range of published vehicles. Medians, spreads and limits are those of a regression over 13 published
 airframes of 31 g to 3.35 kg; tests/test_any_vehicle.py has the table with its sources and repeats the regression. The
 laws have these forms:
 
-- mass: its cube root, the size, is uniform, as in RAPTOR (rl-tools, l2f, `sample_initial_parameters`), whose ranges of
-  thrust-to-weight ratio and of lag are used as well.
+- mass: its logarithm is uniform, so that light and heavy vehicles are equally frequent. RAPTOR (rl-tools, l2f,
+  `sample_initial_parameters`), whose ranges of thrust-to-weight ratio and of lag are used, draws its cube root.
 - arm: a power of the mass, by regression; it would be the cube root for geometrically similar vehicles.
-- inertia: m l^2 times a number; I_zz is nearly I_xx + I_yy, the value of a flat body (perpendicular axis theorem).
+- inertia: m l^2 times a number, limited from below by the largest angular acceleration; I_zz is nearly I_xx + I_yy, the
+  value of a flat body (perpendicular axis theorem).
 - thrust: C_T rho n^2 D^4 of a propeller that fits between the arms.
 - torque: momentum theory of hover, power T sqrt(T / (2 rho A)) over a figure of merit.
 - drag: proportional to thrust and to air speed over tip speed, the form of blade flapping and induced drag (Mahony,
@@ -67,6 +68,7 @@ LAWS = {
 }
 ARM_POWER, THRUST_POWER, LAG_POWER = 0.423, 0.143, -1.07
 _SHORTEST_LAG = 0.03  # s
+_MAX_ACCELERATION = 1200.0  # rad/s^2: arm times the thrust of a rotor over the inertia; limit of RAPTOR
 _FROUDE = 12.0  # maximum speed over sqrt(g l): 8 to 17 for the bundled vehicles
 _COLLISION_HEIGHT = 0.5  # over the collision radius, about that of the bundled vehicles
 _DOWNWASH_LOSS = 0.07 * 35.0  # `inflow_loss` of the Crazyflie times the speed of its blade tips
@@ -90,23 +92,23 @@ def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: f
     """
     check_masses(lightest, heaviest)
     dtype = params.mass.dtype
-    size_key, *keys = jax.random.split(key, len(LAWS) + 1)
+    mass_key, *keys = jax.random.split(key, len(LAWS) + 1)
     key_of = dict(zip(LAWS, keys, strict=True))
-    size = jax.random.uniform(size_key, (), dtype, np.cbrt(lightest), np.cbrt(heaviest))
+    mass = jnp.exp(jax.random.uniform(mass_key, (), dtype, np.log(lightest), np.log(heaviest)))
 
     def vary(name: str, median: Array, low: Array, high: Array) -> Array:
         spread = LAWS[name].spread
         ends = jnp.log(low / median) / spread, jnp.log(high / median) / spread
         return median * jnp.exp(spread * jax.random.truncated_normal(key_of[name], *ends, (), dtype))
 
-    return _vehicle(params, size**3, vary)
+    return _vehicle(params, mass, vary)
 
 
 def median(params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST) -> Params:
-    """The quadrotor of middle size with the medians of the scaling laws; arguments and errors are those of `draw`."""
+    """The quadrotor of the median mass with the medians of the scaling laws; arguments and errors as for `draw`."""
     check_masses(lightest, heaviest)
-    size = jnp.asarray((np.cbrt(lightest) + np.cbrt(heaviest)) / 2, params.mass.dtype)
-    return _vehicle(params, size**3, lambda name, median, low, high: jnp.clip(median, low, high))
+    mass = jnp.asarray(np.sqrt(lightest * heaviest), params.mass.dtype)
+    return _vehicle(params, mass, lambda name, median, low, high: jnp.clip(median, low, high))
 
 
 def check_masses(lightest: float, heaviest: float) -> None:
@@ -135,12 +137,16 @@ def _vehicle(params: Params, mass: Array, vary: Vary) -> Params:
     place = arm * jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(arm)])
     rotor_pos = place[None] * jnp.asarray(_CORNERS, arm.dtype)
 
-    across, elongation = by_law("inertia", mass * arm**2), by_law("elongation")
+    _, _, low, high = LAWS["thrust_to_weight"]
+    thrust_to_weight = within("thrust_to_weight", mass**THRUST_POWER, low, high)
+    _, _, low, high = LAWS["inertia"]
+    elongation, slender = by_law("elongation"), mass * arm**2
+    torque = arm * thrust_to_weight * mass * GRAVITY / 4
+    least = jnp.maximum(low * slender, (1 + elongation) / 2 * torque / _MAX_ACCELERATION)
+    across = within("inertia", slender, least, high * slender)
     roll = 2 * across / (1 + elongation)
     inertia = jnp.stack([roll, elongation * roll, 2 * across * by_law("flatness")])
 
-    _, _, low, high = LAWS["thrust_to_weight"]
-    thrust_to_weight = within("thrust_to_weight", mass**THRUST_POWER, low, high)
     coefficient = by_law("thrust_coefficient")
     kf = coefficient * AIR_DENSITY * (2 * radius) ** 4 / 3600  # N/RPM^2
     weight = mass * GRAVITY / 4  # on one rotor

@@ -295,7 +295,8 @@ def test_an_action_of_zero_hovers_whatever_vehicle_is_drawn():
 def test_realistic_any_draws_vehicles_before_what_else_is_drawn():
     env = jd.make("hover", realistic="any", randomize=(scaled("mass", 2.0, 2.0),))
     nominal, drawn = env.params, env.reset(jax.random.key(3))[1].params
-    assert drawn.max_thrust / drawn.weight < 2.5 + 1e-6 and nominal.mass > 0.5
+    assert drawn.max_thrust / drawn.weight < 2.5 + 1e-6
+    np.testing.assert_allclose(nominal.mass, np.sqrt(0.02 * 3))
     assert "any quadrotor of 0.02 to 3 kg; mass times" in jd.explain(env).physics["drawn per episode"]
     assert jd.explain(env).vehicle["name"] == "any vehicle" and jd.make("hover", realistic="any") != env
 

@@ -1,7 +1,8 @@
 """Run a benchmark: `python -m benchmarks NAME [--quick] [--json]`; `NAME --help` lists its options.
 
 A benchmark is a module with a docstring that asks its question, `main(options) -> (result, lines)`, and
-`add_arguments(parser)` where it has options of its own. Versions, machine and commit are added to every result.
+`add_arguments(parser)` where it has options of its own. Versions, machine and commit, and the
+printed lines, are added to every result.
 """
 
 import argparse
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.common import about
 
-HELPERS = ("__init__", "__main__", "cameras_scenes", "common", "published")
+HELPERS = ("__init__", "__main__", "cameras_scenes", "common", "published", "tables")
 NAMES = sorted(path.stem for path in Path(__file__).parent.glob("*.py") if path.stem not in HELPERS)
 
 
@@ -32,7 +33,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     options = parser.parse_args(sys.argv[2:])
     result, lines = benchmark.main(options)
-    result["about"] = about() | result.get("about", {})
+    result |= {"about": about() | result.get("about", {}), "lines": lines}
     if options.json:
         print(json.dumps(result))
     else:

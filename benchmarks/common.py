@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import jax
 
 from jaxdrones.cli import throughput as timing
-from jaxdrones.cli.machine import versions
+from jaxdrones.cli.machine import processor, versions
 from jaxdrones.cli.throughput import seconds as seconds
 
 
@@ -20,6 +20,7 @@ def about() -> dict[str, object]:
         "commit": commit.stdout.strip(),
         **{name: text for name, text in versions().items() if name in ("jax", "jaxlib", "python")},
         "device": str(jax.devices()[0]),
+        "cpu": processor(),
         "cores": os.cpu_count(),
     }
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from benchmarks.rivals import environment
 from jaxdrones import assets
-from jaxdrones.dynamics import crazyflie_motors
+from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.flights import FlightLog, errors_as_dict, hold_errors, load_flights, load_vehicle, open_loop_errors
 
 OURS = {True: ("cf2x", "cf21_brushless"), False: ("cf2x", "cf21")}

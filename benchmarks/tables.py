@@ -1,8 +1,8 @@
 """Measure the tables of the pages again: `make tables`, or `python -m benchmarks.tables NAME ...` for some of them.
 
-A table stands on its page between `<!-- measured: NAME OPTIONS -->` and `<!-- end -->`. It is what
-`python -m benchmarks NAME OPTIONS` prints, with machine, versions and commit; the whole result is kept beside the pages,
-as JSON in benchmarks/results/. Measure on idle cores and from a commit without changes.
+A table is on its page between `<!-- measured: NAME OPTIONS -->` and `<!-- end -->`. It is the output of
+`python -m benchmarks NAME OPTIONS` with machine, versions and commit; the result is kept as JSON in benchmarks/results/.
+Measure on idle cores, at a commit without changes.
 """
 
 import argparse
@@ -31,8 +31,9 @@ def result_file(command: str) -> Path:
 def table(command: str, result: dict) -> str:
     """The text between the marks of a page."""
     about = result["about"]
-    made = f"at commit {about['commit']}, jax {about['jax']}, Python {about['python']}, {about['cores']} cores, {about['cpu']}"
-    return "\n".join([f"`python -m benchmarks {command}` {made}:", "", "```text", *result["lines"], "```", ""])
+    versions = f"commit {about['commit']}, jax {about['jax']}, Python {about['python']}"
+    source = f"`python -m benchmarks {command}` at {versions}, on {about['cores']} cores of {about['cpu']}:"
+    return "\n".join([source, "", "```text", *result["lines"], "```", ""])
 
 
 def rewritten(text: str, results: dict[str, dict]) -> str:

@@ -2,44 +2,31 @@
 
 from jaxdrones import rotation, vector
 from jaxdrones.accelerate.worlds import over_worlds
-from jaxdrones.dynamics import (
-    Battery,
-    Model,
-    Motors,
-    battery,
-    battery_current,
-    battery_voltage,
-    charge_at,
-    clock,
-    crazyflie_motors,
-    cubic_motors,
-    downwash,
-    downwash_2021,
+from jaxdrones.dynamics.aero import (
     drag,
     drag_world_axes,
-    drone_contact,
-    euler,
     external_force,
-    failing,
-    ground_contact,
     ground_effect,
     ground_effect_2021,
-    implicit_midpoint,
-    in_wind,
-    inflow_thrust,
-    instant_rotors,
-    lagging_rotors,
-    lithium_polymer,
-    logarithmic_wind,
-    midpoint,
-    obstacle_contact,
+    quadratic_drag,
+)
+from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
+from jaxdrones.dynamics.inflow import inflow_thrust
+from jaxdrones.dynamics.integrators import euler, implicit_midpoint, midpoint, rk4, semi_implicit_euler
+from jaxdrones.dynamics.interaction import downwash, downwash_2021
+from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.power import Battery, battery, battery_current, battery_voltage, charge_at, lithium_polymer
+from jaxdrones.dynamics.propulsion import (
+    Motors,
+    crazyflie_motors,
+    cubic_motors,
+    failing,
     pwm_of_thrust,
     pwm_rotors,
-    quadratic_drag,
-    rk4,
-    semi_implicit_euler,
     supply_voltage,
 )
+from jaxdrones.dynamics.rotors import instant_rotors, lagging_rotors
+from jaxdrones.dynamics.wind import clock, in_wind, logarithmic_wind
 from jaxdrones.engine.explicit import make_derivative, make_step
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.rollout import rollout

@@ -22,7 +22,7 @@ import numpy as np
 import jaxdrones as jd
 from jaxdrones.cli.score import closed_loop_table, open_loop_table
 from jaxdrones.control import firmware_pid
-from jaxdrones.dynamics import crazyflie_motors
+from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.flights import (
     HORIZONS,
     Vehicle,

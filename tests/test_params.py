@@ -10,7 +10,7 @@ from helpers import VEHICLES, assert_close
 
 import jaxdrones
 from jaxdrones import State
-from jaxdrones.dynamics import rotor_wrench
+from jaxdrones.dynamics.rotors import rotor_wrench
 
 RTOL = 1e-12  # the same products in another order
 

@@ -23,7 +23,7 @@ from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorPara
 import jaxdrones as jd
 from benchmarks.rivals.crazyflow import make_sim, make_step
 from benchmarks.rivals.rotorpy import RADIANS_PER_SECOND
-from jaxdrones.dynamics import FULL_PWM, crazyflie_motors
+from jaxdrones.dynamics.propulsion import FULL_PWM, crazyflie_motors
 from jaxdrones.flights import HORIZONS, FlightLog, errors_as_dict, load_flights
 from jaxdrones.flights.open_loop import cut_windows, mean_errors, window_starts
 from jaxdrones.flights.preparation import PERIOD

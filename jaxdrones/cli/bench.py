@@ -14,7 +14,7 @@ from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
 from jaxdrones.cli.report import as_json
 from jaxdrones.cli.throughput import seconds
-from jaxdrones.dynamics import drag
+from jaxdrones.dynamics.aero import drag
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.envs import make
 from jaxdrones.limits import LARGEST_COUNT, check_at_most

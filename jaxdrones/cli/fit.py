@@ -62,7 +62,7 @@ def add(commands) -> None:
 
 def _fit(options: argparse.Namespace) -> int:
     from jaxdrones.control import firmware_pid
-    from jaxdrones.dynamics import crazyflie_motors
+    from jaxdrones.dynamics.propulsion import crazyflie_motors
     from jaxdrones.flights import fit
     from jaxdrones.flights.files import find_log
     from jaxdrones.flights.report import check_no_fit, report_as_dict, write_vehicle

@@ -11,7 +11,7 @@ from jaxdrones import assets
 from jaxdrones.checks import check_choice, check_number, check_positive, check_whole
 from jaxdrones.cli.common import folder, print_error, print_warning
 from jaxdrones.cli.report import as_json
-from jaxdrones.dynamics import drone_contact, ground_contact
+from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS, PHYSICS_HZ

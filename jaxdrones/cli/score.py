@@ -45,7 +45,7 @@ def _score(options: argparse.Namespace) -> int:
     import numpy as np
 
     from jaxdrones.control import firmware_pid
-    from jaxdrones.dynamics import crazyflie_motors
+    from jaxdrones.dynamics.propulsion import crazyflie_motors
     from jaxdrones.flights import (
         errors_as_dict,
         hold_errors,

@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.shared import recomputed
 from jaxdrones.checks import check_positive, check_whole
-from jaxdrones.dynamics import Model, instant_rotors, newton_euler, quat_rate, semi_implicit_euler
 from jaxdrones.dynamics.contact import LARGEST_STEP
-from jaxdrones.dynamics.integrators import Integrator
-from jaxdrones.dynamics.rotors import limited
+from jaxdrones.dynamics.integrators import Integrator, semi_implicit_euler
+from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
+from jaxdrones.dynamics.rotors import instant_rotors, limited
 from jaxdrones.engine.clearance import NearObstacles
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Contact, Physics, Rotors, check_functions

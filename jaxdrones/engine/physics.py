@@ -11,9 +11,9 @@ import jax
 from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_arguments, check_sequence, takes_scene, with_scene
-from jaxdrones.dynamics import Model, instant_rotors
+from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
-from jaxdrones.dynamics.rotors import rotor_reaction, rotor_wrench, with_rotor_speed
+from jaxdrones.dynamics.rotors import instant_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, check_wrench, describe, from_others, side_by_side
 from jaxdrones.errors import UserError

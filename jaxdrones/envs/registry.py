@@ -20,18 +20,11 @@ from jaxdrones.checks import (
     check_whole,
     shown,
 )
-from jaxdrones.dynamics import (
-    EFFECTS,
-    INTEGRATORS,
-    PAIRS,
-    ROTORS,
-    Model,
-    drone_contact,
-    external_force,
-    ground_contact,
-    lagging_rotors,
-    obstacle_contact,
-)
+from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.dynamics.aero import external_force
+from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
+from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import Step

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.control import Setpoint, firmware_pid
-from jaxdrones.dynamics import FULL_PWM, Motors, midpoint
+from jaxdrones.dynamics.integrators import midpoint
+from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.flights.open_loop import equations_of_motion, lagged_rpm

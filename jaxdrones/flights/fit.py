@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxdrones.checks import shown
 from jaxdrones.control import firmware_pid
-from jaxdrones.dynamics import Motors, crazyflie_motors
+from jaxdrones.dynamics.propulsion import Motors, crazyflie_motors
 from jaxdrones.errors import UserError
 from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, normal_equations, standard_errors
 from jaxdrones.flights.log import FlightLog

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.dynamics import Motors
+from jaxdrones.dynamics.propulsion import Motors
 from jaxdrones.flights.open_loop import HORIZONS, Windows, predict, residuals
 from jaxdrones.flights.parameters import with_parameters
 from jaxdrones.flights.vehicle import Vehicle

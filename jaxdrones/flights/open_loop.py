@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.dynamics import Motors, drag, flapping_moment, midpoint, rate_damping, trim_torque
-from jaxdrones.dynamics.propulsion import FULL_PWM
+from jaxdrones.dynamics.aero import drag
+from jaxdrones.dynamics.flapping import flapping_moment, rate_damping, trim_torque
+from jaxdrones.dynamics.integrators import midpoint
+from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.engine.explicit import Derivative, make_derivative
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation
 from jaxdrones.control import firmware_pid
-from jaxdrones.dynamics import FULL_PWM, Motors
+from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.flights.closed_loop import (
     ClosedLoopInputs,
     closed_loop_columns,

@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 from jaxdrones import control, rotation
 from jaxdrones.checks import check_choice, check_params, check_shape, check_whole, shown
 from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, mellinger, pid, rates, simple_pid
-from jaxdrones.dynamics import drag, lagging_rotors
+from jaxdrones.dynamics.aero import drag
+from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.rollout import rollout
 from jaxdrones.errors import UserError

@@ -13,7 +13,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdrones.checks import check_choice, check_shape, shown
-from jaxdrones.dynamics import Model, instant_rotors
+from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.engine.explicit import make_derivative
 from jaxdrones.engine.physics import Physics, Rotors
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect

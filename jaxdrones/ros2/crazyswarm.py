@@ -20,7 +20,8 @@ import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.checks import check_positive
-from jaxdrones.dynamics import downwash, ground_contact
+from jaxdrones.dynamics.contact import ground_contact
+from jaxdrones.dynamics.interaction import downwash
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError
 from jaxdrones.params import repeat

@@ -12,7 +12,7 @@ from helpers import VEHICLES, assert_finite
 import jaxdrones
 from jaxdrones import State
 from jaxdrones.control.allocation import mixer, rpm_from_wrench
-from jaxdrones.dynamics import rotor_wrench
+from jaxdrones.dynamics.rotors import rotor_wrench
 
 N = 200  # wrenches in a batch, as in the recorded cases
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from jaxdrones import rotation
 from jaxdrones.control import attitude, geometric
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.dynamics import rotor_wrench
+from jaxdrones.dynamics.rotors import rotor_wrench
 
 HZ = 240
 SECONDS = 8  # the same for all flights, so that they are compiled once

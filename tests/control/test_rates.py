@@ -10,7 +10,8 @@ import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.control import rates
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.dynamics import newton_euler, rotor_wrench
+from jaxdrones.dynamics.rigid_body import newton_euler
+from jaxdrones.dynamics.rotors import rotor_wrench
 
 INPUTS = ("pos", "quat", "vel", "target_pos", "target_vel")
 

@@ -9,7 +9,7 @@ import pytest
 from helpers import assert_close, assert_finite, make_step
 
 import jaxdrones as jd
-from jaxdrones.dynamics import battery_power, open_circuit_voltage
+from jaxdrones.dynamics.power import battery_power, open_circuit_voltage
 
 DRAWN = jd.Model("drawn", lambda params: 0 * params.mass, lambda params, state, _: jd.battery_current(params, state))
 MODELS = (jd.battery(), DRAWN)

@@ -7,7 +7,7 @@ from helpers import flying
 
 import jaxdrones
 from jaxdrones import Wrench, rotation
-from jaxdrones.dynamics import newton_euler, quat_rate
+from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 
 params = jaxdrones.load_params("cf2x")
 team = jaxdrones.repeat(params, 20)

@@ -8,8 +8,7 @@ from helpers import VEHICLES, assert_finite, name_of
 
 import jaxdrones
 from jaxdrones import State, instant_rotors, lagging_rotors
-from jaxdrones.dynamics import rotor_wrench
-from jaxdrones.dynamics.rotors import lost_share, rotor_reaction
+from jaxdrones.dynamics.rotors import lost_share, rotor_reaction, rotor_wrench
 
 level = State(*(jnp.zeros(3), jnp.array([0.0, 0, 0, 1]), jnp.zeros(3), jnp.zeros(3)), rpm=jnp.zeros(4))
 

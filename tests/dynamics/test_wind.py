@@ -7,8 +7,9 @@ import pytest
 from helpers import assert_close, assert_finite, flying, make_step
 
 import jaxdrones as jd
-from jaxdrones.dynamics import battery_power, flapping_moment, rate_damping
+from jaxdrones.dynamics.flapping import flapping_moment, rate_damping
 from jaxdrones.dynamics.inflow import flow_through
+from jaxdrones.dynamics.power import battery_power
 
 AREA = {"drag_area": jnp.array([2e-3, 3e-3, 6e-3])}
 CF2X = jd.load_params("cf2x").replace(aux=AREA)

@@ -11,7 +11,7 @@ from helpers import assert_close
 import jaxdrones as jd
 from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.fitting import fits_a_kernel
-from jaxdrones.dynamics import Model
+from jaxdrones.dynamics.model import Model
 from jaxdrones.envs import AutoReset, check_env, make
 from jaxdrones.envs.observations import reading
 from jaxdrones.sensing.sensor import Sensor

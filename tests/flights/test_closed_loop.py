@@ -6,7 +6,7 @@ import pytest
 
 import jaxdrones
 from jaxdrones.control import firmware_pid
-from jaxdrones.dynamics import FULL_PWM, crazyflie_motors
+from jaxdrones.dynamics.propulsion import FULL_PWM, crazyflie_motors
 from jaxdrones.flights import FlightLog, Vehicle, simulate_closed_loop
 
 ROWS, REST, LOADED = 700, 4.1, 3.3

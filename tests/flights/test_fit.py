@@ -15,7 +15,7 @@ import jaxdrones
 from jaxdrones import State, rotation
 from jaxdrones.cli import main
 from jaxdrones.control import firmware_pid
-from jaxdrones.dynamics import crazyflie_motors
+from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.errors import UserError
 from jaxdrones.flights import Vehicle, fit, hold_errors, load_flights, load_vehicle, open_loop_errors
 from jaxdrones.flights.fit import _estimate

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import jax
 
 from jaxdrones.checks import check_number, check_positive, check_whole
-from jaxdrones.dynamics import Model, instant_rotors
+from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.engine.bullet.client import BALLS, TINY, Client
 from jaxdrones.engine.bullet.step import BulletStep
 from jaxdrones.engine.neighbors import NeighborGrid

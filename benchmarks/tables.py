@@ -1,7 +1,7 @@
 """Measure the tables of the pages again: `make tables`, or `python -m benchmarks.tables NAME ...` for some of them.
 
 A table is on its page between `<!-- measured: NAME OPTIONS -->` and `<!-- end -->`. It is the output of
-`python -m benchmarks NAME OPTIONS` with machine, versions and commit; the result is kept as JSON in benchmarks/results/.
+`python -m benchmarks NAME OPTIONS` with machine, versions and commit. benchmarks/results/ has the results as JSON.
 Measure on idle cores, at a commit without changes.
 """
 

@@ -128,9 +128,9 @@ def train(
             advantages = torch.zeros_like(rewards)
             next_value, advantage = agent.value(next_obs), torch.zeros(num_envs)
             for t in reversed(range(horizon)):
-                goes_on = 1 - ended[t]
-                delta = rewards[t] + gamma * goes_on * next_value - values[t]
-                advantage = delta + gamma * gae_lambda * goes_on * advantage
+                not_ended = 1 - ended[t]
+                delta = rewards[t] + gamma * not_ended * next_value - values[t]
+                advantage = delta + gamma * gae_lambda * not_ended * advantage
                 advantages[t], next_value = advantage, values[t]
 
         flat = [x.flatten(0, 1) for x in (obs, actions, log_probs, advantages, advantages + values)]

@@ -36,13 +36,13 @@ class UnexpectedKeyword(TypeError):
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def is_known(value: Any) -> bool:
-    """Whether something has a value that can be looked at."""
+def is_concrete(value: Any) -> bool:
+    """Whether a value is concrete, not traced."""
     return not isinstance(value, _UNKNOWN) and type(value) is not object
 
 
-def shown(value: Any) -> str:
-    """A value in one short line: of an array its numbers, not its address or type."""
+def short_repr(value: Any) -> str:
+    """Representation of a value in one short line; of an array, its numbers."""
     text = repr(np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic | jax.Array) else value)
     text = " ".join(text.split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
@@ -62,9 +62,9 @@ def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: st
 def check_finite(name: str, tree: Any) -> None:
     """Raise if a concrete array of `tree` holds NaN or infinity; traced values cannot be looked at."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if is_known(leaf) and not np.all(np.isfinite(leaf)):
+        if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
             where = name + jax.tree_util.keystr(path)
-            raise UserError(f"{where} is not finite: {shown(leaf)}; give finite numbers")
+            raise UserError(f"{where} is not finite: {short_repr(leaf)}; give finite numbers")
 
 
 def check_number(
@@ -90,7 +90,7 @@ def check_number(
         below: upper bound that is not allowed.
         infinite: whether infinity is allowed.
     """
-    if not is_known(value):
+    if not is_concrete(value):
         return
     given = {"at least": at_least, "above": above, "at most": at_most, "below": below}
     bounds = {word: bound for word, bound in given.items() if bound is not None}
@@ -98,7 +98,7 @@ def check_number(
         words = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items())
         wanted = {"": "a finite number", "above 0": "a positive number"}.get(words, f"a number of {words}")
         wanted = wanted.replace("number of above", "number above").replace("number of below", "number below")
-        raise UserError(f"{name} is {shown(value)}; give {wanted}" + (f" ({unit})" if unit else ""))
+        raise UserError(f"{name} is {short_repr(value)}; give {wanted}" + (f" ({unit})" if unit else ""))
 
 
 def _is_number(value: Any) -> bool:
@@ -130,13 +130,13 @@ def check_whole(name: str, value: int, minimum: int = 1) -> None:
     except TypeError:
         whole = False
     if not whole:
-        raise UserError(f"{name} is {shown(value)}; give a whole number of at least {minimum}")
+        raise UserError(f"{name} is {short_repr(value)}; give a whole number of at least {minimum}")
 
 
 def check_switch(name: str, value: bool | str, others: tuple[str, ...] = ()) -> None:
     """Raise unless `value` is true or false, or one of the `others`."""
     if not isinstance(value, bool | np.bool_) and not (isinstance(value, str) and value in others):
-        raise UserError(f"{name} is {shown(value)}; give {' or '.join(['True', 'False', *map(repr, others)])}")
+        raise UserError(f"{name} is {short_repr(value)}; give {' or '.join(['True', 'False', *map(repr, others)])}")
 
 
 def check_choice(kind: str, name: str, known: Iterable[str]) -> None:
@@ -163,14 +163,14 @@ def hint(name: str, known: Iterable[str]) -> str:
 def check_sequence(name: str, value: Any, example: str) -> tuple:
     """The entries of a sequence, or an error if something single stands in its place."""
     if isinstance(value, str) or callable(value) or not isinstance(value, Iterable):
-        raise UserError(f"{name} is {shown(value)}; give a sequence, for example ({example},)")
+        raise UserError(f"{name} is {short_repr(value)}; give a sequence, for example ({example},)")
     return tuple(value)
 
 
 def check_callable(name: str, value: Any, example: str) -> None:
     """Raise unless `value` is a function."""
     if not callable(value):
-        raise UserError(f"{name}: {shown(value)} is not a function; give for example {example}")
+        raise UserError(f"{name}: {short_repr(value)} is not a function; give for example {example}")
 
 
 def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], hint: str = "") -> None:
@@ -238,7 +238,7 @@ def check_arrays(name: str, tree: Any) -> None:
     """
     for field, leaf in vars(tree).items():
         if field != "aux" and isinstance(leaf, _NO_ARRAYS):
-            raise UserError(f"{name}.{field} is {shown(leaf)}; give an array, for example with jax.numpy.array(...)")
+            raise UserError(f"{name}.{field} is {short_repr(leaf)}; give an array, for example jax.numpy.array(...)")
 
 
 def check_params(params: Any, finite: bool = True) -> None:
@@ -257,17 +257,17 @@ def check_params(params: Any, finite: bool = True) -> None:
     for bound, words, names in (0, "positive numbers", POSITIVE), (-_SMALLEST, "numbers of at least 0", _NOT_NEGATIVE):
         for name in names:
             leaf = constants[name]
-            if is_known(leaf) and not (np.asarray(leaf) > bound).all():
-                raise UserError(f"params.{name} is {shown(leaf)}; give {words}")
+            if is_concrete(leaf) and not (np.asarray(leaf) > bound).all():
+                raise UserError(f"params.{name} is {short_repr(leaf)}; give {words}")
 
 
 def _without_infinity(leaf: Any) -> Any:
-    return np.where(np.isposinf(leaf), 0, leaf) if is_known(leaf) else leaf
+    return np.where(np.isposinf(leaf), 0, leaf) if is_concrete(leaf) else leaf
 
 
 def check_quaternion(name: str, quat: Any) -> None:
     """Raise unless quaternions (..., 4) have unit length, where they can be looked at."""
-    if not is_known(quat) or np.shape(quat)[-1:] != (4,):  # what else it is, is said where shapes are checked
+    if not is_concrete(quat) or np.shape(quat)[-1:] != (4,):  # what else it is, is said where shapes are checked
         return
     quat = np.asarray(quat, float)
     length = np.sqrt((quat * quat).sum(axis=-1))
@@ -281,7 +281,7 @@ def check_key(name: str, key: Any) -> None:
     """Raise unless `key` is one random key, typed or raw; what is traced has a shape, too."""
     example = "give a random key, for example jax.random.key(0)"
     if not isinstance(key, jax.Array | np.ndarray):
-        raise UserError(f"{name} is {shown(key)}; {example}")
+        raise UserError(f"{name} is {short_repr(key)}; {example}")
     typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     one = () if typed else _raw_key_shape()
     if not typed and (key.dtype != np.uint32 or key.shape[key.ndim - len(one) :] != one):

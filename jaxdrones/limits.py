@@ -20,11 +20,11 @@ def check_seed(name: str, seed: int) -> None:
     check_at_most(name, seed, LARGEST_SEED, minimum=0)
 
 
-def check_at_most(name: str, value: int, most: int, minimum: int = 1) -> None:
-    """Raise unless `value` is an integer from `minimum` to `most`."""
+def check_at_most(name: str, value: int, limit: int, minimum: int = 1) -> None:
+    """Raise unless `value` is an integer from `minimum` to `limit`."""
     check_whole(name, value, minimum)
-    if value > most:
-        raise UserError(f"{name} is {str(value)[:30]}; give at most {most}")
+    if value > limit:
+        raise UserError(f"{name} is {str(value)[:30]}; give at most {limit}")
 
 
 def check_memory(what: str, size: int, advice: str) -> None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.checks import check_params, check_shape, check_whole, shown
+from jaxdrones.checks import check_params, check_shape, check_whole, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.vector import safe_sqrt
@@ -149,6 +149,6 @@ def repeat(params: Params, n: int) -> Params:
 
 def _check_single(name: str, params: Params, meaning: str) -> None:
     if not isinstance(params, Params):
-        raise UserError(f"{shown(params)} is given; {meaning}, for example of jaxdrones.load_params")
+        raise UserError(f"{short_repr(params)} is given; {meaning}, for example of jaxdrones.load_params")
     check_params(params)
     check_shape(name, params.mass, (), meaning)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxdrones.checks import check_choice, is_known
+from jaxdrones.checks import check_choice, is_concrete
 from jaxdrones.errors import UserError
 
 ON_FAILURE = ("hold", "raise")
@@ -65,7 +65,7 @@ def check_on_failure(on_failure: str, *given: Any) -> None:
         given: arguments of the planner; what is traced has no status that could be looked at.
     """
     check_choice("on_failure", on_failure, ON_FAILURE)
-    if on_failure == "raise" and not all(map(is_known, jax.tree.leaves(given))):
+    if on_failure == "raise" and not all(map(is_concrete, jax.tree.leaves(given))):
         raise UserError(
             "on_failure is 'raise' inside jax.jit or jax.vmap, where no error depends on values; leave it out, and "
             "look at the status of the memory"

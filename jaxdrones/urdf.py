@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import assets
-from jaxdrones.checks import check_choice, shown
+from jaxdrones.checks import check_choice, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import AIR_DENSITY, Params
 
@@ -72,7 +72,7 @@ def load_params(vehicle: str | os.PathLike) -> Params:
         ValueError: an unknown vehicle, or a URDF that lacks something or holds nonsense; says what.
     """
     if not isinstance(vehicle, str | os.PathLike):
-        raise UserError(f"vehicle is {shown(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
+        raise UserError(f"vehicle is {short_repr(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
     path = Path(vehicle)
     if path.suffix != ".urdf":
         check_choice("vehicle", str(vehicle), assets.vehicles())
@@ -140,7 +140,7 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
     largest = np.max(inertia)
     demand(
         largest <= (np.sum(inertia) - largest) * (1 + 1e-6),
-        f"the moments of inertia {shown(inertia)} are those of no body",
+        f"the moments of inertia {short_repr(inertia)} are those of no body",
         "each is at most the sum of the other two",
     )
     x, y, _ = v["rotor_pos"].T
@@ -155,8 +155,8 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
     values = np.linalg.svd(allocation, compute_uv=False)
     demand(
         values[0] <= _CONDITION * values[-1],
-        f"rotors at {shown(v['rotor_pos'])} m with rotor_spin {shown(spin)} cannot turn a drone about every axis",
-        "place them around the centre of mass, with neighbours that turn opposite ways",
+        f"rotors at {short_repr(v['rotor_pos'])} m, spin {short_repr(spin)}, cannot turn a drone about every axis",
+        "place them around the center of mass, with neighbors that turn opposite ways",
     )
     full = v["kf"] * max_rpm**2
     torque = np.array([full * np.sum(np.abs(y)) / 2, full * np.sum(np.abs(x)) / 2, 2 * v["km"] * max_rpm**2])
@@ -189,7 +189,7 @@ class _Urdf:
         except ET.ParseError as error:
             raise UserError(f"{path}: is not well-formed XML ({error}); mend the file") from None
         except (LookupError, ValueError) as error:  # of its encoding, or of its name
-            raise UserError(f"{shown(str(path))[1:-1]}: cannot be read ({error}); save it as UTF-8") from None
+            raise UserError(f"{short_repr(str(path))[1:-1]}: cannot be read ({error}); save it as UTF-8") from None
         if self._root.tag != "robot":
             raise UserError(f"{path}: is no URDF, its root is <{self._root.tag}>; give a file with <robot>")
 
@@ -243,7 +243,7 @@ class _Urdf:
         if text is None:
             there = "the tag is missing" if tag is None else f"found {', '.join(tag.keys()) or 'no attribute'}"
             raise UserError(f"{self.name}: <{path}> lacks '{attribute}' ({meaning}); {there}")
-        where = f'{self.name}: <{path}> {attribute}="{shown(text)[1:-1]}" ({meaning})'
+        where = f'{self.name}: <{path}> {attribute}="{short_repr(text)[1:-1]}" ({meaning})'
         try:
             values = np.array([_float(word) for word in text.split()])
         except ValueError:
@@ -262,7 +262,7 @@ class _Urdf:
     def _check_zero(self, path: str, attribute: str, entries: slice, remedy: str) -> None:
         values = self.numbers(path, attribute, 3, "origin, m or rad", default="0 0 0")
         if np.any(values[entries] != 0):
-            raise UserError(f"{self.name}: <{path}> {attribute} is {shown(values)}; {remedy}")
+            raise UserError(f"{self.name}: <{path}> {attribute} is {short_repr(values)}; {remedy}")
 
     def _tag(self, path: str) -> ET.Element | None:
         """The only tag at a path, whose parts are the only ones, too; `None` if it is missing."""

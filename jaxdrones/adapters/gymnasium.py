@@ -22,7 +22,7 @@ from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import SEEDS, Session, as_env, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
-from jaxdrones.checks import check_choice, check_whole, shown
+from jaxdrones.checks import check_choice, check_whole, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
@@ -197,7 +197,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("step is called before reset; call reset")
         if self._over.any():
             raise gymnasium.error.ResetNeeded(
-                f"the episodes of worlds {shown(np.flatnonzero(self._over))} have ended; call "
+                f"the episodes of worlds {short_repr(np.flatnonzero(self._over))} have ended; call "
                 'reset(options={"reset_mask": terminated | truncated})'
             )
         actions = self._layout.gather(actions, (self.num_envs,))

@@ -128,8 +128,8 @@ def velocity_loop(
     integral = jnp.clip(memory.vel_integral + error * dt, -_MAX_INTEGRAL, _MAX_INTEGRAL)
     forward, left, up = vector.components(gains.vel_p * error + gains.vel_i * integral)
     tilt = jnp.clip(-jnp.stack([left, forward]), -gains.max_tilt, gains.max_tilt)
-    most = _MAX_TORQUE / _THRUST_PER_OUTPUT
-    thrust = gains.base_thrust + _THRUST_PER_OUTPUT * jnp.clip(up, -most, most)
+    limit = _MAX_TORQUE / _THRUST_PER_OUTPUT
+    thrust = gains.base_thrust + _THRUST_PER_OUTPUT * jnp.clip(up, -limit, limit)
     return memory.replace(vel_integral=integral), tilt, jnp.clip(thrust, gains.min_thrust, FULL)
 
 
@@ -142,16 +142,16 @@ def attitude_loop(
     limit = gains.max_attitude_integral
     integral = jnp.clip(memory.attitude_integral + error * dt, -limit, limit)
     change = _wrap_yaw(measured - memory.rpy) / dt
-    asked = gains.attitude_p * error + gains.attitude_i * integral - gains.attitude_d * change
-    return memory.replace(attitude_integral=integral, rpy=measured), asked
+    target = gains.attitude_p * error + gains.attitude_i * integral - gains.attitude_d * change
+    return memory.replace(attitude_integral=integral, rpy=measured), target
 
 
 def rate_loop(
-    gains: Gains, memory: Memory, state: State, asked: Float[Array, "3"], dt: Array | float
+    gains: Gains, memory: Memory, state: State, target: Float[Array, "3"], dt: Array | float
 ) -> tuple[Memory, Float[Array, "3"]]:
     """Torque (16 bit, right-handed body axes) towards rates (degrees/s)."""
     gyro, measured = low_pass(memory.gyro, degrees(state.omega), gains.gyro_cutoff, dt)
-    error = asked - measured
+    error = target - measured
     limit = gains.max_rate_integral
     integral = jnp.clip(memory.rate_integral + error * dt, -limit, limit)
     change = (measured - memory.rates) / dt

@@ -206,10 +206,10 @@ def _fly(
         attitude = degrees(setpoint.rpy)
     if isinstance(setpoint, Rates):
         check_shape("setpoint.omega", setpoint.omega, (3,), "one target for one drone")
-        memory, asked = memory.replace(rpy=attitude), degrees(setpoint.omega)
+        memory, target = memory.replace(rpy=attitude), degrees(setpoint.omega)
     else:
-        memory, asked = attitude_loop(gains, memory, state, attitude, dt)
-    memory, torque = rate_loop(gains, memory, state, asked, dt)
+        memory, target = attitude_loop(gains, memory, state, attitude, dt)
+    memory, torque = rate_loop(gains, memory, state, target, dt)
     memory = jax.tree.map(lambda kept, empty: jnp.where(thrust > 0, kept, empty), memory, reset(memory))
     return memory, attitude, thrust, jnp.where(thrust > 0, torque, 0)
 

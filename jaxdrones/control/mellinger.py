@@ -166,8 +166,8 @@ def pwm(
     """
     memory, axes, thrust, torque = _fly(gains, memory, state, setpoint, dt)
     voltage, duty = motors.duty_cycles(gains.motor, thrust, torque, battery, memory.battery, dt)
-    asked = degrees(rotation.to_rpy(rotation.from_matrix(jnp.stack(axes, axis=-1))))
-    return memory.replace(battery=voltage), motors.Command(asked, thrust, torque, duty)
+    target = degrees(rotation.to_rpy(rotation.from_matrix(jnp.stack(axes, axis=-1))))
+    return memory.replace(battery=voltage), motors.Command(target, thrust, torque, duty)
 
 
 def _fly(

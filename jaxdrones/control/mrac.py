@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_positive, is_known
+from jaxdrones.checks import check_number, check_positive, is_concrete
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_memory, check_single
@@ -78,7 +78,7 @@ def gains(params: Params | None = None) -> Gains:
     if params is None:
         with jax.ensure_compile_time_eval():  # so that `gains()` may be called during tracing
             params = load_params("cf2x")
-    if not all(is_known(leaf) for leaf in (params.mass, params.inertia, params.gravity)):
+    if not all(is_concrete(leaf) for leaf in (params.mass, params.inertia, params.gravity)):
         raise UserError(
             "params are being traced, so poles cannot be placed; give values, outside of jax.jit and jax.vmap"
         )

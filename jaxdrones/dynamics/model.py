@@ -9,7 +9,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arguments, check_callable, shown
+from jaxdrones.checks import check_arguments, check_callable, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -34,7 +34,7 @@ class Model:
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
-            raise UserError(f"name of a model is {shown(self.name)}; give a string that is not empty")
+            raise UserError(f"name of a model is {short_repr(self.name)}; give a string that is not empty")
         for field, arguments in ("init", ("params",)), ("rate", ("params", "state", "command")):
             function = getattr(self, field)
             check_callable(f"{field} of the model {self.name!r}", function, f"a function of ({', '.join(arguments)})")

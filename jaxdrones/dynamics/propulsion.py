@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice, check_finite, check_number, check_shape, is_known, shown
+from jaxdrones.checks import check_choice, check_finite, check_number, check_shape, is_concrete, short_repr
 from jaxdrones.dynamics.model import constants
 from jaxdrones.dynamics.power import battery_voltage
 from jaxdrones.dynamics.rotors import lagging_rotors
@@ -56,11 +56,12 @@ def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
     check_shape("coefficients of the thrust curve", coefficients, (4,), "those of the powers 0 to 3 of the voltage")
     check_finite("coefficients of the thrust curve", coefficients)
     check_number("supply of the motors", supply, "V", above=0)
-    if is_known(coefficients):
+    if is_concrete(coefficients):
         _, b, c, d = np.asarray(coefficients, float)
         if not (d > 0 and c * c < 3 * b * d):
             raise UserError(
-                f"the thrust curve {shown(coefficients)} does not rise everywhere; give a cubic whose slope is positive"
+                f"the thrust curve {short_repr(coefficients)} does not rise everywhere; "
+                "give a cubic whose slope is positive"
             )
     return Motors(jnp.asarray(coefficients, float), jnp.asarray(supply, float))
 

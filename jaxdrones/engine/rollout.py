@@ -15,7 +15,7 @@ from jaxdrones.checks import (
     check_params,
     check_quaternion,
     check_whole,
-    shown,
+    short_repr,
 )
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.errors import UserError
@@ -130,7 +130,11 @@ def _commanded(control: Control, params: Params, memory: Any, state: State, k: A
     """What a controller answers, or an error if that is something else than memory and rotor speeds."""
     answer = control(params, memory, state, k)
     if not (isinstance(answer, tuple | list) and len(answer) == 2):
-        given = f"an array of shape {np.shape(answer)}" if isinstance(answer, jax.Array | np.ndarray) else shown(answer)
+        given = (
+            f"an array of shape {np.shape(answer)}"
+            if isinstance(answer, jax.Array | np.ndarray)
+            else short_repr(answer)
+        )
         raise UserError(f"control returned {given}; return (memory, rpm), with memory as it was given if there is none")
     given, returned = (str(jax.tree.structure(x)) for x in (memory, answer[0]))
     if given != returned:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape, shown
+from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -60,7 +60,7 @@ def check_team(params: Params, state: State, rpm: Any) -> None:
 
 def _check_aux(name: str, aux: Any, n: int) -> None:
     if not isinstance(aux, dict):
-        raise UserError(f"{name} is {shown(aux)}; give a dictionary by the names of models")
+        raise UserError(f"{name} is {short_repr(aux)}; give a dictionary by the names of models")
     for path, leaf in jax.tree_util.tree_leaves_with_path(aux):
         where = name + jax.tree_util.keystr(path)
         if jnp.shape(leaf)[:1] != (n,):

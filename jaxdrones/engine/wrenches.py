@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_shape, shown
+from jaxdrones.checks import check_shape, short_repr
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -54,7 +54,7 @@ def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | No
     """
     called = f"{name}: {describe([function])}"
     if not isinstance(wrench, Wrench):
-        given = f"an array of shape {wrench.shape}" if isinstance(wrench, jax.Array) else shown(wrench)
+        given = f"an array of shape {wrench.shape}" if isinstance(wrench, jax.Array) else short_repr(wrench)
         raise UserError(f"{called} returned {given}; return jaxdrones.Wrench(force, torque), N and N m in body axes")
     shape, of = ((3,), "one drone") if drones is None else ((drones, 3), f"each of {drones} drones")
     for part in ("force", "torque"):
@@ -69,7 +69,7 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
     """
     index = jnp.arange(len(state.pos))
 
-    def because_of(j, counts, other, other_state, i, own_params, own_state):
+    def pair_wrench(j, counts, other, other_state, i, own_params, own_state):
         # A drone is not its own neighbor. What does not count is moved out of reach before it is masked, so that
         # neither value nor gradient of a pair is ever taken at zero distance.
         counts = counts & (i != j)
@@ -83,13 +83,13 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
         return [jnp.where(counts, x, 0) for x in parts]
 
     def on_all():
-        on_each = jax.vmap(because_of, in_axes=(None, None, None, None, 0, 0, 0))
+        on_each = jax.vmap(pair_wrench, in_axes=(None, None, None, None, 0, 0, 0))
         from_each = jax.vmap(on_each, in_axes=(0, None, 0, 0, None, None, None))
         return [_sum(x) for x in from_each(index, True, params, state, index, params, state)]
 
     def on_near():
         other, other_state = jax.tree.map(lambda x: x.at[near].get(mode="promise_in_bounds"), (params, state))
-        from_each = jax.vmap(jax.vmap(because_of), in_axes=(0, 0, 0, 0, None, None, None))
+        from_each = jax.vmap(jax.vmap(pair_wrench), in_axes=(0, 0, 0, 0, None, None, None))
         return [_sum(x) for x in from_each(near, meant, other, other_state, index, params, state)]
 
     if neighbors is None:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdrones.checks import shown
+from jaxdrones.checks import short_repr
 from jaxdrones.engine.step import HostStep
 from jaxdrones.engine.wrenches import describe
 from jaxdrones.envs.env import Env
@@ -113,7 +113,7 @@ def explain(env: Env) -> Explanation:
         ValueError: something else than an environment, or a term that describes more or fewer numbers than it has.
     """
     if not isinstance(env, Env):
-        raise UserError(f"explain was given {shown(env)}; give an environment, for example jaxdrones.make('hover')")
+        raise UserError(f"env is {short_repr(env)}; give an environment, for example jaxdrones.make('hover')")
     task = env.task
     drone = jax.tree.map(lambda x: x[0], env.params)
     action = _action_quantities(env, drone)

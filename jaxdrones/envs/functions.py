@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import shown
+from jaxdrones.checks import short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.envs.actions import Action
 from jaxdrones.errors import UserError
@@ -51,10 +51,10 @@ def scene_example(scene: Scene | DrawScene) -> Scene:
     if isinstance(scene, Scene):
         return scene
     if not callable(scene):
-        raise UserError(f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
+        raise UserError(f"scene is {short_repr(scene)}; give a jaxdrones.sensing.Scene, or a function of a key")
     example = jax.eval_shape(scene, jax.random.key(0))
     if not isinstance(example, Scene):
-        returned = shown(scene(jax.random.key(0)))
+        returned = short_repr(scene(jax.random.key(0)))
         raise UserError(f"the function that draws the scene returned {returned}; return a jaxdrones.sensing.Scene")
     return example
 
@@ -242,7 +242,7 @@ def _check_arrays(what: str, tree: Any) -> None:
     """Raise unless all leaves of a tree are arrays or numbers."""
     for leaf in jax.tree.leaves(tree):
         if _shape(leaf) is None:
-            raise UserError(f"{what} that hold {shown(leaf)}; give arrays and numbers")
+            raise UserError(f"{what} that hold {short_repr(leaf)}; give arrays and numbers")
 
 
 def _shape(x: Any) -> tuple[int, ...] | None:
@@ -257,7 +257,7 @@ def _kind(x: Any) -> str:
     shape = _shape(x)
     if isinstance(x, jax.Array | np.ndarray) and shape is not None:
         return f"an array {shape} of {x.dtype}"
-    return shown(x)
+    return short_repr(x)
 
 
 def _where(what: str, function: Any) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 from jaxdrones import user_code
-from jaxdrones.checks import UnexpectedKeyword, check_callable, check_choice, check_keyword, hint, shown
+from jaxdrones.checks import UnexpectedKeyword, check_callable, check_choice, check_keyword, hint, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks import follow, forest, gates, gym_pybullet_drones, hover, room, swap, tracking
 from jaxdrones.tasks.task import Task
@@ -90,5 +90,5 @@ def make_task(task: str | Task | Callable[..., Task], options: dict[str, Any], o
         raise UserError(f"{name} takes {words} without a default; give defaults in the file, or values as options")
     made = function(**options)
     if not isinstance(made, Task):
-        raise UserError(f"{name} returned {shown(made)}; return a jaxdrones.tasks.Task")
+        raise UserError(f"{name} returned {short_repr(made)}; return a jaxdrones.tasks.Task")
     return made

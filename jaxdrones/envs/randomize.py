@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
-from jaxdrones.checks import POSITIVE, check_callable, check_choice, check_number, check_sequence, shown
+from jaxdrones.checks import POSITIVE, check_callable, check_choice, check_number, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -140,7 +140,7 @@ def all_randomizations(
     whole = [one for one in chosen if isinstance(one, AnyVehicle)]
     rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
     if len(whole) > 1 or (whole and vehicle is not None):
-        other = "another AnyVehicle" if len(whole) > 1 else f"vehicle={shown(vehicle)}"
+        other = "another AnyVehicle" if len(whole) > 1 else f"vehicle={short_repr(vehicle)}"
         raise UserError(f"{other} is given, but every episode draws a vehicle already; leave out one of them")
     return (*whole, *rest)
 
@@ -149,11 +149,11 @@ def delay_bounds(delay: float | Sequence[float], duration: float) -> tuple[float
     """The shortest and the longest delay, s."""
     bounds = tuple(delay) if isinstance(delay, tuple | list) else (delay, delay)
     if len(bounds) != 2:
-        raise UserError(f"delay is {shown(delay)}; give a number, or the shortest and the longest of an episode")
+        raise UserError(f"delay is {short_repr(delay)}; give a number, or the shortest and the longest of an episode")
     for bound in bounds:
         check_number("delay", bound, "s, less than an episode", at_least=0, below=duration)
     if bounds[0] > bounds[1]:
-        raise UserError(f"delay is {shown(delay)}; give the shortest first")
+        raise UserError(f"delay is {short_repr(delay)}; give the shortest first")
     return bounds
 
 

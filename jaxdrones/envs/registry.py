@@ -18,7 +18,7 @@ from jaxdrones.checks import (
     check_sequence,
     check_switch,
     check_whole,
-    shown,
+    short_repr,
 )
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.dynamics.aero import external_force
@@ -218,7 +218,7 @@ def _terms(observation: Sequence[str | ObservationTerm], known: dict[str, Observ
     for term in terms:
         if not isinstance(term, ObservationTerm):
             raise UserError(
-                f"observation: {shown(term)} is not an observation term; give one or a name of OBSERVATIONS"
+                f"observation: {short_repr(term)} is not an observation term; give one or a name of OBSERVATIONS"
             )
     return terms
 
@@ -253,7 +253,7 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
     kind = kind() if callable(kind) else kind
     if not isinstance(kind, Action):
         raise UserError(
-            f"action is {shown(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
+            f"action is {short_repr(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
         )
     check_controller(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
     return dataclasses.replace(kind, name=action if isinstance(action, str) else kind.name).fitted(nominal)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import shown
+from jaxdrones.checks import short_repr
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import Motors, crazyflie_motors
 from jaxdrones.errors import UserError
@@ -166,9 +166,9 @@ class _Problem:
         self.per_flight = tuple(name for name in names if PARAMETERS[name].per_flight)
         self.names, self.flights = self.shared + self.per_flight, [log.name for log in logs]
         starts = [window_starts(log, _STRIDE) for log in logs]
-        most = max(map(len, starts))
-        self.windows = [_padded(cut_windows(log, s), most) for log, s in zip(logs, starts, strict=True)]
-        self.masks = [jnp.asarray(np.arange(most) < len(s), float) for s in starts]
+        longest = max(map(len, starts))
+        self.windows = [_padded(cut_windows(log, s), longest) for log, s in zip(logs, starts, strict=True)]
+        self.masks = [jnp.asarray(np.arange(longest) < len(s), float) for s in starts]
         self.size = len(self.shared) + len(logs) * len(self.per_flight)
         names = self.shared + self.per_flight * len(logs)
         self.prior = np.array(
@@ -247,7 +247,7 @@ class _Problem:
         by_name = np.concatenate([shared, np.sqrt(np.sum(per_flight**2, axis=0)) / len(self.flights)])
         estimates = {name: _estimate(vehicle, name, error) for name, error in zip(self.names, by_name, strict=True)}
         unidentifiable = [
-            f"{name} ({shown(e.value)} +- {e.std_error:.2g})"
+            f"{name} ({short_repr(e.value)} +- {e.std_error:.2g})"
             for name, e in estimates.items()
             if not e.identifiable and e.std_error >= scale_of(vehicle, name)
         ]

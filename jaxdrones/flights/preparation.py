@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from jaxdrones.checks import shown
 from jaxdrones.errors import UserError
 from jaxdrones.flights.consistency import Motion, contradictions
 from jaxdrones.flights.files import read_log
@@ -160,7 +159,7 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
     largest = np.max(np.abs(x))
     if column == "quat":
         length = np.linalg.norm(x, axis=-1)
-        require(np.all(np.abs(length - 1) < 0.05), f"no unit quaternion (length {shown(length[0, 0])})", "x, y, z, w")
+        require(np.all(np.abs(length - 1) < 0.05), f"no unit quaternion (length {length[0, 0]:.4g})", "x, y, z, w")
     elif column == "omega":
         require(largest <= _MAX_RATE, "degrees/s", "rad/s")
     elif column == "target_yaw":

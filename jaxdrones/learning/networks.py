@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_callable, is_known
+from jaxdrones.checks import check_callable, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -63,7 +63,7 @@ class OwnNetwork:
         check_callable("network", module, "a flax or equinox module")
         self.module, self.output_size = module, output_size
         self.recurrent = hasattr(module, "initial_hidden_state")
-        if self.recurrent and any(np.any(x) for x in jax.tree.leaves(module.initial_hidden_state()) if is_known(x)):
+        if self.recurrent and any(np.any(x) for x in jax.tree.leaves(module.initial_hidden_state()) if is_concrete(x)):
             raise UserError("network.initial_hidden_state() is not zero; give zeros")
         if not isinstance(module, nn.Module):
             self._leaves, self._structure = jax.tree.flatten(module)
@@ -176,7 +176,7 @@ class Policy(PyTreeNode):
             layers += f", GRU of {self.network.recurrent_size}" if self.network.recurrent_size else ""
         numbers = sum(math.prod(np.shape(x)) for x in jax.tree.leaves(self.params))
         count = self.obs_stats.count
-        known = isinstance(count, jax.Array | np.ndarray) and is_known(count) and count.ndim == 0
+        known = isinstance(count, jax.Array | np.ndarray) and is_concrete(count) and count.ndim == 0
         counted = f", statistics of {float(count):,.0f} observations" if known else ""
         whose = ", one network per drone" if self.per_agent else ""
         return f"<Policy {layers}, {numbers:,} parameters{whose}{counted}>"

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_keywords, check_number, is_known
+from jaxdrones.checks import check_keywords, check_number, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -89,7 +89,7 @@ class Config(settings.Config):
 
     def __post_init__(self):
         super().__post_init__()
-        if is_known(self.min_learning_rate):
+        if is_concrete(self.min_learning_rate):
             low = float(self.min_learning_rate)
             check_number("max_learning_rate", self.max_learning_rate, "not below min_learning_rate", at_least=low)
         if self.worlds % self.minibatches:

@@ -13,7 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int
 
-from jaxdrones.checks import check_key, is_known
+from jaxdrones.checks import check_key, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
@@ -101,7 +101,7 @@ def run_training(
     """
     check_key("key", key)
     callbacks = (callback,) if callable(callback) else tuple(callback)
-    if compilation.is_tracing() or not all(map(is_known, (key, *vars(config).values()))):
+    if compilation.is_tracing() or not all(map(is_concrete, (key, *vars(config).values()))):
         if callbacks:
             raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
         state = init(key, env, config, network) if state is None else state
@@ -119,7 +119,7 @@ def run_training(
         rows.append({name: x[:count] for name, x in metrics.items()})
         step += count
         nonfinite = rows[-1]["nonfinite_gradients"]
-        if is_known(nonfinite):  # not so when an environment with traced parameters is mapped
+        if is_concrete(nonfinite):  # not so when an environment with traced parameters is mapped
             streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak)
         values = {name: x[0].item() for name, x in rows[-1].items()} if callbacks else {}
         stop = any([call(step, values, state) is True for call in callbacks])
@@ -156,7 +156,7 @@ def _cached_programs(init: Callable, update: Callable, env: Env, config: Any) ->
 
 
 def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result:
-    length = config.updates - (int(state.step) if is_known(state.step) else 0)
+    length = config.updates - (int(state.step) if is_concrete(state.step) else 0)
     state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=length)
     return Result(state.policy, state, history)
 

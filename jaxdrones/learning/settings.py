@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import jax
 
-from jaxdrones.checks import check_number, check_switch, check_whole, is_known, shown
+from jaxdrones.checks import check_number, check_switch, check_whole, is_concrete, short_repr
 from jaxdrones.errors import UserError
 
 Scalar = float | jax.Array
@@ -23,13 +23,13 @@ Scalar = float | jax.Array
 
 
 def _check_whole_if_known(name: str, value: Any) -> None:
-    if is_known(value):
+    if is_concrete(value):
         check_whole(name, value)
 
 
 def _check_layers(name: str, sizes: Any) -> None:
     if not isinstance(sizes, tuple | list) or not sizes:
-        raise UserError(f"{name} is {shown(sizes)}; give the sizes of the hidden layers, for example (32, 32)")
+        raise UserError(f"{name} is {short_repr(sizes)}; give the sizes of the hidden layers, for example (32, 32)")
     for size in sizes:
         check_whole(f"an entry of {name}", size)
 
@@ -98,7 +98,7 @@ def check_config(config: Any, kind: type) -> None:
     learner = _learner(kind)
     if isinstance(config, dict):
         raise UserError(f"config is a dictionary; give jaxdrones.learning.{learner}.Config(**config)")
-    given = f"{_learner(type(config))}.Config" if dataclasses.is_dataclass(config) else shown(config)
+    given = f"{_learner(type(config))}.Config" if dataclasses.is_dataclass(config) else short_repr(config)
     raise UserError(f"config is {given}; {learner} learns with jaxdrones.learning.{learner}.Config(...)")
 
 

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_shape, is_known, shown
+from jaxdrones.checks import check_shape, is_concrete, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -43,9 +43,9 @@ def command_unit(params: Params) -> Float[Array, ""]:
         ValueError: parameters of a team, or no gravity, so that nothing hovers.
     """
     check_shape("params.mass", params.mass, (), "optimal control is about one drone; use jax.vmap for a team")
-    if is_known(params.gravity) and not np.asarray(params.gravity) > 0:
+    if is_concrete(params.gravity) and not np.asarray(params.gravity) > 0:
         raise UserError(
-            f"params.gravity is {shown(params.gravity)}; optimal control counts commands in the rotor speed of hover, "
+            f"params.gravity is {short_repr(params.gravity)}; optimal control scales commands by the hover speed, "
             "give a positive gravity"
         )
     return params.hover_rpm

@@ -119,9 +119,9 @@ class Mpc:
         else:
             options["equality"] = [True] * constraint.numel()
         self._solver = casadi.nlpsol("mpc", solver, program, options)
-        most = float(model.params.max_rpm) / self._unit
+        limit = float(model.params.max_rpm) / self._unit
         # Solvers relax bounds a little, and beyond the limits of the motors the model does not depend on the commands.
-        free, bounded = np.full(n, np.inf), [np.full(4, _INSIDE * most), np.full(4, (1 - _INSIDE) * most)]
+        free, bounded = np.full(n, np.inf), [np.full(4, _INSIDE * limit), np.full(4, (1 - _INSIDE) * limit)]
         self._low = np.concatenate([*[-free, bounded[0]] * self.horizon, -free])
         self._high = np.concatenate([*[free, bounded[1]] * self.horizon, free])
 

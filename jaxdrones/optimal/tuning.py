@@ -14,7 +14,7 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxdrones import control, rotation
-from jaxdrones.checks import check_choice, check_params, check_shape, check_whole, shown
+from jaxdrones.checks import check_choice, check_params, check_shape, check_whole, short_repr
 from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, mellinger, pid, rates, simple_pid
 from jaxdrones.dynamics.aero import drag
 from jaxdrones.dynamics.rotors import lagging_rotors
@@ -122,7 +122,7 @@ def _tunable(controller: str | ModuleType) -> ModuleType:
 
 
 def _name(module: Any) -> str:
-    return module.__name__.rpartition(".")[2] if isinstance(module, ModuleType) else shown(module)
+    return module.__name__.rpartition(".")[2] if isinstance(module, ModuleType) else short_repr(module)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxdrones.checks import check_choice, check_shape, shown
+from jaxdrones.checks import check_choice, check_shape, short_repr
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.engine.explicit import make_derivative
@@ -56,7 +56,7 @@ class CasadiModel:
         """(nx,) the numbers of a state in the order of `names`."""
         given, wanted = (jax.tree.map(np.shape, s) for s in (state, self.start))
         if given != wanted:
-            raise UserError(f"the state has the shapes {shown(str(given))}; the model's are {shown(str(wanted))}")
+            raise UserError(f"the state has shapes {short_repr(str(given))}; expected {short_repr(str(wanted))}")
         return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(state)])
 
     def state(self, vector: ArrayLike) -> State:

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import shown
+from jaxdrones.checks import short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2 import topics
@@ -213,5 +213,5 @@ def numbers(vector: Any) -> tuple[float, ...]:
 
 def _finite(values: tuple[float, ...], name: str) -> tuple[float, ...]:
     if not all(map(math.isfinite, values)):
-        raise Refused(name, f"is {shown(values)}", "give finite numbers")
+        raise Refused(name, f"is {short_repr(values)}", "give finite numbers")
     return values

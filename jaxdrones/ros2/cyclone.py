@@ -172,13 +172,13 @@ class CycloneTransport:
     def spin(self, timeout: float) -> None:
         """Hand over what has arrived; wait up to `timeout` s if nothing has."""
         self._wake.wait(duration(seconds=max(timeout, 1e-6)))
-        asked = [(request, *service) for service in self._services for request in _taken(service[0], idl.REQUEST)]
+        requests = [(request, *service) for service in self._services for request in _taken(service[0], idl.REQUEST)]
         for reader, kind, receive in self._readers:
             for sample in _taken(reader, kind):
                 receive(sample)
         for reader, publishes in self._peers:
             self._ends += [(end, publishes) for end in reader.take(_MOST)]
-        for request, _, replies, answer in asked:
+        for request, _, replies, answer in requests:
             success, message = answer()
             replies.write(idl.REPLY(guid=request.guid, seq=request.seq, success=success, message=message))
 

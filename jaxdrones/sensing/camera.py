@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_quaternion, check_whole, shown
+from jaxdrones.checks import check_number, check_quaternion, check_whole, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -57,7 +57,7 @@ class Camera:
 
     def __post_init__(self):
         if not isinstance(self.resolution, tuple | list) or len(self.resolution) != 2:
-            raise UserError(f"resolution of a camera is {shown(self.resolution)}; give (width, height) in pixels")
+            raise UserError(f"resolution of a camera is {short_repr(self.resolution)}; give (width, height) in pixels")
         for name, pixels in zip(("width", "height"), self.resolution, strict=True):
             check_whole(f"{name} of a camera", pixels)
         object.__setattr__(self, "resolution", tuple(self.resolution))
@@ -71,7 +71,7 @@ class Camera:
             value = getattr(self, name)
             if value is not None:
                 if np.shape(value) != (length,):
-                    raise UserError(f"{name} of a camera is {shown(value)}; give {length} numbers")
+                    raise UserError(f"{name} of a camera is {short_repr(value)}; give {length} numbers")
                 object.__setattr__(self, name, tuple(map(float, value)))
         check_quaternion("orientation of a camera", self.orientation)
         length = math.hypot(*self.orientation)
@@ -171,4 +171,4 @@ corners of the pixels in place of their centers."""
 def check_camera(camera: Any) -> None:
     """Raise unless `camera` is a camera."""
     if not isinstance(camera, Camera):
-        raise UserError(f"camera is {shown(camera)}; give a jaxdrones.Camera, for example Camera(resolution=(16, 12))")
+        raise UserError(f"camera is {short_repr(camera)}; give for example jaxdrones.Camera(resolution=(16, 12))")

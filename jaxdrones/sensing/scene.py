@@ -21,8 +21,8 @@ from jaxdrones.checks import (
     check_shape,
     check_switch,
     check_whole,
-    is_known,
-    shown,
+    is_concrete,
+    short_repr,
 )
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
@@ -76,7 +76,7 @@ class Scene(PyTreeNode, kw_only=True):
         for obstacle in obstacles:
             if not isinstance(obstacle, Obstacle | File):
                 known = ", ".join(kind.__name__ for kind in (*KINDS.values(), Mesh, Urdf))
-                raise UserError(f"{shown(obstacle)} is not an obstacle; give each as an argument of its own: {known}")
+                raise UserError(f"{short_repr(obstacle)} is not an obstacle; give each as its own argument: {known}")
         arrays: dict[str, Any] = {}
         for name, kind in KINDS.items():
             rows = [_rows(obstacle) for obstacle in obstacles if isinstance(obstacle, kind)]
@@ -201,7 +201,7 @@ def check_scene(scene: Any, files: bool = False) -> None:
     """Raise unless `scene` is the scene of one world; meshes and URDF files need `files`."""
     if not isinstance(scene, Scene):
         raise UserError(
-            f"scene is {shown(scene)}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)"
+            f"scene is {short_repr(scene)}; give a jaxdrones.sensing.Scene, for example jaxdrones.sensing.Scene.of(box)"
         )
     for name in KINDS:
         stack = getattr(scene, name)
@@ -251,13 +251,13 @@ def _rows(obstacle: Obstacle) -> Obstacle:
             continue
         arrays[name] = array = jnp.asarray(value, bool if name == "active" else float)
         if name == "active" and jnp.asarray(value).dtype.kind != "b":
-            raise UserError(f"active of {kind} is {shown(value)}; give True or False")
+            raise UserError(f"active of {kind} is {short_repr(value)}; give True or False")
         length = LENGTHS.get(name)
         if length and array.shape[-1:] != (length,):
-            raise UserError(f"{name} of {kind} is {shown(value)}; give {length} numbers")
+            raise UserError(f"{name} of {kind} is {short_repr(value)}; give {length} numbers")
         check_finite(f"{name} of {kind}", value)
-        if name not in ("pos", "quat", "color", "active") and is_known(value) and not (np.asarray(value) > 0).all():
-            raise UserError(f"{name} of {kind} is {shown(value)}; give positive numbers (m)")
+        if name not in ("pos", "quat", "color", "active") and is_concrete(value) and not (np.asarray(value) > 0).all():
+            raise UserError(f"{name} of {kind} is {short_repr(value)}; give positive numbers (m)")
     check_quaternion(f"quat of {kind}", obstacle.quat)
     arrays["quat"] = arrays["quat"] / jnp.linalg.norm(arrays["quat"], axis=-1, keepdims=True)
     axes = {name: array.shape[: array.ndim - (name in LENGTHS)] for name, array in arrays.items()}

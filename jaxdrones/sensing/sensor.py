@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_arguments, check_callable, check_number, check_positive, check_sequence, shown
+from jaxdrones.checks import check_arguments, check_callable, check_number, check_positive, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
@@ -62,7 +62,7 @@ class Sensor:
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
-            raise UserError(f"name of a sensor is {shown(self.name)}; give a text, for example 'imu'")
+            raise UserError(f"name of a sensor is {short_repr(self.name)}; give a text, for example 'imu'")
         measured, begun = f"measure of sensor {self.name!r}", f"init of sensor {self.name!r}"
         check_callable(measured, self.measure, "lambda key, params, state, rate, scene, memory: (memory, state.pos)")
         check_arguments(measured, self.measure, ("key", "params", "state", "rate", "scene", "memory"))
@@ -96,7 +96,7 @@ def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[S
     sensors = check_sequence("sensors", sensors, "sensor")
     for sensor in sensors:
         if not isinstance(sensor, Sensor):
-            raise UserError(f"sensors holds {shown(sensor)}; give jaxdrones.Sensor(name, measure)")
+            raise UserError(f"sensors holds {short_repr(sensor)}; give jaxdrones.Sensor(name, measure)")
     names = [sensor.name for sensor in sensors]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -203,7 +203,7 @@ def _checked(sensor: Sensor, memory: Any, result: Any) -> tuple[Any, Any]:
     """Validated memory and reading of a sensor of one drone."""
     called = f"measure of sensor {sensor.name!r}"
     if not isinstance(result, tuple) or len(result) != 2:
-        raise UserError(f"{called} returned {shown(result)}; return the two values (memory, reading)")
+        raise UserError(f"{called} returned {short_repr(result)}; return the two values (memory, reading)")
     after, reading = result
     if _types(after) != _types(memory):
         raise UserError(
@@ -212,7 +212,7 @@ def _checked(sensor: Sensor, memory: Any, result: Any) -> tuple[Any, Any]:
         )
     for leaf in jax.tree.leaves(reading):
         if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int):
-            raise UserError(f"{called} returned a reading with {shown(leaf)} in it; return arrays")
+            raise UserError(f"{called} returned a reading with {short_repr(leaf)} in it; return arrays")
     return after, jax.tree.map(jnp.asarray, reading)
 
 

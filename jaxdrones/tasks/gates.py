@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_number, check_switch, check_whole, shown
+from jaxdrones.checks import check_number, check_switch, check_whole, short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -78,7 +78,7 @@ def gates(
     check_switch("random_start", random_start)
     check_number("start_spread", start_spread, "m", at_least=0, at_most=_MAX_SPREAD)
     if level not in LEVELS:
-        raise UserError(f"level is {shown(level)}; give one of {', '.join(map(str, LEVELS))}")
+        raise UserError(f"level is {short_repr(level)}; give one of {', '.join(map(str, LEVELS))}")
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """On the ground at the start of the track, or in the air in front of a random gate."""

@@ -21,7 +21,7 @@ from jaxdrones.checks import (
     check_sequence,
     check_switch,
     check_whole,
-    shown,
+    short_repr,
 )
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
@@ -167,7 +167,9 @@ class Task:
     def __post_init__(self):
         for name, kind in ("name", str), ("summary", str), ("camera", Camera | None):
             if not isinstance(x := getattr(self, name), kind) or x == "":
-                raise UserError(f"{name} of the task is {shown(x)}; give {'a text' if kind is str else 'a Camera'}")
+                raise UserError(
+                    f"{name} of the task is {short_repr(x)}; give a {'string' if kind is str else 'Camera'}"
+                )
         check_whole(f"number of drones of {self.name}", self.drones)
         check_number("duration", self.duration, "s", above=0)
         check_number("control_hz", self.control_hz, "1/s", above=0)
@@ -184,7 +186,7 @@ class Task:
             check_choice("image", image, IMAGES)
         for name, term in _mapping("observations", self.observations, "an ObservationTerm").items():
             if not isinstance(term, ObservationTerm):
-                raise UserError(f"observations[{name!r}] is {shown(term)}; give an ObservationTerm")
+                raise UserError(f"observations[{name!r}] is {short_repr(term)}; give an ObservationTerm")
 
     def _check_functions(self) -> None:
         """Raise unless the functions of the task are functions of so many arguments."""
@@ -194,7 +196,7 @@ class Task:
         _check_function("success", self.advance if self.success is None else self.success, ("metrics", "dt"))
         for name, entry in _mapping("rewards", self.rewards, "(scale, function of (task, world))").items():
             if not (isinstance(entry, tuple | list) and len(entry) == 2):
-                raise UserError(f"rewards[{name!r}] is {shown(entry)}; give (scale, function of (task, world))")
+                raise UserError(f"rewards[{name!r}] is {short_repr(entry)}; give (scale, function of (task, world))")
             check_number(f"scale of the reward {name!r}", entry[0])
             _check_function(f"rewards[{name!r}]", entry[1], _OF_A_WORLD)
         if not self.rewards:
@@ -236,14 +238,14 @@ class Task:
 def _mapping(field: str, value: Any, example: str) -> Mapping[str, Any]:
     """A mapping by name, or an error that says what to give."""
     if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
-        raise UserError(f"{field} is {shown(value)}; give a dictionary of names, {{'name': {example}}}")
+        raise UserError(f"{field} is {short_repr(value)}; give a dictionary of names, {{'name': {example}}}")
     return value
 
 
 def _check_function(field: str, value: Any, arguments: tuple[str, ...]) -> None:
     """Raise unless a field holds a function that can be called with so many arguments."""
     if not callable(value) or isinstance(value, type):
-        raise UserError(f"{field} is {shown(value)}; give a function of ({', '.join(arguments)})")
+        raise UserError(f"{field} is {short_repr(value)}; give a function of ({', '.join(arguments)})")
     check_arguments(field, value, arguments)
 
 

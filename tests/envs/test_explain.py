@@ -150,7 +150,7 @@ def test_a_term_of_a_user_is_shown_even_if_it_says_nothing_and_refused_if_it_say
         make("hover", observation=(short,))
     still = Action(2, lambda params, memory, state, action, setpoint, dt: (memory, params.hover_rpm * jnp.ones(4)))
     assert [entry.quantity.name for entry in explain(make("hover", action=still)).action] == ["number 0", "number 1"]
-    with pytest.raises(ValueError, match="explain was given 'hover'; give an environment"):
+    with pytest.raises(ValueError, match="env is 'hover'; give an environment"):
         explain("hover")
 
 

@@ -51,7 +51,7 @@ def episode(env, key, tape):
     return jax.tree.map(lambda first, x: jnp.concatenate([first[None], x]), (obs, world), later)
 
 
-def shown(t):
+def short_repr(t):
     """The step whose state is seen at step t: every third one, 4 steps later, and the start until then."""
     return max(0, (t - 4) // 3 * 3)
 
@@ -62,7 +62,7 @@ TAPE = jax.random.uniform(jax.random.key(1), (12, 1, 4), float, -0.5, 0.5)
 @pytest.mark.slow
 def test_an_image_shows_the_state_of_its_time_until_the_next_one_comes(env):
     obs, worlds = jax.jit(functools.partial(episode, env))(KEY, TAPE)
-    at = np.array([shown(t) for t in range(len(TAPE) + 1)])
+    at = np.array([short_repr(t) for t in range(len(TAPE) + 1)])
     expected = jax.vmap(lambda world: jd.render(world.scene, world.params, world.drones, env.vision.camera).depth)(
         worlds
     )
@@ -79,7 +79,7 @@ def test_the_gradient_of_a_held_image_is_that_of_the_state_that_it_shows(env):
 
     def rendered(tape, key):
         _, worlds = episode(blind, key, tape)
-        at = np.array([shown(t) for t in range(8, len(TAPE) + 1)])
+        at = np.array([short_repr(t) for t in range(8, len(TAPE) + 1)])
         worlds = jax.tree.map(lambda x: x[at], worlds)
         return jnp.sum(
             jnp.log(jax.vmap(lambda w: jd.render(w.scene, w.params, w.drones, env.vision.camera).depth)(worlds))

@@ -133,7 +133,7 @@ def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
         (lambda: Scene.of(BALL, BALL).padded(spheres=1), "has 2 spheres and the array holds 1; give spheres=2 or more"),
         (lambda: Scene.of(BALL).padded(balls=1), "unknown kind of obstacles 'balls'"),
         (lambda: Scene.of("box"), "'box' is not an obstacle"),
-        (lambda: Scene.of((BALL, BALL)), "give each as an argument of its own"),
+        (lambda: Scene.of((BALL, BALL)), "give each as its own argument"),
         (lambda: Scene.of(BALL, ground=3), "ground is 3; give True or False"),
         (lambda: Scene.of(gate((0, 0, 1), opening=-1)), "size of Box is .*; give positive"),
         (lambda: gate(np.zeros((2, 3))), r"pos of a gate has shape \(2, 3\).*jax\.vmap"),

@@ -88,7 +88,7 @@ class BulletStep(HostStep):
             self.client.check_open()
             check_team(params, state, rpm)
             return _refuse_gradients(functools.partial(self._traced, substeps))(params, state, rpm, scene)
-        acting = self._stand(scene)
+        acting = self._set_scene(scene)
         team = self._pack(params, state, rpm)
         aux = Layout.of(state.aux)
         for _ in range(substeps):
@@ -104,7 +104,7 @@ class BulletStep(HostStep):
         Raises:
             ValueError: a wrong shape, a closed client, or a state that is not finite.
         """
-        acting = self._stand(self._given(scene))
+        acting = self._set_scene(self._given(scene))
         team = self._pack(params, state, state.rpm)
         loads = self._loads_on(team, Layout.of(state.aux), acting)
         team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
@@ -127,7 +127,7 @@ class BulletStep(HostStep):
             self.client.check_open()
             check_team(params, state, state.rpm)
             return self._traced_camera(params, state, camera, scene)
-        self._stand(scene)
+        self._set_scene(scene)
         team = self._place(params, state)
         looks = np.asarray(views(params, state, scene, camera), float)
         rgb, depth, segmentation = drone_pictures(self.client, team, looks, camera)
@@ -146,7 +146,7 @@ class BulletStep(HostStep):
 
         Of the camera the lens matters, not where it is mounted.
         """
-        self._stand(self._given(scene))
+        self._set_scene(self._given(scene))
         self._place(params, state)
         return photo(self.client, eye, target, camera)
 
@@ -157,7 +157,7 @@ class BulletStep(HostStep):
         check_scene(scene, files=True)
         return scene
 
-    def _stand(self, scene: Scene) -> Scene:
+    def _set_scene(self, scene: Scene) -> Scene:
         """Let a scene with values stand around; returns what wrenches depend on of it."""
         self.client.check_open()
         self.client.set_scene(scene if scene is self._scene else jax.device_get(scene))
@@ -213,7 +213,7 @@ class BulletStep(HostStep):
         team, acting, handed = arrays.one_array(state, rpm), self._acting(scene), self._handed(scene)
 
         def advance(bodies, scene, team, loads):
-            self._become(bodies, scene)
+            self._sync_world(bodies, scene)
             return self.client.advance(np.asarray(team, float), np.asarray(loads, float)).astype(team.dtype)
 
         def substep(team, _):
@@ -237,7 +237,7 @@ class BulletStep(HostStep):
         pictures = tuple(jax.ShapeDtypeStruct((n, *shape), dtype) for shape, dtype in kinds)
 
         def take(bodies, scene, team, looks):
-            self._become(bodies, scene)
+            self._sync_world(bodies, scene)
             team = np.asarray(team, float)
             check_finite("state", team)
             self.client.place(team)
@@ -252,7 +252,7 @@ class BulletStep(HostStep):
         """What a compiled program hands over of a scene; nothing of that of `make_step`."""
         return None if scene is self._scene else scene
 
-    def _become(self, bodies: jax.Array, scene: Scene | None) -> None:
+    def _sync_world(self, bodies: jax.Array, scene: Scene | None) -> None:
         """The world that a compiled program calls back with; its team is no longer that of a call with values."""
         self.client.check_open()
         self._params = None

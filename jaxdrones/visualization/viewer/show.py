@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_choice, check_params, check_positive, shown
+from jaxdrones.checks import check_choice, check_params, check_positive, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import read_log
 from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
@@ -114,8 +114,8 @@ def records_of(flight: Any, of_trajectory: dict[str, Any]) -> list[FlightLog]:
         of_trajectory: arguments of `show` that only a bare trajectory needs; `None` where they were left out.
     """
     raise UserError(
-        f"{shown(flight)} cannot be shown; give a trajectory of jaxdrones.rollout, a record, an episode, or the path "
-        "of a log.npz"
+        f"{short_repr(flight)} cannot be shown; give a trajectory of jaxdrones.rollout, a record, an episode, or the "
+        "path of a log.npz"
     )
 
 

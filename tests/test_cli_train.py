@@ -12,7 +12,7 @@ import pytest
 
 from jaxdrones.cli import main
 from jaxdrones.cli.report import percent, success
-from jaxdrones.learning import checkpoint
+from jaxdrones.learning import checkpoint, loggers
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.training import run as run_module
 from jaxdrones.training import trainer
@@ -44,11 +44,18 @@ def test_training_writes_policies_state_progress_figure_and_report(trained):
     assert [row["update"] for row in rows] == [1, 2, 3, 4]
     assert rows[-1]["steps"] == 4 * 4 * 4 and "evaluated_return" in rows[-1] and rows[-1]["seconds"] > 0
     assert (folder / "curve.png").read_bytes().startswith(b"\x89PNG")
-    assert len(list(folder.glob("events.out.tfevents.*"))) == 1
     (report,) = printed["seeds"]
     assert report == json.loads((folder / "report.json").read_text())
     assert report["evaluation"]["episodes"] == 8 and report["evaluation"]["success"] is None  # too short to succeed
     assert report["seconds"]["training"] > 0 and report["seconds"]["compiling"] > 0
+
+
+@pytest.mark.needs("tensorboardX")
+def test_a_logger_of_the_command_line_gets_every_update(monkeypatch, tmp_path):
+    logged = []
+    monkeypatch.setattr(loggers.TensorBoard, "__call__", lambda self, update, metrics, state: logged.append(update))
+    assert main([*TRAIN, "--no-figure", "--json", "--log", "tensorboard", "--output", str(tmp_path)]) == 0
+    assert logged == [1, 2, 3, 4] and list(tmp_path.glob("events.out.tfevents.*"))
 
 
 @pytest.mark.slow
@@ -275,6 +282,7 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
     ("arguments", "message"),
     [
         (["train", "hover", "--sweep", "horizon"], "give NAME=VALUE,VALUE"),
+        (["train", "hover", "--log", "tensorboard,csv"], "give names of tensorboard, wandb, mlflow"),
         (["train", "hover", "--sweep", "horizon=2,3", "--set", "horizon=2"], "given by --set and by --sweep"),
         (["train", "hover", "--config", "none.toml"], "--config none.toml cannot be read"),
         (["train", "hoover"], "unknown task 'hoover'; did you mean 'hover'"),

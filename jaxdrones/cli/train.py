@@ -24,7 +24,7 @@ from jaxdrones.cli.train_output import (
     show_results,
     warn_of_unknown_settings,
 )
-from jaxdrones.cli.train_request import Request, remaining
+from jaxdrones.cli.train_request import LOGGERS, Request, remaining
 from jaxdrones.envs import TASKS
 from jaxdrones.errors import UserError
 from jaxdrones.visualization import plots
@@ -47,7 +47,7 @@ def add(commands) -> None:
         "The command writes these files:\n\n"
         "  best, last     policies, each a .msgpack and a .json\n"
         "  state          everything that --resume needs to continue, bit for bit\n"
-        "  progress.csv   a row for each update; an event file holds the same for TensorBoard\n"
+        "  progress.csv   a row for each update\n"
         "  curve.png      learning curves\n"
         "  report.json    the evaluation of the best policy, and the time that training took\n\n"
         "Ctrl-C keeps the best policy and the state. A run in --output, finished or not, is replaced only with\n"
@@ -112,6 +112,9 @@ def add(commands) -> None:
         "--resume", action="store_true", help="continue the run in --output; with --budget train a finished one longer"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
+    parser.add_argument(
+        "--log", metavar="NAME,NAME", help=f"log the metrics of every update with {', '.join(LOGGERS)}, as installed"
+    )
     add_live(parser, "show an episode in the browser after every evaluation, and the learning curve")
     parser.add_argument("--hosts", type=int, metavar="N", help="number of processes that train together (1)")
     parser.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
@@ -142,7 +145,7 @@ def _on_hosts(options: argparse.Namespace) -> int:
             output = options.output or run_folder(options.task)
             if options.resume and output.is_dir():
                 shutil.copytree(output, copy)
-            options.output, options.no_figure = copy, True
+            options.output, options.no_figure, options.log = copy, True, None
         distributed.wait_for_hosts("copied")
         return _train(options)
 
@@ -199,6 +202,7 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
         warn_of_unknown_settings(recipe)
     config, what = recipe.config, described(recipe) + f", {request.row}" * bool(request.row)
     print_line(f"{what}: {config.worlds} worlds x {config.horizon} control steps an update; compiling")
+    loggers = {seed: request.loggers(run) for seed, run in runs.items()}
     trainer.compile()
     started = [run for run in runs.values() if request.resume and run.started]
     made = max((run.sidecar_entry("state", "update") for run in started), default=0)
@@ -220,7 +224,7 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
                 on_progress = LiveTraining(live, trainer, run, title, on_progress).update
             try:
                 with display:
-                    loop.train(trainer, run, seed, on_progress, deadlines.next())
+                    loop.train(trainer, run, seed, on_progress, deadlines.next(), loggers[seed])
             except KeyboardInterrupt:
                 if not (run.folder / "last.json").exists():
                     return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,7 +16,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.result import MAX_CALL, PATIENCE, Diverged, check_gradients
+from jaxdrones.learning.result import MAX_CALL, PATIENCE, Callback, Diverged, check_gradients
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.training import distributed
 from jaxdrones.training.plan import EVALUATIONS, IN_A_ROW, STOPPING_EVALUATIONS, TimePlan, next_evaluation
@@ -33,7 +33,14 @@ OnProgress = Callable[[int, dict[str, float]], None]
 """(number of updates made, newest metrics) -> None: shows progress."""
 
 
-def train(trainer: Trainer, run: Run, seed: int, on_progress: OnProgress, deadline: float | None = None) -> None:
+def train(
+    trainer: Trainer,
+    run: Run,
+    seed: int,
+    on_progress: OnProgress,
+    deadline: float | None = None,
+    loggers: Sequence[Callback] = (),
+) -> None:
     """Train one seed to the end, from the start or from the state that the run holds; evaluate the best policy.
 
     Args:
@@ -43,6 +50,7 @@ def train(trainer: Trainer, run: Run, seed: int, on_progress: OnProgress, deadli
         on_progress: function that shows progress.
         deadline: time of `time.perf_counter` at which everything has to be written, s; the number of updates then
             follows from the time that updates and evaluations take, and is at least one more.
+        loggers: called with the metrics of every update, such as those of `learning.loggers`.
 
     Raises:
         Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so far is
@@ -55,7 +63,7 @@ def train(trainer: Trainer, run: Run, seed: int, on_progress: OnProgress, deadli
         run.remove_report()
         loop.save()
         try:
-            loop.run_updates(on_progress)
+            loop.run_updates(on_progress, loggers)
         except KeyboardInterrupt:
             if jax.process_count() == 1:
                 loop.save()
@@ -113,10 +121,10 @@ class _Loop:
             self.plan = TimePlan(deadline, self.update, self._evaluations, self.last_evaluation_seconds)
             self._set_updates(max(self.updates, self.update + 1))  # until an update was timed
 
-    def run_updates(self, on_progress: OnProgress) -> None:
+    def run_updates(self, on_progress: OnProgress, loggers: Sequence[Callback]) -> None:
         """Make all updates that remain."""
         saved, length = self.seconds, 1
-        with Progress(self.run, self._columns(), self.update) as progress:
+        with Progress(self.run, self._columns(), self.update, loggers) as progress:
             while self.update < self.updates:
                 length = min(length, self._next_evaluation() - self.update, MAX_CALL)
                 state, rows, seconds = self.advance(length)

@@ -2,7 +2,7 @@
 
     best, last       policies: the best one in an evaluation, and the newest
     state            everything that training needs to continue, bit for bit
-    progress.csv     a row for each update; an event file holds the same for TensorBoard
+    progress.csv     a row for each update
     report.json      the evaluation of the best policy, and the time that training took
 
 Each of best, last and state is a .msgpack and a .json that describes it. All name the training that they are of, and
@@ -27,7 +27,6 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import checkpoint, files
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
-from jaxdrones.training.events import PREFIX
 from jaxdrones.training.recipe import Recipe
 
 CHECKPOINTS = ("best", "last", "state")
@@ -45,12 +44,8 @@ class Run:
         """The files of a run that exist: checkpoints, progress, report."""
         names = [f"{name}.{suffix}" for name in CHECKPOINTS for suffix in ("msgpack", "json")]
         whole = [self.folder / name for name in (*names, "progress.csv", "report.json")]
-        candidates = (*whole, *map(writing.beside, whole), *self.event_files())
+        candidates = (*whole, *map(writing.beside, whole))
         return [file for file in candidates if file.exists()]
-
-    def event_files(self) -> list[Path]:
-        """The event files, oldest first."""
-        return sorted(self.folder.glob(f"{PREFIX}.*.jaxdrones"))
 
     def prepare(self, size: int) -> None:
         """Make the folder and check that `size` bytes can be written to it.

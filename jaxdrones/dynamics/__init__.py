@@ -1,4 +1,4 @@
-"""Wrenches on a drone and its motion. The tables are the names of the command line."""
+"""Wrenches, rotors, models and integrators of a drone, with the tables of names for the command line."""
 
 from jaxdrones.dynamics.aero import drag, drag_world_axes, external_force, ground_effect, ground_effect_2021
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact

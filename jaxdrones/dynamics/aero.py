@@ -1,4 +1,4 @@
-"""Effects of the surroundings on one drone: drag (paper, equation 4), ground effect (equation 5), external forces.
+"""Drag (paper, equation 4), ground effect (equation 5) and external forces on one drone.
 
 `drag` and `ground_effect` are the smooth, physical laws. `drag_world_axes` and `ground_effect_2021` are those of
 gym-pybullet-drones (2021), for its figures and its recorded data.
@@ -31,8 +31,8 @@ def drag(params: Params, state: State) -> Wrench:
 def quadratic_drag(params: Params, state: State) -> Wrench:
     """Drag of the body, -rho/2 A |v| v with v the velocity relative to the air.
 
-    A is `params.aux["drag_area"]`, (3,) m^2 along the body axes: the drag coefficient times the area seen from there.
-    It acts beside the rotors' `drag`, which is linear and governs below some 5 m/s.
+    A is `params.aux["drag_area"]`, (3,) m^2: drag coefficient times projected area along each body axis. It adds to the
+    rotors' linear `drag`, which dominates below about 5 m/s.
     """
     area = constants(params, "drag_area", "jax.numpy.array([2e-3, 2e-3, 6e-3])")
     air_velocity = rotation.rotate_inverse(state.quat, state.vel - params.wind)
@@ -83,7 +83,7 @@ def ground_effect_2021(params: Params, state: State, scene: Any = None) -> Wrenc
 
 
 def external_force(params: Params, state: State) -> Wrench:
-    """The force `params.external_force` on the center of mass."""
+    """Force `params.external_force` on the center of mass."""
     return Wrench.of_force(rotation.rotate_inverse(state.quat, params.external_force))
 
 

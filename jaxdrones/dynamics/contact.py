@@ -1,16 +1,16 @@
-"""Compliant contact of a drone with the ground and with obstacles, and of two drones with each other.
+"""Compliant contact of a drone with the ground, with obstacles and with other drones.
 
-For the explicit backend only: Bullet resolves contacts itself, and with these effects it would do so twice.
+For the explicit backend only: Bullet resolves contacts itself.
 
-The collision shape of a drone is that of Bullet: a disc whose rim is a ring of spheres, as high as its collision
+The collision shape of a drone is that of Bullet: a disc with a ring of spheres as its rim, as high as its collision
 cylinder. The normal force per mass at a penetration depth x that grows at the rate x' is
 
-    s (a + b x') + c x,  s = x^2 / (d^2 + x^2),  and never pulls.
+    s (a + b x') + c x,  s = x^2 / (d^2 + x^2),  and never negative.
 
-At the surface this is the law of Hunt and Crossley (1975): the damping grows from zero with the depth, so that no force
-jumps at touchdown, and a drone that leaves is not held back. Deeper inside the damping levels off, because explicit
-integration is unstable with more. Friction is Coulomb's, and viscous at low slip speed. All forces are in proportion to
-a mass, so that one set of coefficients serves every vehicle.
+At the surface this is the law of Hunt and Crossley (1975): the damping grows from zero with the depth, so the force is
+continuous at touchdown and does not hold back a drone that leaves. Deeper inside the damping levels off, because
+explicit integration is unstable with more. Friction is Coulomb's, and viscous at low slip speed. All forces are
+proportional to a mass, so one set of coefficients serves every vehicle.
 
 A velocity that is damped at a rate above 1/dt overshoots in explicit integration, and at a rate above 2/dt it gains
 energy. For every vehicle, heave, tilt and slip are each damped at no more than 408 1/s, 1.7 over `LARGEST_STEP`;
@@ -41,29 +41,29 @@ _ANGLES = 2 * np.pi / _SPHERES * np.arange(_SPHERES)
 _ONSET_DEPTH = 2.5e-3  # m, d: depth of half the damping; a drone at rest is 1.5 mm deep; 1 mm makes gradients noisier
 _PRELOAD = 20.0  # m/s^2, a: about twice gravity, so that a drone rests near the surface
 _DAMPING = 120.0  # 1/s, a b: half of 1/dt for a drone that heaves
-_MAX_TILTING = 3.4  # tilt of a level drone is damped at most at so many times that rate, 1.7/dt; an hb's at 3.3 times
-_STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; the damping is just above critical, so that drones hardly bounce
-_FRICTION_RATE = 400.0  # 1/s: the highest rate at which friction on the ground slows a point of the rim
+_MAX_TILTING = 3.4  # largest ratio of the damping rate of tilt of a level drone to that rate, 1.7/dt; 3.3 for an hb
+_STIFFNESS = 3000.0  # 1/s^2, c: (55 rad/s)^2; the damping is just above critical, so drones hardly bounce
+_FRICTION_RATE = 400.0  # 1/s: highest rate of friction on the ground at a point of the rim
 LARGEST_STEP = 1 / 240
 """Longest physics step with which contact is stable, for every vehicle, s."""
-_FRICTION_RATE_ON_DRONE = 15.0  # 1/s: the same between drones at each of 16 points; more shakes a drone that is carried
+_FRICTION_RATE_ON_DRONE = 15.0  # 1/s: the same between drones at each of 16 points; more shakes a carried drone
 _MAX_SHARE_ON_DRONE = 4.0  # normal force at one point over that of its lever; three loaded points then stay below 2/dt
 _STICTION_SPEED = 0.01  # m/s: friction is viscous below; with the weight of a cf2x below 0.05 m/s
 _GROUND_FRICTION = 0.5  # coefficient, also of obstacles: gym-pybullet-drones gives its drones 0.5 and its plane 1.0
 _DRONE_FRICTION = 0.25  # coefficient: 0.5 times 0.5
-_ROUNDING = 1e-4  # m: rounds off the distance of two points that coincide
+_ROUNDING = 1e-4  # m: smooths the distance of coincident points
 
 
 @declare(Needs(contact="ground", ground_only=True))
 def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
-    """Normal force and friction of the ground, the plane z = 0, on a drone that touches it. The ground never pulls.
+    """Normal force and friction of the ground, the plane z = 0, on a drone.
 
-    Not for the Bullet backend, which has a ground of its own.
+    Not for the Bullet backend, which resolves contact with the ground itself.
 
     Args:
         params: of the drone.
         state: of the drone.
-        scene: a `jaxdrones.Scene`; one without a ground does not push. There is a ground when left out.
+        scene: a `jaxdrones.Scene`; without a ground the wrench is zero. By default there is a ground.
     """
     if scene is not None and not scene.ground:
         return Wrench(jnp.zeros_like(state.pos), jnp.zeros_like(state.pos))
@@ -77,7 +77,7 @@ def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
     cos, sin = (jnp.asarray(f(_ANGLES), radius.dtype) for f in (np.cos, np.sin))
 
     def around(a: Array, b: Array, c: Array) -> list[Float[Array, " spheres"]]:
-        """The components of a + b cos t + c sin t at every sphere."""
+        """Components of a + b cos t + c sin t at every sphere."""
         return [i + j * cos + k * sin for i, j, k in zip(components(a), components(b), components(c), strict=True)]
 
     _, _, height = around(state.pos + p, x, y)
@@ -93,12 +93,12 @@ def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
 
 @declare(Needs(contact="obstacles"))
 def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
-    """Normal force and friction of the obstacles of a scene on a drone that touches them, by the law of the ground.
+    """Normal force and friction of the obstacles of a scene on a drone, by the law of the ground.
 
-    Each of the eight spheres touches the obstacle that is nearest to it, or in which it is deepest. What fits between
-    two spheres, such as a thin pole, or a corner, reaches into the disc. The explicit backend also sweeps the way
-    of every physics step and stops the disc, less its rounding, at the surface of an obstacle (`stop_at`). Not for the
-    Bullet backend, which resolves these contacts itself.
+    Each of the eight spheres touches its nearest or deepest obstacle. Thin poles and corners can reach between two
+    spheres into the disc. The explicit backend also sweeps the motion of every physics step and stops the disc, less
+    its rounding, at the surface of an obstacle (`stop_at`). Not for the Bullet backend, which resolves these contacts
+    itself.
 
     Args:
         params: of the drone.
@@ -129,9 +129,9 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
 
 
 def stop_at(state: State, normals: Float[Array, "planes 3"], heights: Float[Array, " planes"]) -> State:
-    """The state of a drone that does not cross planes n . pos = h: moved back to them, its velocity along them.
+    """Project the state of a drone onto the half spaces n . pos >= h: move it back and remove the approach velocity.
 
-    The impact is inelastic and gives no spin, so that no energy is gained; compliant contact does the rest.
+    The impact is inelastic and without spin, so it adds no energy; compliant contact does the rest.
 
     Args:
         state: of one drone.
@@ -147,25 +147,24 @@ def stop_at(state: State, normals: Float[Array, "planes 3"], heights: Float[Arra
 
 
 def contact_radius(params: Params) -> Float[Array, ""]:
-    """Radius of the ball about the center of mass that holds all of a drone that can touch anything, m."""
+    """Radius of the bounding ball of a drone's collision shape about the center of mass, m."""
     radius, ring = rim(params)
     return safe_sqrt(ring**2 + params.collision_offset**2) + radius
 
 
 @declare(Needs(contact="drones"))
 def drone_contact(params: Params, state: State, other: Params, other_state: State) -> Wrench:
-    """Normal force and friction of another drone on a drone that it touches; the other one gets the opposite.
+    """Normal force and friction of another drone on a drone; the other drone gets the opposite.
 
-    The spheres of each drone meet the disc of the other, which is rounded by its spheres. These 16 points share one
-    normal force, so that two rims that meet and two discs that lie on each other give way alike. Not for the Bullet
-    backend, which resolves these contacts itself.
+    The spheres of each drone touch the rounded disc of the other. These 16 points share one normal force, so contact
+    of two rims and of two discs is equally stiff. Not for the Bullet backend, which resolves these contacts itself.
 
-    Contact of drones is softer than that with the ground, and softer than in Bullet. Two cf2x that meet rim to rim stop
-    each other at 1 m/s; at 3 m/s most slip past each other, one over the other (26 of 30, in Bullet 1 of 30). Flat onto
-    each other they stop up to 3 m/s, and pass through each other at 5 m/s. A drone that lies on another, off its
-    middle, slides down; in Bullet it stays.
+    Contact of drones is softer than with the ground, and softer than in Bullet. Two cf2x stop each other rim to rim at
+    1 m/s; at 3 m/s most slip past each other, one over the other (26 of 30, in Bullet 1 of 30). Disc to disc they stop
+    each other up to 3 m/s, and pass through each other at 5 m/s. A drone that lies off-center on another slides down;
+    in Bullet it stays.
     """
-    # World frame, with positions from the center of mass of the first drone: so they are as exact far from the origin.
+    # World frame, with positions relative to the center of mass of the first drone, for precision far from the origin.
     first = _body(params, state, jnp.zeros_like(state.pos))
     second = _body(other, other_state, other_state.pos - state.pos)
     ours, theirs = _contacts(first, second), _contacts(second, first)
@@ -187,7 +186,7 @@ def drone_contact(params: Params, state: State, other: Params, other_state: Stat
 
 
 class _Body(NamedTuple):
-    """The collision shape of a drone and how it moves; world frame, with the origin where the caller puts it."""
+    """Collision shape of a drone and its motion; world frame, with an origin chosen by the caller."""
 
     pos: Array
     """Center of mass."""
@@ -204,14 +203,14 @@ class _Body(NamedTuple):
 
 
 class _Contact(NamedTuple):
-    """Where a sphere of one body is nearest to the disc of another."""
+    """Nearest points of a sphere of one body and the disc of another."""
 
     point: Float[Array, "3"]
     """On the surface of the disc."""
     normal: Float[Array, "3"]
     """From the disc to the sphere, of unit length."""
     depth: Float[Array, ""]
-    """Penetration, m; negative where they do not touch."""
+    """Penetration, m; negative for a gap."""
 
 
 def _body(params: Params, state: State, pos: Float[Array, "3"]) -> _Body:
@@ -221,12 +220,12 @@ def _body(params: Params, state: State, pos: Float[Array, "3"]) -> _Body:
 
 
 def _velocity(body: _Body, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The velocity of a point of a body."""
+    """Velocity of a point of a body."""
     return body.vel + cross(body.omega, point - body.pos)
 
 
 def _contacts(spheres: _Body, disc: _Body) -> _Contact:
-    """The contact of each sphere of one body with the disc of another; arrays have a leading axis over spheres."""
+    """Contact of each sphere of one body with the disc of another; arrays have a leading axis over spheres."""
     x, y, _ = spheres.axes
     axis = disc.axes[2]
 
@@ -250,7 +249,7 @@ def _normal_force_per_mass(depth: Array, depth_rate: Array, damping: ArrayLike =
 
 
 def _load(params: Params, depth: Array, depth_rate: Array, slip_squared: Array) -> tuple[Array, Array]:
-    """Normal force (N) and friction over slip velocity (N s/m) at one sphere on what does not move."""
+    """Normal force (N) and friction over slip velocity (N s/m) at one sphere on a static body."""
     ix, iy, _ = components(params.inertia)
     tilting = params.mass * rim(params)[1] ** 2 / 2 / jnp.minimum(ix, iy)  # rate of damped tilt over that of heave
     damping = _DAMPING / jnp.maximum(1, tilting / _MAX_TILTING)
@@ -277,7 +276,7 @@ def rim(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
 
 
 def _sliding_mass(params: Params) -> Float[Array, ""]:
-    """Effective mass of a point of the rim that is pushed sideways, so that the drone slides, tilts and turns, kg."""
+    """Effective mass of a point of the rim under a sideways force, with the drone free to slide, tilt and turn, kg."""
     radius, ring = rim(params)
     low = jnp.abs(params.collision_offset) + radius
     ix, _, iz = components(params.inertia)
@@ -285,11 +284,11 @@ def _sliding_mass(params: Params) -> Float[Array, ""]:
 
 
 def _tilting_mass(params: Params) -> Float[Array, ""]:
-    """Effective mass of a sphere that is pushed along the thrust axis, times a constant; at most the mass, kg."""
+    """Effective mass of a sphere under a force along the thrust axis, times a constant; at most the mass, kg."""
     ix, _, _ = components(params.inertia)
     return jnp.minimum(params.mass, _MAX_SHARE_ON_DRONE / (1 / params.mass + rim(params)[1] ** 2 / ix))
 
 
 def _series_mass(a: Array, b: Array) -> Array:
-    """The reduced mass of two masses that push each other."""
+    """Reduced mass of two masses."""
     return a * b / (a + b)

@@ -1,4 +1,4 @@
-"""Torques that recorded flights show beyond a rigid body with four thrusts: flapping, rate damping, trim."""
+"""Torques identified from recorded flights: flapping, rate damping, trim."""
 
 import jax.numpy as jnp
 
@@ -13,10 +13,10 @@ _MOST_CLIMB = 3.0  # m/s, limit of the climb speed in the loss; the identified f
 
 
 def flapping_moment(params: Params, state: State) -> Wrench:
-    """Moment of rotors in horizontal flight: their discs tilt back, and their drag acts above the center of mass.
+    """Moment of rotors in horizontal flight, from tilted discs and from drag above the center of mass.
 
     M = sum(rotor speed) (c_y v g_y, -c_x u g_x, 0) with u, v, w the velocity relative to the air along the body axes.
-    It pitches a drone that flies forward nose up. The factor g = 1 - l w + k w^2 depends on the climb speed, as flights
+    It pitches the nose up in forward flight. The factor g = 1 - l w + k w^2 depends on the climb speed, as flights
     of the Crazyflie 2.1 brushless show (docs/reality.md).
     """
     u, v, w = components(rotation.rotate_inverse(state.quat, state.vel - params.wind))
@@ -29,10 +29,10 @@ def flapping_moment(params: Params, state: State) -> Wrench:
 
 
 def rate_damping(params: Params, state: State) -> Wrench:
-    """Torque against the angular velocity: a descending rotor gains thrust, a rising one loses thrust."""
+    """Torque against the angular velocity: a sinking rotor gains thrust, a rising one loses thrust."""
     return Wrench.of_torque(-params.relative_density * params.rate_damping * state.omega)
 
 
 def trim_torque(params: Params, state: State) -> Wrench:
-    """The constant torque `params.trim_torque` of a vehicle that is not in balance."""
+    """Constant torque `params.trim_torque` of an unbalanced vehicle."""
     return Wrench.of_torque(params.trim_torque)

@@ -1,4 +1,4 @@
-"""Thrust of rotors that move through the air: momentum theory and blade elements."""
+"""Thrust of moving rotors by momentum theory and blade elements."""
 
 import jax
 import jax.numpy as jnp
@@ -12,21 +12,21 @@ from jaxdrones.vector import components, cross
 from jaxdrones.wrench import Wrench
 
 _NEWTON_STEPS = 3
-_STOPPED = 1.0  # RPM; a slower rotor has no thrust to lose
-_STILL = 1e-6  # (m/s)^2; makes the inflow of a rotor that neither turns nor moves differentiable
+_STOPPED = 1.0  # RPM; the thrust of a slower rotor is negligible
+_STILL = 1e-6  # (m/s)^2; makes the inflow of a resting rotor differentiable
 
 
 def inflow_thrust(params: Params, state: State) -> Wrench:
-    """Change of thrust at constant rotor speed: a loss in a climb, a gain in descent or forward flight.
+    """Change of thrust at constant rotor speed: a loss in climb, a gain in descent or forward flight.
 
-    With U the air speed through a moving rotor, and v_h that in hover,
+    With U the flow through a moving rotor, and v_h that in hover,
 
         dF = -s(2 b (U - v_h)) F,  b = inflow_loss hover_rpm / P.
 
     A blade element loses lift in proportion to the flow through the disc. In a slow climb the induced velocity falls by
     half the climb speed, hence the factor 2: in a climb at w the fraction b w is lost. Beyond one half of the thrust
     the limit s (`lost_share`) keeps thrust positive, and at most doubles it in a fast descent. Forward flight lowers
-    the induced velocity, which is translational lift. The lift that advancing blades gain is not modeled. Sources:
+    the induced velocity (translational lift). The lift of advancing blades is not modeled. Sources:
     Leishman, Principles of Helicopter Aerodynamics, 2006, chapters 2 and 3; Glauert 1926.
 
     The z component of `drag_coeff` is the same loss, measured on the Crazyflie: set it to zero if you also use `drag`.
@@ -45,13 +45,13 @@ def inflow_thrust(params: Params, state: State) -> Wrench:
 def flow_through(
     climb: Float[Array, ""], edgewise_squared: Float[Array, ""], in_hover: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Speed U of the air through a rotor of constant thrust, m/s: (U - w) sqrt(V^2 + U^2) = v_h^2, after Glauert.
+    """Flow U through a rotor of constant thrust, m/s: (U - w) sqrt(V^2 + U^2) = v_h^2, after Glauert.
 
-    If air flows from below, U < 0, the square root has V alone: momentum theory has several solutions there, or none
+    For flow from below, U < 0, the square root has V alone: momentum theory has several solutions there, or none
     (vortex ring state), and this solution is smooth.
 
     Args:
-        climb: w, speed of the rotor through the air along its axis, m/s; negative when it sinks.
+        climb: w, speed of the rotor through the air along its axis, m/s; negative in descent.
         edgewise_squared: V^2, square of its speed in the plane of the disc, (m/s)^2.
         in_hover: v_h, induced velocity in hover, m/s.
     """

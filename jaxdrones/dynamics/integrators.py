@@ -1,7 +1,7 @@
-"""Integrators `(derivative, state, dt) -> state` of one world, whose arrays have a leading drone axis.
+"""Integrators `(derivative, state, dt) -> state` of one world; arrays have a leading drone axis.
 
 A derivative has the type of its state, so a step is `x + dt k` leaf by leaf. Only the quaternion is special:
-it is normalized, or turned by the exponential of a rotation vector.
+it is normalized, or rotated by the exponential of a rotation vector.
 """
 
 from collections.abc import Callable
@@ -26,8 +26,8 @@ def euler(derivative: Derivative, state: State, dt: float) -> State:
 def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> State:
     """Semi-implicit Euler, order 1: velocities first, then poses with the new velocities.
 
-    The attitude is turned by the exponential map. The order of operations is that of gym-pybullet-drones. The explicit
-    gyroscopic term gains energy when a drone tumbles: see the table in the README before using it above a few rad/s.
+    The attitude is rotated by the exponential map. The order of operations is that of gym-pybullet-drones. The explicit
+    gyroscopic term gains energy in a tumble: see the table in the README before using it above a few rad/s.
     """
     state = _normalized(state)  # the exponential map keeps the length only up to rounding
     after = _add(state, dt, derivative(state))
@@ -36,13 +36,13 @@ def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> Stat
 
 
 def midpoint(derivative: Derivative, state: State, dt: float) -> State:
-    """The explicit midpoint rule, order 2, on the whole state, with one normalization per step."""
+    """Explicit midpoint rule, order 2, on the whole state, with one normalization per step."""
     halfway = _add(state, dt / 2, derivative(state))
     return _normalized(_add(state, dt, derivative(halfway)))
 
 
 def rk4(derivative: Derivative, state: State, dt: float) -> State:
-    """The classical Runge-Kutta method, order 4, on the whole state, with one normalization per step."""
+    """Classical Runge-Kutta method, order 4, on the whole state, with one normalization per step."""
     k1 = derivative(state)
     k2 = derivative(_add(state, dt / 2, k1))
     k3 = derivative(_add(state, dt / 2, k2))
@@ -52,10 +52,10 @@ def rk4(derivative: Derivative, state: State, dt: float) -> State:
 
 
 def implicit_midpoint(derivative: Derivative, state: State, dt: float) -> State:
-    """The implicit midpoint rule x + dt f((x + x')/2), order 2.
+    """Implicit midpoint rule x + dt f((x + x')/2), order 2.
 
-    It conserves what is quadratic in the state, so a tumbling body neither gains nor loses energy. The equation is
-    solved by eight fixed-point iterations; each shrinks the error by a factor of about |omega| dt / 2.
+    It conserves quadratic invariants, so a tumbling body neither gains nor loses energy. The equation is solved by
+    eight fixed-point iterations; each reduces the error by a factor of about |omega| dt / 2.
     """
 
     def iterate(rate: State, _: None) -> tuple[State, None]:
@@ -74,5 +74,5 @@ def _normalized(state: State) -> State:
 
 
 def _turn(quat: Float[Array, "4"], rotation_vector: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The attitude after a rotation about body axes, q exp(v)."""
+    """Attitude after a rotation about body axes, q exp(v)."""
     return rotation.multiply(quat, rotation.exp(rotation_vector))

@@ -1,4 +1,4 @@
-"""Downwash: what one drone does to another through the air (paper, equation 6)."""
+"""Downwash of one drone on another (paper, equation 6)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -20,15 +20,15 @@ _MIN_WIDTH = 5e-4  # m; equation 6 has no width at a height of 0.6875 m
 
 
 def downwash(params: Params, state: State, other: Params, other_state: State) -> Wrench:
-    """Thrust that the rotors of a drone lose in the jet of the other one; smooth and bounded.
+    """Loss of thrust of the rotors of a drone in the jet of another drone; smooth and bounded.
 
-    The jet blows along the other drone's thrust axis. Its speed follows from the induced speed of the other's
-    rotors, hence from its thrust, and falls with the distance z along and r off the axis as
+    The jet is along the other drone's thrust axis. Its speed is proportional to the induced speed U_0 of the other's
+    rotors, and falls with the distance z along and r off the axis as
     U(z, r) = U_0 10.11 / (z/l + 5.817) / (1 + (sqrt(2) - 1) (r/w)^2)^2, w = 0.07668 (z + 5.817 l),
     l the distance of neighboring motors; it sets in smoothly within one l below the other drone.
-    A rotor loses the share `inflow_loss` of its thrust per m/s that blows down its own axis, so that a drone
-    that is half in the jet tilts; beyond one half of the thrust the loss levels off (`lost_share`). The law is valid
-    from 2.5 l on (Bauersfeld et al. 2024); nearer it is an assumption.
+    A rotor loses the fraction `inflow_loss` of its thrust per m/s of flow down its own axis, so a drone halfway in the
+    jet tilts; beyond one half of the thrust the loss levels off (`lost_share`). The law is valid from 2.5 l on
+    (Bauersfeld et al. 2024); nearer it is an assumption.
     """
     length = jnp.sqrt(2.0) * other.arm
     axis = rotation.z_axis(other_state.quat)
@@ -52,10 +52,10 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
 
 
 def downwash_2021(params: Params, state: State, other: Params, other_state: State) -> Wrench:
-    """Equation 6: a force along -z of the lower drone's body, whatever the two drones' thrusts and attitudes.
+    """Equation 6: a force along -z of the lower drone's body, independent of thrusts and attitudes.
 
-    The force of the equation diverges where the drones meet, and its width vanishes 0.6875 m apart: below 0.05 m of
-    height difference and 0.5 mm of width, the values at these bounds are used.
+    The force of the equation diverges at zero height difference, and its width vanishes at 0.6875 m: the height
+    difference is limited to at least 0.05 m and the width to at least 0.5 mm.
     """
     k1, k2, k3 = other.downwash_coeff
     dx, dy, dz = other_state.pos - state.pos

@@ -1,4 +1,4 @@
-"""Models with a continuous state of their own: a battery, a gust filter, flapping blades, a motor controller."""
+"""Models with a continuous state, for example a battery, a gust filter, flapping blades or a motor controller."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from jaxdrones.state import State
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A differential equation that is integrated along with the rigid body; its state is `state.aux[name]`.
+    """Differential equation integrated with the rigid body; its state is `state.aux[name]`.
 
-    Every integrator treats it at its own order; Bullet takes explicit Euler steps beside its own.
+    Every integrator treats it at its own order; Bullet takes explicit Euler steps.
     """
 
     name: str
     """Key of `State.aux`."""
     init: Callable[[Params], Any]
-    """`init(params)`: the state at the start, a pytree of floating-point arrays."""
+    """`init(params)`: initial state, a pytree of floating-point arrays."""
     rate: Callable[[Params, State, Float[Array, "4"]], Any]
-    """`rate(params, state, command)`: the time derivative of the state, a pytree of the same type; `command` holds
-    the commanded rotor speeds, RPM, as they were given."""
+    """`rate(params, state, command)`: time derivative of the state, a pytree of the same type; `command` is the
+    commanded rotor speeds, RPM, before any limit."""
     of_team: bool = False
-    """Whether `init` and `rate` are of a whole team, with a leading drone axis on every array, not of one drone."""
+    """Whether `init` and `rate` are written for a team, with a leading drone axis on every array, not for one drone."""
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
@@ -41,14 +41,14 @@ class Model:
             check_arguments(f"{field} of the model {self.name!r}", function, arguments)
 
     def start(self, params: Params) -> Any:
-        """The state of a team at the start, every array with a leading drone axis."""
+        """Initial state of a team, every array with a leading drone axis."""
         return self.init(params) if self.of_team else jax.vmap(self.init)(params)
 
     def team_rate(self, params: Params, state: State, command: Float[Array, "n 4"]) -> Any:
-        """The time derivative of the state of a team.
+        """Time derivative of the state of a team.
 
         Raises:
-            ValueError: `rate` returns something of another type than the state.
+            ValueError: `rate` returns another type than the state.
         """
         rate = (self.rate if self.of_team else jax.vmap(self.rate))(params, state, command)
         given, wanted = jax.eval_shape(lambda: rate), jax.eval_shape(lambda: state.aux[self.name])
@@ -60,10 +60,10 @@ class Model:
 
 
 def constants(params: Params, name: str, example: str) -> Any:
-    """`params.aux[name]`, the constants of a model that is not in the core.
+    """Constants of a model, `params.aux[name]`.
 
     Raises:
-        ValueError: there are none; says what to give, `example`.
+        ValueError: missing constants; the message shows `example`.
     """
     if name not in params.aux:
         found = ", ".join(params.aux) or "nothing"

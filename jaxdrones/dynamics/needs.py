@@ -1,4 +1,4 @@
-"""What an effect or a pair effect declares about itself, so that an engine treats it as it must."""
+"""Declarations of effects and pair effects for the engines."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @dataclasses.dataclass(frozen=True)
 class Needs:
-    """A declaration; `declare` gives it to a function, and `functools.partial` and `functools.wraps` keep it."""
+    """Declaration of an effect, attached by `declare`; kept by `functools.partial` and `functools.wraps`."""
 
     contact: str = ""
-    """What the drone touches, `ground`, `obstacles` or `drones`; empty if the effect is no contact.
+    """Kind of contact: `ground`, `obstacles` or `drones`; empty for other effects.
 
-    Bullet refuses contact, because it resolves contacts by itself. The explicit backend checks that its physics step is
-    short enough, computes contact with obstacles only where one is near, and stops fast drones at their surfaces."""
+    Bullet rejects contact effects, as it resolves contacts itself. The explicit backend checks that its physics step is
+    short enough, computes contact with obstacles only near one, and stops fast drones at their surfaces."""
     ground_only: bool = False
-    """Whether all that the effect looks at in a scene is if there is a ground."""
+    """Whether the effect uses only the ground of a scene."""
 
 
 def declare(needs: Needs) -> Callable[[Function], Function]:
@@ -34,7 +34,7 @@ def declare(needs: Needs) -> Callable[[Function], Function]:
 
 
 def needs_of(function: Callable) -> Needs:
-    """The needs that an effect declares, also one with bound arguments."""
+    """Declaration of an effect, also of one with bound arguments."""
     while isinstance(function, functools.partial):
         function = function.func
     needs = getattr(function, "needs", None)

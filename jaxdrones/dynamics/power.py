@@ -1,4 +1,4 @@
-"""A lithium-polymer battery: its charge, and its voltage under the load of the rotors.
+"""Lithium-polymer battery: charge, and voltage under the load of the rotors.
 
 The circuit is an open-circuit voltage, a resistance, and one pair of resistance and capacitance in series (Thevenin).
 """
@@ -33,13 +33,13 @@ class Battery(PyTreeNode):
     cells: Array
     """() number of cells in series."""
     resistance: Array
-    """() resistance of battery, plug and wires, whose voltage drop is immediate, ohm."""
+    """() instantaneous resistance of battery, plug and wires, ohm."""
     slow_resistance: Array
-    """() resistance whose voltage drop lags with the time constant `slow_time`, ohm."""
+    """() resistance of the slow voltage drop, with time constant `slow_time`, ohm."""
     slow_time: Array
     """() time constant of the slow voltage drop, s."""
     efficiency: Array
-    """() power of ideal rotors with the same thrust in hover over the electrical power of the motors."""
+    """() ideal rotor power in hover over electrical power of the motors."""
     idle_power: Array
     """() power of the electronics, W."""
 
@@ -56,16 +56,16 @@ def lithium_polymer(
     """Constants of a battery; the defaults are those of a Crazyflie 2.1 with 250 mAh.
 
     Resistance and efficiency are fitted to flights of NanoBench (Ullah and Baca 2026): at an efficiency of 0.3 the
-    batteries of its flights have 0.21 to 0.52 ohm, and no measurable slow resistance. So give the resistance of your
+    batteries of its flights have 0.21 to 0.52 ohm, and no measurable slow resistance. Give the resistance of your own
     battery. The idle power is an estimate.
 
     Args:
         capacity: charge when full, A s; 3.6 times the mAh on the label.
         cells: number of cells in series.
         resistance: resistance of battery, plug and wires, all cells together, ohm.
-        slow_resistance: resistance whose voltage drop lags behind the current, ohm.
-        slow_time: time constant of this lag, s.
-        efficiency: power of an ideal rotor with the same thrust over the electrical power of a motor.
+        slow_resistance: resistance of the slow voltage drop, ohm.
+        slow_time: time constant of the slow voltage drop, s.
+        efficiency: ideal rotor power over electrical power of a motor at the same thrust.
         idle_power: power of the electronics, W.
 
     Raises:
@@ -89,16 +89,16 @@ def lithium_polymer(
 
 
 def battery() -> Model:
-    """The model of a battery that is full at the start; its constants are `Params.aux["battery"]`.
+    """Model of a battery, full at the start; its constants are `Params.aux["battery"]`.
 
-    `state.aux["battery"]` holds `charge` () in A s and `slow_drop` (), the part of the voltage drop that follows the
-    current with a lag, V. The charge falls by exactly the integral of `battery_current`.
+    `state.aux["battery"]` holds `charge` () in A s and `slow_drop` (), the lagging part of the voltage drop, V. The
+    charge falls by exactly the integral of `battery_current`.
     """
     return Model("battery", _full, _rate)
 
 
 def battery_power(params: Params, state: State) -> Float[Array, ""]:
-    """Electrical power that motors and electronics demand, W.
+    """Electrical power demand of motors and electronics, W.
 
     By momentum theory a rotor needs the power F sqrt(F / (2 rho A)) for its thrust F = k_F P^2 in hover. `efficiency`
     is this power over the electrical power; it includes the losses of rotor, motor and driver.
@@ -111,8 +111,7 @@ def battery_power(params: Params, state: State) -> Float[Array, ""]:
 def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
     """Terminal voltage U under the load of the turning rotors, V, from U (E - U) = R P.
 
-    E is the voltage before the resistance R. The maximum power of a battery is E^2 / (4 R), at U = E / 2; it delivers
-    this power if the demand is higher.
+    E is the voltage before the resistance R. The power is limited to the battery's maximum E^2 / (4 R), at U = E / 2.
 
     Args:
         params: parameters of the drone, with the constants of the battery in `aux["battery"]`.
@@ -123,7 +122,7 @@ def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
 
 
 def battery_current(params: Params, state: State) -> Float[Array, ""]:
-    """Current out of the battery, A: power over voltage, and at most U / R, which it is at the maximum power."""
+    """Battery current, A: power over voltage, at most U / R, the current at maximum power."""
     power, voltage = battery_power(params, state), battery_voltage(params, state)
     return power / jnp.maximum(voltage, _constants(params).resistance * power / voltage)
 
@@ -131,7 +130,7 @@ def battery_current(params: Params, state: State) -> Float[Array, ""]:
 def open_circuit_voltage(battery: Battery, charge: Float[Array, ""]) -> Float[Array, ""]:
     """Voltage of a battery at rest, V, at a charge in A s (Chen and Rincon-Mora 2006).
 
-    It falls to zero just below a charge of zero, and there the current also becomes zero.
+    Just below zero charge, voltage and current fall to zero.
     """
     share = charge / battery.capacity
     a, b, c, d = _CUBIC
@@ -139,10 +138,9 @@ def open_circuit_voltage(battery: Battery, charge: Float[Array, ""]) -> Float[Ar
 
 
 def charge_at(battery: Battery, voltage: Float[ArrayLike, ""]) -> Float[Array, ""]:
-    """Charge of a battery at rest with this voltage, A s: for a flight that starts with a measured voltage.
+    """Charge of a battery at rest with this voltage, A s, the inverse of `open_circuit_voltage`.
 
-    Voltages above that of a full and below that of an empty battery give the charges of these. In between, the
-    derivative is exact.
+    Voltages are limited to those of an empty and of a full battery. In between, the derivative is exact.
     """
     voltage = jnp.asarray(voltage, battery.capacity.dtype)
 

@@ -1,4 +1,4 @@
-"""Rotors with PWM commands, and rotors that fail."""
+"""Rotors with PWM commands, and rotor failures."""
 
 import functools
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from jaxdrones.vector import safe_sqrt
 Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
 
 FULL_PWM = 65535
-"""The PWM command of a motor that is always on."""
+"""PWM command at a duty cycle of 1."""
 
 
 class Motors(PyTreeNode):
@@ -38,7 +38,7 @@ class Motors(PyTreeNode):
         return jnp.maximum(thrust_at(self.coefficients, voltage), 0)
 
     def voltage(self, thrust: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Voltage that gives a thrust (N), V: the one root of a cubic that rises everywhere."""
+        """Voltage for a thrust (N), V: the single root of the monotonic cubic."""
         return voltage_for(self.coefficients, thrust)
 
 
@@ -47,11 +47,11 @@ def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
 
     Args:
         coefficients: (4,) coefficients of the powers 0 to 3 of the voltage, N/V^0 to N/V^3.
-        supply: voltage where no battery is simulated, V.
+        supply: supply voltage without a simulated battery, V.
 
     Raises:
-        ValueError: a wrong shape, numbers that are not finite, a curve that does not rise everywhere, or a supply that
-            is not positive.
+        ValueError: a wrong shape, numbers that are not finite, a curve that does not rise everywhere, or a supply
+            voltage that is not positive.
     """
     check_shape("coefficients of the thrust curve", coefficients, (4,), "those of the powers 0 to 3 of the voltage")
     check_finite("coefficients of the thrust curve", coefficients)
@@ -71,21 +71,20 @@ def crazyflie_motors(propellers: str = "2.1+", supply: ArrayLike = 3.7) -> Motor
 
     Args:
         propellers: a name of `THRUST_CURVES`: `2.1`, `2.1+` or `thrust upgrade`.
-        supply: voltage where no battery is simulated, V.
+        supply: supply voltage without a simulated battery, V.
 
     Raises:
-        ValueError: unknown propellers, or a supply that is not positive.
+        ValueError: unknown propellers, or a supply voltage that is not positive.
     """
     check_choice("propellers", propellers, THRUST_CURVES)
     return cubic_motors(np.array(THRUST_CURVES[propellers]), supply)
 
 
 def pwm_rotors(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Rotors with a first-order lag whose command is the PWM of each motor, 0 to 65535.
+    """Rotors with a first-order lag and a PWM command for each motor, 0 to 65535.
 
-    The mean voltage of a motor is the fraction PWM / 65535 of the supply voltage, which is that of `battery()` under
-    load, or the motors' `supply` if the step does not have this model. The motors' cubic gives the thrust, and `kf` the
-    speed for this thrust.
+    The mean voltage of a motor is the fraction PWM / 65535 of the supply voltage: that of `battery()` under load, or
+    the motors' `supply` in a step without this model. The motors' cubic gives the thrust, and `kf` the speed for it.
 
     Args:
         params: parameters of the drone, with `Motors` in `aux["motors"]`.
@@ -100,7 +99,7 @@ def pwm_rotors(params: Params, state: State, command: Float[Array, "4"]) -> tupl
 
 
 def pwm_of_thrust(params: Params, state: State, thrust: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The PWM for which `pwm_rotors` reach a thrust (4,) in N, limited to 0 .. 65535: battery compensation."""
+    """PWM commands for rotor thrusts (4,), N, limited to 0 .. 65535: battery compensation for `pwm_rotors`."""
     return FULL_PWM * _duty(FULL_PWM * _motors(params).voltage(thrust) / supply_voltage(params, state))
 
 
@@ -110,10 +109,10 @@ def supply_voltage(params: Params, state: State) -> Float[Array, ""]:
 
 
 def failing(rotors: Rotors) -> Rotors:
-    """Rotors that may fail: each gets the fraction `params.aux["rotor_health"]` (4,) of its command.
+    """Rotors with failures: each gets the fraction `params.aux["rotor_health"]` (4,) of its command.
 
-    A rotor of health 1 is intact, and a rotor of health 0 slows down and stops. Like every parameter, the health may be
-    drawn for an episode, change in flight, and have a gradient.
+    A rotor of health 1 is intact, and a rotor of health 0 slows down and stops. Like every parameter, the health can be
+    randomized, change in flight, and have a gradient.
 
     Args:
         rotors: `lagging_rotors`, `pwm_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
@@ -128,7 +127,7 @@ def failing(rotors: Rotors) -> Rotors:
 
 
 def _duty(pwm: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Duty cycle, 0 to 1; at the limits themselves the derivative is not zero, so that a gradient can leave them."""
+    """Duty cycle, 0 to 1; the derivative at the limits is not zero, so gradient descent can leave them."""
     return jnp.where(pwm < 0, 0, jnp.where(pwm > FULL_PWM, 1, pwm / FULL_PWM))
 
 

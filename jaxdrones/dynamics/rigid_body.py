@@ -1,4 +1,4 @@
-"""Newton-Euler: wrench -> accelerations."""
+"""Newton-Euler equations."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,12 +17,12 @@ def newton_euler(params: Params, state: State, wrench: Wrench) -> tuple[Float[Ar
 
 
 def quat_rate(state: State) -> Float[Array, "4"]:
-    """Rate of the attitude, q' = q (omega, 0) / 2."""
+    """Time derivative of the attitude, q' = q (omega, 0) / 2."""
     return rotation.multiply(state.quat, jnp.append(state.omega / 2, 0.0))
 
 
 def specific_force(params: Params, state: State, acc: Float[Array, "3"]) -> Float[Array, "3"]:
-    """What an accelerometer in the center of mass measures: R^T (a - g), m/s^2, body.
+    """Specific force R^T (a - g) at the center of mass, m/s^2, body: the reading of an ideal accelerometer.
 
     Args:
         params: of the drone.

@@ -1,4 +1,4 @@
-"""Rotors: how their speed follows the command, and the wrenches they produce (paper, equations 1 to 3)."""
+"""Rotor speeds and rotor wrenches (paper, equations 1 to 3)."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,10 +12,10 @@ _RADIANS_PER_SECOND = 2 * jnp.pi / 60  # per RPM
 
 
 def limited(params: Params, rpm: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The nearest speeds at which rotors can turn, RPM: from 0 to `max_rpm`, which may be infinite.
+    """Rotor speeds limited to 0 .. `max_rpm`, RPM; `max_rpm` may be infinite.
 
-    A rotor does not turn backwards, where the square of its speed would lift all the same. The derivative is zero
-    beyond the limits and one on them, so that a gradient finds back from there.
+    Rotors do not turn backwards. The derivative is zero beyond the limits and one on them, so gradient descent can
+    leave the limits.
     """
     return jnp.where(rpm < 0, 0, jnp.where(rpm > params.max_rpm, params.max_rpm, rpm))
 
@@ -23,14 +23,14 @@ def limited(params: Params, rpm: Float[Array, "4"]) -> Float[Array, "4"]:
 def instant_rotors(
     params: Params, state: State, command: Float[Array, "4"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Rotors that take the limited command at once (paper). Returns their speed and its rate, RPM and RPM/s."""
+    """Rotors without lag (paper). Returns their speed and its rate, RPM and RPM/s."""
     return limited(params, command), jnp.zeros_like(command)
 
 
 def lagging_rotors(
     params: Params, state: State, command: Float[Array, "4"]
 ) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Rotors that follow the limited command by a first-order lag, with time constants of their own up and down.
+    """Rotors with a first-order lag, with different time constants up and down.
 
     Returns their speed and its rate, RPM and RPM/s.
     """
@@ -50,19 +50,19 @@ def drag_speed(params: Params, state: State) -> Float[Array, ""]:
 
 
 def induced_speed(params: Params, rpm: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Speed of the air through a rotor in hover by momentum theory, sqrt(F / (2 rho A)), m/s.
+    """Induced speed of a rotor in hover by momentum theory, sqrt(F / (2 rho A)), m/s.
 
-    It does not depend on the density of the air, to which thrust is proportional.
+    It is independent of the air density, as thrust is proportional to it.
     """
     area = jnp.pi * params.prop_radius**2
     return rpm * jnp.sqrt(params.kf / (2 * AIR_DENSITY * area))
 
 
 def lost_share(loss: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Share of the thrust that a rotor loses, from the linear law of blade elements; negative for a gain.
+    """Limited loss of thrust as a fraction, given that of the linear blade-element law; negative for a gain.
 
-    Up to one half it is the linear law's. Beyond, where blades stall, it tends smoothly to one: thrust stays positive,
-    and does not grow to more than twice its value. The form of this limit is an assumption.
+    Up to one half it is linear. Beyond, where blades stall, it tends smoothly to one: thrust stays positive and at most
+    doubles. The form of this limit is an assumption.
     """
     beyond = jnp.exp(-jnp.maximum(-2 * loss - 1, 0)) - jnp.exp(-jnp.maximum(2 * loss - 1, 0))
     return jnp.clip(loss, -0.5, 0.5) + beyond / 2
@@ -75,7 +75,7 @@ def rotor_wrench(params: Params, state: State) -> Wrench:
 
 
 def rotor_reaction(params: Params, state: State, rpm_rate: Float[Array, "4"]) -> Wrench:
-    """Torque of the spinning rotors on the body: -h' of rotors that change speed, -omega x h of a body that turns.
+    """Reaction torque of the rotors on the body, -h' - omega x h.
 
     h is the angular momentum of the rotors relative to the body, along its z axis.
     """
@@ -87,13 +87,13 @@ def rotor_reaction(params: Params, state: State, rpm_rate: Float[Array, "4"]) ->
 def angular_momentum(params: Params, rpm: Float[Array, "4"]) -> Float[Array, ""]:
     """Angular momentum of the rotors relative to the body, about body z, kg m^2/s.
 
-    A rotor turns against the torque that its drag exerts on the body. Linear: of RPM/s it is the rate.
+    A rotor turns against its drag torque on the body. The function is linear: RPM/s give the rate.
     """
     return dot(-params.rotor_inertia * _RADIANS_PER_SECOND * params.rotor_spin, rpm)
 
 
 def with_rotor_speed(params: Params, state: State, rpm: Float[Array, "4"]) -> State:
-    """The state after the rotors have taken another speed at once; the body keeps the angular momentum of both."""
+    """State after an instant change of rotor speed, with the total angular momentum conserved."""
     change = angular_momentum(params, rpm - state.rpm)
     _, _, inertia = components(params.inertia)
     return state.replace(rpm=rpm, omega=state.omega - along_z(change / inertia))

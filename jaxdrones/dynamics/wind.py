@@ -1,4 +1,4 @@
-"""Wind that depends on position and time."""
+"""Wind fields of position and time."""
 
 import functools
 import inspect
@@ -21,14 +21,14 @@ Effect = Callable[[Params, State], Wrench]
 
 
 def clock() -> Model:
-    """The model of time: `state.aux["clock"]` () is the time since the start, s."""
+    """Model of time: `state.aux["clock"]` () is the time since the start, s."""
     return Model(
         "clock", lambda params: jnp.zeros_like(params.mass), lambda params, state, _: jnp.ones_like(params.mass)
     )
 
 
 def in_wind(field: WindField, effect: Effect) -> Effect:
-    """An effect in a wind field, which is added to `params.wind` at the position of the drone.
+    """Wrap an effect in a wind field, which is added to `params.wind` at the position of the drone.
 
     Args:
         field: `(pos) -> wind` or `(pos, time) -> wind` for one drone, (3,) m/s, world; the latter needs the model
@@ -36,7 +36,7 @@ def in_wind(field: WindField, effect: Effect) -> Effect:
         effect: `(params, state) -> Wrench` that depends on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`.
 
     Raises:
-        ValueError: an argument that is not such a function; in flight, a field of time without a clock.
+        ValueError: an argument of another type; in flight, a field of time without a clock.
     """
     check_callable("field", field, "jaxdrones.logarithmic_wind(5.0)")
     check_callable("effect", effect, "jaxdrones.drag")
@@ -59,16 +59,16 @@ def in_wind(field: WindField, effect: Effect) -> Effect:
 def logarithmic_wind(
     speed: float, height: float = 6.1, roughness: float = 0.0457, direction: float = 0.0
 ) -> Callable[[Float[Array, "3"]], Float[Array, "3"]]:
-    """The mean wind over flat ground, which grows with the logarithm of the height (MIL-F-8785C, 3.7.3.1).
+    """Logarithmic mean wind over flat ground (MIL-F-8785C, 3.7.3.1).
 
     It is u ln(z / z_0) / ln(h / z_0) at the height z, and zero below z_0.
 
     Args:
         speed: wind speed u at `height`, m/s.
         height: h, m; the default is 20 ft.
-        roughness: roughness length z_0, m; the default is 0.15 ft, which the specification has for take-off and landing
+        roughness: roughness length z_0, m; the default is 0.15 ft, the specification's value for take-off and landing
             (2 ft otherwise).
-        direction: direction towards which the wind blows, rad from the x axis towards the y axis.
+        direction: heading of the wind velocity, rad from the x axis towards the y axis.
 
     Raises:
         ValueError: a height that is not above the roughness, or numbers that are not positive.
@@ -86,7 +86,7 @@ def logarithmic_wind(
 
 
 def _arguments(function: Callable) -> int:
-    """The number of positional arguments without defaults; 1 for a function without a signature."""
+    """Number of positional arguments without defaults; 1 for a function without a signature."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):

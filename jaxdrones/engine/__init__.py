@@ -1,1 +1,1 @@
-"""The step of a world: wrenches summed, integrated by JAX (`explicit`) or by Bullet (`bullet`)."""
+"""Steps of a world, integrated by JAX (`explicit`) or by Bullet (`bullet`)."""

@@ -1,7 +1,7 @@
-"""Contact with obstacles for the drones that are near one: none touches anything in a ball that is free of obstacles.
+"""Skip obstacle contact for drones that are provably clear.
 
-The distance from the nearest obstacle changes by no more than the way that a drone moves. So one distance for every
-control step tells in all its physics steps which drones cannot touch anything, exactly and at whatever speed.
+The distance from the nearest obstacle is 1-Lipschitz in the position. One distance query a control step therefore gives
+a free ball around each drone, and contact is exact without any computation for as long as the drone stays in its ball.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from jaxdrones.state import State
 from jaxdrones.vector import dot, safe_sqrt
 from jaxdrones.wrench import Wrench
 
-_ROUNDING = 1e-3  # m: what may be touched reaches a little farther than what is touched
+_ROUNDING = 1e-3  # m: margin of the search beyond contact
 _ONE_IN = 32  # worlds
-_CLEAR = 0.2  # of the thickness of a drone: the part that no obstacle enters; the rest yields in compliant contact
+_CLEAR = 0.2  # of the thickness of a drone: the core that no obstacle enters; the rest yields in compliant contact
 
 
 class FreeBalls(NamedTuple):
-    """A ball about every drone of a team in which there is no obstacle."""
+    """Obstacle-free ball around every drone of a team."""
 
     center: Float[Array, "n 3"]
     """m, world."""
@@ -39,12 +39,12 @@ class FreeBalls(NamedTuple):
 
     @classmethod
     def about(cls, state: State, scene: Scene) -> FreeBalls:
-        """The largest balls about the drones."""
+        """Largest free balls around the drones."""
         pos, scene = jax.lax.stop_gradient((state.pos, scene.replace(ground=False)))
         return cls(pos, jax.vmap(scene.distance)(pos))
 
     def hold(self, params: Params, state: State) -> Bool[Array, " n"]:
-        """Whether all of each drone is in its ball."""
+        """Whether each drone is entirely inside its ball."""
 
         def is_inside(center: Array, radius: Array, params: Params, state: State) -> Array:
             moved = state.pos - center
@@ -54,23 +54,23 @@ class FreeBalls(NamedTuple):
 
 
 class NearObstacles:
-    """Contact with obstacles in the physics steps of a control step, for drones that leave their free balls.
+    """Obstacle contact in the physics steps of a control step, for drones outside their free balls.
 
-    Of many worlds, only those are computed in which a drone is not in its ball.
+    Under `vmap`, only worlds with a drone outside its ball are computed.
     """
 
     def __init__(self, contacts: Sequence[Callable], state: State, scene: Scene):
         """Find the free balls.
 
         Args:
-            contacts: effects that declare contact with obstacles, such as `obstacle_contact`.
+            contacts: effects with declared obstacle contact, such as `obstacle_contact`.
             state: of the team at the start of the control step.
             scene: obstacles.
         """
         self._contacts, self._scene, self._free = contacts, scene, FreeBalls.about(state, scene)
 
     def contact(self, params: Params, state: State) -> Wrench:
-        """The wrench of the obstacles on every drone of a team."""
+        """Wrench of the obstacles on every drone of a team."""
 
         def on_all(params: Params, state: State, scene: Scene) -> Wrench:
             first, *others = (jax.vmap(with_scene(f, scene))(params, state) for f in self._contacts)
@@ -80,16 +80,16 @@ class NearObstacles:
         return where_needed(on_all, _ONE_IN)(~jnp.all(self._free.hold(*still)), params, state, self._scene)
 
     def stopped(self, params: Params, before: State, after: State) -> State:
-        """The team at the end of a physics step in which no drone passes through an obstacle, at any speed.
+        """Team at the end of a physics step, with no drone inside or behind an obstacle, at any speed.
 
-        Compliant contact yields, and depends on the start of a step alone. So the path of every step is swept. The
-        planes that stop a drone are constants of the gradient: it is exact for a drone and flat obstacles, leaves out
-        how the normal of a round obstacle turns, and takes obstacles that move for resting ones.
+        Compliant contact yields, and depends on the start of a step alone, so the path of every step is swept. The
+        stopping planes are constants of the gradient: it is exact for flat obstacles, and neglects the curvature of
+        round obstacles and derivatives with respect to the obstacles' poses.
 
         Args:
             params: of a team of n drones.
             before: the team at the start of the step.
-            after: the team at its end, if nothing is in the way.
+            after: the team at the end of an unobstructed step.
         """
 
         def find(params: Params, before: State, after: State, scene: Scene) -> Planes:
@@ -108,6 +108,6 @@ class NearObstacles:
 
 
 def _core(params: Params, state: State) -> Disc:
-    """The part of a drone that no obstacle enters."""
+    """Core of a drone, impenetrable for obstacles."""
     radius, ring = rim(params)
     return Disc.of(state.pos, state.quat, params.collision_offset, ring, _CLEAR * radius)

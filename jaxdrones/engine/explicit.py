@@ -1,4 +1,4 @@
-"""The pure-JAX backend: the derivative of a team, and `step(params, state, rpm) -> state` for one world."""
+"""JAX backend: the derivative of a team, and `step(params, state, rpm) -> state` for one world."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def make_derivative(
     rotors: Rotors = instant_rotors,
     neighbors: NeighborGrid | None = None,
 ) -> Derivative:
-    """Build the law of motion of a team: for linearization, sensors, and integrators of your own.
+    """Build the equations of motion of a team, for linearization, sensors and custom integrators.
 
     Args:
         effects: as for `make_step`.
@@ -55,12 +55,12 @@ def make_derivative(
     Returns:
         `derivative(params, state, command, scene=Scene()) -> State`, pure: params and state of a team of n drones,
         command (n, 4) the commanded rotor speeds, RPM. The rate has the type of the state: `pos` m/s, `quat` 1/s,
-        `vel` m/s^2 (world), `omega` rad/s^2 (body), `rpm` RPM/s, and that of every model in `aux`. What no law moves
-        (a further field of a subclass of `State`, the aux of no model) has the rate zero. Rotors that take their speed
-        at once have it, whatever `state.rpm` is.
+        `vel` m/s^2 (world), `omega` rad/s^2 (body), `rpm` RPM/s, and that of every model in `aux`. Other leaves (extra
+        fields of a subclass of `State`, `aux` without a model) have a zero rate. Rotors without a lag have their
+        commanded speed, whatever `state.rpm` is.
 
     Raises:
-        ValueError: an argument that should be a function, a model or a neighbor grid and is not.
+        ValueError: an argument that is not a function, a model or a neighbor grid.
     """
     of_team = _derivative_of(Physics(effects, pairs, team_effects, models, rotors, neighbors))
 
@@ -109,31 +109,29 @@ def make_step(
     """Build the step of a world.
 
     Args:
-        effects: wrenches on a drone by itself, `(params, state) -> Wrench`: `drag`, `ground_effect`, your own. One
-            with a parameter named `scene` is given the scene: `obstacle_contact`, `ground_contact`.
-        pairs: wrenches on a drone because of another, `(params, state, other, other_state) -> Wrench`: `downwash`.
+        effects: wrenches on one drone, `(params, state) -> Wrench`, such as `drag` and `ground_effect`. A parameter
+            named `scene` receives the scene, as in `obstacle_contact` and `ground_contact`.
+        pairs: wrenches on a drone by another one, `(params, state, other, other_state) -> Wrench`, such as `downwash`.
         rotors: `instant_rotors`, `lagging_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
         integrator: `semi_implicit_euler`, `euler`, `rk4` or `implicit_midpoint`.
         dt: physics step, s.
         substeps: physics steps per call, with the command held.
-        team_effects: wrenches on all drones of the team, `(params, state) -> Wrench` with force and torque (n, 3):
-            cables between chosen drones.
-        models: differential equations that are integrated along, such as a battery; their states are in `state.aux`.
-        neighbors: limits pairs to drones near each other, which is faster from some 700 drones on.
-        scene: what stands around; effects that take it honor it. It can be another one at every call.
+        team_effects: wrenches on all drones of the team, `(params, state) -> Wrench` with force and torque (n, 3), such
+            as cables between drones.
+        models: additional differential equations, such as a battery; their states are in `state.aux`.
+        neighbors: limits pairs to nearby drones, which is faster from about 700 drones on.
+        scene: default scene of effects with a `scene` parameter. A call can override it.
 
     Returns:
         `step(params, state, rpm) -> state`, pure and compiled: params and state of a team of n drones,
-        rpm (n, 4) the commanded rotor speeds. The rotors limit them to [0, `params.max_rpm`], and so the speeds that
-        a state starts with. There is no floor: drones fall through z = 0 unless `ground_contact` is among the
-        effects, and pass through each other unless `drone_contact` is among the pairs. It raises `ValueError` on a
-        wrong shape, and where it is called with values, on constants that do not fly and on quaternions that are no
-        attitude.
+        rpm (n, 4) the commanded rotor speeds. Rotor speeds are limited to [0, `params.max_rpm`]. There is no floor:
+        drones fall through z = 0 without `ground_contact` in `effects`, and pass through each other without
+        `drone_contact` in `pairs`. The step raises `ValueError` on a wrong shape, and with concrete arguments on
+        constants that cannot fly and on quaternions that are not of unit length.
 
     Raises:
-        ValueError: `dt` or `substeps` not positive, an argument that should be a function or a model and is not, a
-            scene with obstacles and no effect that takes it, or contact with `dt` above 1/240 s, with which it would
-            gain energy.
+        ValueError: `dt` or `substeps` not positive, an argument that is not a function or a model, a scene with
+            obstacles without an effect that uses it, or contact with `dt` above 1/240 s, where it is unstable.
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)
@@ -150,7 +148,7 @@ def make_step(
 
 
 class ExplicitStep(Step):
-    """A compiled step that looks at what it is given, where that has values: once at constants and at a start."""
+    """Compiled step that validates new concrete inputs once."""
 
     def __init__(self, physics: Physics, integrator: Integrator, dt: float, substeps: int, scene: Scene):
         self.physics, self._scene, self.dt, self.substeps = physics, scene, dt, substeps
@@ -193,14 +191,14 @@ class ExplicitStep(Step):
         return state
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """The derivative that is integrated, once rotors without a lag have their speed; see `make_derivative`."""
+        """Time derivative of the state, with rotors without a lag at their commanded speed; see `make_derivative`."""
         return self._rate(params, state, rpm, self._given(scene))
 
     def __repr__(self) -> str:
         return f"<step: {self._text}>"
 
     def _given(self, scene: Scene | None) -> Scene:
-        """What effects depend on of the scene of a call."""
+        """Part of the scene of a call that effects depend on."""
         if scene is None:
             scene = self._scene
         else:

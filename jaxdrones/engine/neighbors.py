@@ -1,4 +1,4 @@
-"""Who is near whom in a large team: a grid of cells as wide as the cutoff of what drones do to each other."""
+"""Neighbor search in a large team by a grid of cells as wide as the interaction cutoff."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxdrones.checks import check_positive, check_whole
 
-_FARTHEST = 16_000  # cells from the middle of the team; who is further counts as there
+_FARTHEST = 16_000  # cells from the middle of the team; drones farther out are clamped
 _ROW = 2 * _FARTHEST + 3  # cells, one beyond either end
 
 
 @dataclasses.dataclass(frozen=True)
 class NeighborGrid:
-    """Pair effects between drones that are near each other in the horizontal plane, and no others."""
+    """Restrict pair effects to drones within a horizontal cutoff."""
 
     cutoff: float
-    """m; what is further apart does nothing to each other."""
+    """m; pairs farther apart do not interact."""
     capacity: int = 24
-    """Drones in three neighbouring cells, each `cutoff` wide; if there are more, all pairs of the team are tried."""
+    """Drones in three neighboring cells, each `cutoff` wide; with more, all pairs of the team are computed."""
 
     def __post_init__(self):
         check_positive("cutoff", self.cutoff, "m")
         check_whole("capacity", self.capacity)
 
     def near(self, pos: Float[Array, "n 3"]) -> tuple[Int[Array, "k n"], Bool[Array, "k n"], Bool[Array, ""]]:
-        """Indices of all that may be within cutoff of each drone, which of them are meant, and whether all are there.
+        """Indices of candidates within the cutoff of each drone, their mask, and whether the list is complete.
 
-        Drones are sorted row by row of the grid, so that those in three neighbouring cells of a row follow one another.
+        Drones are sorted by rows of the grid, so those in three neighboring cells of a row are contiguous.
         """
         middle = jnp.mean(pos[:, :2], axis=0, keepdims=True)
         column, row = jnp.clip(jnp.floor((pos[:, :2] - middle) / self.cutoff), -_FARTHEST, _FARTHEST).astype(int).T

@@ -1,4 +1,4 @@
-"""What acts on a team: the same sum of wrenches and the same models for every backend."""
+"""Sum of wrenches and models of a team, shared by the backends."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _ARGUMENTS = {
     "integrator": ("derivative", "state", "dt"),
 }
 _ELSEWHERE = {
-    "effects": "; what depends on another drone belongs to pairs, what depends on the team to team_effects",
-    "pairs": "; what depends on one drone alone belongs to effects",
+    "effects": "; wrenches by another drone belong to pairs, wrenches on the team to team_effects",
+    "pairs": "; wrenches on one drone alone belong to effects",
 }
 
 
 class Loads(NamedTuple):
-    """What acts on a team at an instant; every array has the leading drone axis."""
+    """Wrenches and rates of a team at an instant; every array has a leading drone axis."""
 
     state: State
     """With the rotor speeds of this instant."""
@@ -53,11 +53,10 @@ class Loads(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Physics:
-    """Effects, models and rotors of a team, as both `make_step` take them.
+    """Effects, models and rotors of a team, shared by both `make_step`.
 
     Raises:
-        ValueError: a sequence that holds something else than functions, two models of one name, or a neighbor grid
-            that is none.
+        ValueError: an entry that is not a function, two models of one name, or an invalid neighbor grid.
     """
 
     effects: Sequence[Effect] = ()
@@ -96,11 +95,11 @@ class Physics:
         return any(takes_scene(effect) and not needs_of(effect).ground_only for effect in self.effects)
 
     def seen(self, scene: Scene) -> Scene:
-        """The part of a scene on which effects depend."""
+        """Part of a scene that effects depend on."""
         return scene if self.takes_scene else Scene(ground=scene.ground)
 
     def contacts(self, *touched: str) -> list[Callable]:
-        """The effects and pairs that are contact with something: `ground`, `obstacles`, `drones`."""
+        """Effects and pairs with declared contact with the `ground`, `obstacles` or `drones`."""
         return [f for f in (*self.effects, *self.pairs) if needs_of(f).contact in touched]
 
     def touches(self, scene: Scene) -> bool:
@@ -108,7 +107,7 @@ class Physics:
         return scene.has_obstacles and bool(self.contacts("obstacles"))
 
     def init(self, params: Params, state: State) -> State:
-        """The state of a team with the states of its models, which start anew unless they are there."""
+        """State of a team, with missing model states initialized."""
         fresh = {model.name: model.start(params) for model in self.models if model.name not in state.aux}
         return state.replace(aux=state.aux | fresh)
 
@@ -120,10 +119,10 @@ class Physics:
         scene: Scene,
         contact: Contact | None = None,
     ) -> Loads:
-        """Rotor speeds and everything that acts on a team; arguments are those of `wrench` and the commanded speeds.
+        """Rotor speeds, wrenches and rates of a team; arguments are those of `wrench` and the commanded speeds.
 
         Raises:
-            ValueError: the state lacks that of a model, or a function returns something of another type.
+            ValueError: a missing model state, or a function with a result of another type.
         """
         rpm, rpm_rate = self.rotor_speed(params, state, command)
         state = state.replace(rpm=rpm)
@@ -137,7 +136,7 @@ class Physics:
         """Rotor speeds of a team and their rates, RPM and RPM/s.
 
         Raises:
-            ValueError: the state lacks that of a model.
+            ValueError: a missing model state.
         """
         for model in self.models:
             if model.name not in state.aux:
@@ -147,18 +146,18 @@ class Physics:
         return jax.vmap(self.rotors)(params, state, command)
 
     def at_speed(self, params: Params, state: State, command: Float[Array, "n 4"]) -> State:
-        """The state of a team after rotors without a lag have taken the speed of a command."""
+        """State of a team with rotors without a lag at their commanded speed."""
         speed, _ = self.rotor_speed(params, state, command)
         return state if speed is state.rpm else jax.vmap(with_rotor_speed)(params, state, speed)
 
     def wrench(self, params: Params, state: State, scene: Scene, contact: Contact | None = None) -> Wrench:
-        """The sum of the rotors' aerodynamic wrench and of all effects, one row per drone.
+        """Sum of the rotors' aerodynamic wrench and of all effects, one row per drone.
 
         Args:
             params: of a team of n drones.
             state: of the team.
             scene: obstacles and ground.
-            contact: the contact of the team with obstacles, if it is computed in a faster way.
+            contact: optional faster implementation of the team's contact with obstacles.
         """
         contacts = self.contacts("obstacles")
         effects = [effect for effect in self.effects if effect not in contacts]
@@ -179,10 +178,10 @@ class Physics:
 
 
 def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable, ...]:
-    """The functions that an argument of `make_step` holds.
+    """Validated functions of an argument of `make_step`.
 
     Raises:
-        ValueError: it is not a sequence of functions that can be called as they will be.
+        ValueError: not a sequence of functions, or a function with the wrong parameters.
     """
     example = f"jaxdrones.{_EXAMPLE[name]}" if name in _EXAMPLE else "a function (params, state) -> Wrench of the team"
     if callable(functions):

@@ -1,4 +1,4 @@
-"""Many steps in one program."""
+"""Rollouts: many control steps in one program."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ from jaxdrones.state import State
 Advance = Callable[[Params, State, jax.Array], State]
 Control = Callable[[Params, Any, State, jax.Array], tuple[Any, jax.Array]]
 
-_LEG = 1 / 30  # s: a leg for each picture of a screen
+_LEG = 1 / 30  # s: one leg a screen frame
 
 
 def rollout(
@@ -43,19 +43,19 @@ def rollout(
         step: of either backend, `(params, state, rpm) -> state`.
         control: `(params, memory, state, k) -> (memory, rpm)`, rpm (n, 4); k counts control steps.
         params: of the team.
-        state: of the team, at the start; the models of the step that have no state in it start anew.
-        memory: what the controller keeps between calls, any pytree; `None` if nothing.
+        state: initial state of the team; missing model states are initialized.
+        memory: memory of the controller, any pytree; `None` for none.
         length: number of control steps.
-        checkpoint: control steps between those that a backward pass keeps; it flies the others again, and needs memory
-            for `length / checkpoint + checkpoint` steps instead of `length`.
+        checkpoint: control steps between checkpoints of the backward pass. Other steps are recomputed, which reduces
+            memory from `length` to `length / checkpoint + checkpoint` steps.
 
     Returns:
         The final state, and the state after every control step: arrays (length, n, ...).
 
     Raises:
-        ValueError: `length` < 1 or no multiple of `checkpoint`, wrong shapes, a controller that answers something
-            else, or numbers that do not fly (where they can be looked at): not finite, a mass that is not positive, a
-            quaternion that is not of unit length.
+        ValueError: `length` < 1 or not a multiple of `checkpoint`, wrong shapes, a controller with another result, or
+            concrete values that cannot fly: not finite, a mass that is not positive, a quaternion that is not of unit
+            length.
     """
     check_whole("length", length)
     check_callable("control", control, "lambda params, memory, state, k: (memory, rpm)")
@@ -86,17 +86,17 @@ def rollout(
 
 
 def leg_length(dt: float) -> int:
-    """Control steps of `dt` seconds in a leg of about a thirtieth of a second; at least one."""
+    """Number of control steps of `dt` seconds in a leg of about 1/30 s; at least one."""
     return max(1, round(_LEG / dt))
 
 
 def legs(
     step: Step, control: Control, params: Params, state: State, memory: Any, length: int, leg: int
 ) -> Iterator[State]:
-    """Fly `length` control steps as `rollout` does, `leg` of them at a time; the last leg may be shorter.
+    """Fly `length` control steps as `rollout` does, in legs of `leg` steps; the last leg may be shorter.
 
     Yields:
-        The state after every control step of a leg: arrays (leg, n, ...) on the host.
+        State after every control step of a leg: arrays (leg, n, ...) on the host.
     """
     carry = memory, step.init(params, state)
     if isinstance(step, HostStep):  # is faster called than called back
@@ -127,7 +127,7 @@ def _advance(
 
 
 def _commanded(control: Control, params: Params, memory: Any, state: State, k: Any) -> tuple[Any, jax.Array]:
-    """What a controller answers, or an error if that is something else than memory and rotor speeds."""
+    """Validated memory and rotor speeds of a controller."""
     answer = control(params, memory, state, k)
     if not (isinstance(answer, tuple | list) and len(answer) == 2):
         given = (

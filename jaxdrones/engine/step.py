@@ -1,4 +1,4 @@
-"""The step of a world, whatever integrates it."""
+"""Interfaces of steps."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from jaxdrones.state import State
 
 
 class Step(abc.ABC):
-    """`step(params, state, rpm) -> state` of a team, and the derivative that it integrates."""
+    """`step(params, state, rpm) -> state` of a team, and its derivative."""
 
     physics: Physics
     integrator: str
-    """Name of what integrates."""
+    """Name of the integrator."""
     dt: float
     """Physics step, s."""
     substeps: int
@@ -33,7 +33,7 @@ class Step(abc.ABC):
             params: constants of the team.
             state: of the team.
             rpm: (n, 4) commanded rotor speeds, RPM.
-            scene: what stands around in this episode; that of `make_step` when left out.
+            scene: scene of this call; by default that of `make_step`.
         """
 
     @abc.abstractmethod
@@ -44,25 +44,25 @@ class Step(abc.ABC):
         """
 
     def init(self, params: Params, state: State) -> State:
-        """The state with the states of this step's models, which start anew unless they are there."""
+        """State with missing model states initialized."""
         return self.physics.init(params, state)
 
 
 class HostStep(Step):
-    """A step that leaves JAX.
+    """Step that runs outside of JAX.
 
-    Compiled code reaches it through a callback; a rollout that is not itself compiled loops over it in Python.
+    Compiled code calls it through a callback; an uncompiled rollout loops over it in Python.
     """
 
     @abc.abstractmethod
     def camera(self, params: Params, state: State, camera: Camera, scene: Scene | None = None) -> Images:
-        """What the camera on every drone of a team sees."""
+        """Images of the camera of every drone of a team."""
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Give back what the step holds; it cannot be called any more then."""
+        """Release the resources of the step."""
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether some array of a pytree is being traced, so that it has no value yet."""
+    """Whether any array of a pytree is traced."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))

@@ -1,4 +1,4 @@
-"""What every backend demands of a team, and pytrees of a team as one array."""
+"""Validation of teams, and packing of their pytrees into one array."""
 
 import dataclasses
 import math
@@ -32,7 +32,7 @@ _CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name !
 
 
 def check_command(params: Params, state: State, rpm: ArrayLike) -> Float[Array, "n 4"]:
-    """The commanded rotor speeds as numbers of the state's precision.
+    """Validated commanded rotor speeds in the precision of the state.
 
     Raises:
         ValueError: the arrays are not those of one team of n drones.
@@ -70,14 +70,14 @@ def _check_aux(name: str, aux: Any, n: int) -> None:
 
 
 def check_values(params: Params, state: State) -> None:
-    """Raise `ValueError` where values, not shapes, make no flight, and can be looked at: constants and attitudes."""
+    """Raise `ValueError` for concrete constants and attitudes with values that cannot fly."""
     check_params(params, finite=False)
     check_arrays("state", state)
     check_quaternion("state.quat", state.quat)
 
 
 class Layout(NamedTuple):
-    """How a pytree of arrays (n, ...) is laid out as the columns of one array; hashable."""
+    """Column layout of a pytree of arrays (n, ...) in one array; hashable."""
 
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
@@ -85,7 +85,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, tree: Any) -> "Layout":
-        """The layout of a pytree."""
+        """Layout of a pytree."""
         leaves, structure = jax.tree.flatten(tree)
         return cls(structure, tuple(jnp.shape(leaf)[1:] for leaf in leaves))
 
@@ -95,7 +95,7 @@ class Layout(NamedTuple):
         return sum(map(math.prod, self.shapes))
 
     def unpack(self, flat: Any) -> Any:
-        """The pytree that `pack` made an array (n, k) of; the array may be one of NumPy."""
+        """Pytree of a packed array (n, k) of JAX or NumPy; the inverse of `pack`."""
         leaves, start = [], 0
         for shape in self.shapes:
             end = start + math.prod(shape)
@@ -105,6 +105,6 @@ class Layout(NamedTuple):
 
 
 def pack(tree: Any, n: int) -> Float[Array, "n k"]:
-    """All numbers of a pytree of arrays (n, ...) as one array, a row per drone."""
+    """Pack a pytree of arrays (n, ...) into one array, a row per drone."""
     leaves = [jnp.reshape(leaf, (n, -1)) for leaf in jax.tree.leaves(tree)]
     return jnp.concatenate([jnp.zeros((n, 0)), *leaves], axis=-1)

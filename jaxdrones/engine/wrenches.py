@@ -1,4 +1,4 @@
-"""Wrenches between the drones of a team, and what a function that computes wrenches must return."""
+"""Wrenches between drones, and validation of functions that compute wrenches."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ from jaxdrones.vector import components
 from jaxdrones.wrench import Wrench
 
 Effect = Callable[[Params, State], Wrench] | Callable[[Params, State, Scene], Wrench]
-"""`(params, state)` of one drone -> wrench on it; a parameter named `scene` is given the scene."""
+"""`(params, state)` of one drone -> wrench on it; a parameter named `scene` receives the scene."""
 Pair = Callable[[Params, State, Params, State], Wrench]
 """`(params, state, other, other_state)` of two drones -> wrench on the first."""
 TeamEffect = Callable[[Params, State], Wrench]
@@ -30,7 +30,7 @@ _SHORT = 32  # terms
 
 
 def describe(functions: Sequence[Callable]) -> str:
-    """Names of functions, for people."""
+    """Names of functions for messages."""
     return ", ".join(_name(function) for function in functions) or "none"
 
 
@@ -41,16 +41,16 @@ def _name(function: Callable) -> str:
 
 
 def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | None = None) -> Wrench:
-    """The wrench that a function returned.
+    """Validated wrench of a function.
 
     Args:
-        name: of the argument of `make_step` that the function was given in.
-        function: that returned it.
-        wrench: what it returned.
+        name: argument of `make_step` with the function.
+        function: its function.
+        wrench: result of the function.
         drones: number of drones of a team; `None` for one drone.
 
     Raises:
-        ValueError: it is no wrench on one drone or on the team.
+        ValueError: the result is not a wrench on one drone or on the team.
     """
     called = f"{name}: {describe([function])}"
     if not isinstance(wrench, Wrench):
@@ -63,14 +63,14 @@ def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | No
 
 
 def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGrid | None) -> Wrench:
-    """The sum of a pair effect over all other drones, or over those within the cutoff, for every drone of a team.
+    """Sum of a pair effect over all other drones, or over those within the cutoff, for every drone of a team.
 
     The wrenches are computed and summed as six components, each (others, drones).
     """
     index = jnp.arange(len(state.pos))
 
     def pair_wrench(j, counts, other, other_state, i, own_params, own_state):
-        # A drone is not its own neighbor. What does not count is moved out of reach before it is masked, so that
+        # A drone is not its own neighbor. Masked drones are moved out of reach first, so that
         # neither value nor gradient of a pair is ever taken at zero distance.
         counts = counts & (i != j)
         if neighbors is not None:
@@ -101,10 +101,10 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
 
 
 def side_by_side(state: State) -> State:
-    """The team with drones that are in exactly the same place a little above each other, in the order of their indices.
+    """Team with coincident drones displaced slightly upward, in the order of their indices.
 
-    Contact could not tell them apart: they would push each other nowhere, and stay. As all pairs see the same places,
-    action stays equal to reaction.
+    The contact normal of coincident drones is undefined. All pairs use the same displaced positions, so action stays
+    equal to reaction.
     """
     x, y, z = state.pos.T
     same = (x[:, None] == x[None]) & (y[:, None] == y[None]) & (z[:, None] == z[None])
@@ -115,5 +115,5 @@ def side_by_side(state: State) -> State:
 
 
 def _sum(x: jax.Array) -> jax.Array:
-    """The sum over the first axis; written out where it is short, like `vector.dot`."""
+    """Sum over the first axis, unrolled where it is short, like `vector.dot`."""
     return cast(jax.Array, sum(components(x))) if len(x) <= _SHORT else jnp.sum(x, axis=0)

@@ -134,9 +134,9 @@ def test_an_effect_that_returns_no_wrench_is_named(effects, pairs, message):
     [
         (
             {"effects": (downwash,)},
-            r"effects: downwash takes .*give a function of \(params, state\); .*belongs to pairs",
+            r"effects: downwash takes .*give a function of \(params, state\); .*belong to pairs",
         ),
-        ({"pairs": (drag,)}, r"pairs: drag takes .*\(params, state, other, other_state\); .*belongs to effects"),
+        ({"pairs": (drag,)}, r"pairs: drag takes .*\(params, state, other, other_state\); .*belong to effects"),
         ({"rotors": drag}, r"rotors: drag takes .*give a function of \(params, state, command\)"),
         ({"integrator": drag}, r"integrator: drag takes .*give a function of \(derivative, state, dt\)"),
     ],

@@ -1,4 +1,4 @@
-"""PyBullet behind the step of the explicit backend: contacts, cameras, a window. Needs the extra `bullet`."""
+"""Bullet backend: contacts, cameras, a window. Needs the extra `bullet`."""
 
 from jaxdrones.engine.bullet.contacts import Contact
 from jaxdrones.engine.bullet.make import make_step

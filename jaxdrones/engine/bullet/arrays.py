@@ -1,4 +1,4 @@
-"""What Bullet's host sees of a team, and what a compiled program computes for it: arrays with a row per drone."""
+"""Arrays exchanged between compiled programs and the Bullet host, one row per drone."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ START_OMEGA, NEXT_RPM, NEXT_AUX = slice(6, 9), slice(9, 13), slice(13, None)
 
 
 def one_array(state: State, rpm: jax.Array) -> jax.Array:
-    """A team as the host sees it."""
+    """Array (n, k) of a team for the host."""
     omega = jax.vmap(rotation.rotate)(state.quat, state.omega)
     body = [state.pos, state.quat, state.vel, omega, state.rpm, rpm]
     return jnp.concatenate([*body, pack(state.aux, len(state.pos))], axis=-1)
 
 
 def bodies_of(params: Params) -> jax.Array:
-    """What Bullet must know of every drone, (n, 20): see `Client.set_team`."""
+    """Bodies of a team for Bullet, (n, 20): see `Client.set_team`."""
     shape = [params.collision_radius, params.collision_height, params.collision_offset, params.prop_radius]
     rotor_pos = jnp.reshape(params.rotor_pos, (-1, 12))
     return jnp.concatenate([jnp.stack(shape, axis=-1), rotor_pos, params.mass[:, None], params.inertia], axis=-1)
 
 
 def make_start(physics: Physics) -> Callable[[Params, State, jax.Array], State]:
-    """Build the function of the state at the start of a physics step, with the rotor speeds that act in it."""
+    """Build the function for the state at the start of a physics step, with its rotor speeds."""
 
     def start(params: Params, state: State, command: jax.Array) -> State:
         return physics.at_speed(params, state.replace(rpm=jax.vmap(limited)(params, state.rpm)), command)
@@ -50,9 +50,10 @@ def make_start(physics: Physics) -> Callable[[Params, State, jax.Array], State]:
 
 
 def make_loads(physics: Physics, dt: float) -> Callable[..., jax.Array]:
-    """Build `loads(layout, aux, flat_params, team, scene)`, compiled: what acts on drones, what follows, (n, 13 + k).
+    """Build the compiled `loads(layout, aux, flat_params, team, scene)`.
 
-    The layouts are those of the parameters and of the states of models, which the arrays were packed by.
+    It returns loads and the next rotor and model states, (n, 13 + k). The layouts are those of packed parameters and
+    model states.
     """
     start = make_start(physics)
 

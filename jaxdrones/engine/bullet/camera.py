@@ -1,4 +1,4 @@
-"""Cameras of Bullet: one on every drone, and a free one for films."""
+"""Bullet cameras: one on every drone, and a free one for films."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the bo
 # TinyRenderer does not return when a vertex lies behind the plane of the eye by less than 1e-8 m, but not by 0. A pose
 # with 1e-17 in place of 0 leads there, so poses are rounded to a micrometre and a microradian.
 _DIGITS = 6
-_AWAY = [0.0, 0.0, -1e4]  # m; where a drone waits while its own camera looks
+_AWAY = [0.0, 0.0, -1e4]  # m; parking place of a drone while its own camera renders
 _AHEAD = 1000.0  # m; how far in front of the eye the camera's target is
-_TINY_PRINCIPAL_POINT = np.array([0.5, -0.5])  # pixels; TinyRenderer looks through the lower left corners of pixels
+_TINY_PRINCIPAL_POINT = np.array([0.5, -0.5])  # pixels; TinyRenderer samples the lower left corners of pixels
 _NOWHERE = -1
 _EYE, _FORWARD, _UP, _NEAR, _INSIDE = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10  # columns of a view
 
 
 @functools.partial(jax.jit, static_argnames="camera")
 def views(params: Params, state: State, scene: Scene, camera: Camera) -> Float[Array, "n 11"]:
-    """How the camera on every drone of a team looks: eye, forward and up (world), `near`, what the eye is inside of.
+    """Camera views of a team: eye, forward and up (world), `near`, and the label of a solid around the eye.
 
-    The last is a label of the segmentation, -1 for nothing. Meshes and URDF files do not count: they may be hollow.
+    The label is that of the segmentation, -1 for none. Meshes and URDF files are ignored, as they may be hollow.
     """
     n, dtype = len(state.pos), state.pos.dtype
 
@@ -53,7 +53,7 @@ def views(params: Params, state: State, scene: Scene, camera: Camera) -> Float[A
 def drone_pictures(
     client: Client, body: np.ndarray, looks: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """RGBA, depth and segmentation that the camera on every drone of a team sees, each (n, height, width, ...).
+    """RGBA, depth and segmentation of the camera of every drone, each (n, height, width, ...).
 
     The team has been placed. An eye inside a solid sees that solid, black, at `near`.
 

@@ -1,4 +1,4 @@
-"""A Bullet world: its connection and its bodies; the only import of pybullet."""
+"""Client of a Bullet world, and the only import of pybullet."""
 
 import contextlib
 import importlib.util
@@ -28,7 +28,7 @@ def import_pybullet() -> ModuleType:
     """Import pybullet without printing its greeting.
 
     Raises:
-        ImportError: it is not installed. The error names the extra and the versions of Python with wheels.
+        ImportError: it is not installed. The message names the extra and the Python versions with wheels.
     """
     if "pybullet" in sys.modules:
         return sys.modules["pybullet"]
@@ -44,7 +44,7 @@ def import_pybullet() -> ModuleType:
 
 
 class Client:
-    """A connection to Bullet, where there are a scene and a team once `set_scene` and `set_team` were called."""
+    """Connection to Bullet; `set_scene` and `set_team` create its bodies."""
 
     def __init__(self, dt: float, damping: float, collision: str, renderer: str, gui: bool):
         check_choice("collision shape", collision, (BALLS, CYLINDER))
@@ -88,12 +88,12 @@ class Client:
         return ground | drones | {body: f"obstacle {i}" for i, body in around.obstacles.items()}
 
     def set_scene(self, scene: Scene) -> None:
-        """Let this scene, of NumPy arrays, stand around."""
+        """Set the scene, of NumPy arrays."""
         if self.surroundings.set(scene):
             self.labels = self._labels()
 
     def set_team(self, team: np.ndarray) -> None:
-        """Give the drones these bodies.
+        """Set the bodies of the drones.
 
         Columns of (n, 20): collision radius, height, offset; propeller radius, rotor positions (12), for the eye;
         mass, principal moments of inertia (3).
@@ -133,10 +133,10 @@ class Client:
         return np.array([self.p.getMatrixFromQuaternion(quat) for quat in quats.tolist()]).reshape(-1, 3, 3)
 
     def place(self, body: np.ndarray) -> None:
-        """Put the drones where (n, 13+) position, attitude, velocity and angular velocity (all world) say.
+        """Set the position, attitude, velocity and angular velocity (n, 13+) of the drones, world.
 
-        Their contact manifolds outlive a change of pose; taking a drone out of the collision world and putting it back
-        forgets them, so that what happens next does not depend on what happened before.
+        Contact manifolds outlive a change of pose. Removing a drone from the collision world and adding it again clears
+        them, so the result does not depend on earlier steps.
         """
         p, client = self.p, self.id
         for drone, row in zip(self.drones, body.tolist(), strict=True):
@@ -147,7 +147,7 @@ class Client:
             p.resetBaseVelocity(drone, row[7:10], row[10:13], client)
 
     def advance(self, body: np.ndarray, loads: np.ndarray) -> np.ndarray:
-        """One physics step from `body` under force and torque (n, 6+), world; the (n, 13) that follows."""
+        """One physics step from `body` under force and torque (n, 6+), world; returns the next (n, 13)."""
         p, client, world = self.p, self.id, self.p.WORLD_FRAME
         self.place(body)
         for drone, pos, load in zip(self.drones, body[:, :3].tolist(), loads.tolist(), strict=True):

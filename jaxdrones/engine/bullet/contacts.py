@@ -1,4 +1,4 @@
-"""Contacts between bodies: which bodies, where, and with what force."""
+"""Contact points and forces between bodies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxdrones.engine.bullet.client import Client
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """One point at which two bodies press on each other."""
+    """One contact point of two bodies."""
 
     body: str
     """`drone i`."""
@@ -26,11 +26,11 @@ class Contact:
     impulse: float
     """Normal impulse of the physics step, N s."""
     depth: float
-    """How deep the bodies are in each other, m; negative where there is a gap, within the collision margin."""
+    """Penetration, m; negative for a gap within the collision margin."""
 
 
 def contacts_of_last_step(client: Client, dt: float) -> list[Contact]:
-    """The contacts of Bullet's last physics step of length dt (s) that carry a force."""
+    """Contacts with a force in Bullet's last physics step of length dt (s)."""
     names, contacts = client.names(), []
     for point in client.p.getContactPoints(physicsClientId=client.id):
         first, second, on_second, normal, distance, force = point[1], point[2], point[6], point[7], point[8], point[9]

@@ -1,4 +1,4 @@
-"""Building a step of Bullet."""
+"""`make_step` of the Bullet backend."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def make_step(
     renderer: str = TINY,
     gui: bool = False,
 ) -> BulletStep:
-    """Build the step of a world in which Bullet integrates and resolves contacts.
+    """Build the step of a world with Bullet as integrator and contact solver.
 
     Args:
         effects: as for the explicit backend, but for `ground_contact` and `obstacle_contact`.
@@ -47,21 +47,21 @@ def make_step(
         team_effects: as for the explicit backend.
         models: as for the explicit backend; their states take explicit Euler steps of `dt`, as rotors do.
         neighbors: as for the explicit backend.
-        scene: ground and obstacles; a bare ground plane when left out. It can be another one at every call.
+        scene: ground and obstacles, by default a ground plane. A call can override it.
         damping: Bullet's linear and angular damping, 1/s; that of gym-pybullet-drones is 0.04.
-        collision: `balls`, a ring of balls on a disc, which rests and rebounds stably, or `cylinder`, the shape in
+        collision: `balls`, a ring of balls on a disc, stable at rest and in rebounds, or `cylinder`, the shape in
             gym-pybullet-drones.
         renderer: of the cameras: `tiny`, on the CPU, or `egl`, on a GPU.
-        gui: open a window, in which the cameras render too.
+        gui: open a window; the cameras then render in it, too.
 
     Returns:
-        `step(params, state, rpm) -> state`, a context manager that closes the connection. The rotors limit the
-        commanded speeds to [0, `params.max_rpm`].
+        `step(params, state, rpm) -> state`, a context manager that closes the connection. Rotor speeds are limited to
+        [0, `params.max_rpm`].
 
     Raises:
         ValueError: an argument out of range, or contact as an effect: Bullet resolves it already.
         ImportError: pybullet is not installed.
-        OSError: a window is asked for and there is no display.
+        OSError: `gui` without a display.
     """
     check_positive("dt", dt, "s")
     check_whole("substeps", substeps)

@@ -1,4 +1,4 @@
-"""Bullet's words for the kinds of obstacles."""
+"""Bullet collision shapes of the kinds of obstacles."""
 
 from types import ModuleType
 from typing import Any
@@ -9,7 +9,7 @@ from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
 
 def shape_of(p: ModuleType, obstacle: Any) -> dict[str, Any]:
-    """Arguments of `createCollisionShape` for a single obstacle with values.
+    """Arguments of `createCollisionShape` for a single concrete obstacle.
 
     Raises:
         ValueError: Bullet has no such shape.

@@ -1,4 +1,4 @@
-"""The pure step: place the bodies, apply the wrenches, let Bullet step, read back."""
+"""Pure step of the Bullet backend: place the bodies, apply the wrenches, step Bullet, read back."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FILM_CAMERA = Camera(resolution=(640, 480), near=0.1)
 
 
 class BulletStep(HostStep):
-    """`step(params, state, rpm) -> state`. The same input gives the same output whatever was called between."""
+    """`step(params, state, rpm) -> state`; the output depends on the arguments alone."""
 
     integrator = "Bullet"
 
@@ -63,18 +63,18 @@ class BulletStep(HostStep):
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """Advance a team by one control step; arrays as for the explicit backend.
 
-        Given values it returns NumPy arrays; under `jit` and `vmap` it goes through a callback.
+        With concrete arguments it returns NumPy arrays; under `jit` and `vmap` it goes through a callback.
 
         Raises:
-            ValueError: a wrong shape, a closed client, or a number that is not finite (where it can be looked at).
-            TypeError: a gradient is asked for.
+            ValueError: a wrong shape, a closed client, or concrete numbers that are not finite.
+            TypeError: under `jax.grad`.
         """
         return self._flown(params, state, rpm, scene, self.substeps)
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """The mean time derivative over the physics step that follows `state`, contacts included.
+        """Mean time derivative over the next physics step, contacts included.
 
-        Rotors without a lag have their speed at the start of the step, so that their rate is zero.
+        Rotors without a lag have their commanded speed at the start of the step, so their rate is zero.
         """
         after = self._flown(params, state, rpm, scene, substeps=1)
         state = self._at_speed(params, state, jnp.asarray(rpm))
@@ -99,7 +99,7 @@ class BulletStep(HostStep):
         return self._unpack(team, state)
 
     def contacts(self, params: Params, state: State, scene: Scene | None = None) -> list[Contact]:
-        """Who touches whom in the physics step that follows `state` with the rotors held at `state.rpm`.
+        """Contacts in the next physics step, with the rotors held at `state.rpm`.
 
         Raises:
             ValueError: a wrong shape, a closed client, or a state that is not finite.
@@ -114,12 +114,12 @@ class BulletStep(HostStep):
     def camera(
         self, params: Params, state: State, camera: Camera = _DEFAULT_CAMERA, scene: Scene | None = None
     ) -> Images:
-        """What the camera on every drone of a team sees, as `jaxdrones.render` returns it; Bullet renders it.
+        """Images of the camera of every drone, in the format of `jaxdrones.render`, rendered by Bullet.
 
-        An eye inside an obstacle or underground sees that, black, at `near`.
+        A camera inside an obstacle or underground sees it in black at `near`.
 
         Raises:
-            ValueError: a wrong shape, a closed client, a state that is not finite, or something else than a camera.
+            ValueError: a wrong shape, a closed client, a state that is not finite, or an invalid camera.
         """
         check_camera(camera)
         scene = self._given(scene)
@@ -142,23 +142,23 @@ class BulletStep(HostStep):
         camera: Camera = _FILM_CAMERA,
         scene: Scene | None = None,
     ) -> np.ndarray:
-        """A picture of the team from `eye` towards `target` (3,) (m, world), upright: RGB (height, width, 3) uint8.
+        """Upright picture of the team from `eye` towards `target` (3,), m, world: RGB (height, width, 3) uint8.
 
-        Of the camera the lens matters, not where it is mounted.
+        Only the lens of the camera is used, not its mounting.
         """
         self._set_scene(self._given(scene))
         self._place(params, state)
         return photo(self.client, eye, target, camera)
 
     def _given(self, scene: Scene | None) -> Scene:
-        """The scene of a call, that of `make_step` where none is given."""
+        """Scene of a call; by default that of `make_step`."""
         if scene is None:
             return self._scene
         check_scene(scene, files=True)
         return scene
 
     def _set_scene(self, scene: Scene) -> Scene:
-        """Let a scene with values stand around; returns what wrenches depend on of it."""
+        """Place the bodies of a concrete scene; return the part of it that wrenches depend on."""
         self.client.check_open()
         self.client.set_scene(scene if scene is self._scene else jax.device_get(scene))
         return self._acting(scene)
@@ -176,7 +176,7 @@ class BulletStep(HostStep):
         return np.asarray(self._loads(self._layout, aux, self._flat_params, team, scene))
 
     def _pack(self, params: Params, state: State, rpm: ArrayLike) -> np.ndarray:
-        """Check a call with values and make one array of it; the bodies are those of the team from here on."""
+        """Validate a call with concrete arguments, set the team's bodies, and pack the call into one array."""
         self.client.check_open()
         n = len(state.pos)
         shapes = [np.shape(x) for x in (*jax.tree.leaves(state), rpm)]
@@ -200,14 +200,14 @@ class BulletStep(HostStep):
         return team
 
     def _unpack(self, team: np.ndarray, state: State) -> State:
-        """The state with the numbers of a team, as arrays of NumPy."""
+        """State of a team from its packed array, as NumPy arrays."""
         team[:, arrays.OMEGA] = (team[:, None, arrays.OMEGA] @ self.client.matrices(team[:, arrays.QUAT]))[:, 0]
         team = team.astype(self._flat_params.dtype)
         fields: dict[str, Any] = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
         return state.replace(**fields, aux=Layout.of(state.aux).unpack(team[:, arrays.AUX]))
 
     def _traced(self, substeps: int, params: Params, state: State, rpm: jax.Array, scene: Scene) -> State:
-        """The same in a compiled program, which computes the wrenches itself and calls back for every physics step."""
+        """Step in a compiled program, which computes the wrenches and calls back for every physics step."""
         bodies, flat_params = arrays.bodies_of(params), pack(params, len(state.pos))
         layout, aux = Layout.of(params), Layout.of(state.aux)
         team, acting, handed = arrays.one_array(state, rpm), self._acting(scene), self._handed(scene)
@@ -231,7 +231,7 @@ class BulletStep(HostStep):
         return state.replace(omega=jax.vmap(rotation.rotate_inverse)(state.quat, state.omega))
 
     def _traced_camera(self, params: Params, state: State, camera: Camera, scene: Scene) -> Images:
-        """The same in a compiled program; the callback itself computes nothing with JAX, which would be slow."""
+        """Camera images in a compiled program; the callback itself avoids JAX, which would be slow."""
         n, size = len(state.pos), camera.resolution[::-1]
         kinds = (((*size, 4), np.uint8), (size, state.pos.dtype), (size, np.int32))
         pictures = tuple(jax.ShapeDtypeStruct((n, *shape), dtype) for shape, dtype in kinds)
@@ -249,11 +249,11 @@ class BulletStep(HostStep):
         return Images(*jax.pure_callback(take, pictures, *given, looks, vmap_method="sequential"))
 
     def _handed(self, scene: Scene) -> Scene | None:
-        """What a compiled program hands over of a scene; nothing of that of `make_step`."""
+        """Scene as an argument of the callback; `None` for that of `make_step`."""
         return None if scene is self._scene else scene
 
     def _sync_world(self, bodies: jax.Array, scene: Scene | None) -> None:
-        """The world that a compiled program calls back with; its team is no longer that of a call with values."""
+        """Set bodies and scene of a callback, and invalidate the cached team of concrete calls."""
         self.client.check_open()
         self._params = None
         self.client.set_scene(self._scene if scene is None else jax.tree.map(np.asarray, scene))
@@ -261,7 +261,7 @@ class BulletStep(HostStep):
 
 
 def _refuse_gradients(function: Callable) -> Callable:
-    """The same function, with an error that says what to do where a gradient is asked for."""
+    """Wrap a function to raise a helpful error under differentiation."""
     function = jax.custom_jvp(function)
 
     @function.defjvp

@@ -1,4 +1,4 @@
-"""Ground and obstacles in a Bullet world, which change with the scene."""
+"""Ground and obstacles in a Bullet world."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _GROUND_FRICTION = 1.0  # as in gym-pybullet-drones (2021)
 
 
 class _Placed(NamedTuple):
-    """An obstacle in Bullet's world."""
+    """Obstacle in Bullet's world."""
 
     shape: Any
-    """Everything but the pose; where that is equal, a body can be moved."""
+    """Everything but the pose; a body with an equal entry is reused."""
     pose: tuple[list[float], list[float]]
     """Position (3,), m, and attitude (4,)."""
 
 
 class Surroundings:
-    """The bodies that do not move by themselves."""
+    """Static bodies of a scene."""
 
     def __init__(self, p: ModuleType, client: int):
         self.p, self.id = p, client
@@ -42,9 +42,9 @@ class Surroundings:
         self._numbers = np.zeros(0)
 
     def set(self, scene: Scene) -> bool:
-        """Let a scene of NumPy arrays stand here; returns whether anything changed.
+        """Set the scene, of NumPy arrays; return whether anything changed.
 
-        Obstacles of the same shape are moved, others are built anew.
+        Obstacles of the same shape are moved, others are created.
         """
         if scene is self._scene:
             return False
@@ -69,7 +69,7 @@ class Surroundings:
         return True
 
     def _register(self, body: int) -> None:
-        """Let Bullet meet a body anew: contacts are resolved in the order in which it met the bodies."""
+        """Register a body again: Bullet resolves contacts in the order of registration."""
         self.p.setCollisionFilterGroupMask(body, -1, 0, 0, self.id)
         self.p.setCollisionFilterGroupMask(body, -1, _STATIC, ~_STATIC, self.id)
 
@@ -104,14 +104,14 @@ class Surroundings:
         shape = shape_of(p, obstacle)
         collision = p.createCollisionShape(**shape, physicsClientId=self.id)
         if "height" in shape:
-            shape["length"] = shape.pop("height")  # Bullet has two words for it
+            shape["length"] = shape.pop("height")  # Bullet has two names for it
         visual = p.createVisualShape(**shape, rgbaColor=obstacle.color, physicsClientId=self.id)
         return p.createMultiBody(0, collision, visual, pos, quat, physicsClientId=self.id)
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Keep what Bullet's C code prints off stdout, where a caller may be writing JSON, and off stderr."""
+    """Silence the output of Bullet's C code on stdout, where a caller may be writing JSON, and on stderr."""
     sys.stdout.flush()
     sys.stderr.flush()
     with open(os.devnull, "w") as nowhere:

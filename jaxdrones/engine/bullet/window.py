@@ -1,4 +1,4 @@
-"""Bullet's window: real time, body axes, and sliders that take over the motors."""
+"""Bullet's window: real time, body axes, and sliders for the motors."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene
 from jaxdrones.state import State
 
-_AXES_HZ = 24  # how often the body axes are drawn, per simulated second
+_AXES_HZ = 24  # drawings of the body axes per simulated second
 _COLORS = np.eye(3).tolist()  # of the body axes: x red, y green, z blue
 
 
 class Window(HostStep):
-    """A Bullet step with a window: it runs no faster than real time, and has sliders for the motors."""
+    """Bullet step with a window, in real time, with sliders for the motors."""
 
     def __init__(self, step: BulletStep, params: Params, control_dt: float):
         self._step, self._dt, self._count = step, control_dt, 0
@@ -35,7 +35,7 @@ class Window(HostStep):
         self._start = time.monotonic()
 
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """Advance a team, then wait until as much real time has passed as simulated time."""
+        """Advance a team, then wait for real time."""
         p, client = self._step.client.p, self._step.client.id
         if p.readUserDebugParameter(self._button, physicsClientId=client) % 2:
             sliders = [p.readUserDebugParameter(slider, physicsClientId=client) for slider in self._sliders]
@@ -52,7 +52,7 @@ class Window(HostStep):
         return self._step.rate(params, state, rpm, scene)
 
     def camera(self, params: Params, state: State, camera: Camera, scene: Scene | None = None) -> Images:
-        """What the camera on every drone sees, as of the Bullet step."""
+        """Images of the camera of every drone, as of the Bullet step."""
         return self._step.camera(params, state, camera, scene)
 
     def close(self) -> None:

@@ -2,7 +2,7 @@
 
 Each module has `gains()`, `init()` and `control(gains, params, memory, state, setpoint, dt=...) -> (memory, rpm)`, all
 for one drone; `velocity.control` takes an action instead of the setpoint. For a team use `jax.vmap` of `control`, with
-the memory `for_team(init(), n)`. `CONTROLLERS` lists the controllers by the names that the command line uses.
+the memory `for_team(init(), n)`. `CONTROLLERS` maps command line names to controllers.
 """
 
 from jaxdrones.control import (

@@ -1,4 +1,4 @@
-"""Control allocation: rotor speeds from thrust and torque, by the geometry of the rotors."""
+"""Control allocation: rotor speeds from thrust and torque, given the geometry of the rotors."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.vector import safe_sqrt
 
-_MIN_SHARE = 0.01  # smallest share of a rotor in thrust or yaw that counts; usually each rotor has 0.25
+_MIN_SHARE = 0.01  # smallest significant share of a rotor in thrust or yaw; usually each rotor has 0.25
 _ACTIVE_SETS = np.array([[i >> k & 1 for k in range(4)] for i in range(16)], bool)  # rotors whose speed is not zero
 
 
@@ -20,7 +20,7 @@ def mixer(params: Params) -> Float[Array, "4 3"]:
 
 
 def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
-    """Rotor speeds in [0, `max_rpm`] that produce a thrust (N, body z) and a torque (N m, body) as closely as possible.
+    """Rotor speeds in [0, `max_rpm`] for a thrust (N, body z) and a torque (N m, body), as close as possible.
 
     A feasible demand is produced exactly. Otherwise yaw torque is reduced first, until no rotor would turn backwards or
     faster than `max_rpm`. Then thrust is reduced if it is too high, and roll and pitch torque keep their direction (the
@@ -49,7 +49,7 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
 
 
 def _square_of_limit(params: Params) -> Float[Array, ""]:
-    """The square of `max_rpm`, RPM^2; it is infinite, with a zero gradient, if `max_rpm` is infinite."""
+    """Square of `max_rpm`, RPM^2; infinite, with a zero gradient, for an infinite `max_rpm`."""
     unlimited = jnp.isinf(params.max_rpm)
     return jnp.where(unlimited, jnp.inf, jnp.where(unlimited, 0, params.max_rpm) ** 2)
 
@@ -58,9 +58,9 @@ def _square_of_limit(params: Params) -> Float[Array, ""]:
 def _within_authority(
     inverse: Float[Array, "4 4"], target: Float[Array, "4"], limit: Float[Array, ""]
 ) -> Float[Array, "4"]:
-    """The demand with roll and pitch scaled down to what the rotors can produce, and then yaw to the remaining range.
+    """Demand with roll and pitch scaled down to the feasible range, then yaw to the remaining range.
 
-    Otherwise least squares would trade thrust for infeasible torques. Without a limit the demand does not change.
+    Otherwise least squares would trade thrust for infeasible torques. Without a limit the demand is unchanged.
     """
     turning = inverse[:, 1:3] @ target[1:3]
     exact = inverse @ target
@@ -79,7 +79,7 @@ def _within_authority(
 def _excess(
     squares: Float[Array, "4"], limit: Float[Array, ""] | float, direction: Float[Array, "4"]
 ) -> Float[Array, ""]:
-    """The step back along a direction after which no rotor that this direction accelerates exceeds the limit, RPM^2."""
+    """Step back along a direction until no rotor accelerated by it exceeds the limit, RPM^2."""
     raises = direction > _MIN_SHARE
     beyond = jnp.maximum(squares - limit, 0) / jnp.where(raises, direction, 1)
     return jnp.max(jnp.where(raises, beyond, 0))
@@ -102,7 +102,7 @@ def _inverses(matrix: Float[Array, "4 4"]) -> Float[Array, "16 4 4"]:
 def _non_negative_least_squares(
     matrix: Float[Array, "4 4"], inverses: Float[Array, "16 4 4"], target: Float[Array, "4"]
 ) -> Float[Array, "4"]:
-    """The x >= 0 that minimizes |A x - b| for a regular A: the best of the sixteen candidates that are not negative."""
+    """Minimizer x >= 0 of |A x - b| for a regular A: the best non-negative candidate of sixteen."""
     candidates = jnp.swapaxes(inverses, 0, 1) @ target  # (4, 16)
     misses = (matrix[None] @ inverses - jnp.eye(4, dtype=matrix.dtype)[None]) @ jax.lax.stop_gradient(target)
     residuals = jnp.sum(misses**2, axis=-1)

@@ -1,4 +1,4 @@
-"""The attitude that points the thrust along a force, and the attitude error; tracking controllers share them."""
+"""Attitude targets and attitude errors of tracking controllers."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,7 +11,7 @@ Axes = list[Float[Array, "3"]]
 
 
 def from_thrust(force: Float[Array, "3"], yaw: Float[Array, ""]) -> Axes:
-    """The attitude with body z along `force` (N, world) and body x as close to the heading `yaw` (rad) as possible."""
+    """Attitude with body z along `force` (N, world) and body x as close to the heading `yaw` (rad) as possible."""
     sin, cos = sin_cos(yaw)
     heading = jnp.stack([cos, sin, jnp.zeros_like(yaw)])
     z = vector.unit(force)

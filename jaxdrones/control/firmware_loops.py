@@ -1,4 +1,4 @@
-"""The four loops of the Crazyflie's cascaded PID; each computes the set-point of the next one from its own.
+"""Four loops of the Crazyflie's cascaded PID; each computes the set-point of the next one.
 
 Gains and limits are those of Bitcraze's firmware, release 2025.12; the code is an independent implementation of its
 description. Angles are in degrees and rates in degrees per second; pitch is positive nose up, as in the firmware. The
@@ -15,7 +15,7 @@ from jaxdrones.control.firmware_motors import FULL, Motor
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 
-_MAX_INTEGRAL = 5000.0  # m s and m; limit of an integrator that has no limit of its own
+_MAX_INTEGRAL = 5000.0  # m s and m; limit of integrators without a limit in the firmware
 _OVERHEAD = 1.1  # commanded velocity limit over `max_vel`
 _THRUST_PER_OUTPUT = 1000.0
 _MAX_TORQUE = 32767.0  # signed 16 bit

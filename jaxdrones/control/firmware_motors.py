@@ -23,8 +23,8 @@ FULL = 65535.0
 
 _MIXER = ((-0.5, -0.5, -1.0), (-0.5, 0.5, 1.0), (0.5, 0.5, -1.0), (0.5, -0.5, 1.0))
 _BATTERY_FILTER = 0.99  # weight of the last filtered voltage after 1 ms
-_WEIGHT = 0.029 * 9.81  # N, weight of a Crazyflie 2.1 with 2.1+ propellers according to its firmware
-_LEVERS = (0.0325, 0.0325, 0.00699)  # m, lever arms along y and x; torque over thrust according to its firmware
+_WEIGHT = 0.029 * 9.81  # N, weight of a Crazyflie 2.1 with 2.1+ propellers in its firmware
+_LEVERS = (0.0325, 0.0325, 0.00699)  # m, lever arms along y and x; torque over thrust in its firmware
 _INERTIA = (16.6e-6, 16.7e-6, 29.3e-6)  # kg m^2; Foerster 2015
 _ACCELERATION = tuple(
     _WEIGHT * lever * share / inertia for lever, share, inertia in zip(_LEVERS, (0.5, 0.5, 1), _INERTIA, strict=True)
@@ -43,11 +43,11 @@ class Motor(PyTreeNode):
     max_thrust: Array
     """() thrust at full command, N."""
     min_thrust: Array
-    """() thrust below which the motor stands still, N."""
+    """() thrust below which the motor stops, N."""
 
 
 class Command(PyTreeNode):
-    """The commands of the firmware, which it also logs."""
+    """Commands of the firmware, as in its log."""
 
     attitude: Array
     """(3,) desired roll, pitch, yaw, degrees; pitch is positive nose up. For `Rates` the present attitude."""
@@ -60,7 +60,7 @@ class Command(PyTreeNode):
 
 
 def motor(propellers: str = "2.1+") -> Motor:
-    """The motor of a Crazyflie with propellers of the 2.1, of the 2.1+, or of the thrust upgrade kit.
+    """Motor of a Crazyflie with propellers of the 2.1, of the 2.1+, or of the thrust upgrade kit.
 
     Raises:
         ValueError: unknown propellers.
@@ -70,7 +70,7 @@ def motor(propellers: str = "2.1+") -> Motor:
 
 
 def duty_cycle(motor: Motor, command: Float[Array, "4"], battery: Float[Array, ""]) -> Float[Array, "4"]:
-    """Duty cycle (0 to 65535, not limited) that gives the thrust of a 16-bit command at a battery voltage (V)."""
+    """Duty cycle (0 to 65535, not limited) for a 16-bit thrust command at a battery voltage (V)."""
     thrust = command * (motor.max_thrust / FULL)
     turning = (thrust >= motor.min_thrust) & (battery >= _LEAST_VOLTAGE)
     return jnp.where(turning, voltage_for(motor.thrust, thrust) * (FULL / jnp.maximum(battery, _LEAST_VOLTAGE)), 0)
@@ -91,7 +91,7 @@ def mix(
 
 
 def within_range(commands: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Commands limited to 0 .. 65535: if one is too high, all are lowered, which reduces thrust, not torque."""
+    """Commands limited to 0 .. 65535; if one is too high, all are lowered, so thrust is reduced before torque."""
     return jnp.maximum(commands - jnp.maximum(jnp.max(commands) - FULL, 0), 0)
 
 
@@ -103,13 +103,13 @@ def duty_cycles(
     voltage: Float[Array, ""],
     dt: float,
 ) -> tuple[Float[Array, ""], Float[Array, "4"]]:
-    """The filtered voltage of the battery, V, and duty cycles from 0 to 65535.
+    """Filtered battery voltage, V, and duty cycles from 0 to 65535.
 
     Args:
         motor: model of the motors.
         thrust: thrust of each motor, 16 bit.
         torque: roll, pitch, yaw, 16 bit, right-handed body axes.
-        battery: voltage, V; None switches battery compensation off, so that a duty cycle is the command itself.
+        battery: voltage, V; None disables battery compensation, so that a duty cycle equals the command.
         voltage: filtered voltage at the last call, V; zero at the first call.
         dt: time since the last call, s.
 
@@ -134,9 +134,9 @@ def rotor_speeds(
 
 
 def scale(params: Params) -> tuple[Float[Array, ""], Float[Array, "3"]]:
-    """Factors that scale the firmware's gains, so that a vehicle responds as a Crazyflie does.
+    """Factors of the firmware's thrust and torque commands for a vehicle to respond like a Crazyflie.
 
-    The first scales the thrust of a command: the weight over that of a Crazyflie. The second scales torque commands.
+    The first is the weight over that of a Crazyflie.
     """
     return params.weight / _WEIGHT, jnp.array(_ACCELERATION) / _acceleration(params)
 

@@ -1,9 +1,8 @@
-"""The cascaded PID of the Crazyflie's firmware (Bitcraze, release 2025.12).
+"""Cascaded PID of the Crazyflie's firmware (Bitcraze, release 2025.12).
 
 The loops of position and velocity run at 100 Hz, those of attitude and rates at every call, which is 500 Hz on the
 vehicle. The position loop commands `pos_p` times the distance, without the velocity of the set-point, so the vehicle
-lags a moving set-point by 0.5 s. 16-bit numbers are limited as in the firmware, but not rounded, so that they have a
-derivative.
+lags a moving set-point by 0.5 s. 16-bit numbers are limited as in the firmware, but not rounded, to be differentiable.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _SLOW = 0.01  # s, period of the loops of position and velocity
 
 
 class Velocity(PyTreeNode):
-    """A set-point of velocity."""
+    """Set-point of velocity."""
 
     vel: Array
     """(3,) m/s, world."""
@@ -46,7 +45,7 @@ class Velocity(PyTreeNode):
 
 
 class Attitude(PyTreeNode):
-    """A set-point of attitude and thrust."""
+    """Set-point of attitude and thrust."""
 
     rpy: Array
     """(3,) roll, pitch, yaw about fixed axes, rad, right-handed."""
@@ -55,7 +54,7 @@ class Attitude(PyTreeNode):
 
 
 class Rates(PyTreeNode):
-    """A set-point of body rates and thrust."""
+    """Set-point of body rates and thrust."""
 
     omega: Array
     """(3,) rad/s, body, right-handed."""
@@ -67,13 +66,13 @@ AnySetpoint = Setpoint | Velocity | Attitude | Rates
 
 
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
-    """The gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
+    """Gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
 
-    With scaled gains, a command has the thrust over weight and the angular acceleration that it has on a Crazyflie. The
+    With scaled gains, a command gives the thrust over weight and the angular acceleration of a Crazyflie. The
     firmware's thrust curve of the motor voltage is not scaled.
 
     Args:
-        params: parameters of the drone to scale to; a Crazyflie when left out.
+        params: parameters of the drone to scale to; by default a Crazyflie.
         propellers: propellers of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
 
     Raises:
@@ -106,7 +105,7 @@ def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
 
 
 def init() -> Memory:
-    """The memory of a drone before the first call."""
+    """Memory of a drone before the first call."""
     zero = jnp.zeros(3)
     return Memory(
         pos_integral=zero,
@@ -124,7 +123,7 @@ def init() -> Memory:
 
 
 def reset(memory: Memory) -> Memory:
-    """The memory with the integrators at zero.
+    """Memory with the integrators at zero.
 
     The firmware resets them when the kind of the set-point changes, as at the start of a landing, and while the motors
     are off.
@@ -136,9 +135,9 @@ def reset(memory: Memory) -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: AnySetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`, that produce the thrusts that the firmware commands.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts commanded by the firmware.
 
-    A command is a fraction of `gains.motor.max_thrust` at any battery voltage, thanks to battery compensation, and the
+    With battery compensation a command is a fraction of `gains.motor.max_thrust` at any battery voltage, and the
     vehicle's `kf` gives the rotor speed for this thrust. The mixing follows from the geometry of the rotors.
 
     Args:
@@ -166,15 +165,15 @@ def pwm(
     *,
     dt: float = 0.002,
 ) -> tuple[Memory, motors.Command]:
-    """The commands of the firmware of one Crazyflie: desired attitude, thrust, and the duty cycles of its motors.
+    """Firmware commands of one Crazyflie: desired attitude, thrust, and duty cycles of the motors.
 
     Args:
         gains: gains of the four loops.
         memory: memory after the last call.
         state: estimated state of the drone.
         setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude` or `Rates`.
-        battery: voltage for the battery compensation, V, which is filtered over 0.1 s; None switches the compensation
-            off, so that a duty cycle is the command itself.
+        battery: voltage for the battery compensation, V, filtered over 0.1 s; None disables the compensation, so that a
+            duty cycle equals the command.
         dt: time between calls, s.
 
     Raises:
@@ -215,7 +214,7 @@ def _fly(
 
 
 def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Memory:
-    """The memory; at the first call its past attitude and rates are the present ones, so that derivatives are zero."""
+    """Memory with zero derivatives at the first call: past attitude and rates are the present ones."""
     measured = degrees(state.omega)
     start = dict(rpy=rpy(state.quat), rates=measured, gyro=settled(measured, gains.gyro_cutoff, dt))
     first = jnp.isinf(memory.age)
@@ -223,7 +222,7 @@ def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Me
 
 
 def _slow_loops(gains: Gains, memory: Memory, state: State, setpoint: Setpoint | Velocity, dt: float) -> Memory:
-    """The memory; if the loops of position and velocity are due, with their new tilt and thrust."""
+    """Memory with new tilt and thrust where the loops of position and velocity are due."""
     check_shape("setpoint.yaw", setpoint.yaw, (), "one target for one drone")
     check_shape("setpoint.vel", setpoint.vel, (3,), "one target for one drone")
     period = jnp.maximum(_SLOW, dt)

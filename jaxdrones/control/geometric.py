@@ -19,7 +19,7 @@ from jaxdrones.state import State
 
 
 class Gains(PyTreeNode):
-    """Gains per unit of mass and inertia, so that one set serves every vehicle."""
+    """Gains per unit of mass and inertia, independent of the vehicle."""
 
     pos: Array
     """(3,) 1/s^2."""
@@ -42,7 +42,7 @@ def gains() -> Gains:
 
 
 def init() -> None:
-    """The memory of a drone: this controller has none."""
+    """Empty memory."""
 
 
 def control(

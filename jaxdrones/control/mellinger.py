@@ -1,9 +1,9 @@
-"""The tracking controller of Mellinger and Kumar (2011), as the Crazyflie's firmware flies it.
+"""Tracking controller of Mellinger and Kumar (2011) in the version of the Crazyflie's firmware.
 
 The control law is that of Hoenig and Preiss in Bitcraze's firmware: position control with an integral, the attitude
 error on SO(3), and a derivative of the roll and pitch rates. It runs at 500 Hz and also follows velocity, acceleration
 and rates of the set-point. Thrust and torque are 16-bit numbers, limited as in the firmware but not rounded. It needs
-rotors that lag by less than 0.1 s: with the fall time of 0.25 s of `cf2x` it oscillates.
+rotors with a lag of less than 0.1 s: with the fall time of 0.25 s of `cf2x` it oscillates.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jaxdrones.state import State
 
 _GRAVITY = 9.81  # m/s^2
 _MAX_TORQUE = 32000.0  # 16 bit
-_MASSES = {"2.1": 0.029, "2.1+": 0.029, "thrust upgrade": 0.0325}  # kg, according to the firmware
+_MASSES = {"2.1": 0.029, "2.1+": 0.029, "thrust upgrade": 0.0325}  # kg, in the firmware
 
 
 class Gains(PyTreeNode):
@@ -78,12 +78,12 @@ class Memory(PyTreeNode):
 
 
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
-    """The gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
+    """Gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
 
-    With scaled gains, an error causes the linear and angular acceleration that it causes on a Crazyflie.
+    With scaled gains, an error causes the same linear and angular acceleration as on a Crazyflie.
 
     Args:
-        params: parameters of the drone to scale to; a Crazyflie when left out.
+        params: parameters of the drone to scale to; by default a Crazyflie.
         propellers: propellers of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
 
     Raises:
@@ -116,7 +116,7 @@ def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
 
 
 def init() -> Memory:
-    """The memory of a drone before the first call."""
+    """Memory of a drone before the first call."""
     zero = jnp.zeros(3)
     return Memory(zero, zero, zero, jnp.zeros((2, 3)), jnp.zeros(()), jnp.zeros(()))
 
@@ -124,7 +124,7 @@ def init() -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`, that produce the thrusts that the firmware commands.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts commanded by the firmware.
 
     Args:
         gains: gains of position and attitude.
@@ -151,14 +151,14 @@ def pwm(
     *,
     dt: float = 0.002,
 ) -> tuple[Memory, motors.Command]:
-    """The commands of the firmware of one Crazyflie: desired attitude, thrust, and the duty cycles of its motors.
+    """Firmware commands of one Crazyflie: desired attitude, thrust, and duty cycles of the motors.
 
     Args:
         gains: gains of position and attitude.
         memory: memory after the last call.
         state: estimated state of the drone.
         setpoint: target; all of pos, vel, acc, yaw and omega are used.
-        battery: voltage for the battery compensation, V; without it a duty cycle is the command itself.
+        battery: voltage for the battery compensation, V; without it a duty cycle equals the command.
         dt: time between calls, s.
 
     Raises:

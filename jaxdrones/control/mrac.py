@@ -1,9 +1,9 @@
-"""Model-reference adaptive control of gym-pybullet-drones (2.x): state feedback with gains that adapt in flight.
+"""Model-reference adaptive control of gym-pybullet-drones (2.x): state feedback with adaptive gains.
 
 The state x is position, roll, pitch and yaw, velocity and body rates. In hover its linear model is x' = A x + B u, with
 u thrust (N) and torque (N m). The weight is not part of the model; the adaptation compensates it. The feedback places
-the poles of the model at -1 to -12 1/s. This closed loop is the reference model that the adaptation makes the drone
-follow (Narendra and Annaswamy, Stable Adaptive Systems, chapter 3).
+the poles of the model at -1 to -12 1/s. This closed loop is the reference model of the adaptation (Narendra and
+Annaswamy, Stable Adaptive Systems, chapter 3).
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ class Memory(PyTreeNode):
     model: Array
     """(12,) state of the reference model."""
     running: Array
-    """() 1 after the first call, which sets the state of the reference model to that of the drone."""
+    """() 1 after the first call, which initializes the reference model with the state of the drone."""
 
 
 def gains(params: Params | None = None) -> Gains:
-    """The gains of gym-pybullet-drones for `cf2x`, or those of its method for another vehicle.
+    """Gains of gym-pybullet-drones for `cf2x`, or by its method for another vehicle.
 
     Poles are placed by the method of Tits and Yang, in float64 on the host.
 
@@ -108,7 +108,7 @@ def _hover(mass: np.ndarray, inertia: np.ndarray, gravity: np.ndarray) -> tuple[
 
 
 def init() -> Memory:
-    """The memory of a drone before the first call."""
+    """Memory of a drone before the first call."""
     return Memory(jnp.zeros((12, 4)), jnp.zeros((4, 4)), jnp.zeros(12), jnp.zeros(()))
 
 
@@ -117,7 +117,7 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 
-    As in gym-pybullet-drones, thrust becomes PWM as in `pid`, and the torque, in N m, is mixed as if it were in PWM.
+    As in gym-pybullet-drones, thrust is converted to PWM as in `pid`, and the torque in N m is mixed as if in PWM.
 
     Args:
         gains: initial gains.
@@ -153,7 +153,7 @@ def _state(state: State) -> Float[Array, "12"]:
     """Position, roll, pitch and yaw, velocity, body rates.
 
     As in gym-pybullet-drones, the rates are rotated to the body by roll, pitch and yaw about moving axes in that order,
-    which is not the attitude.
+    which differs from the attitude.
     """
     roll, pitch, yaw = rpy = rotation.to_rpy(state.quat)
     omega = rotation.rotate(state.quat, state.omega)

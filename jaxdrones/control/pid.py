@@ -1,4 +1,4 @@
-"""The PID of gym-pybullet-drones for Crazyflies: position loop, attitude loop, PWM mixer.
+"""PID of gym-pybullet-drones for Crazyflies: position loop, attitude loop, PWM mixer.
 
 It originates from the Dynamic Systems Lab of the University of Toronto. For every vehicle, torques and thrust are in
 units of the Crazyflie's 16-bit PWM.
@@ -66,12 +66,12 @@ class Memory(PyTreeNode):
 
 
 def rpm_to_pwm(rpm: Any) -> Any:
-    """The Crazyflie's 16-bit PWM of a rotor speed (RPM), any shape."""
+    """Crazyflie's 16-bit PWM for a rotor speed (RPM), any shape."""
     return (rpm - _PWM_OFFSET) / _PWM_TO_RPM
 
 
 def gains(vehicle: str = "cf2x") -> Gains:
-    """The gains of gym-pybullet-drones for `cf2x` and `cf2p`.
+    """Gains of gym-pybullet-drones for `cf2x` and `cf2p`.
 
     Raises:
         ValueError: another vehicle; the gains fit a Crazyflie's mass, inertia and PWM.
@@ -93,7 +93,7 @@ def gains(vehicle: str = "cf2x") -> Gains:
 def fits(params: Params) -> bool:
     """Whether the gains suit a drone, or every drone of a team, by its parameters.
 
-    They do if mass, inertia, arm, thrust and torque coefficient are within a quarter of those of `cf2x` or of `cf2p`.
+    They do if mass, inertia, arm, thrust and torque coefficient are within 25 % of those of `cf2x` or of `cf2p`.
 
     Raises:
         ValueError: the parameters are being traced.
@@ -108,13 +108,13 @@ def fits(params: Params) -> bool:
 
 
 def _numbers(params: Params) -> np.ndarray:
-    """The parameters on which the gains depend: (7,) for one drone, (n, 7) for a team."""
+    """Parameters behind the gains: (7,) for one drone, (n, 7) for a team."""
     scalars = np.stack([params.mass, params.arm, params.kf, params.km], axis=-1)
     return np.concatenate([scalars, params.inertia], axis=-1)
 
 
 def init() -> Memory:
-    """The memory of a drone before the first call."""
+    """Memory of a drone before the first call."""
     return Memory(jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
 
 
@@ -141,11 +141,11 @@ def control(
     return memory, rotor_speeds(params, thrust, torque)
 
 
-@jax.checkpoint  # recomputing both loops is cheaper in a backward pass than storing
+@jax.checkpoint  # recomputing both loops in a backward pass is cheaper than storing
 def position_loop(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, dt: float
 ) -> tuple[Memory, Float[Array, ""], attitude.Axes]:
-    """Thrust per rotor (PWM, not clipped) and the attitude that points it along the desired force."""
+    """Thrust per rotor (PWM, not clipped) and target attitude for the desired force."""
     error = setpoint.pos - state.pos
     limit = jnp.array(_MAX_POS_INTEGRAL)
     integral = jnp.clip(memory.pos_integral + error * dt, -limit, limit)
@@ -162,7 +162,7 @@ def attitude_loop(
 ) -> tuple[Memory, Float[Array, "3"]]:
     """Torque (PWM) towards the attitude `target`.
 
-    The rate is a difference of roll, pitch and yaw that is not unwrapped, as in gym-pybullet-drones: it jumps where yaw
+    The rate is a difference of roll, pitch and yaw without unwrapping, as in gym-pybullet-drones: it jumps where yaw
     crosses +-180 degrees.
     """
     rpy = rotation.to_rpy(state.quat)

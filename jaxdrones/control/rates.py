@@ -1,4 +1,4 @@
-"""Collective thrust and body rates: an outer loop that commands them and an inner loop that follows them."""
+"""Control of collective thrust and body rates in an outer and an inner loop."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def gains() -> Gains:
 
 
 def init() -> None:
-    """The memory of a drone: this controller has none."""
+    """Empty memory."""
 
 
 def control(

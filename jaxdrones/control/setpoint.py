@@ -1,4 +1,4 @@
-"""The target of a controller."""
+"""Set-points of controllers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Setpoint(PyTreeNode):
         yaw: ArrayLike | None = None,
         omega: ArrayLike | None = None,
     ) -> Setpoint:
-        """A target with the position (*n, 3) and the other given quantities; the rest is zero."""
+        """Set-point at a position (*n, 3), with other quantities zero by default."""
         pos = jnp.asarray(pos)
         zero = jnp.zeros_like(pos)
         return cls(

@@ -1,4 +1,4 @@
-"""The simple PID of gym-pybullet-drones for the Hummingbird.
+"""Simple PID of gym-pybullet-drones for the Hummingbird.
 
 The desired force gives the angles; thrust and torque give the rotor speeds by least squares.
 """
@@ -52,7 +52,7 @@ class Memory(PyTreeNode):
 
 
 def gains() -> Gains:
-    """The gains of gym-pybullet-drones for the Hummingbird (`hb`)."""
+    """Gains of gym-pybullet-drones for the Hummingbird (`hb`)."""
     return Gains(
         pos_p=jnp.array([0.1, 0.1, 0.2]),
         pos_i=jnp.array([1e-4, 1e-4, 1e-4]),
@@ -64,14 +64,14 @@ def gains() -> Gains:
 
 
 def init() -> Memory:
-    """The memory of a drone before the first call."""
+    """Memory of a drone before the first call."""
     return Memory(jnp.zeros(3), jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
 
 
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`; those of gym-pybullet-drones are not limited.
+    """Rotor speeds of one drone, RPM, up to `max_rpm` (unlimited in gym-pybullet-drones).
 
     The controller keeps yaw at zero: it uses only `pos` of the setpoint. Derivatives are differences of errors, so the
     first call has a spike. With the inertia of the Hummingbird it needs 60 calls per second; the paper uses 48 calls
@@ -107,7 +107,7 @@ def control(
 
 
 def _angles_of(force: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Limited roll and pitch that point body z (or -z) along the force, and a yaw of zero; rad."""
+    """Limited roll and pitch for body z (or -z) along the force, and zero yaw; rad."""
     x, y, z = jnp.where(force[2] < 0, -force, force)
     roll = atan2(-y, safe_sqrt(x**2 + z**2))
     pitch = atan2(x, z)

@@ -1,4 +1,4 @@
-"""Checks of every controller that its arguments are those of one drone."""
+"""Validation of controller arguments for one drone."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The memory of a team of drones that have the same controller."""
+"""Controller memory of a team."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from jaxdrones.checks import check_whole
 
 
 def for_team(memory: Any, n: int) -> Any:
-    """The memory of a controller for each of `n` drones: every array gains a leading drone axis.
+    """Memory of a controller for each of `n` drones, with a leading drone axis on every array.
 
     Raises:
         ValueError: `n` < 1.

@@ -1,4 +1,4 @@
-"""The velocity input of the paper (equation 8): a direction and a fraction of a speed limit, followed by the PID."""
+"""Velocity input of the paper (equation 8): direction and fraction of a speed limit, tracked by the PID."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -38,10 +38,10 @@ def control(
 
 
 def setpoint(params: Params, state: State, action: Float[Array, "4"]) -> Setpoint:
-    """The setpoint of an action: the position and heading of the drone, and the commanded velocity."""
+    """Setpoint of an action: position and heading of the drone, and commanded velocity."""
     return Setpoint.at(state.pos, vel=commanded(params, action), yaw=rotation.to_rpy(state.quat)[2])
 
 
 def commanded(params: Params, action: Float[Array, "4"]) -> Float[Array, "3"]:
-    """The velocity that an action commands, m/s, world."""
+    """Commanded velocity of an action, m/s, world."""
     return SPEED_SHARE * params.max_speed * jnp.abs(action[3]) * vector.unit(action[:3])

@@ -1,4 +1,4 @@
-"""Environments: tasks, steps, action types and observations put together."""
+"""Environments: tasks with steps, action types and observations."""
 
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.autoreset import AutoReset

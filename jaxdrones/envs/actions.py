@@ -1,4 +1,4 @@
-"""Action types, from numbers in [-1, 1] to rotor speeds, scaled by the vehicle so that 0 hovers whatever the mass."""
+"""Action types: from numbers in [-1, 1] to rotor speeds, scaled by the vehicle so that 0 is hover."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ _AHEAD = "way from the drone to the setpoint"
 
 @dataclasses.dataclass(frozen=True)
 class Action:
-    """An action type: functions of one drone."""
+    """Action type: functions of one drone."""
 
     size: int
-    """How many numbers an action of one drone has."""
+    """Length of the action of one drone."""
     rpm: Command
     """(params, memory, state, action (size,), setpoint of the task, control period) -> (memory, rotor speeds, RPM)."""
     init: Callable[[], Any] = lambda: None
     """() -> memory of one drone at the start of an episode."""
     for_vehicle: Callable[[Params], Action] | None = None
-    """Nominal parameters of the team -> the action type for this vehicle; `None` where it is the same for all."""
+    """Nominal parameters of the team -> action type for this vehicle; `None` if independent of the vehicle."""
     entries: Callable[[Params], tuple[Quantity, ...]] | None = None
-    """Nominal parameters of one drone -> what each number stands for, for `jaxdrones.explain`."""
+    """Nominal parameters of one drone -> description of each entry, for `jaxdrones.explain`."""
     name: str = ""
-    """The name by which an environment knows the action type; `jaxdrones.make` sets it."""
+    """Name of the action type, set by `jaxdrones.make`."""
 
     def team_memory(self, n: int) -> Any:
-        """The memory of a team of n drones at the start of an episode."""
+        """Memory of a team of n drones at the start of an episode."""
         return for_team(self.init(), n)
 
     def fitted(self, params: Params) -> Action:
-        """The action type for this vehicle."""
+        """Action type for this vehicle."""
         return self if self.for_vehicle is None else dataclasses.replace(self.for_vehicle(params), name=self.name)
 
 
@@ -69,7 +69,7 @@ def _rotor_speeds(names: list[str], near_hover: float | None) -> Action:
 
 
 def thrust_and_torques(torque_share: float = 0.05) -> Action:
-    """Collective thrust from zero to twice the weight, and torques up to a share of the largest.
+    """Collective thrust from zero to twice the weight, and torques up to a fraction of the largest.
 
     As in gym-pybullet-drones (2021), they are allocated to rotors without an upper limit, and then limited.
     """
@@ -89,7 +89,7 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
 
 
 def angular_acceleration(largest: tuple[float, float, float] = (100.0, 100.0, 10.0)) -> Action:
-    """A speed of all rotors (-1 standstill, 0 hover, 1 full), and angular accelerations up to `largest` in hover."""
+    """Common rotor speed (-1 standstill, 0 hover, 1 full), and angular accelerations up to `largest` in hover."""
 
     def command(params, memory, state, action, setpoint, dt):
         x, y, _ = params.rotor_pos.T
@@ -119,7 +119,7 @@ def one_d_thrust(share: float = 0.05) -> Action:
 
 
 def velocity_input() -> Action:
-    """Velocity command of gym-pybullet-drones (2021): a direction and a share of the speed limit."""
+    """Velocity command of gym-pybullet-drones (2021): a direction and a fraction of the speed limit."""
 
     def entries(params: Params) -> Entries:
         highest = float(velocity.SPEED_SHARE * params.max_speed)
@@ -130,7 +130,7 @@ def velocity_input() -> Action:
 
 
 def one_d_velocity() -> Action:
-    """The velocity command along z alone."""
+    """Velocity command along z alone."""
 
     def target(params, state, action):
         vertical = jnp.stack([0 * action[0], 0 * action[0], jnp.sign(action[0]), jnp.abs(action[0])])
@@ -164,7 +164,7 @@ def one_d_position(step: float = 0.1) -> Action:
 def destination(max_step: float = 1.0) -> Action:
     """A position in the world within 1 m of the origin along each axis, m: the `pid` action of (2.x).
 
-    The setpoint is on the straight line there, at most `max_step` (m) ahead of the drone.
+    The setpoint is on the straight line to it, at most `max_step` (m) ahead of the drone.
     """
 
     def target(params, state, action):
@@ -176,7 +176,7 @@ def destination(max_step: float = 1.0) -> Action:
 
 
 def pid_gains() -> Action:
-    """Six numbers that scale the PID's six gain vectors by 0 to 2; the PID flies to the task's target."""
+    """Factors of 0 to 2 for the PID's six gain vectors; the PID flies to the task's target."""
 
     def command(params, memory, state, action, setpoint, dt):
         own = pid.gains()
@@ -233,9 +233,9 @@ def attitude_and_thrust(max_tilt: float = 60.0) -> Action:
 def _setpoint(
     size: int, target: Callable[[Params, State, Array], Setpoint], entries: Callable[[Params], Entries]
 ) -> Action:
-    """An action type that commands a setpoint, whatever the task.
+    """Action type that commands a setpoint.
 
-    The PID follows it with vehicles that its gains suit, the geometric controller with all others.
+    It is tracked by the PID for vehicles within its gains' range, and by the geometric controller for all others.
     """
 
     def flown_by(controller) -> Action:
@@ -251,7 +251,7 @@ def _setpoint(
 
 
 def _about_axes(name: str, unit: str, largest: Iterable) -> Entries:
-    """Three numbers about the axes of the body, of which an action of 1 is the largest."""
+    """Entries about the three body axes, with the value at an action of 1."""
     axes = zip("xyz", map(float, largest), strict=True)
     return tuple(Quantity(f"{axis} of the {name}", unit, "body", (-value, 0.0, value)) for axis, value in axes)
 
@@ -263,7 +263,7 @@ def _speeds(params: Params, near_hover: float | None) -> tuple[float, float, flo
 
 
 def _thrust(low: Array | float, zero: Array, high: Array) -> Entries:
-    """The collective thrust at -1, 0 and 1, N."""
+    """Collective thrust at -1, 0 and 1, N."""
     return (Quantity("collective thrust", "N", "body", (float(low), float(zero), float(high))),)
 
 

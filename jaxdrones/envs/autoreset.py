@@ -1,4 +1,4 @@
-"""Automatic reset: a new episode begins in the step in which one ends."""
+"""Automatic reset in the step that ends an episode."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxdrones.tasks.task import World
 
 
 class Episode(PyTreeNode):
-    """A world, and the statistics of its episode so far."""
+    """World with the statistics of its episode so far."""
 
     world: World
     episode_return: Array
@@ -27,10 +27,10 @@ class Episode(PyTreeNode):
 
 
 class AutoReset:
-    """`reset` and `step` of an environment on an `Episode` in place of a `World`; a new episode follows one that ends.
+    """Environment with automatic resets: `reset` and `step` on an `Episode` in place of a `World`.
 
     `info` gains `final_obs` and `final_world`, the last observation and world before a possible reset (of every step),
-    and `episode`: `return` (n,) and `length` () so far, which are those of the whole episode where it ended.
+    and `episode`: `return` (n,) and `length` () so far, those of the whole episode at its end.
     """
 
     def __init__(self, env: Env, progress: Array | None = None):
@@ -53,7 +53,7 @@ class AutoReset:
     def step(
         self, key: jax.Array, episode: Episode, action: Float[Array, "n a"]
     ) -> tuple[Obs, Episode, Float[Array, " n"], Array, Array, dict[str, Any]]:
-        """One control step; where it ends the episode, the observation and the world are those of the next one."""
+        """One control step; at the end of an episode, observation and world are those of the next one."""
         obs, episode, reward, terminated, truncated, info = self.step_without_reset(key, episode, action)
         info = info | {"final_obs": obs, "final_world": episode.world}
         obs, episode = self.renewed(terminated | truncated, key, obs, episode)
@@ -62,14 +62,14 @@ class AutoReset:
     def step_without_reset(
         self, key: jax.Array, episode: Episode, action: Float[Array, "n a"]
     ) -> tuple[Obs, Episode, Float[Array, " n"], Array, Array, dict[str, Any]]:
-        """One control step, whose info has the statistics of the episode; where it ends, nothing is reset."""
+        """One control step with the statistics of the episode in `info`, without a reset."""
         obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
         episode = Episode(world, episode.episode_return + reward, episode.length + 1)
         info = info | {"episode": {"return": episode.episode_return, "length": episode.length}}
         return obs, episode, reward, terminated, truncated, info
 
     def renewed(self, ended: Array, key: jax.Array, obs: Obs, episode: Episode) -> tuple[Obs, Episode]:
-        """The start of a new episode where one has `ended`, and elsewhere what is given; `key` is that of the step."""
+        """Replace worlds and observations by a new start where `ended`; `key` is that of the step."""
         world, key = episode.world, jax.random.fold_in(key, RESET)
         vector = obs["state"] if isinstance(obs, dict) else obs
         fresh_obs, fresh = where_needed(self._fresh, one_in=256)(ended, key)
@@ -84,10 +84,10 @@ class AutoReset:
 
     @property
     def _kept(self) -> tuple[str, ...]:
-        """Fields of a world that a reset leaves as they are: what is the same in every episode, and images."""
+        """Fields of a world that survive a reset: constant fields and images."""
         return (*self.env.constant_fields, "images", "poses")
 
     def _fresh(self, key: jax.Array) -> tuple[Array, World]:
-        """A reset, without images and without the fields that are the same in every episode."""
+        """Reset without images and constant fields."""
         obs, world = self.env.begin(key, *self._progress)
         return obs, world.replace(**dict.fromkeys(self._kept))

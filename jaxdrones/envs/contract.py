@@ -1,4 +1,4 @@
-"""A test of the contract of an environment, for environments of users too."""
+"""Contract test for environments."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _IMAGE_AXES = 4  # of images of an episode: time, drones, rows, columns
 
 
 class ContractError(AssertionError):
-    """An environment violates its contract; the message says how and where."""
+    """Violation of the contract of environments."""
 
 
 def check_env(env: Env, steps: int = 5) -> None:
-    """Test an environment: fly a few steps with random actions and check everything that comes back.
+    """Test an environment with a few steps of random actions.
 
-    It checks shapes, types and bounds; that the same key gives the same episode; that arguments are not changed; that
-    the reward is the sum of its named terms; that wrong actions are refused; and on the explicit backend also that
+    It checks shapes, types and bounds; that the same key gives the same episode; that arguments are not mutated; that
+    the reward is the sum of its named terms; that invalid actions are rejected; and on the explicit backend also that
     `jax.jit` and `jax.vmap` give the same results as plain calls.
 
     Args:

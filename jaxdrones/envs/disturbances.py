@@ -1,4 +1,4 @@
-"""Disturbances, which change wind or external force during an episode: random pushes and Dryden turbulence."""
+"""Disturbances of wind or external force during an episode: random pushes and Dryden turbulence."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ _SQRT3 = math.sqrt(3.0)
 _TERMS = 40  # terms of a series for arguments up to 1
 
 Disturbance = Callable[[jax.Array, Params, float], Params]
-"""(key, params, control period) of a team -> its parameters with the surroundings of the next control step."""
+"""(key, params, control period) of a team -> its parameters with wind and external force of the next control step."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DisturbanceWithMemory:
-    """A disturbance that depends on what it did before; its memory is `params.aux[name]`."""
+    """Disturbance with memory, in `params.aux[name]`."""
 
     name: str
     """Key of `Params.aux`."""
     init: Callable[[jax.Array, Params], Any]
-    """`init(key, params)`: the memory of one drone at the start of an episode, a pytree of arrays."""
+    """`init(key, params)`: memory of one drone at the start of an episode, a pytree of arrays."""
     advance: Disturbance
-    """`advance(key, params, control period)` of a team: its parameters with new surroundings and a new memory."""
+    """`advance(key, params, control period)` of a team: its parameters with new wind, force and memory."""
     text: str
-    """What it does, for people."""
+    """Description."""
 
     def __post_init__(self):
         object.__setattr__(self, "__doc__", self.text)
 
     def __call__(self, key: jax.Array, params: Params, dt: float) -> Params:
-        """The parameters of a team with the surroundings of the next control step."""
+        """Parameters of a team with wind and external force of the next control step."""
         if self.name not in params.aux:
             raise UserError(
                 f"params.aux lacks {self.name!r}, the memory of a disturbance; start from its start(key, params)"
@@ -53,11 +53,11 @@ class DisturbanceWithMemory:
         return self.advance(key, params, dt)
 
     def start(self, key: jax.Array, params: Params) -> Params:
-        """The parameters of one drone with the memory at the start of an episode."""
+        """Parameters of one drone with the memory at the start of an episode."""
         return params.replace(aux=params.aux | {self.name: self.init(key, params)})
 
     def nominal(self, params: Params) -> Params:
-        """The parameters of a team with a memory of zeros: the place for it."""
+        """Parameters of a team with a memory of zeros."""
         keys = jax.random.split(jax.random.key(0), len(params.mass))
         shapes = jax.eval_shape(jax.vmap(self.init), keys, params)
         return params.replace(aux=params.aux | {self.name: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)})
@@ -68,7 +68,7 @@ class DisturbanceWithMemory:
 
 
 def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) -> Disturbance:
-    """External forces of U(-force, force) (share of the weight) along each axis, at random times.
+    """External forces of U(-force, force) (fraction of the weight) along each axis, at random times.
 
     One begins every `interval` seconds and lasts `duration` seconds on average, both with exponential distributions.
 
@@ -94,27 +94,27 @@ def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) ->
 
 
 def dryden(speed: float, altitude: float = 6.096, airspeed: float | None = None) -> DisturbanceWithMemory:
-    """Dryden turbulence at low altitude: gusts that are added to the wind with which an episode starts.
+    """Dryden turbulence at low altitude, added to the wind at the start of the episode.
 
-    The gusts of each drone are independent of those of the others. Along the mean wind (along x without mean wind),
-    across it and upwards they have the spectra of MIL-F-8785C,
+    The gusts of different drones are independent. Along the mean wind (along x without mean wind), across it and
+    upwards they have the spectra of MIL-F-8785C,
 
         u: s_u^2 (2 L_u / pi) / (1 + (L_u W)^2),  v, w: s^2 (L / pi) (1 + 3 (L W)^2) / (1 + (L W)^2)^2,
 
     over the spatial frequency W >= 0, rad/m, with L_w = h, L_u = L_v = h / (0.177 + 0.000823 h)^1.2 (h in feet),
-    s_w = 0.1 W_20 and s_u = s_v = s_w / (0.177 + 0.000823 h)^0.4. The filters are discretized exactly, so that
-    intensities and spectra do not depend on the control rate, and an episode starts with stationary turbulence.
+    s_w = 0.1 W_20 and s_u = s_v = s_w / (0.177 + 0.000823 h)^0.4. The filters are discretized exactly, so
+    intensities and spectra are independent of the control rate, and an episode starts with stationary turbulence.
     Rotational gusts are not modeled: they matter for wings that are long compared with L.
 
-    The turbulence acts through the effects that depend on `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`. The
-    state of the filters and the mean wind are in `params.aux["dryden"]`.
+    The turbulence acts through effects of `params.wind`: `drag`, `quadratic_drag`, `inflow_thrust`. The state of the
+    filters and the mean wind are in `params.aux["dryden"]`.
 
     Args:
         speed: W_20, the mean wind speed 20 ft above the ground, m/s: 7.7 is light, 15.4 moderate, 23.1 severe. It only
             sets the intensity; the mean wind itself is `params.wind`.
         altitude: h, m, 3.048 to 304.8.
-        airspeed: speed at which a drone flies through the gusts, m/s. The default is the specification's mean wind
-            speed at the altitude, as for a drone that hovers.
+        airspeed: speed of the drone through the gusts, m/s. The default is the specification's mean wind speed at the
+            altitude, for a drone in hover.
 
     Raises:
         ValueError: a speed that is not positive, or an altitude out of range.
@@ -158,7 +158,7 @@ def scales(speed: float, altitude: float) -> dict[str, tuple[float, float]]:
 
 
 def _next(along: float, up: float, memory: dict[str, Array], noise: Float[Array, "5"]) -> dict[str, Array]:
-    """The states of the filters after a step.
+    """States of the filters after a step.
 
     `along` and `up` are the step over the time constants of u and v, and of w.
 
@@ -178,7 +178,7 @@ def _next(along: float, up: float, memory: dict[str, Array], noise: Float[Array,
 
 
 def _decayed(z: Float[Array, "2"], step: float) -> Float[Array, "2"]:
-    """The decayed states of a chain after a step, without noise."""
+    """Decayed states of a chain after a step, without noise."""
     return math.exp(-step) * jnp.stack([z[0], z[1] + step * z[0]])
 
 
@@ -194,7 +194,7 @@ def _correlated(n1: Float[Array, ""], n2: Float[Array, ""], step: float) -> Floa
 
 
 def _shaped(z: Float[Array, "2"]) -> Float[Array, ""]:
-    """The output of the filter (1 + sqrt(3) s) / (1 + s)^2, with variance 1."""
+    """Output of the filter (1 + sqrt(3) s) / (1 + s)^2, with variance 1."""
     return _SQRT3 * z[0] + (1 - _SQRT3) * z[1]
 
 

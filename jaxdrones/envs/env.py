@@ -1,4 +1,4 @@
-"""An environment: a task, a step, an action type and an observation, as two pure functions."""
+"""Environments as two pure functions, `reset` and `step`."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
 class Env:
     """`reset(key) -> obs, world` and `step(key, world, action) -> obs, world, reward, terminated, truncated, info`.
 
-    Both are pure: use `jax.jit`, `jax.vmap` for many worlds, `jax.grad` on the explicit backend. Nothing is reset
-    when an episode ends; `AutoReset` does that. `jaxdrones.make` makes environments by name.
+    Both are pure: use `jax.jit`, `jax.vmap` for many worlds, `jax.grad` on the explicit backend. Episodes do not reset
+    automatically; see `AutoReset`. `jaxdrones.make` makes environments by name.
 
-    An environment is immutable; `dataclasses.replace(env, steps=100)` is another one. It hashes and compares by
-    identity, so that it may be a static argument of `jax.jit`, and pickles by value.
+    An environment is immutable; `dataclasses.replace(env, steps=100)` makes a changed copy. It hashes and compares by
+    identity, so it can be a static argument of `jax.jit`, and pickles by value.
     """
 
     task: Task
@@ -51,25 +51,25 @@ class Env:
     action: Action
     """Action type, fitted to the vehicle."""
     terms: tuple[ObservationTerm, ...]
-    """Observation terms, which are concatenated."""
+    """Observation terms to concatenate."""
     randomize: tuple[Randomization, ...] = ()
-    """Randomizations that draw the parameters of every episode from the nominal ones."""
+    """Randomizations of the parameters of every episode."""
     noise: Noise | None = None
     """Noise of the observed state."""
     disturbance: Disturbance | None = None
-    """Sets wind or external force before every control step, for example `random_pushes`."""
+    """Disturbance of wind or external force before every control step, for example `random_pushes`."""
     delay: tuple[float, float] = (0.0, 0.0)
-    """Shortest and longest delay between action and command, s; if they differ, every drone and episode draws one."""
+    """Shortest and longest delay between action and command, s; drawn per drone and episode."""
     vision: Vision | None = None
-    """Cameras, as `jaxdrones.envs.vision.make_vision` returns them for the same step and scene."""
+    """Cameras from `jaxdrones.envs.vision.make_vision` for the same step and scene."""
     sensors: tuple[Sensor, ...] = ()
-    """Sensors of every drone, which measure after `reset` and after every control step."""
+    """Sensors of every drone, read after `reset` and after every control step."""
     scene: Scene | DrawScene = dataclasses.field(default_factory=Scene)
-    """Obstacles and ground, or a function `(key) -> Scene` that draws them for every episode."""
+    """Obstacles and ground, or a function `(key) -> Scene` for random scenes."""
     vehicle: str = "drones"
     """Name of the vehicle."""
     steps: int = 0
-    """Number of control steps after which an episode is truncated; those of the task's duration when 0."""
+    """Number of control steps until an episode is truncated; 0 for the task's duration."""
 
     def __post_init__(self):
         check_process()
@@ -114,14 +114,14 @@ class Env:
 
     @property
     def delay_steps(self) -> tuple[float, float]:
-        """Shortest and longest delay, control steps; 0.02 s at 100 Hz are two, whatever the rounding."""
+        """Shortest and longest delay, control steps, robust to rounding."""
         steps = (bound / self.dt for bound in self.delay)
         shortest, longest = (float(round(x)) if math.isclose(x, round(x), abs_tol=1e-6) else x for x in steps)
         return shortest, longest
 
     @functools.cached_property
     def draws(self) -> tuple[Randomization, ...]:
-        """All randomizations: those given, the start of a disturbance with memory, and a random delay."""
+        """All randomizations, including the start of a disturbance with memory and a random delay."""
         own: list[Randomization] = []
         if isinstance(self.disturbance, DisturbanceWithMemory):
             own.append(self.disturbance.starting())
@@ -134,7 +134,7 @@ class Env:
         """Length of every observation term of a drone.
 
         Raises:
-            ValueError: a function of the task or an observation term returns something else than it should.
+            ValueError: a function of the task or an observation term returns an invalid result.
         """
         return check_episode(
             self.task, self.params, self.scene, self.terms, self.dt, functools.partial(episode.first_world, self)
@@ -157,7 +157,7 @@ class Env:
 
     @property
     def constant_fields(self) -> tuple[str, ...]:
-        """Names of the fields of a world that are the same in every episode."""
+        """Names of the fields of a world that are constant over episodes."""
         params = () if self.draws or self.disturbance else ("params",)
         return (*params, "scene") if isinstance(self.scene, Scene) else params
 
@@ -168,7 +168,7 @@ class Env:
         return sum(leaf.size for leaf, drawn in leaves if drawn) // self.drones
 
     def reset(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Obs, World]:
-        """The first observation, and the world at the start of an episode.
+        """First observation and world of an episode.
 
         Args:
             key: random key.
@@ -183,14 +183,14 @@ class Env:
         return observation(obs, world), world
 
     def begin(self, key: jax.Array, progress: float | Array = 1.0) -> tuple[Float[Array, "n d"], World]:
-        """The same as `reset`, but without images."""
+        """`reset` without images."""
         check_key("key", key)
         world = self.compiled(episode.start)(key, progress)
         rate = episode.state_rate(self, world, world.drones.rpm)
         return self.compiled(episode.first_observation)(key, world, rate)
 
     def with_images(self, method: str, key: jax.Array, world: World, *args: Any) -> World:
-        """The world with new images, by a method of `Vision`, compiled unless it leaves JAX."""
+        """World with new images by a method of `Vision`, compiled unless it leaves JAX."""
         assert self.vision is not None
         look = getattr(self.vision, method)
         noise = jax.random.fold_in(key, episode.VISION) if self.vision.camera.noise else None
@@ -203,13 +203,13 @@ class Env:
 
         Args:
             key: random key for noise and disturbances.
-            world: as `reset` or `step` returned it.
+            world: from `reset` or `step`.
             action: (n, a), clipped to [-1, 1].
 
         Returns:
-            The observation; the world; the reward (n,); terminated (), whether the episode ended for good; truncated
-            (), whether it was cut; and info: `rewards` and `metrics` by name (n,), `terminations` and `truncations`
-            by name ().
+            The observation; the world; the reward (n,); terminated (), whether the episode ended in a terminal state;
+            truncated (), whether it was cut; and info: `rewards` and `metrics` by name (n,), `terminations` and
+            `truncations` by name ().
 
         Raises:
             ValueError: no random key, a wrong shape, or numbers that are not finite (unless traced).
@@ -227,17 +227,17 @@ class Env:
         return observation(obs, world), world, *outcome
 
     def privileged_observation(self, world: World) -> PrivilegedObservation:
-        """What a critic may know in training: the observation without noise, and the drawn parameters."""
+        """Privileged observation for a critic: the observation without noise, and the drawn parameters."""
         return PrivilegedObservation(
             observe(self.terms, self.task, world), deviations(world.params, self.params, self._drawn)
         )
 
     def compiled(self, function: Callable) -> Callable:
-        """`function(env, ...)` with this environment, compiled once."""
+        """Compiled `function(env, ...)` with this environment, cached."""
         return self._program(function, functools.partial(function, self))
 
     def close(self) -> None:
-        """End the connection of a backend that has one."""
+        """Close the connection of the Bullet backend, if any."""
         if isinstance(self.physics, HostStep):
             self.physics.close()
 
@@ -259,12 +259,12 @@ class Env:
 
     @property
     def draws_delay(self) -> bool:
-        """Whether every episode draws its delay."""
+        """Whether the delay is random."""
         return self.delay[0] < self.delay[1]
 
     @functools.cached_property
     def _drawn(self) -> list[bool]:
-        """Which leaves of the parameters differ from episode to episode."""
+        """Mask of the random leaves of the parameters."""
         return randomize.drawn_leaves(self.draws, self.params)
 
 

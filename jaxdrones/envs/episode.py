@@ -1,4 +1,4 @@
-"""Phases of an episode: the start, the command of a control step, and its outcome. `env` is an `Env`."""
+"""Phases of an episode: start, command and outcome of a control step. `env` is an `Env`."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from jaxdrones.state import State
 from jaxdrones.tasks.task import World
 
 DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE, VISION = range(8)
-"""Random streams: what a key is folded with, so that only the draws that are used cost time."""
+"""Random streams to fold into a key, so that only used draws cost time."""
 
 Key = Any  # a random key; `None` where nothing is drawn
 
 
 def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
-    """The world at the start of an episode, before the first measurement."""
+    """World at the start of an episode, before the first measurement."""
     params = randomize.draw(env.draws, jax.random.fold_in(key, RANDOMIZE), env.params)
     scene = env.scene if isinstance(env.scene, Scene) else env.scene(jax.random.fold_in(key, SCENE))
     known = randomize.scaling_params(env.randomize, params, env.params)
@@ -44,13 +44,13 @@ def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
 
 
 def first_world(env: Any, key: jax.Array) -> World:
-    """The world at the start of an episode, with the first readings."""
+    """World at the start of an episode, with the first readings."""
     world = start(env, key)
     return _first_readings(env, key, world, state_rate(env, world, world.drones.rpm))
 
 
 def first_observation(env: Any, key: jax.Array, world: World, rate: State | None) -> tuple[Array, World]:
-    """The first observation, and the world with the first readings."""
+    """First observation, and world with the first readings."""
     world = _first_readings(env, key, world, rate)
     return _noisy_observation(env, key, world), world
 
@@ -64,28 +64,28 @@ def _first_readings(env: Any, key: jax.Array, world: World, rate: State | None) 
 
 
 def _measured(env: Any, key: jax.Array, world: World, rate: State) -> World:
-    """The world with new readings of the sensors."""
+    """World with new readings of the sensors."""
     after = measure_sensors(env.sensors, key, world.params, world.drones, rate, world.scene, world.sensors)
     sensors, readings = hold_between(env.sensors, world.step, env.dt, (world.sensors, world.readings), after)
     return world.replace(sensors=sensors, readings=readings)
 
 
 def state_rate(env: Any, world: World, rpm: Array) -> State | None:
-    """The time derivative of the state for the sensors, if there are any."""
+    """Time derivative of the state for the sensors, if any."""
     if not env.sensors:
         return None
     return env.physics.rate(world.params, world.drones, rpm, scene_for_step(env, world))
 
 
 def scene_for_step(env: Any, world: World) -> Scene | None:
-    """The scene as an argument of the step; `None` if the step needs none or was built with it."""
+    """Scene as an argument of the step; `None` if the step needs none or was built with it."""
     if isinstance(env.physics, HostStep):
         return None if isinstance(env.scene, Scene) else world.scene
     return env.physics.physics.seen(world.scene)
 
 
 def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Array]:
-    """The world with the new action and disturbance, and the commanded rotor speeds."""
+    """World with the new action and disturbance, and commanded rotor speeds."""
     action = jnp.clip(jnp.asarray(action, world.actions.dtype), -1, 1)
     actions = jnp.concatenate([world.actions[:, 1:], action[:, None]], axis=1)
     params = world.params
@@ -106,7 +106,7 @@ def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Arr
 def outcome(
     env: Any, key: Key, world: World, rate: State | None
 ) -> tuple[Array, World, Array, Array, Array, dict[str, Any]]:
-    """What `step` returns, from the world with the state after it."""
+    """Result of `step`, given the world with the new state."""
     task = env.task
     world = world.replace(step=world.step + 1)
     if rate is not None:

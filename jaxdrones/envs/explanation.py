@@ -1,4 +1,4 @@
-"""What an environment observes, commands, rewards and simulates, as tables for people and as data for machines."""
+"""Descriptions of observations, actions, rewards and simulation of an environment, as text and JSON."""
 
 from __future__ import annotations
 
@@ -30,48 +30,48 @@ _NUMBERS = (
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One number of the observation or action of a drone."""
+    """One entry of the observation or action of a drone."""
 
     term: str
-    """Name of the observation term or of the action type that it belongs to."""
+    """Name of its observation term or action type."""
     quantity: Quantity
     low: float
-    """Smallest number that occurs."""
+    """Lower bound."""
     high: float
-    """Largest number that occurs."""
+    """Upper bound."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A reward, a metric, or a condition that ends an episode."""
+    """Reward, metric, or condition for the end of an episode."""
 
     name: str
     meaning: str
     weight: float | None = None
-    """Weight of a reward; `None` of anything else."""
+    """Weight of a reward; `None` otherwise."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Explanation:
-    """What an environment observes, commands, rewards and simulates; its text is a table."""
+    """Description of an environment; its text is a table."""
 
     task: dict[str, str]
     """Name, summary, team, time, start, target and success."""
     observation: tuple[Entry, ...]
     images: dict[str, str]
-    """What an image of one drone is, by name."""
+    """Images of one drone by name."""
     action: tuple[Entry, ...]
     rewards: tuple[Part, ...]
     metrics: tuple[Part, ...]
     terminations: tuple[Part, ...]
     truncations: tuple[Part, ...]
     physics: dict[str, str]
-    """Backend, integrator, rates, rotors, effects, and what is drawn at random."""
+    """Backend, integrator, rates, rotors, effects, and randomizations."""
     vehicle: dict[str, str]
     """Constants of the vehicle, with units."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The same for JSON; numbers have an `index` in their observation or action."""
+        """Dictionary for JSON; entries have an `index` in their observation or action."""
         entries = {name: _plain(getattr(self, name)) for name in ("observation", "action")}
         parts = {
             name: [dataclasses.asdict(part) for part in getattr(self, name)]
@@ -100,17 +100,16 @@ class Explanation:
 
 
 def explain(env: Env) -> Explanation:
-    """What every number of the observation and action of an environment is, what is rewarded, and what is simulated.
+    """Describe the observation, action, rewards and simulation of an environment.
 
     Args:
         env: environment of `jaxdrones.make`.
 
     Returns:
-        An object whose text is a readable table (`print(jaxdrones.explain(env))`), and whose `as_dict()` is for
-        machines.
+        An object with a table as its text (`print(jaxdrones.explain(env))`), and with `as_dict()` for JSON.
 
     Raises:
-        ValueError: something else than an environment, or a term that describes more or fewer numbers than it has.
+        ValueError: an argument that is not an environment, or a term with the wrong number of descriptions.
     """
     if not isinstance(env, Env):
         raise UserError(f"env is {short_repr(env)}; give an environment, for example jaxdrones.make('hover')")
@@ -172,7 +171,7 @@ def _action_quantities(env: Env, drone: Params) -> tuple[Quantity, ...]:
 
 
 def _checked(what: str, described: tuple[Quantity, ...], size: int) -> tuple[Quantity, ...]:
-    """The quantities of a term or action type, one for each of its numbers; unknown ones where it describes none."""
+    """Quantities of a term or action type, one per entry; placeholders without a description."""
     if not described:
         return tuple(Quantity(f"number {i}", _UNKNOWN, _UNKNOWN) for i in range(size))
     if len(described) != size:
@@ -237,7 +236,7 @@ def _vehicle(env: Env, drone: Params) -> dict[str, str]:
 
 
 def number(x: float) -> str:
-    """A number with five digits."""
+    """Format a number with five digits."""
     return f"{x:.5g}"
 
 

@@ -1,4 +1,4 @@
-"""Checks of the functions of users (of tasks, scenes and policies) and of the process that calls them."""
+"""Validation of users' functions (of tasks, scenes and policies) and of the calling process."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from jaxdrones.tasks.task import ObservationTerm, Task, World
 from jaxdrones.user_code import place
 
 DrawScene = Callable[[jax.Array], Scene]
-"""(key) -> the scene of an episode."""
+"""(key) -> scene of an episode."""
 _NUMBERS = "biuf"  # kinds of dtypes
 _processes: set[int] = set()  # in which environments were made
 
 
 def check_process() -> None:
-    """Raise in a process that was forked from one in which environments were made, where JAX would hang.
+    """Raise in a process forked after environments were made, where JAX would hang.
 
     Raises:
-        RuntimeError: this is such a process; says how to start another one.
+        RuntimeError: a forked process; the message explains how to spawn one.
     """
     if os.getpid() not in _processes:
         if _processes:
@@ -43,10 +43,10 @@ def check_process() -> None:
 
 
 def scene_example(scene: Scene | DrawScene) -> Scene:
-    """The scene, or the shapes and types of one if it is drawn.
+    """Scene, or shapes and types of a random scene.
 
     Raises:
-        ValueError: it is neither a scene nor a function that draws one.
+        ValueError: neither a scene nor a function that returns one.
     """
     if isinstance(scene, Scene):
         return scene
@@ -60,7 +60,7 @@ def scene_example(scene: Scene | DrawScene) -> Scene:
 
 
 def _is_own(function: Any) -> bool:
-    """Whether a function belongs to this library, whose tests check it."""
+    """Whether a function belongs to this library, and so needs no check."""
     return str(getattr(getattr(function, "func", function), "__module__", "")).startswith("jaxdrones.")
 
 
@@ -72,21 +72,21 @@ def check_episode(
     dt: float,
     first_world: Callable[[jax.Array], World],
 ) -> list[int]:
-    """Raise unless the functions of a task return what they should; traces them, and computes nothing.
+    """Validate the results of a task's functions by tracing them, without computation.
 
     Args:
         task: the task.
         params: nominal parameters of the team.
-        scene: the scene of all episodes, or the function that draws it.
+        scene: scene of all episodes, or a function for random scenes.
         terms: observation terms.
         dt: control period, s.
-        first_world: (key) -> the world at the start of an episode, with the first readings of the sensors.
+        first_world: (key) -> world at the start of an episode, with the first readings of the sensors.
 
     Returns:
-        How many numbers of a drone each observation term has.
+        Length of each observation term of a drone.
 
     Raises:
-        UserError: a function returns something else; names it and its file.
+        UserError: an invalid result; the message names the function and its file.
     """
 
     def sizes(key: jax.Array) -> list[Any]:
@@ -101,7 +101,7 @@ def check_episode(
 
 
 def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None:
-    """Raise unless the start of a task returns the state of the team and the task's variables."""
+    """Raise unless a task's start returns the state of the team and the task's variables."""
     if _is_own(task.start):
         return
     where, n = _where("start", task.start), task.drones
@@ -141,11 +141,11 @@ def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> 
 
 
 def _check_functions(task: Task, world: World, dt: float) -> None:
-    """Raise unless target, rewards, conditions, metrics, `advance` and `success` return what a `Task` needs.
+    """Validate target, rewards, conditions, metrics, `advance` and `success` of a task.
 
     Args:
         task: the task.
-        world: a world at the start of an episode, traced.
+        world: traced world at the start of an episode.
         dt: control period, s.
     """
     n = task.drones
@@ -176,7 +176,7 @@ def check_policy(name: str, policy: Any, obs: Any, shape: tuple[int, int]) -> No
         name: of the policy.
         policy: function of observations, or a recurrent policy.
         obs: observations of the team, or their shapes.
-        shape: that of the actions.
+        shape: of the actions.
     """
 
     def act(obs):
@@ -201,11 +201,11 @@ def check_policy(name: str, policy: Any, obs: Any, shape: tuple[int, int]) -> No
     jax.eval_shape(act, obs)
 
 
-_ROWS = 100  # of the metrics that `success` is tried with
+_ROWS = 100  # of the metrics for the trial call of `success`
 
 
 def _check_one_each(what: str, function: Callable, n: int, arguments: tuple, kinds: str = _NUMBERS) -> None:
-    """Raise unless a function returns one number, or one boolean, for each of n drones."""
+    """Raise unless a function returns one number or boolean for each of n drones."""
     if _is_own(function):
         return
     x = function(*arguments)
@@ -216,7 +216,7 @@ def _check_one_each(what: str, function: Callable, n: int, arguments: tuple, kin
 
 
 def _check_like(where: str, what: str, given: Any, wanted: Any) -> None:
-    """Raise unless the fields of a pytree have the shapes of another one's."""
+    """Raise unless the fields of two pytrees have equal shapes."""
     for field, like in vars(wanted).items():
         if field == "aux" or like is None:
             continue
@@ -226,7 +226,7 @@ def _check_like(where: str, what: str, given: Any, wanted: Any) -> None:
 
 
 def _check_kept(where: str, what: str, before: Any, after: Any) -> None:
-    """Raise unless a tree keeps its structure, its shapes and its types from step to step."""
+    """Raise unless a tree keeps its structure, shapes and types from step to step."""
     _check_arrays(f"{where} returns {what}", after)
     leaves, structure = jax.tree.flatten(before)
     others, other = jax.tree.flatten(after)
@@ -246,14 +246,14 @@ def _check_arrays(what: str, tree: Any) -> None:
 
 
 def _shape(x: Any) -> tuple[int, ...] | None:
-    """The shape of an array or a number; `None` of anything else."""
+    """Shape of an array or a number; `None` otherwise."""
     if isinstance(x, jax.Array | np.ndarray | np.generic | bool | int | float | complex):
         return np.shape(x)
     return None
 
 
 def _kind(x: Any) -> str:
-    """What something is, for an error."""
+    """Description of a value for error messages."""
     shape = _shape(x)
     if isinstance(x, jax.Array | np.ndarray) and shape is not None:
         return f"an array {shape} of {x.dtype}"
@@ -261,7 +261,7 @@ def _kind(x: Any) -> str:
 
 
 def _where(what: str, function: Any) -> str:
-    """What a function is of a task, and where it is defined."""
+    """Role and location of a function of a task, for error messages."""
     where = place(function)
     return f"{where}: {what}" if where else what
 
@@ -271,7 +271,7 @@ _MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a C
 
 
 def check_controller(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:
-    """Raise if the controller of an action type would be called too seldom, or if the rotors lag too much."""
+    """Raise for a control rate or a rotor lag at which the controller of an action type is unstable."""
     if action.for_vehicle is None:
         return
     if dt > _MAX_PERIOD * (1 + 1e-6):

@@ -1,4 +1,4 @@
-"""The tasks by name, and tasks made of a name, of a function or of a file of a user."""
+"""Tasks by name, from functions and from users' files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TASKS: dict[str, Callable[..., Task]] = {
 
 
 def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
-    """The function that makes a task.
+    """Function of a task by name or from a file.
 
     Args:
         task: a name of `TASKS`, `file.py:function`, or the function itself.
@@ -54,16 +54,16 @@ def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
 
 
 def make_task(task: str | Task | Callable[..., Task], options: dict[str, Any], others: Collection[str]) -> Task:
-    """The task that `jaxdrones.make` was given.
+    """Task for the arguments of `jaxdrones.make`.
 
     Args:
-        task: a task, or what `task_function` takes.
+        task: a task, or an argument of `task_function`.
         options: keyword arguments of the function.
-        others: names of the other options of `jaxdrones.make`, for errors.
+        others: names of the other options of `jaxdrones.make`, for error messages.
 
     Raises:
-        ValueError: an unknown name, or a function that returns something else than a task.
-        TypeError: an option that the function does not have.
+        ValueError: an unknown name, or a function that does not return a task.
+        TypeError: an unknown option.
     """
     if isinstance(task, Task):
         if options:

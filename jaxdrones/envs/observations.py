@@ -1,4 +1,4 @@
-"""Observation terms by name; an observation is their concatenation. Every term has a bound.
+"""Observation terms by name, each with a bound; an observation is their concatenation.
 
 `kinematics` is equation 7 of the paper, `adjacency` equation 8; images (equation 9) belong to the environment.
 """
@@ -56,7 +56,7 @@ def velocity_error(task: Task, world: World) -> Array:
 
 
 def quaternion(task: Task, world: World) -> Array:
-    """Attitude (x, y, z, w); of the two quaternions that are the same attitude the one with w >= 0."""
+    """Attitude (x, y, z, w), with w >= 0."""
     quat = world.drones.quat
     return jnp.where(quat[:, 3:] < 0, -quat, quat)
 
@@ -72,7 +72,7 @@ def rotation_matrix(task: Task, world: World) -> Array:
 
 
 def gravity(task: Task, world: World) -> Array:
-    """Direction of gravity in body axes: the attitude but for the heading, as an accelerometer at rest shows it."""
+    """Direction of gravity in body axes: the attitude without the heading."""
     return -jax.vmap(lambda quat: rotation.to_matrix(quat)[2])(world.drones.quat)
 
 
@@ -87,7 +87,7 @@ def omega_world(task: Task, world: World) -> Array:
 
 
 def rotor_speed(task: Task, world: World) -> Array:
-    """Rotor speeds as shares of the highest."""
+    """Rotor speeds as fractions of the highest."""
     return world.drones.rpm / world.params.max_rpm[:, None]
 
 
@@ -108,7 +108,7 @@ def kinematics_2x(task: Task, world: World) -> Array:
 def normalized_kinematics(task: Task, world: World) -> Array:
     """Twelve numbers in [-1, 1]: observation of gym-pybullet-drones (2021).
 
-    As there, vz is clipped at 1 m/s but divided by 3, and of the angular velocity only the direction is observed.
+    As there, vz is clipped at 1 m/s but divided by 3, and only the direction of the angular velocity is observed.
     """
     x, y, z = world.drones.pos.T
     vx, vy, vz = world.drones.vel.T
@@ -118,20 +118,20 @@ def normalized_kinematics(task: Task, world: World) -> Array:
     place = [jnp.clip(x, -15, 15) / 15, jnp.clip(y, -15, 15) / 15, jnp.clip(z, 0, 5) / 5]
     motion = [jnp.clip(vx, -3, 3) / 3, jnp.clip(vy, -3, 3) / 3, jnp.clip(vz, -1, 1) / 3]
     columns = jnp.stack([*place, roll, pitch, yaw, *motion], axis=-1)
-    turns = speed > jnp.finfo(speed.dtype).eps ** 0.5  # rad/s: below, a direction would be one of rounding errors
+    turns = speed > jnp.finfo(speed.dtype).eps ** 0.5  # rad/s: below, the direction would be rounding noise
     return jnp.concatenate([columns, turn * (turns / jnp.where(turns, speed, 1))[:, None]], -1)
 
 
 def adjacency(task: Task, world: World, radius: float = 10.0) -> Array:
-    """Equation 8: 1 for every drone nearer than `radius` (m) and for the drone itself, else 0."""
+    """Equation 8: 1 for every drone within `radius` (m) and for the drone itself, else 0."""
     return (_distances(world) < radius).astype(world.drones.pos.dtype)
 
 
 def last_actions(count: int) -> ObservationTerm:
-    """A term of the last actions, oldest first."""
+    """Observation term of the last actions, oldest first."""
 
     def observe(task: Task, world: World) -> Array:
-        """The last actions, oldest first."""
+        """Last actions, oldest first."""
         return jnp.reshape(world.actions[:, -count:], (len(world.actions), -1))
 
     def entries(drones: int, action: tuple[Quantity, ...]) -> tuple[Quantity, ...]:
@@ -142,9 +142,9 @@ def last_actions(count: int) -> ObservationTerm:
 
 
 def neighbors(count: int) -> ObservationTerm:
-    """A term of the nearest drones, nearest first: relative position (m) and velocity (m/s), world axes.
+    """Observation term of the nearest drones, nearest first: relative position (m) and velocity (m/s), world axes.
 
-    It is padded with zeros where the team has fewer other drones.
+    It is padded with zeros for smaller teams.
     """
 
     def observe(task: Task, world: World) -> Array:
@@ -168,10 +168,10 @@ def neighbors(count: int) -> ObservationTerm:
 
 
 def reading(sensor: str, bound: float = math.inf, entries: tuple[Quantity, ...] = ()) -> ObservationTerm:
-    """A term of the latest reading of a sensor of this name, flattened; `entries` say what its numbers stand for."""
+    """Observation term of the latest reading of a sensor, flattened; `entries` describe it."""
 
     def observe(task: Task, world: World) -> Array:
-        """The latest reading of a sensor."""
+        """Latest reading of a sensor."""
         n = len(world.drones.pos)
         return jnp.concatenate([jnp.reshape(x, (n, -1)) for x in jax.tree.leaves(world.readings[sensor])], axis=-1)
 
@@ -179,7 +179,7 @@ def reading(sensor: str, bound: float = math.inf, entries: tuple[Quantity, ...] 
 
 
 def preview(*ahead: float) -> ObservationTerm:
-    """A term of the future positions of the target, `ahead` (s) from now, relative to the drone, m, world axes."""
+    """Observation term of the target positions `ahead` (s) from now, relative to the drone, m, world axes."""
 
     def observe(task: Task, world: World) -> Array:
         """Future positions of the target, relative to the drone."""
@@ -191,27 +191,27 @@ def preview(*ahead: float) -> ObservationTerm:
 
 
 def observe(terms: Sequence[ObservationTerm], task: Task, world: World) -> Float[Array, "n d"]:
-    """The observation: all terms side by side, clipped at their bounds."""
+    """Concatenated observation terms, clipped at their bounds."""
     return jnp.concatenate([_clip(term.observe(task, world), term.bound) for term in terms], axis=-1)
 
 
 def bounds(terms: Sequence[ObservationTerm], widths: Sequence[int]) -> np.ndarray:
-    """(d,) largest magnitude of every entry of an observation, whose terms have so many entries."""
+    """(d,) largest magnitude of every entry of an observation, given the lengths of its terms."""
     columns = [np.broadcast_to(term.bound, (width,)) for term, width in zip(terms, widths, strict=True)]
     return np.concatenate(columns).astype(np.float32)
 
 
 class PrivilegedObservation(PyTreeNode):
-    """Observation of a team that no sensor provides."""
+    """Privileged observation of a team."""
 
     obs: Array
-    """(n, d) the vector that would be observed without noise."""
+    """(n, d) observation without noise."""
     params: Array
-    """(n, e) deviations of the drawn parameters from their nominal values, as shares of the largest nominal one."""
+    """(n, e) relative deviations of the drawn parameters from their nominal values."""
 
 
 def deviations(params: Params, nominal: Params, drawn: Sequence[bool]) -> Float[Array, "n e"]:
-    """Deviations of the drawn leaves of a team's parameters from their nominal values, side by side."""
+    """Concatenated deviations of the drawn leaves of a team's parameters from their nominal values."""
     n = len(nominal.mass)
     leaves = zip(jax.tree.leaves(params), jax.tree.leaves(nominal), drawn, strict=True)
     columns = [jnp.reshape(_deviation(value, own), (n, -1)) for value, own, is_drawn in leaves if is_drawn]

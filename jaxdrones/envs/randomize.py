@@ -1,4 +1,4 @@
-"""Domain randomization: parameters, wind and delay that are drawn for every episode, and sensor noise. All compose."""
+"""Domain randomization of parameters, wind and delay per episode, and sensor noise."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -17,12 +17,12 @@ from jaxdrones.quantity import described
 from jaxdrones.state import State
 
 DELAY = "delay"
-"""Key of `Params.aux`: the delay of an episode, control steps, where it is drawn."""
+"""Key of `Params.aux`: random delay of an episode, control steps."""
 
 Randomization = Callable[[jax.Array, Params], Params]
 """(key, params) of one drone -> its parameters in this episode."""
 Noise = Callable[[jax.Array, State], State]
-"""(key, state) of a team -> the state as its sensors show it."""
+"""(key, state) of a team -> measured state."""
 
 
 def _check_range(field: str, low: float, high: float) -> None:
@@ -34,10 +34,10 @@ def _check_range(field: str, low: float, high: float) -> None:
 
 
 def scaled(field: str, low: float, high: float) -> Randomization:
-    """The nominal value times U(low, high), one factor for the whole array.
+    """Nominal value times U(low, high), one factor for the whole array.
 
     Raises:
-        ValueError: unknown field, `low` above `high`, or a factor that makes something positive negative or zero.
+        ValueError: unknown field, `low` above `high`, or a factor that changes the sign of a positive field.
     """
     _check_range(field, low, high)
     if field in POSITIVE:
@@ -51,7 +51,7 @@ def scaled(field: str, low: float, high: float) -> Randomization:
 
 
 def shifted(field: str, low: float, high: float) -> Randomization:
-    """The nominal value plus U(low, high), drawn for each entry of the array.
+    """Nominal value plus U(low, high), drawn for each entry of the array.
 
     Raises:
         ValueError: unknown field, or `low` above `high`.
@@ -82,11 +82,10 @@ def constant_wind(speed: float) -> Randomization:
 
 @dataclasses.dataclass(frozen=True)
 class AnyVehicle:
-    """Any quadrotor that could be built, of 20 g to 3 kg where no other masses are given (`jaxdrones.vehicles`).
+    """Random quadrotor from scaling laws (`jaxdrones.vehicles`), by default of 20 g to 3 kg.
 
-    What other randomizations draw is hidden from starts and actions, which are scaled by the nominal vehicle. This one
-    draws the vehicle itself, and they are scaled by what it draws, so that an action of 0 hovers. In `jaxdrones.make`
-    the median vehicle is the nominal one.
+    Starts and actions are scaled by the drawn vehicle, so an action of 0 hovers; with other randomizations they are
+    scaled by the nominal vehicle. In `jaxdrones.make` the median vehicle is the nominal one.
 
     Raises:
         ValueError: masses out of range, or the heaviest first.
@@ -102,23 +101,23 @@ class AnyVehicle:
         object.__setattr__(self, "__doc__", f"any quadrotor of {self.lightest:g} to {self.heaviest:g} kg")
 
     def __call__(self, key: jax.Array, params: Params) -> Params:
-        """The drawn vehicle, in the surroundings of `params`."""
+        """Random vehicle, with gravity, air and wind of `params`."""
         return vehicles.draw(key, params, self.lightest, self.heaviest)
 
     def median(self, params: Params) -> Params:
-        """A team of the median vehicle, in the surroundings of the team `params`."""
+        """Team of the median vehicle, with gravity, air and wind of the team `params`."""
         return jax.vmap(lambda one: vehicles.median(one, self.lightest, self.heaviest))(params)
 
 
 def nominal_params(randomize: Sequence[Randomization], params: Params) -> Params:
-    """The parameters of a team before anything is drawn: those given, or the median of the vehicles that are drawn."""
+    """Nominal parameters of a team: those given, or the median of random vehicles."""
     for one in randomize:
         params = one.median(params) if isinstance(one, AnyVehicle) else params
     return params
 
 
 def scaling_params(randomize: Sequence[Randomization], drawn: Params, nominal: Params) -> Params:
-    """What starts and actions are scaled by: the nominal parameters, or the drawn ones where a vehicle is drawn."""
+    """Parameters that scale starts and actions: the nominal ones, or the drawn ones of a random vehicle."""
     return drawn if any(isinstance(one, AnyVehicle) for one in randomize) else nominal
 
 
@@ -128,7 +127,7 @@ _EXAMPLE = "scaled('mass', 0.9, 1.1)"
 def all_randomizations(
     any_vehicle: bool, task: Sequence[Randomization], given: Sequence[Randomization], vehicle: Any
 ) -> tuple[Randomization, ...]:
-    """All randomizations of an environment; first those that draw whole vehicles, which the others then change."""
+    """All randomizations of an environment, whole vehicles first."""
     preset: list[Randomization] = [AnyVehicle()] if any_vehicle else []
     chosen: list[Randomization] = [
         *preset,
@@ -146,7 +145,7 @@ def all_randomizations(
 
 
 def delay_bounds(delay: float | Sequence[float], duration: float) -> tuple[float, float]:
-    """The shortest and the longest delay, s."""
+    """Shortest and longest delay, s."""
     bounds = tuple(delay) if isinstance(delay, tuple | list) else (delay, delay)
     if len(bounds) != 2:
         raise UserError(f"delay is {short_repr(delay)}; give a number, or the shortest and the longest of an episode")
@@ -158,7 +157,7 @@ def delay_bounds(delay: float | Sequence[float], duration: float) -> tuple[float
 
 
 def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> Params:
-    """The parameters of a team after all randomizations, each with a key of its own for every drone."""
+    """Parameters of a team after all randomizations, each with its own key for every drone."""
     n = len(params.mass)
     for one, one_key in zip(randomize, jax.random.split(key, max(len(randomize), 1)), strict=False):
         params = jax.vmap(one)(jax.random.split(one_key, n), params)
@@ -166,7 +165,7 @@ def draw(randomize: Sequence[Randomization], key: jax.Array, params: Params) -> 
 
 
 def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[bool]:
-    """Which leaves of the parameters of a team differ from episode to episode, however rarely."""
+    """Mask of the random leaves of the parameters of a team."""
     one = jax.tree.map(lambda x: x[0], params)
     found = [jax.tree.leaves(compiler.depends(each, jax.random.key(0), one)) for each in randomize]
     return [any(flags) for flags in zip(*found, strict=True)] if found else [False] * len(jax.tree.leaves(params))
@@ -175,8 +174,8 @@ def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[boo
 def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, omega: float = 0.02) -> Noise:
     """White noise on the state with these standard deviations, m, m/s, rad and rad/s.
 
-    The defaults for position and velocity are those of Huang et al.'s swarm simulator. Those for angle and rates are of
-    the size that attitude filters on the Crazyflie have (L2F: 1 mrad and 2 mrad/s; DiffAero: 2.4e-2 rad/s).
+    The defaults for position and velocity are those of Huang et al.'s swarm simulator. Those for angle and rates are
+    typical of attitude filters on the Crazyflie (L2F: 1 mrad and 2 mrad/s; DiffAero: 2.4e-2 rad/s).
 
     Raises:
         ValueError: a negative standard deviation.
@@ -199,7 +198,7 @@ def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, om
 
 
 def drawn_delay(shortest: float, longest: float) -> Randomization:
-    """Delay between action and command U(shortest, longest), control steps, constant in an episode: `params.aux`."""
+    """Delay between action and command U(shortest, longest), control steps, constant in an episode, in `params.aux`."""
 
     def randomize(key: jax.Array, params: Params) -> Params:
         delay = jax.random.uniform(key, (), params.mass.dtype, shortest, longest)
@@ -214,15 +213,15 @@ def with_delay(params: Params, delay: float) -> Params:
 
 
 def delay_of(params: Params) -> Array:
-    """(n,) the delay that an episode has drawn, control steps."""
+    """(n,) random delay of an episode, control steps."""
     return params.aux[DELAY]
 
 
 def delayed(actions: Array, steps: float | Array) -> Array:
-    """The action (n, a) that is in force `steps` control steps after it was given, out of the last h actions (n, h, a).
+    """Action (n, a) of `steps` control steps ago, out of the last h actions (n, h, a).
 
-    For a fraction it is the mean over the control step, in which one action is followed by the next. `steps` is a
-    number, or (n,) of every drone.
+    A fraction gives the mean over the control step in which one action follows another. `steps` is a number, or (n,)
+    for every drone.
     """
     if isinstance(steps, float) and steps == int(steps):
         return actions[:, -1 - int(steps)]
@@ -241,7 +240,7 @@ REALISTIC_RANDOMIZATION: tuple[Randomization, ...] = (
     scaled("rotor_rise_time", 0.8, 1.2),
     scaled("rotor_fall_time", 0.2, 1.2),
 )
-"""Ranges of 10 or 20 % either way, wider where published identifications of the Crazyflie differ by more.
+"""Ranges of +-10 or 20 %, wider where published identifications of the Crazyflie differ more.
 
 Some find a fifth of our torque coefficient; some find that rotors slow down as fast as they speed up, others five times
 as slowly.

@@ -1,4 +1,4 @@
-"""Environments by name."""
+"""`make`: environments by name."""
 
 from __future__ import annotations
 
@@ -87,39 +87,38 @@ def make(
 
     Args:
         task: a name of `TASKS`; `file.py:function` of a function that returns a task, or this function; or a task.
-        backend: `explicit` or `bullet`, which must be closed: use the environment in a `with` block.
-        vehicle: a bundled vehicle, the path of a URDF, or the parameters of one drone; `cf2x` when left out.
-        action: a name of `ACTIONS` or an action type; the task's own when left out.
-        observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; the task's own when left
-            out.
-        vision: which of `rgb`, `depth`, `segmentation` to observe beside the rest, as images of a camera on every
-            drone; the task's own when left out.
-        camera: that camera, with its rate, latency and noise; the task's own when left out, or else a `Camera()`.
-        realistic: lagging rotors, drag, a random delay, sensor noise and random parameters, where not given here;
-            `any` draws another vehicle of 20 g to 3 kg for every episode in place of random parameters.
+        backend: `explicit` or `bullet`; use a Bullet environment in a `with` block, which closes it.
+        vehicle: a bundled vehicle, the path of a URDF, or the parameters of one drone; by default `cf2x`.
+        action: a name of `ACTIONS` or an action type; by default the task's.
+        observation: names of `OBSERVATIONS` or of sensors, or observation terms, concatenated; by default the task's.
+        vision: images to observe, any of `rgb`, `depth`, `segmentation`, from a camera on every drone; by default the
+            task's.
+        camera: that camera, with its rate, latency and noise; by default the task's, or else `Camera()`.
+        realistic: defaults with lagging rotors, drag, a random delay, sensor noise and random parameters; `any` draws a
+            vehicle of 20 g to 3 kg for every episode in place of random parameters.
         effects: names of `EFFECTS` or functions.
         pairs: names of `PAIRS` or functions.
         team_effects: functions `(params, state) -> Wrench` of the whole team.
-        models: differential equations that are integrated along, such as a battery.
+        models: additional differential equations, such as a battery.
         rotors: `instant` or `lagging`.
         integrator: a name of `INTEGRATORS`; Bullet has its own.
-        control_hz: control steps per second; the task's own when left out.
-        substeps: physics steps per control step; the task's own when left out.
-        randomize: randomizations that draw each episode's parameters from the nominal ones.
+        control_hz: control steps per second; by default the task's.
+        substeps: physics steps per control step; by default the task's.
+        randomize: randomizations of each episode's parameters.
         noise: noise of the observed state.
-        disturbance: sets the surroundings before every control step, for example `random_pushes`.
-        delay: delay between action and command, s; or the shortest and the longest, between which every episode draws.
+        disturbance: wind or external force for every control step, for example `random_pushes`.
+        delay: delay between action and command, s, or the range of a uniform distribution, drawn per episode.
         sensors: sensors of every drone; their names are observations too.
-        scene: obstacles and ground, or a function `(key) -> Scene` that draws them for every episode; the task's own
-            when left out. On the explicit backend `obstacle_contact` makes obstacles solid, unless another effect
-            takes the scene or the task ends where they are touched.
+        scene: obstacles and ground, or a function `(key) -> Scene` for random scenes; by default the task's. On the
+            explicit backend `obstacle_contact` makes obstacles solid, unless another effect uses the scene or the task
+            ends at contact.
         **options: options of the task, for example `drones`.
 
     Raises:
-        ValueError: an unknown name, a number out of range, an action type that is flown by a controller that the
-            vehicle, its rotors or the control rate do not suit.
-        TypeError: an option that neither this function nor the task has.
-        ImportError: the Bullet backend is asked for and pybullet is not installed.
+        ValueError: an unknown name, a number out of range, or an action type with a controller that is unstable with
+            the vehicle, its rotors or the control rate.
+        TypeError: an unknown option.
+        ImportError: the Bullet backend without pybullet.
     """
     check_process()
     check_choice("backend", backend, BACKENDS)
@@ -224,14 +223,14 @@ def _terms(observation: Sequence[str | ObservationTerm], known: dict[str, Observ
 
 
 def _name(vehicle: str | os.PathLike | Params, randomize: Sequence[Randomization]) -> str:
-    """The name of the vehicle, for people."""
+    """Name of the vehicle for messages."""
     if any(isinstance(one, AnyVehicle) for one in randomize):
         return "any vehicle"
     return "drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem
 
 
 def _all_named(kind: str, values, table: dict, others: dict) -> list:
-    """Functions by name, from a table; a name that is in the table of others belongs to another argument."""
+    """Functions by name from a table; a name of the table of `others` is an error with a hint."""
     values = check_sequence(kind, values, repr(next(iter(table))))
     for value in values:
         if isinstance(value, str) and value not in table and value in others:
@@ -248,7 +247,7 @@ def _named(kind: str, value: Any, table: dict[str, Any]) -> Any:
 
 
 def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> Action:
-    """The action type for the vehicle, or an error if its controller cannot fly that."""
+    """Action type for the vehicle; raise if its controller is unstable with it."""
     kind = _named("action", action, ACTIONS)
     kind = kind() if callable(kind) else kind
     if not isinstance(kind, Action):
@@ -277,7 +276,7 @@ def _vision(
     dt: float,
     scene: Scene | DrawScene,
 ) -> Vision | None:
-    """The vision of an environment; `None` where no image is asked for."""
+    """Vision of an environment; `None` without images."""
     images = check_sequence("vision", task.vision if images is None else images, "'depth'")
     if images:
         return make_vision(step, images, camera or task.camera or Camera(), dt, scene)

@@ -1,4 +1,4 @@
-"""Images of the drones' cameras as an observation (equation 9 of the paper), on either backend."""
+"""Camera images as observations (equation 9 of the paper), on either backend."""
 
 from __future__ import annotations
 
@@ -28,35 +28,35 @@ _PIXELS_OF_STARTS = 2048  # the same at starts of episodes, of which there are f
 
 
 class ImageSpace(NamedTuple):
-    """The values that an image of one drone can have."""
+    """Space of an image of one drone."""
 
     shape: tuple[int, ...]
     dtype: type
     low: float
     high: float
     meaning: str
-    """What a value stands for, with its unit."""
+    """Meaning and unit of a value."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Vision:
-    """Images of the camera on every drone of a team, at the camera's rate and latency and with its noise.
+    """Images of the camera on every drone of a team, with the camera's rate, latency and noise.
 
-    An image shows the state of the control step at whose end it was taken. It is observed when it is as old as the
-    latency, and again at every control step until the next one. Until then the start of the episode is observed.
+    An image is taken at the end of a control step, observed after the latency, and held until the next one. The first
+    image is from the start of the episode.
     """
 
     images: tuple[str, ...]
-    """Which of `rgb`, `depth`, `segmentation`."""
+    """Any of `rgb`, `depth`, `segmentation`."""
     camera: Camera
     render: Callable[[Params, State, Scene], Images]
-    """Takes the images of a team."""
+    """Function that renders the images of a team."""
     on_host: bool
-    """Whether `render` leaves JAX, so that images are taken one after the other."""
+    """Whether `render` runs outside of JAX, one image after the other."""
     every: int
     """Control steps between images."""
     delay: int
-    """Control steps from when an image is taken to when it is observed."""
+    """Control steps between the exposure and the observation of an image."""
 
     def __str__(self) -> str:
         width, height = self.camera.resolution
@@ -65,18 +65,18 @@ class Vision:
         return f"{' and '.join(self.images)} of {width} x {height} pixels{rate}{late}"
 
     def look(self, params: Params, drones: State, scene: Scene) -> dict[str, Array]:
-        """The images of a state, without noise."""
+        """Images of a state, without noise."""
         images = self.render(params, drones, scene)
         return {name: getattr(images, name) for name in self.images}
 
     def first(self, key: Any, world: World) -> World:
-        """The world at the start of an episode with its images."""
+        """World at the start of an episode with its images."""
         pose = _pose(world.drones)
         poses = jnp.tile(pose[None], (self.delay, 1, 1))
         return world.replace(images=self._exposed(key, world.params, pose, world.scene), poses=poses)
 
     def next(self, key: Any, world: World) -> World:
-        """The world after a control step with its images."""
+        """World after a control step with its images."""
         poses = jnp.concatenate([world.poses, _pose(world.drones)[None]])
         if self.every == 1:
             images = self._exposed(key, world.params, poses[0], world.scene)
@@ -86,13 +86,13 @@ class Vision:
         return world.replace(images=images, poses=poses[1:])
 
     def renewed(self, key: Any, world: World, ended: Array) -> World:
-        """The world with the images of a start where an episode has ended."""
+        """World with initial images where an episode has ended."""
         pose = _pose(world.drones)
         poses = jnp.where(ended, pose[None], world.poses)
         return world.replace(images=self._where(ended, _PIXELS_OF_STARTS, key, world, pose), poses=poses)
 
     def spaces(self, drones: int, obstacles: int) -> dict[str, ImageSpace]:
-        """The values that the images of one drone can have, by name."""
+        """Spaces of the images of one drone, by name."""
         width, height = self.camera.resolution
         shape = (height, width)
         known = {
@@ -107,7 +107,7 @@ class Vision:
         return {name: known[name] for name in self.images}
 
     def _where(self, due: Any, pixels: int, key: Any, world: World, pose: Array) -> dict[str, Array]:
-        """New images where they are due, so many pixels at a time; elsewhere those that the world has."""
+        """New images where they are due, in chunks of pixels; elsewhere the images of the world."""
         args = key, world.params, pose, world.scene
         if self.on_host and not is_traced((due, world.images, args)):
             return self._exposed(*args) if due else world.images
@@ -115,7 +115,7 @@ class Vision:
         return where_due(self._exposed, worlds)(due, world.images, *args)
 
     def _exposed(self, key: Any, params: Params, pose: Float[Array, "n 7"], scene: Scene) -> dict[str, Array]:
-        """The images from these poses, with noise."""
+        """Images from these poses, with noise."""
         images = self.look(params, State.at_rest(pose[:, :3]).replace(quat=pose[:, 3:]), scene)
         if self.camera.noise is not None and "depth" in images:
             images["depth"] = self.camera.noise.apply(key, images["depth"], self.camera)
@@ -123,22 +123,22 @@ class Vision:
 
 
 def observation(vector: Float[Array, "n d"], world: World) -> Any:
-    """An observation: its vector, or a dictionary of `state` and the images of the world if there are any."""
+    """Observation vector, or with images a dictionary of `state` and the images."""
     return {"state": vector, **world.images} if world.images else vector
 
 
 def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, scene: Scene | DrawScene) -> Vision:
-    """The vision of an environment.
+    """Build the vision of an environment.
 
     Args:
-        step: of either backend; that of Bullet renders the images itself.
-        images: which of `rgb`, `depth`, `segmentation`.
+        step: of either backend; a Bullet step renders the images itself.
+        images: any of `rgb`, `depth`, `segmentation`.
         camera: on every drone.
         dt: control period, s.
-        scene: of the environment; a step of Bullet was built with it unless it is drawn.
+        scene: of the environment; a Bullet step was built with it unless it is random.
 
     Raises:
-        ValueError: an unknown image, something else than a camera, or more images than control steps.
+        ValueError: an unknown image, an invalid camera, or more images than control steps.
     """
     for image in images:
         check_choice("image", image, IMAGES)

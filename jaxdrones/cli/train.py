@@ -24,7 +24,7 @@ from jaxdrones.cli.train_output import (
     show_results,
     warn_of_unknown_settings,
 )
-from jaxdrones.cli.train_request import LOGGERS, Request, remaining
+from jaxdrones.cli.train_request import Request, remaining
 from jaxdrones.envs import TASKS
 from jaxdrones.errors import UserError
 from jaxdrones.visualization import plots
@@ -113,7 +113,9 @@ def add(commands) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
     parser.add_argument(
-        "--log", metavar="NAME,NAME", help=f"log the metrics of every update with {', '.join(LOGGERS)}, as installed"
+        "--log",
+        metavar="NAME,NAME",
+        help="log the metrics of every update with tensorboard, wandb or mlflow, if installed",
     )
     add_live(parser, "show an episode in the browser after every evaluation, and the learning curve")
     parser.add_argument("--hosts", type=int, metavar="N", help="number of processes that train together (1)")
@@ -193,6 +195,7 @@ def _train_row(request: Request, begin: float) -> int:
 def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines) -> int:
     """Train every run in its locked folder, and print the results."""
     from jaxdrones.learning import Diverged
+    from jaxdrones.learning.loggers import named_loggers
     from jaxdrones.training import loop
     from jaxdrones.training.presets import settings_known
     from jaxdrones.training.run import Run
@@ -202,7 +205,7 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
         warn_of_unknown_settings(recipe)
     config, what = recipe.config, described(recipe) + f", {request.row}" * bool(request.row)
     print_line(f"{what}: {config.worlds} worlds x {config.horizon} control steps an update; compiling")
-    loggers = {seed: request.loggers(run) for seed, run in runs.items()}
+    loggers = {seed: named_loggers(request.log, run.folder) for seed, run in runs.items()}
     trainer.compile()
     started = [run for run in runs.values() if request.resume and run.started]
     made = max((run.sidecar_entry("state", "update") for run in started), default=0)

@@ -14,7 +14,6 @@ from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
 
-LOGGERS = ("tensorboard", "wandb", "mlflow")
 _MAX_SEEDS = 1000
 _MAX_SECONDS = 3.6e6
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -42,8 +41,7 @@ class Request:
     live: int | None
     figure: bool
     json: bool
-    log: tuple[str, ...]
-    """Names of loggers."""
+    log: str | None
     row: str = ""
     """Settings of --sweep, for titles."""
 
@@ -62,6 +60,9 @@ class Request:
             check_at_most("episodes", options.episodes, LARGEST_COUNT)
         if options.resume and options.overwrite:
             raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")
+        from jaxdrones.learning.loggers import logger_names
+
+        logger_names(options.log)
         updates, seconds = parse_budget(options.budget)
         settings = asked_settings(options)
         if "updates" in settings and options.budget is not None:
@@ -73,11 +74,10 @@ class Request:
             seconds=seconds,
             output=options.output or run_folder(options.task),
             figure=not options.no_figure,
-            log=parse_log(options.log),
             **{
                 name: getattr(options, name) for name in ("realistic", "stop_at", "episodes", "budget", "seeds", "seed")
             },
-            **{name: getattr(options, name) for name in ("resume", "overwrite", "live", "json")},
+            **{name: getattr(options, name) for name in ("resume", "overwrite", "live", "json", "log")},
         )
 
     def swept(self, sweep: list[str]) -> list[Request]:
@@ -109,21 +109,6 @@ class Request:
         if self.seeds == 1:
             return {first: self.output}
         return {seed: self.output / f"seed-{seed}" for seed in range(first, first + self.seeds)}
-
-    def loggers(self, run: Any) -> list:
-        """The loggers of a run.
-
-        Raises:
-            UserError: a library is not installed.
-        """
-        from jaxdrones.learning import loggers
-
-        made = {
-            "tensorboard": lambda: loggers.TensorBoard(run.folder),
-            "wandb": lambda: loggers.WandB(project="jaxdrones", name=str(run.folder)),
-            "mlflow": lambda: loggers.MLflow(run_name=str(run.folder)),
-        }
-        return [made[name]() for name in self.log]
 
     @property
     def again(self) -> str:
@@ -207,15 +192,6 @@ class Request:
             )
         stop_at = recipe.stop_at if self.stop_at is None else self.stop_at
         return dataclasses.replace(recipe, config=dataclasses.replace(recipe.config, updates=total), stop_at=stop_at)
-
-
-def parse_log(text: str | None) -> tuple[str, ...]:
-    """The names of the loggers that `--log NAME,NAME` gives."""
-    names = tuple(text.split(",")) if text else ()
-    for name in names:
-        if name not in LOGGERS:
-            raise UserError(f"--log is {text!r}; give names of {', '.join(LOGGERS)}, for example --log tensorboard")
-    return names
 
 
 def parse_sweep(text: str) -> tuple[str, list[Any]]:

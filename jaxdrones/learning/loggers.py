@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import importlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,39 @@ class KeepBest:
         report = self._evaluate(state.policy, self._key)
         if self.report is None or _score(report) > _score(self.report):
             self.policy, self.report = state.policy, report
+
+
+_NAMED: dict[str, Callable[[Path], Any]] = {
+    "tensorboard": TensorBoard,
+    "wandb": lambda folder: WandB(project="jaxdrones", name=str(folder)),
+    "mlflow": lambda folder: MLflow(run_name=str(folder)),
+}
+
+
+def logger_names(names: str | None) -> list[str]:
+    """The names in a text such as `tensorboard,wandb`; none for `None`.
+
+    Raises:
+        UserError: an unknown name.
+    """
+    wanted = names.split(",") if names else []
+    for name in wanted:
+        if name not in _NAMED:
+            raise UserError(f"--log is {names!r}; give names of {', '.join(_NAMED)}, for example --log tensorboard")
+    return wanted
+
+
+def named_loggers(names: str | None, folder: Path) -> list[Any]:
+    """The loggers of a run.
+
+    Args:
+        names: as for `logger_names`.
+        folder: folder of the run.
+
+    Raises:
+        UserError: an unknown name, or a library that is not installed.
+    """
+    return [_NAMED[name](folder) for name in logger_names(names)]
 
 
 def _score(report: Report) -> tuple[float, float]:

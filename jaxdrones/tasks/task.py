@@ -133,8 +133,8 @@ class Task:
     metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     """Quantities that are reported but not rewarded, beside the `error` (m) and `speed` (m/s) of every task."""
     success: Callable[[Mapping[str, Array], float], Array] | None = None
-    """(metrics over an episode (T, n), control period) -> (n,): whether a drone did what it should. Metrics keep their
-    last values after the end of an episode. An episode that ends by a failure is none, whatever they are."""
+    """(metrics over an episode (T, n), control period) -> (n,): success of every drone. Metrics keep their last values
+    after the end of an episode. An episode that ends by a failure is no success."""
     success_terminations: tuple[str, ...] = ()
     """Names of the terminations by which an episode may end in success, such as a goal that is reached. Every other
     termination, and every truncation but that of the time, is a failure."""
@@ -147,16 +147,15 @@ class Task:
     substeps: int = 5
     """Physics steps per control step, unless the environment says otherwise."""
     scene: Scene | Callable[[jax.Array], Scene] = dataclasses.field(default_factory=Scene)
-    """Obstacles and ground; or a function `(key) -> Scene` that draws them for every episode."""
+    """Obstacles and ground, or a function `(key) -> Scene` that draws them for every episode."""
     obstacles_terminate: bool = False
-    """Whether the task's terminations find hits of obstacles, so that no force needs to do it."""
+    """Whether a hit of an obstacle terminates the episode, so that contact forces are not needed."""
     camera: Camera | None = None
     """The camera of every drone, unless the environment says otherwise; `Camera()` when left out."""
     vision: tuple[str, ...] = ()
     """Names of the images that are observed, unless the environment says otherwise."""
     contact: tuple[str, ...] = ()
-    """What drones touch on purpose, `ground`, `drones` or `obstacles`: adds those forces to the explicit backend. It
-    has the forces of obstacles anyway, unless the task ends where they are touched."""
+    """Contact forces of the explicit backend: `ground`, `drones`, `obstacles` (unless `obstacles_terminate`)."""
     action: str = "rpm"
     """Name of the default action type."""
     observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
@@ -165,11 +164,10 @@ class Task:
     """Control steps that an episode goes on after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
 
     def __post_init__(self):
-        for name, kind in ("name", str), ("summary", str), ("camera", Camera | None):
+        kinds = {"name": str, "summary": str, "camera": Camera | None}
+        for (name, kind), what in zip(kinds.items(), ("string", "string", "Camera"), strict=True):
             if not isinstance(x := getattr(self, name), kind) or x == "":
-                raise UserError(
-                    f"{name} of the task is {short_repr(x)}; give a {'string' if kind is str else 'Camera'}"
-                )
+                raise UserError(f"{name} of the task is {short_repr(x)}; give a {what}")
         check_whole(f"number of drones of {self.name}", self.drones)
         check_number("duration", self.duration, "s", above=0)
         check_number("control_hz", self.control_hz, "1/s", above=0)

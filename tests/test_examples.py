@@ -84,10 +84,9 @@ def test_torchrls_checker_passes():
 
 
 @pytest.mark.needs("ray")
-def test_what_the_script_for_rllib_saves_flies_without_ray(tmp_path, monkeypatch):
+def test_what_the_script_for_rllib_saves_flies_without_ray(tmp_path):
     sizes = ["--seeds", "1", "--updates", "2", "--worlds", "4", "--horizon", "150", "--output", str(tmp_path)]
-    monkeypatch.setattr("sys.argv", ["rllib_leader_follower.py", *sizes])
-    example("rllib_leader_follower").main()
+    subprocess.run([sys.executable, ROOT / "examples" / "rllib_leader_follower.py", *sizes], check=True)
     flies_without(("ray", "torch"), tmp_path, "leader-follower by ppo")
 
 

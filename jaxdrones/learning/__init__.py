@@ -1,4 +1,4 @@
-"""Learners that train policies by gradients of the simulation or by policy gradients, and evaluation."""
+"""Learners by gradients of the simulation or by policy gradients, and evaluation."""
 
 from jaxdrones.learning import bptt, loggers, ppo, shac
 from jaxdrones.learning.evaluation import Report, evaluate

@@ -1,4 +1,4 @@
-"""Backpropagation through time: the gradient of the rewards through physics and policy (analytic policy gradient)."""
+"""Backpropagation through time: gradients of the rewards through physics and policy (analytic policy gradient)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Config(GradientConfig):
 
 
 def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> result.TrainState:
-    """The state before the first update."""
+    """State before the first update."""
     key, policy_key = jax.random.split(key)
     policy = result.init_policy(policy_key, env, config, network)
     opt_state = _optimizer(config).init(policy.params)
@@ -37,7 +37,7 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> resul
 
 
 def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.TrainState, dict[str, Array]]:
-    """Simulate a trajectory of all worlds and make one step along the gradient of its rewards."""
+    """Simulate a trajectory of all worlds and take one gradient step on its rewards."""
     key, restart_key, collect_key = jax.random.split(state.key, 3)
     progress = collect.progress_of(env, config, state.step)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)

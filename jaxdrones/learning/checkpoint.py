@@ -1,6 +1,6 @@
-"""Policies and training states on disk: arrays as flax msgpack, and a JSON file beside them that describes them.
+"""Checkpoints of policies and training states: arrays as flax msgpack, with a JSON sidecar.
 
-A file that was changed, cut short or taken from another checkpoint is refused; see `learning.files`.
+Modified, truncated and mismatched files are rejected; see `learning.files`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
     """Write `path`.msgpack and `path`.json, both or none.
 
     Args:
-        path: path without an ending; missing folders are made.
+        path: path without a suffix; missing folders are created.
         policy: policy to save.
-        **about: entries of the sidecar, such as task, algorithm and settings: anything that JSON holds, or a dataclass.
+        **about: entries of the sidecar, such as task, algorithm and settings: JSON values or dataclasses.
 
     Raises:
-        ValueError: the policy has numbers that are not finite.
+        ValueError: a parameter is not finite.
     """
     _check_finite(_arrays_file(Path(path)), policy)
     own = {"network": _settings(policy.network), "per_agent": policy.per_agent}
@@ -39,16 +39,15 @@ def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
 
 
 def load(path: str | os.PathLike, network: Any = None) -> Policy:
-    """The policy that `save` wrote, bit for bit.
+    """Load a policy of `save`, bit for bit.
 
     Args:
-        path: path without an ending.
+        path: path without a suffix.
         network: the user's network of the policy, see `learning.networks.OwnNetwork`.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
-        ValueError: the files are damaged or do not fit each other, or the numbers have a precision that JAX has
-            switched off.
+        ValueError: damaged or mismatched files, or a precision that is disabled in JAX.
     """
     path = Path(path)
     sidecar = read_sidecar(path)
@@ -77,7 +76,7 @@ def load(path: str | os.PathLike, network: Any = None) -> Policy:
 
 
 def save_tree(path: str | os.PathLike, tree: Any, **about: Any) -> None:
-    """Write any pytree, such as a training state, with its description; random keys are saved too."""
+    """Write any pytree, such as a training state, with its description; random keys are supported."""
     path = Path(path)
     tree = _without_keys(tree)
     versions = {"jax": jax.__version__, "flax": flax.__version__}
@@ -86,11 +85,11 @@ def save_tree(path: str | os.PathLike, tree: Any, **about: Any) -> None:
 
 
 def load_tree(path: str | os.PathLike, like: Any) -> Any:
-    """The tree that `save_tree` wrote, bit for bit.
+    """Load a tree of `save_tree`, bit for bit.
 
     Args:
-        path: path without an ending.
-        like: tree of the same structure, shapes and dtypes; `jax.eval_shape` makes one without computing anything.
+        path: path without a suffix.
+        like: tree of the same structure, shapes and dtypes, for example from `jax.eval_shape`.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
@@ -124,7 +123,7 @@ def _settings(network: MLP | Network | OwnNetwork) -> dict[str, Any]:
 
 
 def _restore(path: Path, sidecar: dict[str, Any]) -> Any:
-    """The arrays of a checkpoint as NumPy arrays in dictionaries."""
+    """Arrays of a checkpoint as NumPy arrays in dictionaries."""
     content = load_bytes(_arrays_file(path), sidecar)
     try:
         return flax.serialization.msgpack_restore(content)
@@ -133,7 +132,7 @@ def _restore(path: Path, sidecar: dict[str, Any]) -> Any:
 
 
 def _check_shapes(path: Path, sidecar: dict[str, Any], tree: Any) -> None:
-    """Raise unless a tree has the shapes and dtypes that were saved."""
+    """Raise unless a tree has the saved shapes and dtypes."""
     expected, found = _shapes(tree), sidecar.get("shapes", {})
     for name in expected | found:
         if expected.get(name) != found.get(name):

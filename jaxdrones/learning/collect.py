@@ -1,4 +1,4 @@
-"""Trajectories of many worlds at once, whose episodes follow one another."""
+"""Collection of trajectories in many worlds with consecutive episodes."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ probabilities."""
 
 
 class Worlds(PyTreeNode):
-    """w worlds, each in the middle of an episode."""
+    """Batch of w worlds, each in the middle of an episode."""
 
     episodes: Episode
     obs: Obs
     """(w, n, d) current observations; here and below, with cameras, a dictionary of such an array and of images."""
     done: Array
-    """(w,) whether the episode has ended and a new one has to be started."""
+    """(w,) whether the episode has ended and a restart is due."""
     last_return: Array
-    """(w,) return of the last episode that ended, mean of the drones; 0 before the first."""
+    """(w,) return of the last finished episode, mean over drones; 0 before the first."""
     last_weight: Array
     """(w,) weight of that episode in the mean return; 0 before the first. See `mean_return`."""
     hidden_state: Any = None
@@ -44,20 +44,20 @@ class Worlds(PyTreeNode):
 
 
 class Trajectory(PyTreeNode):
-    """t control steps of w worlds."""
+    """Trajectory of t control steps of w worlds."""
 
     obs: Obs
     """(t, w, n, d) observations before the step."""
     action: Array
     """(t, w, n, a)"""
     extras: Any
-    """Extras that `act` returned."""
+    """Extras from `act`."""
     reward: Array
     """(t, w, n)"""
     terminated: Array
-    """(t, w) whether the episode ended for good, so that the state after it has no value."""
+    """(t, w) whether the episode terminated; the state after it has no value."""
     truncated: Array
-    """(t, w) whether the episode was cut, though it could have gone on."""
+    """(t, w) whether the episode was truncated."""
     final_obs: Obs
     """(t, w, n, d) observations after the step, before a new episode starts."""
     episode_return: Array
@@ -67,11 +67,11 @@ class Trajectory(PyTreeNode):
     error: Array
     """(t, w, n) distance from the target, m."""
     privileged: PrivilegedObservation | None
-    """(t, w, n, ...) privileged observations before the step; `None` unless they were asked for."""
+    """(t, w, n, ...) privileged observations before the step; `None` unless requested."""
     final_privileged: PrivilegedObservation | None
     """(t, w, n, ...) privileged observations after the step, before a new episode starts."""
     was_done: Array
-    """(t, w) whether the episode had ended before the step; such a step does not count. Always false with `reset`."""
+    """(t, w) whether the episode had ended before the step, which is then invalid. Always false with `reset`."""
     hidden_state: Any = None
     """(t, w, n, ...) hidden state of the policy after the observations before the step; `None` without one."""
 
@@ -82,7 +82,7 @@ class Trajectory(PyTreeNode):
 
 
 def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
-    """Worlds in which no episode has begun, for a policy that may be recurrent; `restart` starts one in each."""
+    """Worlds before their first episode; `restart` starts one in each."""
     obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), count))
     episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
     hidden_state = None if policy is None else policy.initial_hidden_state((count, env.drones))
@@ -91,14 +91,13 @@ def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
 
 
 def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0, progress: Array | None = None) -> Worlds:
-    """Start a new episode in every world whose episode has ended, and in the others with a given probability.
+    """Start a new episode in every world with a finished episode, and in the others with a given probability.
 
     Args:
         key: random key.
         env: environment.
         worlds: worlds.
-        fraction: probability of a new episode in a world whose episode has not ended; above zero, the worlds do not
-            all reach the same time of their episodes together.
+        fraction: probability of a new episode in the other worlds, which decorrelates the times of their episodes.
         progress: progress of training, see `progress_of`.
     """
     start_key, choice_key = jax.random.split(key)
@@ -121,18 +120,18 @@ def collect(
     privileged: bool = False,
     progress: Array | None = None,
 ) -> tuple[Worlds, Trajectory]:
-    """Simulate all worlds for some control steps; with `jax.set_mesh` each device simulates its share of them.
+    """Simulate all worlds for `length` control steps; with `jax.set_mesh` each device simulates its share.
 
     Args:
         key: random key.
         env: environment.
-        act: chooses the actions in all worlds. On several devices it is differentiated only with respect to the
+        act: function of the actions in all worlds. On several devices it is differentiated only with respect to the
             arguments of a `jax.tree_util.Partial`.
         worlds: worlds at the start of the trajectory.
         length: control steps.
-        reset: whether a new episode starts in the step in which one ends. Otherwise the drones stay as they are, and
-            all later steps are marked by `was_done`, until `restart` starts a new episode.
-        between_steps: function that is applied to the worlds between steps, to change their gradient.
+        reset: whether a new episode starts in the step that ends one. Otherwise the drones are frozen, and all later
+            steps are marked by `was_done`, until `restart` starts a new episode.
+        between_steps: function of the worlds between steps, to change their gradient.
         privileged: whether to record privileged observations.
         progress: progress of training, see `progress_of`.
     """
@@ -167,7 +166,7 @@ def collect(
             hidden_state = set_zero(ended, hidden_state)
             return worlds.replace(episodes=episodes, obs=obs, hidden_state=hidden_state), recorded
         after = worlds.replace(episodes=episodes, obs=obs, done=worlds.done | ended, hidden_state=hidden_state)
-        return _select(worlds.done, worlds, after), recorded  # without this, a lost drone would fly on to infinity
+        return _select(worlds.done, worlds, after), recorded  # otherwise a lost drone would fly on to infinity
 
     def control_steps(
         act: Act, keys: jax.Array, progress: Array | None, index: Array, worlds: Worlds
@@ -188,7 +187,7 @@ def progress_of(env: Env, config: Any, step: Array) -> Array | None:
 
     Args:
         env: environment.
-        config: settings of a learner, of which `updates` counts.
+        config: settings of a learner; `updates` is used.
         step: () updates made.
     """
     task = getattr(env, "task", None)
@@ -201,7 +200,7 @@ def deterministic(policy: Policy) -> Act:
 
 
 class _NoReset(AutoReset):
-    """Episodes after which no new one starts."""
+    """Episodes without automatic reset."""
 
     def step(self, key: jax.Array, episode: Episode, action: Array):
         obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
@@ -214,16 +213,16 @@ class _NoReset(AutoReset):
 def measure(
     env: Env, config: Any, step: Array, worlds: Worlds, trajectory: Trajectory
 ) -> tuple[Worlds, dict[str, Array]]:
-    """The worlds with the returns of the episodes that ended in a trajectory, and the metrics of an update.
+    """Update the returns of the worlds after a trajectory, and compute the metrics of an update.
 
-    The metrics are the mean reward and the mean error (m) of the steps that count, the fraction of them that terminated
-    an episode, and the mean return. The latter is NaN until a whole episode could have been flown, as only those that
-    failed have ended before: in the first `env.steps` steps of a training, and always if every trajectory is shorter
-    and starts new episodes in all worlds.
+    The metrics are the mean reward and the mean error (m) of the valid steps, the fraction of them that terminated an
+    episode, and the mean return. The latter is NaN before a whole episode can have ended, as only failed episodes have
+    ended by then: in the first `env.steps` steps of a training, and always if every trajectory is shorter and starts
+    new episodes in all worlds.
 
     Args:
         env: environment.
-        config: settings of a learner, of which `horizon` and `restart_fraction` count.
+        config: settings of a learner; `horizon` and `restart_fraction` are used.
         step: () updates made before this one.
         worlds: worlds after the trajectory.
         trajectory: trajectory.
@@ -241,10 +240,10 @@ def measure(
 
 
 def with_returns(worlds: Worlds, trajectory: Trajectory, restart_fraction: Scalar) -> Worlds:
-    """The worlds with the return and the weight of the last episode that ended in each.
+    """Worlds with the return and the weight of the last finished episode in each.
 
-    An episode that passed k updates was not cut by `restart` with a probability of (1 - restart_fraction)^k. Long ones
-    end more rarely than they begin, and its inverse is the weight that makes up for it (Horvitz and Thompson 1952).
+    An episode of k updates survives `restart` with the probability (1 - restart_fraction)^k. The inverse is the weight
+    that corrects for missing long episodes (Horvitz and Thompson 1952).
 
     Args:
         worlds: worlds after the trajectory.
@@ -254,9 +253,9 @@ def with_returns(worlds: Worlds, trajectory: Trajectory, restart_fraction: Scala
     ended = trajectory.done & ~trajectory.was_done
     t = jnp.arange(len(ended))[:, None]
     last = jnp.max(jnp.where(ended, t, -1), axis=0)
-    chosen = t == last[None]  # not an index, with which devices would exchange worlds
+    chosen = t == last[None]  # an index would make devices exchange worlds
     length = jnp.sum(jnp.where(chosen, trajectory.length, 0), axis=0)
-    passed = -((last + 1 - length) // len(ended))  # updates that began after its first step
+    passed = -((last + 1 - length) // len(ended))  # updates since its first step
     weight = (1 - jnp.asarray(restart_fraction, trajectory.reward.dtype)) ** -passed
     returns = jnp.mean(jnp.sum(jnp.where(chosen[..., None], trajectory.episode_return, 0), axis=0), axis=-1)
     return worlds.replace(
@@ -266,10 +265,9 @@ def with_returns(worlds: Worlds, trajectory: Trajectory, restart_fraction: Scala
 
 
 def mean_return(worlds: Worlds) -> Float[Array, ""]:
-    """Mean return of the last episode that ended in each world, and of its drones; NaN before there is one.
+    """Mean return of the last finished episode over worlds and drones; NaN before the first.
 
-    Of the episodes that end while some are under way, more are short than long. Of the last ones of all worlds not:
-    every world counts once, however often its episodes end.
+    Every world counts once. A mean over all finished episodes would be biased towards short ones.
     """
     weight = jnp.sum(worlds.last_weight)
     mean = jnp.sum(worlds.last_weight * worlds.last_return) / jnp.where(weight > 0, weight, 1)
@@ -279,12 +277,12 @@ def mean_return(worlds: Worlds) -> Float[Array, ""]:
 def update_obs_stats(
     statistics: RunningStatistics, trajectory: Trajectory, config: Any, step: Array
 ) -> RunningStatistics:
-    """The statistics with the observations of the steps that count in a trajectory, until they are frozen.
+    """Update the statistics with the observations of the valid steps of a trajectory, until they are frozen.
 
     Args:
         statistics: statistics so far.
         trajectory: trajectory.
-        config: settings of a learner, of which `obs_stats_window`, `obs_stats_freeze` and `updates` count.
+        config: settings of a learner; `obs_stats_window`, `obs_stats_freeze` and `updates` are used.
         step: () updates made.
     """
     obs = state_vector(trajectory.obs)

@@ -1,4 +1,4 @@
-"""Compilation of trainings and evaluations: options of the compiler, and when a program is compiled again."""
+"""Compilation of trainings and evaluations."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from jaxdrones.accelerate.compiler import training_options
 
 
 def jit(function: Callable, **arguments: Any) -> Any:
-    """`jax.jit` with the compiler options that suit training.
+    """`jax.jit` with compiler options for training.
 
-    The result may be called or lowered, but not inside another traced function, where JAX refuses compiler options.
-    The options are those of the device, so this starts it.
+    The result can be called or lowered, but not inside another traced function, where JAX rejects compiler options.
+    The options depend on the device, so this initializes it.
 
     Args:
         function: function to compile.

@@ -1,7 +1,7 @@
 """Critic inputs and networks.
 
-A critic is an MLP, with a CNN where there are images. It has no hidden state of its own and takes that of a recurrent
-policy, so that it learns from single control steps in any order.
+A critic is an MLP, with a CNN for images. It has no hidden state of its own and takes that of a recurrent policy as an
+input, so it learns from single control steps in any order.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def init_critic(key: jax.Array, env: Env, policy: Policy, config: Any) -> Any:
     Args:
         key: random key.
         env: environment.
-        policy: policy that the critic judges.
+        policy: policy of the critic.
         config: settings of shac or ppo.
     """
     centralized = getattr(config, "centralized_critic", False)
@@ -43,7 +43,7 @@ def init_critic(key: jax.Array, env: Env, policy: Policy, config: Any) -> Any:
 def discounted_value(
     params: Any, critic_obs: Obs, hidden_sizes: Sequence[int], gamma: Scalar, per_agent: bool = False
 ) -> Float[Array, "*batch n"]:
-    """The discounted sum of future rewards; the network's output is that sum times one minus `gamma`."""
+    """Discounted sum of future rewards; the network's output is that sum times one minus `gamma`."""
     network = make_network(critic_obs, hidden_sizes, 1, 0.01)
     return apply(network, params, critic_obs, per_agent)[1][..., 0] / (1 - gamma)
 
@@ -58,7 +58,7 @@ def critic_observation(
     """Observations of the critic, normalized.
 
     Args:
-        policy: policy that the critic judges.
+        policy: policy of the critic.
         obs: (*batch, n, d) observations of the policy, or a dictionary with images.
         hidden_state: (*batch, n, ...) hidden state of the policy after `obs`; `None` without one.
         privileged: privileged observation, in place of the vector of `obs`.

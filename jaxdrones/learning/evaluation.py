@@ -1,4 +1,4 @@
-"""Evaluation of a policy over many episodes, with the confidence interval of its success rate."""
+"""Evaluation of a policy over many episodes, with a confidence interval of its success rate."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 from jaxdrones.pytree import PyTreeNode
 
 _CHUNK = 1000  # episodes simulated at a time
-_ROUNDING = 1e-4  # relative, and absolute in SI units: by how much repetitions of a flight may differ
-_EPISODE_BYTES = 128  # memory that the results of an episode take per drone until the evaluation ends
+_ROUNDING = 1e-4  # relative, and absolute in SI units: tolerance between repetitions of a flight
+_EPISODE_BYTES = 128  # memory of the results of an episode per drone
 
 
 class Report(PyTreeNode):
@@ -29,12 +29,12 @@ class Report(PyTreeNode):
 
     episodes: int
     distinct_episodes: int
-    """Number of episodes that differ in their start or in what is drawn on the way; 1 where all are one flight."""
+    """Number of distinct episodes, by start or random draws; 1 if all are the same flight."""
     success: float | None
-    """Fraction of the episodes in which every drone met the task's criterion of success and that no failure ended;
-    `None` of a task without a criterion."""
+    """Fraction of the episodes without a failure in which every drone met the task's criterion of success; `None` for a
+    task without a criterion."""
     success_interval: tuple[float, float] | None
-    """95 % confidence interval of `success` (Wilson) from the distinct episodes; `None` where there is only one."""
+    """95 % confidence interval of `success` (Wilson) from the distinct episodes; `None` for only one."""
     final_error: float
     """Mean distance from the target at the end of an episode, m."""
     final_error_percentiles: dict[int, float]
@@ -52,12 +52,12 @@ class Report(PyTreeNode):
 
     @property
     def success_lower_bound(self) -> float:
-        """Lower end of the interval; the success itself of one repeated flight, 0 of a task without a criterion."""
+        """Lower end of the interval; the success itself for a single flight, 0 for a task without a criterion."""
         return self.success_interval[0] if self.success_interval else self.success or 0.0
 
 
 def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) -> Report:
-    """Simulate whole episodes; nothing after the end of an episode counts.
+    """Simulate whole episodes; steps after the end of an episode are ignored.
 
     Args:
         env: environment of either backend.
@@ -67,7 +67,7 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
         episodes: number of episodes.
 
     Raises:
-        ValueError: no random key, or more episodes than the memory holds.
+        ValueError: no random key, or more episodes than fit in memory.
     """
     check_key("key", key)
     check_episodes(env, episodes)
@@ -80,15 +80,15 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
 
 
 def compile_evaluation(env: Env, policy: Any, episodes: int) -> Callable[[AnyPolicy, jax.Array], Report]:
-    """`evaluate` of so many episodes, compiled for all policies of one structure: (policy, key) -> report.
+    """Compile `evaluate` for policies of one structure: (policy, key) -> report.
 
     Args:
         env: environment of the explicit backend.
-        policy: a policy that is a pytree, or the shapes of one.
+        policy: pytree policy, or its shapes.
         episodes: number of episodes.
 
     Raises:
-        ValueError: more episodes than the memory holds.
+        ValueError: more episodes than fit in memory.
     """
     check_episodes(env, episodes)
     split = functools.partial(jax.random.split, num=episodes)
@@ -100,7 +100,7 @@ def compile_evaluation(env: Env, policy: Any, episodes: int) -> Callable[[AnyPol
 
 
 def check_episodes(env: Env, episodes: int) -> None:
-    """Raise if an evaluation of so many episodes needs more memory than there is."""
+    """Raise if the episodes of an evaluation do not fit in memory."""
     check_at_most("episodes", episodes, LARGEST_COUNT)
     check_memory(f"an evaluation of {episodes:,} episodes", episodes * env.drones * _EPISODE_BYTES, "give fewer")
 
@@ -112,13 +112,13 @@ def _compiled_outcomes() -> Callable:
 
 def _outcomes(env: Env, policy: AnyPolicy, keys: jax.Array) -> dict:
     """Outcomes of one episode per key, along a leading axis."""
-    on_host = isinstance(env.physics, HostStep)  # which flies one world after the other, and rebuilds each one's scene
+    on_host = isinstance(env.physics, HostStep)  # which flies the worlds sequentially, and rebuilds the scene of each
     chunk = None if on_host else min(_CHUNK, len(keys))
     return jax.lax.map(functools.partial(_outcome, env, policy), keys, batch_size=chunk)
 
 
 def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:
-    """The outcome of one episode; one in which a position is not finite before its end is no success."""
+    """Outcome of one episode; an episode with a position that is not finite is no success."""
     start_key, key = jax.random.split(key)
     obs, world = env.reset(start_key)
     first_state = (world.drones.pos, world.drones.quat, world.drones.vel, world.drones.omega)
@@ -161,7 +161,7 @@ def _metrics_and_ends(info: dict) -> tuple[dict, dict]:
 
 
 def _fingerprint(tree: Any) -> UInt32[Array, "2"]:
-    """Two sums of all bits of a tree with random odd weights, which are the same for equal trees."""
+    """Hash of a tree: two sums of all bits with random odd weights."""
     total = jnp.zeros(2, jnp.uint32)
     rng = np.random.default_rng(0)
     for leaf in jax.tree.leaves(tree):
@@ -178,10 +178,10 @@ def _fingerprint(tree: Any) -> UInt32[Array, "2"]:
 
 
 def _count_distinct(env: Env, outcomes: dict) -> int:
-    """Number of episodes that are not repetitions of another one.
+    """Number of distinct episodes.
 
-    Two episodes are the same if their worlds start alike and nothing is drawn on the way. All that start in one state
-    are the same if they also come out alike: then nothing that was drawn has an effect.
+    Two episodes are the same with equal initial worlds and no later random draws. All episodes with one initial state
+    are the same if their results also agree: then the random draws have no effect.
     """
 
     def rows(names: list[str]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Actions that are normally distributed about those of a policy."""
+"""Gaussian exploration."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HALF_LOG_2_PI = math.log(2 * math.pi) / 2
 
 
 def explore(policy: Policy, log_std: Array, keys: jax.Array, hidden_state: Any, obs: Obs) -> tuple[Any, Array, Array]:
-    """Actions about those of a policy in many worlds, for `collect.collect`.
+    """Sample actions around those of a policy in many worlds, for `collect.collect`.
 
     Args:
         policy: policy.
@@ -26,7 +26,7 @@ def explore(policy: Policy, log_std: Array, keys: jax.Array, hidden_state: Any, 
         obs: (w, n, d) observations, or a dictionary with images.
 
     Returns:
-        The hidden state after the observations, the actions (w, n, a), and the logarithm of their density (w, n).
+        The hidden state after the observations, the actions (w, n, a), and their log probability density (w, n).
     """
     hidden_state, mean = policy.act(hidden_state, obs)
     action = jax.vmap(sample, (0, 0, None))(keys, mean, log_std)
@@ -34,12 +34,12 @@ def explore(policy: Policy, log_std: Array, keys: jax.Array, hidden_state: Any, 
 
 
 def sample(key: jax.Array, mean: Float[Array, "*batch n a"], log_std: Array) -> Float[Array, "*batch n a"]:
-    """Actions that are normally distributed about their mean."""
+    """Sample normally distributed actions."""
     return mean + jnp.broadcast_to(jnp.exp(log_std), mean.shape) * jax.random.normal(key, mean.shape, mean.dtype)
 
 
 def log_prob(action: Float[Array, "*batch n a"], mean: Array, log_std: Array) -> Float[Array, "*batch n"]:
-    """Logarithm of the density of actions that are normally distributed about their mean."""
+    """Log probability density of normally distributed actions."""
     log_std = jnp.broadcast_to(log_std, mean.shape)
     terms = -(((action - mean) * jnp.exp(-log_std)) ** 2) / 2 - log_std - HALF_LOG_2_PI
     return jnp.sum(terms, axis=-1)

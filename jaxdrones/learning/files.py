@@ -1,8 +1,8 @@
-"""Files with a sidecar: a JSON file beside each file that describes it and holds its checksum.
+"""Files with a JSON sidecar of metadata and checksums.
 
-The sidecar holds the SHA-256 checksum of the file and one of its own content, so that a file that was changed,
-truncated or taken from elsewhere is refused. The sidecar decides which content is valid: that of the file, or that of
-the file beside it (`state.new.msgpack`) that a process leaves when it is killed between two renames.
+The sidecar has the SHA-256 checksums of the file and of its own content, so modified, truncated and mismatched files
+are rejected. After a crash between two renames, the sidecar decides which content is valid: that of the file, or of
+the new file beside it (`state.new.msgpack`).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from jaxdrones import writing
 from jaxdrones.errors import UserError
 
 FORMAT = 4
-"""Version of the format; files of another version are refused."""
+"""Version of the format; files of other versions are rejected."""
 
 ADVICE = "take another checkpoint, or train anew"
 
 
 def save_bytes(file: Path, content: bytes, **about: Any) -> None:
-    """Write a file and its sidecar; a crash leaves both of the new files or both of the old ones."""
+    """Write a file and its sidecar atomically."""
     sidecar = {name: _plain(x) for name, x in about.items()} | {"format": FORMAT, "sha256": _digest(content)}
     sidecar = json.loads(json.dumps(sidecar, default=str))
     sidecar["sidecar_sha256"] = _sidecar_digest(sidecar)
@@ -34,22 +34,22 @@ def save_bytes(file: Path, content: bytes, **about: Any) -> None:
     try:
         new.write_bytes(content)
         writing.write(file.with_suffix(".json"), json.dumps(sidecar, indent=2).encode())
-    except OSError as error:  # that of a full disk names no file
+    except OSError as error:  # the error of a full disk names no file
         new.unlink(missing_ok=True)
         raise OSError(error.errno, error.strerror, str(file)) from error
     writing.rename(file)  # after a crash before this line, `load_bytes` finds the content beside the file
 
 
 def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
-    """The content of the file that `save_bytes` wrote.
+    """Content of a file of `save_bytes`.
 
     Args:
-        file: path with its ending.
+        file: path with its suffix.
         sidecar: content of its sidecar, from `read_sidecar`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or is not the file that the sidecar describes.
+        ValueError: it cannot be read, or does not match the sidecar.
     """
     found = [content for content in map(_read, (file, writing.beside(file))) if content is not None]
     for content in found:
@@ -65,7 +65,7 @@ def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
 
 
 def read_sidecar(path: str | os.PathLike) -> dict[str, Any]:
-    """The content of the sidecar of a checkpoint.
+    """Content of the sidecar of a checkpoint.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
@@ -93,7 +93,7 @@ def read_sidecar(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def one_line(error: Exception) -> str:
-    """The message of an error in one line of at most 120 characters."""
+    """Message of an error in one line of at most 120 characters."""
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
@@ -102,12 +102,12 @@ def _digest(content: bytes) -> str:
 
 
 def _sidecar_digest(sidecar: dict[str, Any]) -> str:
-    """Checksum of the entries of a sidecar, which does not depend on their layout."""
+    """Checksum of the entries of a sidecar, independent of their layout."""
     return _digest(json.dumps(sidecar, sort_keys=True).encode())
 
 
 def _read(file: Path) -> bytes | None:
-    """The content of a file; `None` if there is no such file."""
+    """Content of a file; `None` for a missing file."""
     try:
         return file.read_bytes()
     except FileNotFoundError:
@@ -117,7 +117,7 @@ def _read(file: Path) -> bytes | None:
 
 
 def _finish(file: Path) -> None:
-    """Rename the content that a killed process left beside the file, if it is the one that the sidecar describes."""
+    """Complete an interrupted rename if the new content matches the sidecar."""
     left = _read(writing.beside(file))
     if left is None:
         return

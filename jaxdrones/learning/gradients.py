@@ -1,17 +1,17 @@
-"""Four ways to differentiate a simulated flight.
+"""Gradients of a simulated flight: exact, decayed, or of a surrogate.
 
 The gradients of a long flight of an unstable vehicle grow or shrink with every control step.
 
 - `exact`: the derivative of the simulated physics.
-- `decay`: the gradient is multiplied by a factor below one at every control step backward, so that distant steps
-  contribute little.
-- `surrogate`: the physics is simulated as it is, but differentiated as a simpler step, by default one rigid body step
-  per control period. This is cheaper, and smooth where the simulated physics is not; the gradient is biased.
-- `point_mass`: the physics is simulated as it is, but differentiated as a point mass whose acceleration is commanded;
+- `decay`: the gradient is multiplied by a factor below one at every control step backward, so distant steps contribute
+  little.
+- `surrogate`: the full physics is simulated, but differentiated as a simpler step, by default one rigid body step per
+  control period. This is cheaper and smooth, with a biased gradient.
+- `point_mass`: the full physics is simulated, but differentiated as a point mass with commanded acceleration;
   attitudes have no gradient. See `point_mass`.
 
-With each of them, the gradient may go through the images of cameras or leave them out. It is that of the visible
-surface: a depth jumps at the edge of an obstacle, and the derivative does not show it.
+Each can include or exclude the gradient of camera images. That gradient is of the visible surface, without the jumps of
+depth at the edges of obstacles.
 """
 
 from __future__ import annotations
@@ -52,23 +52,23 @@ def _check_surrogate(name: str, step: Any) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class GradientConfig(Config):
-    """Settings of the learners that differentiate the simulation."""
+    """Settings of learners with gradients of the simulation."""
 
     adam_b2: BelowOne = 0.95
     """Decay rate of Adam's mean of squared gradients, of the policy. It is low because gradients shrink by orders of
-    magnitude while the policy learns."""
+    magnitude during training."""
     gradient: Annotated[GradientName, _check_gradient] = "exact"
-    """How the flight is differentiated: exact, decay, surrogate or point_mass; see `learning.gradients`."""
+    """Kind of gradient: exact, decay, surrogate or point_mass; see `learning.gradients`."""
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
     surrogate: Annotated[Step | None, _check_surrogate] = None
-    """Step whose derivatives are taken with `gradient="surrogate"`; a rigid body with instant rotors when left out."""
+    """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
     image_gradient: Bool = True
-    """Whether the gradient goes through the images of cameras, or takes them for constants."""
+    """Whether to differentiate camera images, or treat them as constants."""
 
 
 def with_gradient(env: Env, config: GradientConfig) -> Env:
-    """The environment whose physics and images are differentiated as the settings say."""
+    """Environment with the gradient of the settings."""
     changed: dict[str, Any] = {}
     if config.gradient == "surrogate":
         changed["physics"] = SurrogateStep(env.physics, config.surrogate or make_step(dt=env.dt))
@@ -81,14 +81,14 @@ def with_gradient(env: Env, config: GradientConfig) -> Env:
 
 
 def gradient_between_steps(config: GradientConfig) -> Callable[[Any], Any]:
-    """A function of the worlds between control steps; it changes their gradient, not their values."""
+    """Function of the worlds between control steps; it changes gradients, not values."""
     if config.gradient == "decay":
         return lambda worlds: scale_gradient(worlds, config.gradient_decay)
     return lambda worlds: worlds
 
 
 def scale_gradient(tree: Any, factor: Scalar) -> Any:
-    """The same numbers, with their gradient multiplied by `factor`."""
+    """Identity with the gradient multiplied by `factor`."""
 
     def scale(x):
         if not jnp.issubdtype(x.dtype, jnp.floating):
@@ -99,15 +99,15 @@ def scale_gradient(tree: Any, factor: Scalar) -> Any:
 
 
 def point_mass(dt: float, response: float = 0.1) -> Callable[[Params, State, Array], State]:
-    """A step of a team as points, for `SurrogateStep`: only its derivatives have a meaning.
+    """Step of a team of point masses, for the derivatives of `SurrogateStep`.
 
-    The rotors command an acceleration: their thrust along the axis to which their torque turns the body. A torque that
-    changes the body rates by dw in a control period turns the thrust by dw times `response` at once. Position and
-    velocity are differentiated with respect to that acceleration and to each other, attitude and rotors not at all.
+    The rotors command an acceleration: thrust along a body axis that their torque rotates. A torque that changes the
+    body rates by dw in a control period rotates the thrust by dw times `response` at once. Position and velocity are
+    differentiated with respect to that acceleration and to each other; attitude and rotors are not.
 
     Args:
         dt: control period, s.
-        response: time in which a change of the body rates turns the body before it is corrected, s.
+        response: time for which a change of the body rates acts before it is corrected, s.
     """
 
     def step(params: Params, state: State, rpm: Array) -> State:
@@ -125,7 +125,7 @@ def point_mass(dt: float, response: float = 0.1) -> Callable[[Params, State, Arr
 
 
 class SurrogateStep(Step):
-    """A step with the values of `step` and the derivatives of `surrogate` at the same state."""
+    """Step with the values of `step` and the derivatives of `surrogate` at the same state."""
 
     def __init__(self, step: Step, surrogate: Callable[[Params, State, Array], State]):
         self.physics, self._step = step.physics, step
@@ -149,5 +149,5 @@ class SurrogateStep(Step):
         return self._mixed(scene, params, state, rpm)
 
     def rate(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
-        """The time derivative of the step that gives the values."""
+        """Time derivative of `step`."""
         return self._step.rate(params, state, rpm, scene)

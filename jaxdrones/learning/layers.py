@@ -1,4 +1,4 @@
-"""Layers of the learners' own networks: multilayer perceptrons, convolutions of images, gated recurrent units."""
+"""Network layers: multilayer perceptrons, convolutions of images, gated recurrent units."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jaxdrones.envs.env import Obs
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
 _SMALL_IMAGE = 100  # pixels, below which a stride is 2 instead of 4
-_LARGEST_GRID = 20  # pixels that the last convolution leaves at most
+_LARGEST_GRID = 20  # largest number of pixels after the last convolution
 
 
 class MLP(nn.Module):
@@ -37,8 +37,8 @@ class MLP(nn.Module):
 class CNN(nn.Module):
     """Features of an image: convolutions, and a dense layer over all their outputs.
 
-    Kernels are as wide as their strides. Such a convolution is a matrix product, which is faster on a CPU than
-    overlapping kernels.
+    Kernels are as wide as their strides, which makes a convolution a matrix product, faster on a CPU than overlapping
+    kernels.
     """
 
     channels: Sequence[int]
@@ -66,7 +66,7 @@ def convolutions(height: int, width: int) -> tuple[tuple[int, ...], tuple[int, .
 
 
 def _patches(image: Float[Array, "*batch h w c"], stride: int) -> Array:
-    """(*batch, ceil(h / stride), ceil(w / stride), stride^2 c): the image in squares, padded with zeros."""
+    """(*batch, ceil(h / stride), ceil(w / stride), stride^2 c): square patches of the image, padded with zeros."""
     *batch, h, w, c = image.shape
     margins = [(margin // 2, margin - margin // 2) for margin in (-h % stride, -w % stride)]
     if any(map(any, margins)):
@@ -85,14 +85,14 @@ class GRU(nn.Module):
     def __call__(
         self, x: Float[Array, "*batch d"], hidden_state: Array | None = None, starts: Array | None = None
     ) -> Float[Array, "*batch size"]:
-        """The hidden state after each input.
+        """Hidden state after each input.
 
         Args:
             x: inputs; with `starts` sequences of them, along the leading axis.
-            hidden_state: (..., size) hidden state before the (first) input; zero when left out.
-            starts: (t, ...) whether an episode starts at this input, so that the hidden state before it is zero.
+            hidden_state: (..., size) hidden state before the (first) input; zero by default.
+            starts: (t, ...) whether an episode starts at this input, with a zero hidden state before it.
         """
-        # At first three quarters of the hidden state are kept in every step, so that early inputs have a gradient.
+        # Initially three quarters of the hidden state are kept in every step, so early inputs have a gradient.
         bias = jnp.repeat(jnp.array([0.0, 1.0, 0.0]), self.size)
         gates = nn.Dense(3 * self.size, kernel_init=_kernel_init(1.0), bias_init=lambda k, s, dtype: bias.astype(dtype))
         inputs, kernel = gates(x), self.param("recurrent_kernel", _orthogonal_gates, self.size, gates.param_dtype)
@@ -118,7 +118,7 @@ class GRU(nn.Module):
 
 
 class Network(nn.Module):
-    """An MLP of the observed vector, of features that a CNN extracts from images, and of the hidden state of a GRU."""
+    """MLP of the observed vector, the CNN features of images, and the hidden state of a GRU."""
 
     hidden_sizes: Sequence[int]
     output_size: int
@@ -135,7 +135,7 @@ class Network(nn.Module):
     def __call__(
         self, obs: Obs, hidden_state: Array | None = None, starts: Array | None = None
     ) -> tuple[Array | None, Array]:
-        """The hidden state after the observations, and outputs (*batch, output_size); see `GRU`."""
+        """Hidden state after the observations, and outputs (*batch, output_size); see `GRU`."""
         x = obs
         if isinstance(obs, dict):
             images = image_channels({name: x for name, x in obs.items() if name != "state"}, self.depth_scale)
@@ -150,7 +150,7 @@ class Network(nn.Module):
 def make_network(
     obs: Obs, hidden_sizes: Sequence[int], output_size: int, output_scale: float, recurrent_size: int = 0
 ) -> MLP | Network:
-    """A network for such observations, with a CNN that suits the resolution of the images.
+    """Network for the given observations, with a CNN for the resolution of the images.
 
     Args:
         obs: observations (*batch, d), or a dictionary of such an array and of images.
@@ -160,7 +160,7 @@ def make_network(
         recurrent_size: size of the hidden state of a GRU; 0 for none.
 
     Raises:
-        ValueError: an image of a kind that policies do not take.
+        ValueError: an unsupported kind of image.
     """
     channels: tuple[int, ...] = ()
     strides: tuple[int, ...] = ()
@@ -183,7 +183,7 @@ def make_network(
 
 
 def image_channels(images: Mapping[str, Array], depth_scale: float) -> Float[Array, "*batch h w c"]:
-    """Images side by side as channels in [0, 1]; `depth_scale` is the depth at which the nearness is 1/2, m."""
+    """Images as concatenated channels in [0, 1]; `depth_scale` is the depth with a nearness of 1/2, m."""
     return jnp.concatenate([IMAGE_CHANNELS[name](images[name], depth_scale) for name in sorted(images)], axis=-1)
 
 
@@ -193,16 +193,16 @@ def _normalize_rgb(rgb: Array, depth_scale: float) -> Float[Array, "*batch h w 3
 
 
 def _nearness(depth: Array, depth_scale: float) -> Float[Array, "*batch h w 1"]:
-    """1 at the camera, 1/2 at `depth_scale`, 0 at infinity, of depths (*batch, h, w) in m; its gradient is bounded."""
+    """Nearness of depths (*batch, h, w), m: 1 at the camera, 1/2 at `depth_scale`, 0 at infinity; bounded gradient."""
     return (depth_scale / (depth_scale + jnp.maximum(depth, 0)))[..., None]
 
 
 IMAGE_CHANNELS: dict[str, Callable[[Array, float], Array]] = {"rgb": _normalize_rgb, "depth": _nearness}
-"""Function of each kind of image that makes channels in [0, 1] of it."""
+"""Conversion of each kind of image to channels in [0, 1]."""
 
 
 def expand(x: Array, ndim: int) -> Array:
-    """The array with trailing axes of length one."""
+    """Array with trailing axes of length one."""
     return x.reshape(x.shape + (1,) * (ndim - x.ndim))
 
 
@@ -211,6 +211,6 @@ def _kernel_init(scale: float):
 
 
 def _orthogonal_gates(key: jax.Array, size: int, dtype: Any) -> Float[Array, "size 3*size"]:
-    """An orthogonal matrix for each of the three gates, side by side."""
+    """Concatenated orthogonal matrices of the three gates."""
     orthogonal = nn.initializers.orthogonal()
     return jnp.concatenate([orthogonal(key, (size, size), dtype) for key in jax.random.split(key, 3)], axis=1)

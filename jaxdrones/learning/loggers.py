@@ -1,6 +1,6 @@
-"""Callbacks of `train`: loggers for CSV, TensorBoard, Weights & Biases and MLflow, and the choice of the best policy.
+"""Callbacks of `train`: loggers for CSV, TensorBoard, Weights & Biases and MLflow, and `KeepBest`.
 
-A logger is called with the number of updates made and their metrics, `logger(update, metrics, state)`.
+A logger is a function `(update, metrics, state)`, with the number of updates so far.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxdrones.learning.networks import Policy
 
 
 class CSV:
-    """A row per update in a CSV file, with the columns `update` and the metrics of the first update."""
+    """Log to a CSV file: a row per update, with the columns `update` and the metrics of the first update."""
 
     def __init__(self, path: str | os.PathLike):
         self._path = Path(path)
@@ -39,7 +39,7 @@ class CSV:
 
 
 class TensorBoard:
-    """Scalars of TensorBoard, by tensorboardX.
+    """Log scalars to TensorBoard, by tensorboardX.
 
     Args:
         folder: folder of the event file.
@@ -56,7 +56,7 @@ class TensorBoard:
 
 
 class WandB:
-    """A run of Weights & Biases; the keyword arguments are those of `wandb.init`."""
+    """Log to Weights & Biases; the keyword arguments are those of `wandb.init`."""
 
     def __init__(self, **options: Any):
         self.run = _library("wandb").init(**options)
@@ -67,7 +67,7 @@ class WandB:
 
 
 class MLflow:
-    """A run of MLflow; the keyword arguments are those of `mlflow.start_run`."""
+    """Log to MLflow; the keyword arguments are those of `mlflow.start_run`."""
 
     def __init__(self, **options: Any):
         self._mlflow = _library("mlflow")
@@ -79,7 +79,7 @@ class MLflow:
 
 
 class KeepBest:
-    """Evaluate the policy every few updates and keep the best one, by success and then by return."""
+    """Evaluate the policy periodically and keep the best one, by success and then by return."""
 
     policy: Policy | None = None
     """Best policy so far; `None` before the first evaluation."""
@@ -91,15 +91,15 @@ class KeepBest:
 
         Args:
             env: environment to evaluate in.
-            key: random key of the episodes, which are the same for all policies.
-            every: updates between two evaluations.
-            episodes: episodes of an evaluation.
+            key: random key of the episodes, common to all policies.
+            every: updates between evaluations.
+            episodes: episodes per evaluation.
         """
         self._env, self._key, self._every, self._episodes = env, key, every, episodes
         self._evaluate: Any = None
 
     def __call__(self, update: int, metrics: dict[str, float], state: Any) -> None:
-        """Evaluate the policy of a training state if it is time."""
+        """Evaluate the policy of a training state if an evaluation is due."""
         if update % self._every:
             return
         if self._evaluate is None:

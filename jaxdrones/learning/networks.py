@@ -1,4 +1,4 @@
-"""Policies: networks of normalized observations, of this package or a user's own."""
+"""Policies: built-in and user-defined networks of normalized observations."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ from jaxdrones.pytree import PyTreeNode
 
 @runtime_checkable
 class RecurrentPolicy(Protocol):
-    """A policy with a hidden state, an array or a pytree; `None` for a policy without one."""
+    """Policy with a hidden state, an array or a pytree; `None` for a policy without one."""
 
     def initial_hidden_state(self, batch: tuple[int, ...]) -> Any:
-        """The hidden state at the start of an episode; `batch` is (drones,) for one team."""
+        """Hidden state at the start of an episode; `batch` is (drones,) for one team."""
 
     def act(self, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "*batch n a"]]:
-        """The hidden state after the observations, and actions."""
+        """Hidden state after the observations, and actions."""
 
 
 AnyPolicy = RecurrentPolicy | Callable[[Obs], Array]
-"""A recurrent policy, or any function from observations (n, d), or a dictionary with images, to actions (n, a)."""
+"""Recurrent policy, or any function from observations (n, d), or a dictionary with images, to actions (n, a)."""
 
 
 def initial_hidden_state(policy: AnyPolicy, drones: int) -> Any:
-    """The hidden state of a team's policy at the start of an episode; `None` for a plain function."""
+    """Hidden state of a team's policy at the start of an episode; `None` for a plain function."""
     return policy.initial_hidden_state((drones,)) if isinstance(policy, RecurrentPolicy) else None
 
 
 def act(policy: AnyPolicy, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "n a"]]:
-    """The hidden state after the observations, and actions."""
+    """Hidden state after the observations, and actions."""
     return policy.act(hidden_state, obs) if isinstance(policy, RecurrentPolicy) else (hidden_state, policy(obs))
 
 
 class OwnNetwork:
-    """A user's network: a flax linen module, a flax nnx module, or an equinox module.
+    """User-defined network: a flax linen, flax nnx or equinox module.
 
     The network maps the normalized observation of one drone, (d,) or a dictionary with images, to one output per
     action; the policy applies tanh to them. A recurrent network also has `initial_hidden_state()`, zeros of any
     structure, and maps `(hidden_state, obs)` to `(hidden_state, output)`.
 
-    The parameters of a linen module are its variables. Those of the others, which are trees of arrays, are a tuple of
-    all arrays of floating-point numbers.
+    The parameters of a linen module are its variables. Those of an nnx or equinox module are a tuple of all its
+    floating-point arrays.
     """
 
     def __init__(self, module: Any, output_size: int):
@@ -75,18 +75,18 @@ class OwnNetwork:
         return id(self.module)
 
     def init(self, key: jax.Array, example: Obs) -> Any:
-        """The parameters that training starts with; the key is for a linen module alone."""
+        """Initial parameters; the key is for a linen module alone."""
         if isinstance(self.module, nn.Module):
             state = (self.module.initial_hidden_state(),) if self.recurrent else ()
             return self.module.init(key, *state, example)
         return tuple(jnp.asarray(x) for x in self._leaves if _is_trained(x))
 
     def restored(self, params: dict[str, Any]) -> Any:
-        """The parameters of a file, which holds tuples as dictionaries."""
+        """Parameters from a file, where tuples are dictionaries."""
         return params if isinstance(self.module, nn.Module) else tuple(params[str(i)] for i in range(len(params)))
 
     def with_params(self, params: Any) -> Callable:
-        """The user's module with other parameters; for linen a function that applies it."""
+        """Module with other parameters; for linen a function that applies it."""
         if isinstance(self.module, nn.Module):
             return functools.partial(self.module.apply, params)
         rest = iter(params)
@@ -117,15 +117,15 @@ def _is_trained(leaf: Any) -> bool:
 
 
 class Policy(PyTreeNode):
-    """A function from a team's observations to its actions; a pytree, which can be saved, mapped and differentiated.
+    """Function from a team's observations to its actions; a pytree, which can be saved, mapped and differentiated.
 
-    A recurrent policy has a hidden state, see `RecurrentPolicy`; a policy without one can be called.
+    A recurrent policy has a hidden state, see `RecurrentPolicy`; other policies are callable.
     """
 
     params: Any
-    """Parameters of the network; with `per_agent` one set for each drone, along a leading axis."""
+    """Parameters of the network; with `per_agent` one set per drone, along a leading axis."""
     obs_stats: RunningStatistics
-    """Statistics that normalize the observations."""
+    """Statistics for the normalization of observations."""
     network: MLP | Network | OwnNetwork = flax.struct.field(pytree_node=False)
     per_agent: bool = flax.struct.field(pytree_node=False, default=False)
 
@@ -139,18 +139,18 @@ class Policy(PyTreeNode):
         recurrent_size: int = 0,
         network: Any = None,
     ) -> Policy:
-        """A policy whose actions are nearly zero, which is hover in most action types.
+        """Create a policy with actions near zero, which is hover in most action types.
 
         Args:
             key: random key.
             env: environment.
             hidden_sizes: sizes of the hidden layers.
-            per_agent: whether every drone has a network of its own; otherwise all drones share one.
+            per_agent: whether every drone has its own network; otherwise all drones share one.
             recurrent_size: size of the hidden state of a GRU; 0 for none.
-            network: a network in place of that of these sizes, see `OwnNetwork`.
+            network: user-defined network in place of these sizes, see `OwnNetwork`.
 
         Raises:
-            ValueError: the network does not fit the environment.
+            ValueError: a network with the wrong input or output for the environment.
         """
         obs = example_observation(env)
         own = make_network(obs, hidden_sizes, env.action_size, 0.01, recurrent_size)
@@ -188,7 +188,7 @@ class Policy(PyTreeNode):
         return self.network.recurrent if own else bool(getattr(self.network, "recurrent_size", 0))
 
     def initial_hidden_state(self, batch: tuple[int, ...]) -> Any:
-        """The hidden state (*batch, ...) at the start of an episode, zero; `None` for a policy without one.
+        """Zero hidden state (*batch, ...) at the start of an episode; `None` for a policy without one.
 
         Args:
             batch: (drones,) for one team; (teams, drones) for many.
@@ -201,7 +201,7 @@ class Policy(PyTreeNode):
         return jnp.zeros((*batch, cast(Network, self.network).recurrent_size))
 
     def act(self, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "*batch n a"]]:
-        """The hidden state (*batch, n, ...) after the observations, and actions in (-1, 1).
+        """Hidden state (*batch, n, ...) after the observations, and actions in (-1, 1).
 
         Args:
             hidden_state: hidden state before them.
@@ -212,7 +212,7 @@ class Policy(PyTreeNode):
         return hidden_state, jnp.tanh(output)
 
     def replay(self, hidden_state: Any, obs: Obs, starts: Array | None) -> Float[Array, "t *batch n a"]:
-        """The actions of a sequence of observations.
+        """Actions of a sequence of observations.
 
         Args:
             hidden_state: (*batch, n, ...) hidden state before the first observation.
@@ -237,13 +237,13 @@ class Policy(PyTreeNode):
 
 
 def example_observation(env: Env) -> Obs:
-    """An observation of one drone, all zero."""
+    """Zero observation of one drone."""
     obs, _ = jax.eval_shape(env.reset, jax.random.key(0))
     return jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), obs)
 
 
 def init_params(key: jax.Array, network: Any, example: Obs, agents: int | None = None) -> Any:
-    """Parameters of a network for one drone's observation; with `agents` one set each, along a leading axis."""
+    """Initial parameters of a network; with `agents` one set each, along a leading axis."""
     if agents is None:
         return network.init(key, example)
     return jax.vmap(network.init, in_axes=(0, None), axis_size=agents)(jax.random.split(key, agents), example)
@@ -257,7 +257,7 @@ def apply(
     hidden_state: Any = None,
     starts: Array | None = None,
 ) -> tuple[Any, Array]:
-    """Hidden states and outputs of the network that all drones share, or of the network of each drone."""
+    """Hidden states and outputs of the shared network, or of each drone's network."""
 
     def of_network(params: Any, x: Obs, hidden_state: Any) -> tuple[Any, Array]:
         if isinstance(network, MLP):
@@ -273,5 +273,5 @@ def apply(
 
 
 def set_zero(where: Array, tree: Any) -> Any:
-    """The tree with zeros where the condition over its leading axes holds."""
+    """Tree with zeros where the condition over its leading axes holds."""
     return jax.tree.map(lambda x: jnp.where(expand(where, x.ndim), 0, x), tree)

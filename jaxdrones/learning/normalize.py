@@ -12,11 +12,11 @@ from jaxdrones.learning.settings import Scalar
 from jaxdrones.pytree import PyTreeNode
 
 _CLIP = 10.0  # standard deviations
-_MIN_STD = 1e-2  # so that an entry that hardly changes is not amplified
+_MIN_STD = 1e-2  # lower bound against amplification of constant entries
 
 
 class RunningStatistics(PyTreeNode):
-    """Mean and variance of all observation vectors seen so far."""
+    """Running mean and variance of observation vectors."""
 
     mean: Array
     """(d,)"""
@@ -27,12 +27,12 @@ class RunningStatistics(PyTreeNode):
 
     @classmethod
     def empty(cls, size: int) -> RunningStatistics:
-        """Statistics before the first vector: mean 0 and variance 1, which the first vectors replace."""
+        """Statistics before the first vector: mean 0 and variance 1, replaced by the first vectors."""
         return cls(jnp.zeros(size), jnp.ones(size), jnp.zeros(()))
 
     @classmethod
     def of(cls, obs: Float[Array, "*batch d"], where: Bool[Array, "*batch"] | None = None) -> RunningStatistics:
-        """Statistics of the vectors along the last axis, of those where a mask is true if one is given."""
+        """Statistics of the vectors along the last axis, optionally with a mask."""
         batch_axes = tuple(range(obs.ndim - 1))
         counts = jnp.ones((1,) * obs.ndim, bool) if where is None else where[..., None]
         count = jnp.sum(jnp.broadcast_to(counts, (*obs.shape[:-1], 1)), dtype=obs.dtype)
@@ -43,12 +43,12 @@ class RunningStatistics(PyTreeNode):
     def update(
         self, obs: Float[Array, "*batch d"], window: Scalar = jnp.inf, where: Bool[Array, "*batch"] | None = None
     ) -> RunningStatistics:
-        """Statistics of the old and the new vectors together (Chan et al. 1983).
+        """Update the statistics with new vectors (Chan et al. 1983).
 
         Args:
             obs: new vectors along the last axis.
-            window: the old vectors weigh at most as much as this number of vectors, so that early ones are forgotten.
-            where: which of the new vectors count; all when left out.
+            window: largest weight of the old vectors, as a number of vectors, so that early ones are forgotten.
+            where: mask of the new vectors; by default all.
         """
         new = RunningStatistics.of(obs, where)
         old_count = jnp.minimum(self.count, window)
@@ -65,10 +65,10 @@ class RunningStatistics(PyTreeNode):
 
 
 def state_vector(obs: Obs) -> Float[Array, "*batch d"]:
-    """The observation without its images."""
+    """Observation without its images."""
     return obs["state"] if isinstance(obs, dict) else obs
 
 
 def map_state_vector(function: Callable[[Array], Array], obs: Obs) -> Obs:
-    """The observation with a function applied to its vector; images stay as they are."""
+    """Apply a function to the vector of an observation; images are unchanged."""
     return obs | {"state": function(obs["state"])} if isinstance(obs, dict) else function(obs)

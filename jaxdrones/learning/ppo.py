@@ -34,21 +34,21 @@ from jaxdrones.learning.settings import (
 )
 from jaxdrones.pytree import PyTreeNode
 
-_MAX_LOG_RATIO = 10.0  # far beyond what is rewarded; its exponential is finite
+_MAX_LOG_RATIO = 10.0  # far beyond the clipping range, with a finite exponential
 
 
 @check_keywords
 @dataclasses.dataclass(frozen=True)
 class Config(settings.Config):
-    """Settings; numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
+    """Settings; numbers that are not shapes may be traced, for `vmap` over many values."""
 
     updates: TracedCount = 400
     horizon: Count = 96
-    """Control steps of a trajectory. About one second is enough for a rotor's speed to change the position."""
+    """Control steps of a trajectory. Rotor speeds affect the position within about one second."""
     obs_stats_freeze: Fraction = 0.1
-    """Fraction of the updates after which the statistics of observations no longer change."""
+    """Fraction of the updates after which the statistics of observations are frozen."""
     learning_rate: Positive = 2e-3
-    """Learning rate at the start; it then adapts to `target_kl`."""
+    """Initial learning rate; it adapts to `target_kl`."""
     gamma: BelowOne = 0.99
     """Discount factor."""
     restart_fraction: Fraction = 0.05
@@ -57,35 +57,35 @@ class Config(settings.Config):
     epochs: Count = 4
     """Passes over each trajectory."""
     minibatches: Count = 8
-    """Minibatches of an epoch, each with all steps of some of the worlds."""
+    """Minibatches of an epoch, each with all steps of a subset of the worlds."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
     centralized_critic: Bool = False
-    """Whether the critic takes all drones' observations and the others' actions, or a drone's own observation."""
+    """Whether the critic observes the team and the other drones' actions, or only its own drone."""
     privileged_critic: Bool = False
-    """Whether the critic takes observations without noise and drawn parameters, which the policy does not observe."""
+    """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
     target_kl: Positive = 0.02
-    """Kullback-Leibler divergence of the updated policy from the one that acted. After an update the learning rate
+    """Kullback-Leibler divergence of the updated policy from the behavior policy. After an update the learning rate
     falls if the divergence was above twice this value and rises if it was below half of it, between
     `min_learning_rate` and `max_learning_rate`."""
     min_learning_rate: Positive = 1e-5
     max_learning_rate: Positive = 5e-3
     anneal_fraction: Fraction = 0.3
-    """Fraction of the updates, the last ones, in which the upper bound of the learning rate falls to
-    `min_learning_rate`, and that of the standard deviation of actions to `final_std`."""
+    """Final fraction of the updates in which the upper bound of the learning rate falls to `min_learning_rate`, and
+    that of the standard deviation of actions to `final_std`."""
     gae_lambda: Fraction = 0.99
     """Lambda of the generalized advantage estimation."""
     clip_epsilon: Positive = 0.2
-    """Largest change of an action's probability ratio that the loss rewards."""
+    """Clipping range of the probability ratio of actions."""
     entropy_coef: NotNegative = 0.0
     value_coef: NotNegative = 0.5
     init_std: Positive = 0.4
-    """Standard deviation of actions at the start, and its upper bound before it is annealed."""
+    """Initial standard deviation of actions, and its upper bound before annealing."""
     min_std: Positive = 0.1
-    """Lower bound of the standard deviation of actions until the upper bound is annealed below it; with less
-    exploration a policy stops learning."""
+    """Lower bound of the standard deviation of actions until the upper bound is annealed below it. It keeps exploration
+    alive."""
     final_std: Positive = 0.02
-    """Upper bound of the standard deviation after the last update. It is small because rotors whose speed fluctuates
-    produce more thrust, so that the mean action alone, which flies after training, would produce too little."""
+    """Upper bound of the standard deviation after the last update. It is small because fluctuating rotor speeds produce
+    more thrust, which the mean action alone, as used after training, would lack."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -97,7 +97,7 @@ class Config(settings.Config):
 
 
 class TrainState(result.TrainState):
-    """Everything that training needs to continue."""
+    """Complete state of a training."""
 
     log_std: Array
     """(a,), or (n, a) with `per_agent`: logarithm of the standard deviation of actions."""
@@ -108,12 +108,12 @@ class TrainState(result.TrainState):
 
 
 class Batch(PyTreeNode):
-    """Trajectories to learn from; leading axes (t, w, n)."""
+    """Training data of an update; leading axes (t, w, n)."""
 
     obs: Obs
     action: Array
     log_prob: Array
-    """Logarithm of the probability density of the action when it was chosen."""
+    """Log probability density of the action under the behavior policy."""
     critic_obs: Obs
     advantage: Array
     value_target: Array
@@ -124,7 +124,7 @@ class Batch(PyTreeNode):
 
 
 def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> TrainState:
-    """The state before the first update."""
+    """State before the first update."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     policy = result.init_policy(policy_key, env, config, network)
     shape = (env.drones, env.action_size) if config.per_agent else (env.action_size,)
@@ -143,7 +143,7 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
-    """Collect a trajectory of all worlds, then make some epochs of gradient steps on it."""
+    """Collect a trajectory of all worlds, then take epochs of gradient steps on it."""
     key, restart_key, collect_key, critic_key, optimize_key = jax.random.split(state.key, 5)
     progress = collect.progress_of(env, config, state.step)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)
@@ -179,7 +179,7 @@ def train(
 
 
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:
-    """The clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy."""
+    """Clipped surrogate loss, plus the weighted error of the values, minus the weighted entropy."""
     ratio, _ = _probability_ratio(policy, log_std, batch)
     clipped = jnp.clip(ratio, 1 - config.clip_epsilon, 1 + config.clip_epsilon)
     surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
@@ -191,13 +191,13 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Bat
 
 
 def divergence(policy: Policy, log_std: Array, batch: Batch) -> Array:
-    """Estimate of the Kullback-Leibler divergence of a policy from the one that acted, never negative."""
+    """Non-negative estimate of the Kullback-Leibler divergence of a policy from the behavior policy."""
     ratio, log_ratio = _probability_ratio(policy, log_std, batch)
     return jnp.mean(ratio - 1 - log_ratio)
 
 
 def _probability_ratio(policy: Policy, log_std: Array, batch: Batch) -> tuple[Array, Array]:
-    """How much more probable the actions are than when they were chosen, and its logarithm."""
+    """Probability ratio of the actions to the behavior policy, and its logarithm."""
     mean = policy.replay(jax.tree.map(lambda x: x[0], batch.hidden_state), batch.obs, batch.starts)
     log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob
     return jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO)), log_ratio
@@ -206,10 +206,10 @@ def _probability_ratio(policy: Policy, log_std: Array, batch: Batch) -> tuple[Ar
 def batch_of(
     key: jax.Array, config: Config, state: TrainState, hidden_state: Any, trajectory: collect.Trajectory
 ) -> Batch:
-    """The transitions of a trajectory with their advantages, normalized, and the targets of their values.
+    """Transitions of a trajectory with normalized advantages and value targets.
 
-    `hidden_state` (w, n, ...) is that of the policy before the trajectory, or `None`. The key draws the actions that a
-    centralized critic takes after the last steps of episodes and of the trajectory.
+    `hidden_state` (w, n, ...) is that of the policy before the trajectory, or `None`. The key is for the actions of a
+    centralized critic after the last steps of episodes and of the trajectory.
     """
     policy = state.policy
     final_state, final_mean = policy.act(trajectory.hidden_state, trajectory.final_obs)
@@ -235,7 +235,7 @@ def batch_of(
 
 
 def _optimize(key: jax.Array, config: Config, state: TrainState, batch: Batch):
-    """Some epochs of gradient steps: (policy parameters, log_std, critic), optimizer state, metrics."""
+    """Epochs of gradient steps: (policy parameters, log_std, critic), optimizer state, metrics."""
     w = batch.advantage.shape[1]
     *epoch_keys, last_key = jax.random.split(key, config.epochs + 1)
 

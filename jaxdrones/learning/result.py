@@ -1,4 +1,4 @@
-"""Training: the state, the loop over updates, its result, and the optimizers of the learners."""
+"""Training loop, its state and result, and optimizers."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from jaxdrones.pytree import PyTreeNode
 MAX_CALL = 64
 """Largest number of updates in one call of a compiled program."""
 PATIENCE = 10
-"""Training has diverged when gradients were not finite in so many updates in a row, or in all of fewer updates."""
+"""Number of consecutive updates with gradients that are not finite at which a training counts as diverged."""
 
 _RATE_FACTOR = 1.2  # by which the learning rate is raised or lowered
 
 
 class Diverged(RuntimeError):
-    """Training has diverged: its numbers or its gradients are not finite."""
+    """Diverged training: parameters or gradients are not finite."""
 
 
 class TrainState(PyTreeNode):
-    """Everything that training needs to continue."""
+    """Complete state of a training."""
 
     step: Array
-    """() updates made."""
+    """() number of updates."""
     key: Array
     policy: Policy
     opt_state: optax.OptState
@@ -49,21 +49,21 @@ Callback = Callable[[int, dict[str, float], Any], Any]
 
 
 class Result(PyTreeNode):
-    """A trained policy, and how the training went."""
+    """Trained policy, training state and history."""
 
     policy: Policy
     train_state: Any
-    """State to continue the training from."""
+    """State for further training."""
     history: dict[str, Array]
-    """(updates,) every metric of `update`. `nonfinite_gradients` counts the gradients of an update that were not finite
-    and were replaced by zero."""
+    """(updates,) every metric of `update`. `nonfinite_gradients` counts the gradients of an update that were not
+    finite, and so replaced by zero."""
 
     def __repr__(self) -> str:
         return f"<Result: {self.policy!r}, history of {', '.join(self.history)}>"
 
 
 def init_policy(key: jax.Array, env: Env, config: Config, network: Any) -> Policy:
-    """The policy before the first update, with the network of the settings or a user's own."""
+    """Policy before the first update, with the network of the settings or of the user."""
     return Policy.init(key, env, config.hidden_sizes, config.per_agent, config.recurrent_size, network)
 
 
@@ -81,12 +81,12 @@ def run_training(
     """Make all updates of a learner.
 
     Inside `jax.jit` or `jax.vmap`, or with traced settings, the updates become part of that function. Otherwise the
-    program is compiled here and kept for further calls with equal settings and the same environment.
+    program is compiled and cached for equal settings and the same environment.
 
     Args:
         init: the learner's `init(key, env, config, network)`.
         update: the learner's `update(env, config, state)`.
-        key: random key; not used with a `state`.
+        key: random key; unused with a `state`.
         env: environment.
         config: settings of the learner.
         network: a flax linen, flax nnx or equinox module in place of the network of the settings; see
@@ -95,9 +95,9 @@ def run_training(
         state: state to continue from, the `train_state` of a result; up to `config.updates` updates in total.
 
     Raises:
-        ValueError: no random key, or a state that has made all updates.
-        Diverged: gradients were not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised;
-            `history["nonfinite_gradients"]` has their number.
+        ValueError: no random key, or a state without updates left.
+        Diverged: gradients that are not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised; see
+            `history["nonfinite_gradients"]`.
     """
     check_key("key", key)
     callbacks = (callback,) if callable(callback) else tuple(callback)
@@ -128,7 +128,7 @@ def run_training(
 
 
 def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, total: Array) -> tuple[Any, dict]:
-    """Make `count` updates, at most `MAX_CALL`, of a training of `total`; the metrics are arrays (MAX_CALL,)."""
+    """Run `count` updates, at most `MAX_CALL`, of a training of `total`; the metrics are arrays (MAX_CALL,)."""
     config = dataclasses.replace(config, updates=total)
     shapes = jax.eval_shape(functools.partial(update, env, config), state)[1]
     metrics = jax.tree.map(lambda x: jnp.zeros((MAX_CALL, *x.shape), x.dtype), shapes)
@@ -142,7 +142,7 @@ def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, t
 
 
 def _programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple[Callable, Callable]:
-    """The compiled `init` and `advance` of an environment and settings."""
+    """Compiled `init` and `advance` of an environment and settings."""
     try:
         return _cached_programs(init, update, env, config)
     except TypeError:  # settings that cannot be hashed, such as arrays
@@ -162,15 +162,15 @@ def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result
 
 
 def check_gradients(nonfinite: Sequence[int] | np.ndarray, patience: int = PATIENCE, before: int = 0) -> int:
-    """Raise if gradients were not finite in too many updates in a row.
+    """Raise after too many consecutive updates with gradients that are not finite.
 
     Args:
-        nonfinite: (updates,) number of gradients of each update that were not finite.
+        nonfinite: (updates,) number of gradients of each update that are not finite.
         patience: number of such updates in a row at which to raise.
-        before: number of such updates in a row just before these.
+        before: number of consecutive such updates before these.
 
     Returns:
-        The number of such updates in a row, up to the last of these updates.
+        The number of consecutive such updates at the end.
 
     Raises:
         Diverged: too many updates in a row.
@@ -186,31 +186,31 @@ def check_gradients(nonfinite: Sequence[int] | np.ndarray, patience: int = PATIE
 def cosine_adam(
     learning_rate: Scalar, steps: Scalar, max_grad_norm: Scalar, adam_b2: Scalar = 0.999
 ) -> optax.GradientTransformation:
-    """Adam with clipped gradients and a learning rate that falls to zero along a cosine.
+    """Adam with clipped gradients and a cosine decay of the learning rate to zero.
 
     All parameters are flattened to one vector, which compiles faster.
 
     Args:
-        learning_rate: learning rate at the start.
-        steps: number of steps until the learning rate is zero.
+        learning_rate: initial learning rate.
+        steps: number of steps of the decay.
         max_grad_norm: largest norm of a gradient; see `clip_gradient`.
         adam_b2: decay rate of Adam's mean of squared gradients.
     """
 
-    def schedule(step):  # optax.cosine_decay_schedule, for a number of steps that may be traced
+    def schedule(step):  # optax.cosine_decay_schedule, for a traced number of steps
         return learning_rate * (0.5 * (1 + jnp.cos(jnp.pi * jnp.minimum(step, steps) / steps)))
 
     return optax.flatten(optax.chain(clip_gradient(max_grad_norm), optax.adam(schedule, b2=adam_b2)))
 
 
 def adapted_learning_rate(config: Any, updates: Scalar, learning_rate: Scalar, kl: Scalar) -> Array:
-    """The learning rate of PPO after an update, adapted to the divergence from the policy that acted.
+    """Learning rate of PPO after an update, adapted to the divergence from the behavior policy.
 
     Args:
         config: settings of ppo.
-        updates: updates made, this one included.
+        updates: number of updates, this one included.
         learning_rate: learning rate of this update.
-        kl: divergence of the updated policy from the one that acted in this update.
+        kl: divergence of the updated policy from the behavior policy of this update.
     """
     raised = jnp.where(kl < config.target_kl / 2, _RATE_FACTOR, 1)
     factor = jnp.where(kl > 2 * config.target_kl, 1 / _RATE_FACTOR, raised)
@@ -219,13 +219,13 @@ def adapted_learning_rate(config: Any, updates: Scalar, learning_rate: Scalar, k
 
 
 def annealed(config: Any, updates: Scalar, high: Scalar, low: Scalar) -> Array:
-    """`high` until the last updates, in which it falls to `low` by the same factor in each."""
+    """Geometric decay from `high` to `low` in the last updates."""
     remaining = jnp.clip((1 - updates / config.updates) / jnp.maximum(config.anneal_fraction, 1e-6), 0, 1)
     return low * (high / low) ** remaining
 
 
 def clip_gradient(max_grad_norm: Scalar) -> optax.GradientTransformation:
-    """Scale gradients down to a norm of at most `max_grad_norm`; replace those that are not finite by zero."""
+    """Scale gradients to a norm of at most `max_grad_norm`; replace those that are not finite by zero."""
 
     def update(gradient, state, params=None):
         norm = optax.tree.norm(gradient)
@@ -237,5 +237,5 @@ def clip_gradient(max_grad_norm: Scalar) -> optax.GradientTransformation:
 
 
 def count_nonfinite(norm: Array) -> Int[Array, ""]:
-    """The number of gradients whose norm is not finite."""
+    """Number of gradients with a norm that is not finite."""
     return jnp.sum(~jnp.isfinite(norm))

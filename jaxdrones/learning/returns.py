@@ -23,7 +23,7 @@ def trajectory_advantages(
     gamma: Scalar,
     gae_lambda: Scalar,
 ) -> Float[Array, "t w n"]:
-    """Advantages of every drone in a trajectory; the episodes of a team end together. See `advantages`."""
+    """Advantages of every drone in a trajectory, see `advantages`; the episodes of a team end together."""
     terminated = jnp.broadcast_to(trajectory.terminated[..., None], value.shape)
     truncated = jnp.broadcast_to(trajectory.truncated[..., None], value.shape)
     return advantages(trajectory.reward, value, next_value, terminated, truncated, gamma, gae_lambda)
@@ -40,15 +40,14 @@ def advantages(
 ) -> Float[Array, "t *w"]:
     """Generalized advantage estimation (Schulman et al. 2016), exact at time limits.
 
-    A termination ends the sum, and the state after it has no value. A truncation ends the sum too, but the value of the
-    last observation stands for the rewards that would have followed.
+    A termination ends the sum with a value of zero, a truncation with the value of the last observation.
 
     Args:
         reward: reward of every step.
         value: value of the observation before the step.
         next_value: value of the observation after the step, before a new episode starts.
-        terminated: whether the step ended the episode for good.
-        truncated: whether the episode was cut after the step.
+        terminated: whether the step terminated the episode.
+        truncated: whether the step truncated the episode.
         gamma: discount factor.
         gae_lambda: 0 sums one step, 1 all steps to the end of the episode.
 

@@ -1,7 +1,7 @@
-"""Settings that all learners share, and the type of each setting with the check of its values.
+"""Common settings of the learners, and annotated types of settings with validation.
 
-A learner's `Config` annotates each field with one of these types. Numbers that are not shapes may be traced by JAX;
-a traced number is not checked.
+A learner's `Config` annotates each field with one of these types. Numbers that are not shapes may be traced by JAX, and
+are then not validated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxdrones.checks import check_number, check_switch, check_whole, is_concret
 from jaxdrones.errors import UserError
 
 Scalar = float | jax.Array
-"""A number that may be traced, so that `jax.vmap` trains with many values of it at once."""
+"""Number that may be traced, for `jax.vmap` over many values."""
 
 
 def _check_whole_if_known(name: str, value: Any) -> None:
@@ -48,14 +48,14 @@ HiddenSizes = Annotated[tuple[int, ...], _check_layers]
 
 
 def check_settings(config: Any) -> None:
-    """Raise unless every setting of a dataclass is one that its type allows."""
+    """Raise unless every setting of a dataclass is valid for its type."""
     for name, check in _checks(config.__class__).items():
         check(name, getattr(config, name))
 
 
 @functools.cache
 def _checks(kind: type) -> dict[str, Callable[[str, Any], None]]:
-    """The check of each field of a dataclass that has one."""
+    """Checks of the fields of a dataclass."""
     hints = typing.get_type_hints(kind, include_extras=True)
     annotated = {field.name: getattr(hints[field.name], "__metadata__", ()) for field in dataclasses.fields(kind)}
     return {name: metadata[0] for name, metadata in annotated.items() if metadata}
@@ -63,7 +63,7 @@ def _checks(kind: type) -> dict[str, Callable[[str, Any], None]]:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Settings of every learner; numbers that are not shapes may be traced, so that `vmap` trains with many values."""
+    """Common settings; numbers that are not shapes may be traced, for `vmap` over many values."""
 
     updates: TracedCount = 200
     worlds: Count = 256
@@ -73,13 +73,13 @@ class Config:
     recurrent_size: NonNegativeInt = 0
     """Size of the hidden state of a gated recurrent unit (GRU) in the policy; 0 for none."""
     obs_stats_window: PositiveOrInfinite = 1e9
-    """Number of trajectories over which the statistics of observations average."""
+    """Averaging window of the statistics of observations, in trajectories."""
     obs_stats_freeze: Fraction = 0.2
-    """Fraction of the updates after which the statistics of observations no longer change."""
+    """Fraction of the updates after which the statistics of observations are frozen."""
     per_agent: Bool = False
-    """Whether every drone has networks of its own; otherwise all drones share them."""
+    """Whether every drone has its own networks; otherwise all drones share them."""
     learning_rate: Positive = 2e-2
-    """Learning rate of the policy at the start."""
+    """Initial learning rate of the policy."""
     gamma: Fraction = 1.0
     """Discount factor."""
     restart_fraction: Fraction = 0.2
@@ -92,7 +92,7 @@ class Config:
 
 
 def check_config(config: Any, kind: type) -> None:
-    """Raise unless the settings are those of the learner whose `Config` is `kind`."""
+    """Raise unless the settings are of the type `kind`."""
     if isinstance(config, kind):
         return
     learner = _learner(kind)

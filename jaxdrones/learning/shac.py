@@ -1,4 +1,4 @@
-"""Short-horizon actor-critic (Xu et al. 2022): backpropagation through short trajectories, with a terminal value."""
+"""Short-horizon actor-critic (Xu et al. 2022): backpropagation through short trajectories with a terminal value."""
 
 from __future__ import annotations
 
@@ -37,38 +37,38 @@ _CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 @check_keywords
 @dataclasses.dataclass(frozen=True)
 class Config(GradientConfig):
-    """Settings; numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
+    """Settings; numbers that are not shapes may be traced, for `vmap` over many values."""
 
     updates: TracedCount = 220
     gamma: BelowOne = 0.98
     """Discount factor."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
     privileged_critic: Bool = False
-    """Whether the critic takes observations without noise and drawn parameters, which the policy does not observe."""
+    """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
     critic_learning_rate: Positive = 5e-3
-    """Learning rate of the critic at the start; it falls to zero along a cosine."""
+    """Initial learning rate of the critic, with a cosine decay to zero."""
     critic_steps: Count = 8
     """Gradient steps of the critic in an update, each on four successive control steps of all worlds."""
     terminal_value_warmup: PositiveFraction = 0.9
-    """Fraction of the updates during which the weight of the terminal value rises linearly from 0 to 1."""
+    """Fraction of the updates in which the weight of the terminal value rises linearly from 0 to 1."""
     gae_lambda: Fraction = 0.95
     """Lambda of the critic's TD(lambda) targets."""
     target_update_rate: PositiveFraction = 0.2
-    """Fraction by which the target critic approaches the critic in an update."""
+    """Step size of the target critic towards the critic in an update."""
 
 
 class TrainState(result.TrainState):
-    """Everything that training needs to continue."""
+    """Complete state of a training."""
 
     critic: Any
     """Parameters of the value function."""
     target_critic: Any
-    """Parameters of the target value function, which follows the critic slowly."""
+    """Parameters of the target value function, a moving average of the critic."""
     critic_opt_state: optax.OptState
 
 
 def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> TrainState:
-    """The state before the first update."""
+    """State before the first update."""
     key, policy_key, critic_key = jax.random.split(key, 3)
     policy = result.init_policy(policy_key, env, config, network)
     critic = init_critic(critic_key, env, policy, config)
@@ -85,7 +85,7 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
 
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
-    """Simulate a trajectory of all worlds, make one step of the policy along its gradient, then fit the critic."""
+    """Simulate a trajectory of all worlds, take one gradient step of the policy, then fit the critic."""
     key, restart_key, collect_key, critic_key = jax.random.split(state.key, 4)
     progress = collect.progress_of(env, config, state.step)
     worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)
@@ -146,9 +146,9 @@ def train(
 
 
 def _at(chosen: Array, trajectory: collect.Trajectory) -> collect.Trajectory:
-    """The chosen step (t, w) of each trajectory: the entries that the critic takes, (w, ...)."""
+    """Inputs of the critic at the chosen step (t, w) of each trajectory, (w, ...)."""
 
-    def select(x: Array) -> Array:  # not by an index, with which devices would exchange worlds
+    def select(x: Array) -> Array:  # an index would make devices exchange worlds
         condition = chosen.reshape(chosen.shape + (1,) * (x.ndim - 2))
         return jnp.sum(jnp.where(condition, x, 0), axis=0, dtype=x.dtype)
 
@@ -163,7 +163,7 @@ def _final_observation(policy: Policy, trajectory: collect.Trajectory) -> Obs:
 
 
 def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: collect.Trajectory):
-    """Parameters, optimizer state and metrics of the critic after some steps towards the TD(lambda) returns."""
+    """Parameters, optimizer state and metrics of the critic after gradient steps on the TD(lambda) returns."""
     obs = critic_observation(state.policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged)
     now = _value(config, state.target_critic, obs)
     later = _value(config, state.target_critic, _final_observation(state.policy, trajectory))

@@ -1,4 +1,4 @@
-"""Policies from the weights of a multilayer perceptron that another library trained."""
+"""Policies from the weights of a multilayer perceptron of another library."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ def mlp_policy(
     obs_stats: RunningStatistics | None = None,
     per_agent: bool = False,
 ) -> Policy:
-    """A policy with the weights of a multilayer perceptron, whose actions are the hyperbolic tangent of its outputs.
+    """Policy with the weights of a multilayer perceptron and tanh outputs.
 
-    `training.run.Run(folder).save_policy("best", policy, recipe=recipe.as_dict(), update=0)` saves it, so that
-    `jaxdrones eval` and `jaxdrones fly --policy` can fly it.
+    `training.run.Run(folder).save_policy("best", policy, recipe=recipe.as_dict(), update=0)` saves it for
+    `jaxdrones eval` and `jaxdrones fly --policy`.
 
     Args:
-        layers: weight (out, in) and bias (out,) of each linear layer; with `per_agent` one of each for every drone,
-            along a leading axis.
+        layers: weight (out, in) and bias (out,) of each linear layer; with `per_agent` a leading axis over drones.
         activation: a name of `learning.layers.ACTIVATIONS`, between the layers.
-        obs_stats: statistics that normalize observations; without them observations are not normalized.
-        per_agent: whether every drone has a network of its own.
+        obs_stats: statistics for the normalization of observations; by default none.
+        per_agent: whether every drone has its own network.
     """
     weights = [(jnp.asarray(weight), jnp.asarray(bias)) for weight, bias in layers]
     params = {

@@ -1,4 +1,4 @@
-"""Tasks: how episodes start, where drones should be, what is rewarded, and when an episode ends."""
+"""Tasks: starts, targets, rewards and terminations of episodes."""
 
 from jaxdrones.quantity import Quantity, described
 from jaxdrones.tasks.shaping import REACH_AND_STAY

@@ -1,4 +1,4 @@
-"""Curves to follow: shapes of one period, and where drone i of a team should be at time t."""
+"""Reference curves: periodic shapes, and positions of a team over time."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from jaxdrones.pytree import PyTreeNode
 
 WAYPOINTS = 8
 RANDOM_NUMBERS = 3 * WAYPOINTS + 3
-"""How many random numbers a shape is given."""
+"""Number of random numbers of a shape."""
 Shape = Callable[[Float[Array, " k"], Float[Array, ""]], Float[Array, "3"]]
-"""(random numbers (27,) in [-1, 1], time in periods) -> place relative to the centre, m; repeats after every period."""
+"""(random numbers (27,) in [-1, 1], time in periods) -> position relative to the center, m; periodic."""
 Point = Callable[[Int[Array, ""], Float[Array, ""]], Float[Array, "3"]]
-"""(drone, time in s) -> place, m, world."""
+"""(drone, time in s) -> position, m, world."""
 
 
 def setpoint_on(point: Callable[[Float[Array, ""]], Float[Array, "3"]], t: Float[Array, ""]) -> Setpoint:
-    """Position, velocity and acceleration at time t (s) of a point that moves, by differentiating its position."""
+    """Position, velocity and acceleration at time t (s) of a moving point, by differentiation of its position."""
 
     def velocity(t):
         return jax.jvp(point, (t,), (jnp.ones_like(t),))[1]
@@ -33,12 +33,12 @@ def setpoint_on(point: Callable[[Float[Array, ""]], Float[Array, "3"]], t: Float
 
 
 def unit_circle(u: Array, s: Array) -> Array:
-    """A level circle of 1 m radius, counter-clockwise from x = 1 m."""
+    """Level circle of 1 m radius, counterclockwise from x = 1 m."""
     return jnp.stack([jnp.cos(_angle(s)), jnp.sin(_angle(s)), jnp.zeros_like(s)])
 
 
 def figure_eight(u: Array, s: Array) -> Array:
-    """An upright eight, as in crazyflow's benchmark: x is the sine, z half the sine of the double angle, m."""
+    """Upright figure eight of crazyflow's benchmark: x is the sine, z half the sine of the double angle, m."""
     return jnp.stack([jnp.sin(_angle(s)), jnp.zeros_like(s), jnp.sin(2 * _angle(s)) / 2])
 
 
@@ -66,12 +66,12 @@ SHAPES: dict[str, Shape] = {
 
 
 class Curve(PyTreeNode):
-    """A place for every drone at every time."""
+    """Position of every drone at every time."""
 
     point: Point = flax.struct.field(pytree_node=False)
 
     def positions(self, n: int, t: float | Array = 0.0) -> Float[Array, "n 3"]:
-        """Where the n drones of a team should be at time t (s)."""
+        """Positions of the n drones of a team at time t (s)."""
         check_whole("number of drones", n)
         return jax.vmap(self.point, (0, None))(jnp.arange(n), jnp.asarray(t, float))
 
@@ -83,7 +83,7 @@ class Curve(PyTreeNode):
 
 
 def circle(radius: float = 0.3, period: float = 10.0, height: float = 0.1, spacing: float = 0.05) -> Curve:
-    """A circle about (0, -radius): drones 60 degrees apart, each `spacing` above the one before, m and s."""
+    """Circle about (0, -radius): drones 60 degrees apart, each `spacing` above the one before, m and s."""
     check_positive("period", period, "s")
     check_finite("circle", dict(radius=radius, height=height, spacing=spacing))
 
@@ -107,7 +107,7 @@ def crossing(n: int, amplitude: float = 0.5, period: float = 5.0, spacing: float
 
 
 def hop(height: float = 0.014, amplitude: float = 0.15, period: float = 4.0, spacing: float = 1.0) -> Curve:
-    """A step to `height + amplitude`, about which z then oscillates; drones `spacing` (m) apart in x."""
+    """Step to `height + amplitude`, with an oscillation of z about it; drones `spacing` (m) apart in x."""
     check_positive("period", period, "s")
     check_finite("hop", dict(height=height, amplitude=amplitude, spacing=spacing))
 
@@ -119,5 +119,5 @@ def hop(height: float = 0.014, amplitude: float = 0.15, period: float = 4.0, spa
 
 
 def _angle(s: Array) -> Array:
-    """The angle after some periods, rad."""
+    """Angle after some periods, rad."""
     return 2 * jnp.pi * s

@@ -1,4 +1,4 @@
-"""Follow another drone and keep it in view."""
+"""Task: follow another drone and keep it in view."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _MAX_DISTANCE = 10.0  # m
 _MIN_PERIOD = 2.0  # s
 _TOUCHING = 2.0  # collision radii between the centers of two drones
 _MAX_SPEED = 30.0  # m/s, bound of an observation
-_SETTLED = 2.0  # s: from then on the leader has to be in view
+_SETTLED = 2.0  # s: time after which the leader has to be in view
 _IN_VIEW = 0.95  # share of the time
 _TOLERANCE = 0.3  # share of the distance
 
 camera = Camera(resolution=(32, 24), field_of_view=60.0)
-"""The camera of the task, fixed to the body. A drone that is out of its field of view is lost from sight."""
+"""Camera of the task, fixed to the body; drones outside its field of view are lost from sight."""
 
 
 _TOUCHED = shaping.variable("touched", "One if the drone has touched another one or the ground.")
@@ -44,11 +44,11 @@ def follow(
 ) -> Task:
     """Drone 0 flies along a random curve; every other drone follows the one before it and keeps it in view.
 
-    A drone is in view when the direction to it is within the field of view of the camera, which looks along body x.
+    A drone is in view when the direction to it is within the field of view of the camera, which points along body x.
 
     Args:
         drones: number of drones, at least two.
-        distance: distance that a drone is to keep from the one that it follows, m.
+        distance: distance to keep from the followed drone, m.
         size: amplitude of the leader's curve, a Lissajous figure, m.
         period: period of that curve, s.
         duration: duration of an episode, s; of 2 s or less there is no criterion of success.
@@ -63,12 +63,12 @@ def follow(
     check_positive("duration", duration, "s")
 
     def leader(variables: dict[str, Array], t: Array) -> Setpoint:
-        """Where the first drone should be."""
+        """Position of the first drone."""
         center = jnp.array([0, 0, HEIGHT], variables["random"].dtype)
         return setpoint_on(lambda t: center + size * lissajous(variables["random"], variables["phase"] + t / period), t)
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """The leader's point on its curve; of the others, the place at the distance from the drone before."""
+        """For the leader, its point on the curve; for the others, the point at the distance from the drone before."""
         first = leader(variables, t)
         pos, vel = variables["pos"], variables["vel"]
         return Setpoint.at(
@@ -97,7 +97,7 @@ def follow(
         return state, variables | {"pos": state.pos, "vel": state.vel, "touched": false}
 
     def distance_error(task: Task, world: World) -> Float[Array, " n"]:
-        """Difference of the distance from the drone that is followed from the one to keep, m; zero of the leader."""
+        """Difference between actual and desired distance from the followed drone, m; zero for the leader."""
         apart = norm(_to_followed(world))
         return jnp.where(_is_leader(world), 0, jnp.abs(apart - distance))
 
@@ -132,7 +132,7 @@ def follow(
             "line_of_sight": ObservationTerm(
                 _observe_line_of_sight,
                 1.0 + 1e-6,
-                entries=quantities("direction of the drone that is followed", "-", "body"),
+                entries=quantities("direction of the followed drone", "-", "body"),
             ),
         },
         control_hz=50.0,
@@ -167,13 +167,13 @@ def _is_leader(world: World) -> Bool[Array, " n"]:
 
 
 def _to_followed(world: World) -> Float[Array, "n 3"]:
-    """Vector from every drone to the one that it follows, m, world; zero of the leader."""
+    """Vector from every drone to the followed one, m, world; zero for the leader."""
     pos = world.drones.pos
     return jnp.concatenate([pos[:1], pos[:-1]]) - pos
 
 
 def _observe_line_of_sight(task: Task, world: World) -> Float[Array, "n 3"]:
-    """Direction of the drone that is followed, body axes; zero of the leader."""
+    """Direction of the followed drone, body axes; zero for the leader."""
     return jax.vmap(rotation.rotate_inverse)(world.drones.quat, jax.vmap(unit)(_to_followed(world)))
 
 
@@ -184,12 +184,12 @@ def _observe_velocity_error(task: Task, world: World) -> Float[Array, "n 3"]:
 
 
 def _out_of_sight(task: Task, world: World) -> Float[Array, " n"]:
-    """One minus the cosine of the angle from the camera's axis to the drone that is followed; zero of the leader."""
+    """One minus the cosine of the angle from the camera's axis to the followed drone; zero for the leader."""
     return jnp.where(_is_leader(world), 0, 1 - _observe_line_of_sight(task, world)[:, 0])
 
 
 def _in_view(world: World) -> Bool[Array, " n"]:
-    """Whether the drone that is followed is within the field of view; true of the leader."""
+    """Whether the followed drone is within the field of view; true for the leader."""
     to_followed = jax.vmap(rotation.rotate_inverse)(world.drones.quat, _to_followed(world))
     ahead, left, up = to_followed.T
     horizontal, vertical = camera.slopes
@@ -198,7 +198,7 @@ def _in_view(world: World) -> Bool[Array, " n"]:
 
 
 def _seen(task: Task, world: World) -> Float[Array, " n"]:
-    """One if the drone that is followed is within the field of view."""
+    """One if the followed drone is within the field of view."""
     return _in_view(world).astype(world.drones.pos.dtype)
 
 

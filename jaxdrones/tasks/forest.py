@@ -1,4 +1,4 @@
-"""Fly through a forest to a goal on the other side, by what a depth camera sees."""
+"""Task: fly through a forest to a goal on the other side, with a depth camera."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from jaxdrones.tasks.touching import touches
 from jaxdrones.vector import safe_sqrt
 
 HEIGHT = 1.5  # m, of flight
-REACHED = 1.0  # m: a drone that is nearer to its goal has reached it
-_HIGHEST = 4.0  # m; trees are higher, so that the way over them is not open
+REACHED = 1.0  # m: distance at which a goal is reached
+_HIGHEST = 4.0  # m; trees are higher, so drones cannot fly over them
 _TREE_HEIGHT = 5.0  # m
 _SPACING = 1.0  # m in y between drones
-_CLEARANCE = 1.5  # m between a tree and where a drone starts or arrives
-_REACH = (0.0, 0.5, 0.2)  # m: drones start within this of their places
-_BEHIND = 2.0  # m before the start and beyond the goal that still belong to the strip
+_CLEARANCE = 1.5  # m between a tree and a start or goal
+_REACH = (0.0, 0.5, 0.2)  # m: spread of the starts
+_BEHIND = 2.0  # m: margin of the strip before the start and beyond the goal
 _MAX_SPEED = 20.0  # m/s
-_LANES = 32  # straight flights that tell the traversability
+_LANES = 32  # straight flights for the traversability
 
 camera = Camera(resolution=(16, 12), field_of_view=90.0, far=24.0)
-"""The camera of the task, fixed to the body; 24 m are more than from one side of the forest to the other."""
+"""Camera of the task, fixed to the body; its range is longer than the forest."""
 
 
 _METRICS = {
@@ -52,16 +52,15 @@ def forest(
     width: float = 10.0,
     duration: float | None = None,
 ) -> Task:
-    """Fly through a forest, drawn anew in every episode, to a goal on the other side.
+    """Fly through a random forest to a goal on the other side.
 
     Args:
         drones: number of drones; they start 1 m apart in y.
         speed: commanded speed, m/s; at most 20.
         density: trees per m^2.
         length: distance of the goal, m.
-        width: width of the forest, m; a drone that leaves it to the side is lost.
-        duration: duration of an episode, s; twice what the way takes at the commanded speed, and a second, when left
-            out.
+        width: width of the forest, m; leaving it to the side ends the episode.
+        duration: duration of an episode, s; by default twice the time at the commanded speed plus 1 s.
 
     Raises:
         ValueError: a number out of range.
@@ -105,19 +104,19 @@ def forest(
         }
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """The goal on the other side of the forest."""
+        """Goal on the other side of the forest."""
         return Setpoint.at(variables["goal"])
 
     def desired(task: Task, world: World) -> Float[Array, "n 3"]:
-        """The velocity towards the goal, m/s, world; slower only where the goal is reached."""
+        """Velocity towards the goal, m/s, world; slower only at the goal."""
         return shaping.velocity_to_target(task, world, speed, REACHED)
 
     def velocity(task: Task, world: World) -> Float[Array, " n"]:
-        """Magnitude of the velocity error as a share of the commanded speed."""
+        """Magnitude of the velocity error over the commanded speed."""
         return shaping.length(world.drones.vel - desired(task, world), 0.1 * speed) / speed
 
     def progress(task: Task, world: World) -> Float[Array, " n"]:
-        """Approach to the goal as a share of the commanded speed."""
+        """Speed of approach to the goal over the commanded speed."""
         return world.variables["progress"] / (speed * world.dt)
 
     def heading(task: Task, world: World) -> Float[Array, " n"]:

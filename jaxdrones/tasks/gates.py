@@ -1,4 +1,4 @@
-"""Race through gates: the track of lsy_drone_racing, nominal, randomised or drawn at random."""
+"""Task: race through gates on the track of lsy_drone_racing, nominal, randomized or random."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_cont
 from jaxdrones.tasks.touching import touches
 from jaxdrones.vector import atan2
 
-# x, y, z (m) and heading (rad) in which each gate is crossed, in this order
+# x, y, z (m) and crossing heading (rad) of each gate, in this order
 GATES = np.array([(0.5, 0.25, 0.7, -0.78), (1.05, 0.75, 1.2, 2.35), (-1.0, -0.25, 0.7, 3.14), (0.0, -0.75, 1.2, 0.0)])
 POLES = np.array([(0.0, 0.75), (1.0, 0.25), (-1.5, -0.25), (-0.5, -0.75)])  # x, y, m
 START = np.array([-1.5, 0.75])
@@ -33,8 +33,8 @@ POLE_RADIUS, POLE_HEIGHT = 0.015, 1.52  # m
 LEVELS = (0, 1, 2, 3)
 _START_SPACING = 0.5  # m in y between drones at the start
 _MAX_SPREAD = 0.15  # m, so that drones stay apart at the start
-_ARENA = 3.0  # m from the middle of the track along every axis, beyond which a drone is lost
-_MAX_DRONES = 5  # so that all start inside the arena
+_ARENA = 3.0  # m from the middle of the track along every axis: bounds of the arena
+_MAX_DRONES = 5  # so that all drones start inside the arena
 
 _GATE_RANGE = np.array([0.15, 0.15, 0.1, 0.2])  # m, m, m, rad: level 2 moves gates by U(-range, range)
 _POLE_RANGE = 0.15  # m
@@ -61,15 +61,15 @@ def gates(
 ) -> Task:
     """One lap through four gates.
 
-    Gates and poles are obstacles of the scene: solid in Bullet, visible to cameras, and hit as in
-    `sensing.collisions`. Another scene may be given that begins with four gates, such as one of `sensing.track`.
+    Gates and poles are obstacles of the scene: solid in Bullet, visible to cameras, with collisions by
+    `sensing.collisions`. A scene of your own has to begin with four gates, as from `sensing.track`.
 
     Args:
         drones: number of drones, at most 5; they start 0.5 m apart in y and do not observe each other.
         level: 0 nominal; 1 random inertia; 2 gates and poles displaced too; 3 random tracks without poles.
         duration: duration of an episode, s.
-        random_start: for training: drones start in the air in front of a random gate, one time in five on the ground
-            at the start of the track; else always there.
+        random_start: for training: start in the air in front of a random gate with probability 0.8, else on the ground
+            at the start of the track.
         start_spread: on the ground, drones start within +-start_spread of the start along x and y, m; at most 0.15.
     """
     check_whole("number of drones of gates", drones)
@@ -108,7 +108,7 @@ def gates(
         return hovering(params, pos), variables | lap | {"lap_time": jnp.zeros(n, dtype)}
 
     def target(variables, t) -> Setpoint:
-        """The center of the next gate."""
+        """Center of the next gate."""
         return Setpoint.at(_gate(variables)[:, :3])
 
     def crashed(task: Task, world: World):
@@ -168,7 +168,7 @@ def _finished(metrics: Mapping[str, Array], dt: float) -> Array:
 
 
 def _advance(task: Task, world: World) -> dict[str, Array]:
-    """Which gates are passed on the straight line from the last position to this one, and what is hit."""
+    """Update passed gates and collisions on the straight line from the last position to this one."""
     variables, pos = world.variables, world.drones.pos
     ahead = _gate(variables)
     before, after = _in_gate(ahead, variables["pos"]), _in_gate(ahead, pos)
@@ -191,7 +191,7 @@ def _advance(task: Task, world: World) -> dict[str, Array]:
 
 
 def _scene(level: int, key: jax.Array | None = None) -> Scene:
-    """Gates and poles of a level; those of levels 2 and 3 are drawn from the key."""
+    """Gates and poles of a level, random in levels 2 and 3."""
     if key is None:
         return _solids(GATES, POLES)
     gate_key, pole_key = jax.random.split(key)
@@ -203,15 +203,15 @@ def _scene(level: int, key: jax.Array | None = None) -> Scene:
 
 
 def _random_track(u: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """A round of four gates, from random numbers in [-1, 1]."""
+    """Track of four gates from random numbers in [-1, 1]."""
     quarter = jnp.array([(1, 0), (0, 1), (-1, 0), (0, -1)], u.dtype)  # one gate in each, so that they stay apart
     place = quarter * jnp.array([[1.3, 0.9]]) + 0.25 * u[:, :2]
-    heading = jnp.arctan2(quarter[:, 0], -quarter[:, 1]) + 0.6 * u[:, 3]  # counter-clockwise, 34 degrees off
+    heading = jnp.arctan2(quarter[:, 0], -quarter[:, 1]) + 0.6 * u[:, 3]  # counterclockwise, 34 degrees off
     return jnp.concatenate([place, 0.95 + 0.25 * u[:, 2:3], heading[:, None]], axis=-1)
 
 
 def _solids(gates: ArrayLike, poles: ArrayLike | None = None) -> Scene:
-    """The scene of gates (4, 4) and of poles (k, 2)."""
+    """Scene of gates (4, 4) and poles (k, 2)."""
     if poles is None:
         return track(gates, OPENING, FRAME)
     gates, poles = jnp.asarray(gates, float), jnp.asarray(poles, float)
@@ -221,7 +221,7 @@ def _solids(gates: ArrayLike, poles: ArrayLike | None = None) -> Scene:
 
 
 def _gates_of(scene: Scene, dtype) -> Float[Array, "4 4"]:
-    """The gates of a scene: x, y, z of the centers (m) and headings (rad)."""
+    """Gates of a scene: x, y, z of the centers (m) and headings (rad)."""
     beams = BEAMS * len(GATES)
     if scene.boxes is None or len(scene.boxes.pos) < beams:
         found = 0 if scene.boxes is None else len(scene.boxes.pos)
@@ -237,7 +237,7 @@ def _gates_of(scene: Scene, dtype) -> Float[Array, "4 4"]:
 
 
 def _poles_of(scene: Scene, dtype) -> Float[Array, "4 2"]:
-    """X and y of the first four cylinders of a scene, m; far away where it has fewer."""
+    """X and y of the first four cylinders of a scene, m; missing ones are far away."""
     pos = jnp.zeros((0, 2)) if scene.cylinders is None else scene.cylinders.pos[: len(POLES), :2]
     missing = len(POLES) - len(pos)
     return jnp.pad(jnp.asarray(pos, dtype), ((0, missing), (0, 0)), constant_values=_NOWHERE)
@@ -250,12 +250,12 @@ def _random_inertia(key: jax.Array, params: Params) -> Params:
 
 
 def _gate(variables: dict[str, Array], later: int = 0) -> Float[Array, "n 4"]:
-    """The gate that every drone is to cross next, or the one that is `later` gates ahead, at most the last one."""
+    """Next gate of every drone, or the one `later` gates ahead, at most the last one."""
     return variables["gates"][jnp.minimum(variables["index"] + later, len(GATES) - 1)]
 
 
 def _normal(gate: Float[Array, "n 4"]) -> Float[Array, "n 3"]:
-    """The direction in which a gate is crossed."""
+    """Crossing direction of a gate."""
     yaw = gate[:, 3]
     return jnp.stack([jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)], axis=-1)
 
@@ -268,7 +268,7 @@ def _in_gate(gate: Float[Array, "n 4"], pos: Float[Array, "n 3"]) -> Float[Array
 
 
 def _observe_gates(task: Task, world: World) -> Float[Array, "n 12"]:
-    """Centre relative to the drone (m) and direction of the next gate and of the one after it, world axes."""
+    """Center relative to the drone (m) and direction of the next gate and of the one after it, world axes."""
     ahead = [_gate(world.variables, later) for later in (0, 1)]
     return jnp.concatenate([x for gate in ahead for x in (gate[:, :3] - world.drones.pos, _normal(gate))], axis=-1)
 

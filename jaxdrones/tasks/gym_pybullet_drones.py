@@ -1,12 +1,11 @@
-"""The tasks of gym-pybullet-drones (2021), and those of version 2.x (`hover_2x`, `multi_hover`).
+"""Tasks of gym-pybullet-drones (2021), and those of version 2.x (`hover_2x`, `multi_hover`).
 
 Rewards, terminations, truncations and starts are those of gym-pybullet-drones. It reads its clock before the step:
-rewards that follow a moving target lag one control step behind, and an episode of T seconds has two steps more than
-T / dt.
+rewards for a moving target lag one control step behind, and an episode of T seconds has two steps more than T / dt.
 
-gym-pybullet-drones has no criteria of success and starts all episodes of a task alike. With `start_spread` (m, at most
-0.5) every drone starts up to so much higher or lower, but above the ground; most of these tasks command one speed for
-all rotors, which does not move a drone sideways.
+gym-pybullet-drones has no criteria of success and one fixed start for each task. With `start_spread` (m, at most 0.5)
+every drone starts up to that much higher or lower, but above the ground; most of these tasks command one speed for all
+rotors, which does not move a drone sideways.
 """
 
 import dataclasses
@@ -31,21 +30,21 @@ _NEAR_PARTNER = 0.05  # m between the hulls
 _TILT = 0.4  # rad of roll or pitch, at which (2.x) truncates the episode
 
 Starts = Float[Array, "n 3"]
-"""Where the drones started, m: the variables of all tasks here."""
+"""Initial positions, m: the variables of all tasks here."""
 Target = Callable[[Starts, Array], Setpoint]
 Cost = Callable[[Float[Array, "n 3"], World], Float[Array, " n"]]
-"""(target positions, world after a step) -> the negative reward of every drone."""
+"""(target positions, world after a step) -> negative reward of every drone."""
 Criterion = Callable[[Mapping[str, Array], float], Array]
 
 
 def hover(drones: int = 1, start_spread: float = 0.0) -> Task:
-    """Equation 12: the negative squared distance from (0, 0, 1)."""
+    """Hover at z = 1 m, rewarded by the negative squared distance from (0, 0, 1) (equation 12)."""
     summary, success = "hover at z = 1 m (equation 12)", _of_one(drones)
     return _task_2021("hover-2021", summary, drones, start_spread, _at(0.0, 0.0, 1.0), _squared_distance, success)
 
 
 def takeoff(drones: int = 1, start_spread: float = 0.0) -> Task:
-    """Get off the ground: -5 below 2 cm, else -1 / (10 z)."""
+    """Take off: reward -5 below 2 cm, else -1 / (10 z)."""
 
     def cost(target, world):
         """5 below 2 cm of height, else 1 / (10 z)."""
@@ -64,7 +63,7 @@ def fly_through_gate(drones: int = 1, start_spread: float = 0.0) -> Task:
     """
 
     def target(starts, t):
-        """A point that moves through the gate."""
+        """Moving point through the gate."""
         zero = jnp.zeros_like(t)
         speed = -2 / _DURATION_2021
         return _everywhere(starts, [zero, speed * t, zero + 0.75], vel=[zero, zero + speed, zero])
@@ -78,7 +77,7 @@ def fly_through_gate(drones: int = 1, start_spread: float = 0.0) -> Task:
 
 
 def tune(drones: int = 1, start_spread: float = 0.0) -> Task:
-    """Find the six gain vectors of the PID that follow y = 4 cos(0.288 t), z = 1 m.
+    """Tune the six gain vectors of the PID to track y = 4 cos(0.288 t), z = 1 m.
 
     As in gym-pybullet-drones (2021), the target velocity is a difference over the last 1/48 s.
     """
@@ -87,7 +86,7 @@ def tune(drones: int = 1, start_spread: float = 0.0) -> Task:
         return 4 * jnp.cos(_TUNE_RATE * t)
 
     def target(starts, t):
-        """A point that swings along y at a height of 1 m."""
+        """Point oscillating along y at a height of 1 m."""
         zero = jnp.zeros_like(t)
         return _everywhere(starts, [zero, y(t), zero + 1], vel=[zero, 48 * (y(t) - y(t - 1 / 48)), zero])
 
@@ -97,7 +96,7 @@ def tune(drones: int = 1, start_spread: float = 0.0) -> Task:
 
 
 def leader_follower(drones: int = 2, start_spread: float = 0.0) -> Task:
-    """Equation 13: the leader, drone 0, hovers at (0, 0, 0.5); the others are to be as high as the leader."""
+    """Leader, drone 0, hovers at (0, 0, 0.5); the others match its height (equation 13)."""
 
     def cost(target, world):
         """Leader: squared distance from its target, m^2; others: squared height over the leader over n, m^2."""
@@ -110,7 +109,7 @@ def leader_follower(drones: int = 2, start_spread: float = 0.0) -> Task:
 
 
 def flock(drones: int = 2, start_spread: float = 0.0) -> Task:
-    """The first drone hovers at (0, 0, 1); every other one is to be as high as the one before it."""
+    """First drone hovers at (0, 0, 1); every other one matches the height of the one before it."""
 
     def cost(target, world):
         """First drone: squared distance from its target, m^2; others: squared height over the drone before, m^2."""
@@ -123,10 +122,10 @@ def flock(drones: int = 2, start_spread: float = 0.0) -> Task:
 
 
 def meetup(drones: int = 2, start_spread: float = 0.0) -> Task:
-    """Drone i and drone n - 1 - i meet; the reward is the negative squared distance between them."""
+    """Drones i and n - 1 - i meet; the reward is the negative squared distance between them."""
 
     def target(starts, t):
-        """Half-way between the starts of the drone and its partner."""
+        """Midpoint between the starts of the drone and its partner."""
         return Setpoint.at((starts + starts[::-1]) / 2)
 
     def cost(target, world):
@@ -174,7 +173,7 @@ def _task_2021(
     check_whole(f"number of drones of {name}", drones, minimum)
 
     def late_cost(task: Task, world: World) -> Float[Array, " n"]:
-        """The cost after the step from the target before it."""
+        """Cost after the step with respect to the target before it."""
         return cost(task.target(world.variables, world.time - world.dt).pos, world)
 
     return Task(
@@ -201,11 +200,11 @@ def _task_2x(
     check_whole(f"number of drones of {name}", drones)
 
     def closeness(task: Task, world: World) -> Float[Array, " n"]:
-        """The larger of 0 and 2 - d^4, with d the distance from the target, m."""
+        """Maximum of 0 and 2 - d^4, with d the distance from the target, m."""
         return jnp.maximum(0, 2 - distance(task, world) ** 4)
 
     def arrived(task: Task, world: World):
-        """The distances of all drones from their targets are 0.1 mm in sum or less."""
+        """The sum of all drones' distances from their targets is at most 0.1 mm."""
         return jnp.broadcast_to(jnp.sum(distance(task, world)) < 1e-4, len(world.drones.pos))
 
     def out_of_box(task: Task, world: World):
@@ -247,7 +246,7 @@ def _at(x: float, y: float, z: float) -> Target:
 
 
 def _at_height(z: float) -> Target:
-    """The target of every drone is above its start, that of the first one above the origin."""
+    """Target above the start of each drone, above the origin for the first."""
     return described(
         f"At a height of {z:g} m: the first drone over the origin, the others over their starts.",
         lambda starts, t: Setpoint.at(starts.at[:, 2].set(z).at[0, :2].set(0)),
@@ -255,7 +254,7 @@ def _at_height(z: float) -> Target:
 
 
 def _everywhere(starts: Starts, pos: list[Array], vel: list[Array]) -> Setpoint:
-    """The same target for every drone."""
+    """Common target of all drones."""
     at, moving = (jnp.broadcast_to(jnp.stack(v).astype(starts.dtype), starts.shape) for v in (pos, vel))
     return Setpoint.at(at, vel=moving)
 
@@ -266,7 +265,7 @@ def _squared_distance(target: Float[Array, "n 3"], world: World) -> Float[Array,
 
 
 def _of_one(drones: int) -> Criterion | None:
-    """The criterion of tasks whose drones have one target: a team cannot be at one place, and has none."""
+    """Criterion of success of tasks with one common target, for single drones only."""
     return _close_at_the_end if drones == 1 else None
 
 
@@ -287,5 +286,5 @@ def _gap_to_partner(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def _met(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Whether a drone touched its partner or was within 5 cm of doing so in the end."""
+    """Whether the gap to the partner was at most 5 cm in the end."""
     return metrics["gap"][-1] < _NEAR_PARTNER

@@ -1,4 +1,4 @@
-"""Hover from any start, recover from a throw, land."""
+"""Tasks: hover from any start, recover from a throw, land."""
 
 from collections.abc import Mapping
 
@@ -16,13 +16,13 @@ from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import standing_height, thrown
 from jaxdrones.tasks.task import MAX_SPIN, Task, World, out_of_control, upright
 
-SPACING = 3.0  # m between neighboring goals, more than the drones are thrown apart
+SPACING = 3.0  # m between neighboring goals, more than the spread of the starts
 _MAX_REACH = 5.0  # m; a drone is lost 3 m or more beyond it
 _MAX_HEIGHT = 1000.0  # m; float32 resolves 0.1 mm there
 _MAX_SPEED = 100.0  # m/s
-_TOUCHING = 0.02  # m above the ground: sinking is then that of the touch
+_TOUCHING = 0.02  # m above the ground: height at which the touchdown speed is measured
 _SOFT = 0.6  # m/s
-SETTLED = 2.0  # s: how long a drone has to hover in the end
+SETTLED = 2.0  # s: time in hover at the end for success
 
 
 def hover(
@@ -75,12 +75,12 @@ def hover(
 
 
 def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Task:
-    """Start upside down, thrown and tumbling: level out at once, then fly back. Reports the altitude lost."""
+    """Recover from an upside-down, tumbling start: level out, then fly back. Reports the altitude lost."""
     check_whole("number of drones of recovery", drones)
     check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
-        """Near the goal, upside down, in motion and turning."""
+        """Near the goal, upside down, moving and rotating."""
         goal = _goals(params, height)
         state = thrown(key, params, goal, reach=0.2, speed=2.0, omega=5.0, tilt=jnp.radians(60.0))
         half_turn = jnp.array([1, 0, 0, 0], goal.dtype)
@@ -88,7 +88,7 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
         return state.replace(quat=quat), {"goal": goal, "lowest": state.pos[:, 2], "start": state.pos[:, 2]}
 
     def target(variables, t):
-        """The goal."""
+        """Goal."""
         return Setpoint.at(variables["goal"])
 
     def altitude_lost(task: Task, world: World) -> Array:
@@ -131,15 +131,15 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         return state, {"goal": pad, "sinking": -state.vel[:, 2], "touch_speed": jnp.zeros_like(params.mass)}
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """The pad."""
+        """Landing pad."""
         return Setpoint.at(variables["goal"])
 
     def above(world: World) -> Array:
-        """Height above where a drone stands on the pad, m."""
+        """Height above rest on the pad, m."""
         return world.drones.pos[:, 2] - world.variables["goal"][:, 2]
 
     def descent(task: Task, world: World):
-        """How much faster than 0.3 m/s plus half the height per second the drone sinks, m/s."""
+        """Excess of the sink rate over 0.3 m/s plus half the height per second, m/s."""
         return jnp.maximum(-world.drones.vel[:, 2] - (0.3 + 0.5 * jnp.maximum(above(world), 0)), 0)
 
     def advance(task: Task, world: World) -> dict[str, Array]:
@@ -160,7 +160,7 @@ def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task
         advance=advance,
         metrics={
             "upright": upright,
-            "touch_speed": shaping.variable("touch_speed", "Largest speed of sinking within 2 cm of the ground, m/s."),
+            "touch_speed": shaping.variable("touch_speed", "Largest sink rate within 2 cm of the ground, m/s."),
         },
         success=_landed,
         contact=("ground",),
@@ -176,7 +176,7 @@ def settled(
 
 
 def _recovered(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Whether a drone was level to 15 degrees, slower than 0.5 m/s and within half a metre of the goal in the end."""
+    """Whether a drone was level to 15 degrees, slower than 0.5 m/s and within half a meter of the goal in the end."""
     level = metrics["upright"][-1] > jnp.cos(jnp.radians(15.0))
     return level & (metrics["speed"][-1] < 0.5) & (metrics["error"][-1] < 0.5)
 

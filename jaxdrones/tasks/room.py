@@ -1,4 +1,4 @@
-"""Drones that exchange places in a room with pillars."""
+"""Task: exchange places in a room with pillars."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ _METRICS = {
 
 
 def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float = 8.0) -> Task:
-    """Drones on a ring in a room exchange places, and touch neither each other nor walls or pillars.
+    """Drones on a ring in a room exchange places without collisions with each other, walls or pillars.
 
     Args:
         drones: number of drones; they start 1 m or more apart.
-        pillars: number of pillars, which stand at random places; those too close to a start or a goal are left out.
+        pillars: number of random pillars; those too close to a start or a goal are left out.
         size: length and width of the room, m.
         duration: duration of an episode, s.
 
@@ -76,11 +76,11 @@ def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float =
         }
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """The goal: a place on the ring where another drone started."""
+        """Goal: the place of another drone at the start."""
         return Setpoint.at(variables["goal"])
 
     def velocity(task: Task, world: World) -> Float[Array, " n"]:
-        """Magnitude of the velocity error as a share of the speed of flight."""
+        """Magnitude of the velocity error over the speed of flight."""
         desired = shaping.velocity_to_target(task, world, _SPEED, _SLOW_WITHIN)
         return shaping.length(world.drones.vel - desired, 0.1 * _SPEED) / _SPEED
 

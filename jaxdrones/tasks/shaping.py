@@ -1,4 +1,4 @@
-"""Reward terms that several tasks share; all are smooth, for policies that are optimised by gradient."""
+"""Shared reward terms, all smooth for gradient-based learners."""
 
 import functools
 
@@ -14,7 +14,7 @@ _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
 _CROWDED = 0.4  # m, distance of the nearest drone below which the reward falls
 _MARGIN = 0.2  # m between a drone and an obstacle beside it
-_MARGIN_TIME = 0.1  # s: by how much the margin grows with the closing speed
+_MARGIN_TIME = 0.1  # s: growth of the margin with the closing speed
 _SOFTNESS = 0.1  # m, over which the margin begins
 
 
@@ -24,7 +24,7 @@ def length(v: Float[Array, "n 3"], small: float) -> Float[Array, " n"]:
 
 
 def alive(task: Task, world: World) -> Float[Array, " n"]:
-    """One for every step of the episode."""
+    """One in every step."""
     return jnp.ones_like(world.drones.pos[:, 0])
 
 
@@ -50,10 +50,10 @@ def gap(world: World) -> Float[Array, " n"]:
 
 
 def clearance(task: Task, world: World) -> Float[Array, " n"]:
-    """How far each drone is inside the margin about obstacles and ground, smoothed, m; more if it approaches them.
+    """Smoothed penetration of the margin around obstacles and ground, m.
 
-    The margin grows with the closing speed, and so does the term: as the cost of DiffPhysDrone ("Back to Newton's
-    laws", 2024), it asks for more distance the faster a drone flies at an obstacle, and for none beside it.
+    Margin and term grow with the closing speed, as in the cost of DiffPhysDrone ("Back to Newton's laws", 2024): a
+    drone needs more distance the faster it approaches an obstacle, and none beside it.
     """
 
     def of_drone(radius: Array, pos: Array, vel: Array) -> Array:
@@ -66,29 +66,29 @@ def clearance(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def velocity_to_target(task: Task, world: World, speed: float, slow_within: float) -> Float[Array, "n 3"]:
-    """The velocity straight to the target, m/s, world: at a given speed, slower within `slow_within` (m) of it."""
+    """Velocity straight to the target, m/s, world: at a given speed, slower within `slow_within` (m) of it."""
     away = task.target_now(world).pos - world.drones.pos
     return speed * away / jnp.maximum(norm(away), slow_within)[:, None]
 
 
 def nearest_drone(pos: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Distance of the nearest other drone, m; infinity of a drone that is alone."""
+    """Distance of the nearest other drone, m; infinity for a single drone."""
     apart = [norm(jnp.roll(pos, k, axis=0) - pos) for k in range(1, len(pos))]
     return functools.reduce(jnp.minimum, apart, jnp.full_like(pos[:, 0], jnp.inf))
 
 
 def crowding(task: Task, world: World) -> Float[Array, " n"]:
-    """Squared penetration of the 0.4 m around a drone by its nearest neighbor, as a share of 0.4 m."""
+    """Squared relative penetration of the 0.4 m around a drone by its nearest neighbor."""
     return jnp.maximum(1 - nearest_drone(world.drones.pos) / _CROWDED, 0) ** 2
 
 
 def variable(name: str, meaning: str) -> Term:
-    """One of the task's variables as a number: a metric, or a term that is paid; `meaning` says what it is."""
+    """Task variable as a metric or reward term, described by `meaning`."""
     return described(meaning, lambda task, world: world.variables[name].astype(world.drones.pos.dtype))
 
 
 def flag(name: str, meaning: str) -> Condition:
-    """One of the task's variables that is true or false: a condition; `meaning` says what it is."""
+    """Boolean task variable as a condition, described by `meaning`."""
     return described(meaning, lambda task, world: world.variables[name])
 
 
@@ -104,4 +104,4 @@ REACH_AND_STAY: dict[str, tuple[float, Term]] = {
     "omega": (-0.02, body_rates),
     "action_change": (-0.02, action_change),
 }
-"""Terms that bring a drone to a moving or resting target and keep it there with small body rates."""
+"""Terms for flight to a moving or resting target and hover there with small body rates."""

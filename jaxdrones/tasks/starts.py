@@ -26,10 +26,10 @@ def hovering(params: Params, pos: Float[Array, "n 3"]) -> State:
 
 
 def above_ground(spread: float) -> Callable[[jax.Array, Params], tuple[State, Float[Array, "n 3"]]]:
-    """The start of gym-pybullet-drones, or one whose heights are drawn about it: the state, and the positions in it.
+    """Start of gym-pybullet-drones, optionally with random heights: the state, and its positions.
 
     Args:
-        spread: drones start up to this much higher or lower, m, but above the ground.
+        spread: half width of the range of heights, m; drones start above the ground.
 
     Raises:
         ValueError: a number out of range.
@@ -48,7 +48,7 @@ def above_ground(spread: float) -> Callable[[jax.Array, Params], tuple[State, Fl
 
 
 def standing_height(params: Params) -> Float[Array, " n"]:
-    """Height (z) of a drone that stands on the ground, m."""
+    """Height (z) of a drone at rest on the ground, m."""
     return params.collision_height / 2 - params.collision_offset
 
 
@@ -62,13 +62,13 @@ def thrown(
     omega: float,
     tilt: float | Array,
 ) -> State:
-    """A random state: near `pos`, in motion, with the rotors at hover speed.
+    """Random state near `pos`, in motion, with the rotors at hover speed.
 
     Args:
         key: random key.
         params: parameters of the team.
-        pos: (n, 3) positions about which the drones start, m.
-        reach: displacement from there, U(-reach, reach) along each axis, m: a number or one per axis.
+        pos: (n, 3) mean positions, m.
+        reach: displacement U(-reach, reach) along each axis, m: a number or one per axis.
         speed: velocity, U(-speed, speed) along each axis, m/s.
         omega: body rates, U(-omega, omega) about each axis, rad/s.
         tilt: rotation about a random axis by U(0, tilt), rad.

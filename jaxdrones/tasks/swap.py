@@ -1,4 +1,4 @@
-"""A swarm in which drones exchange places without touching."""
+"""Task: a swarm exchanges places without collisions."""
 
 import math
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ _MIN_SPACING = 0.6  # m between neighboring places on the ring
 def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
     """Drones on a ring exchange places: each flies the same number of places on, and keeps clear of the others.
 
-    Two drones collide when their centres are nearer than two collision radii.
+    Two drones collide when their centers are closer than two collision radii.
 
     Args:
         drones: number of drones, at least two.
@@ -45,7 +45,7 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         }
 
     def target(variables, t) -> Setpoint:
-        """The goal: a place on the ring where another drone started."""
+        """Goal: the place of another drone at the start."""
         return Setpoint.at(variables["goal"])
 
     def advance(task: Task, world: World) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-"""A task: how an episode starts, where drones should be, what is rewarded, and when the episode ends."""
+"""`Task`: start, target, rewards and terminations of an episode."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from jaxdrones.vector import safe_sqrt
 
 
 class World(PyTreeNode):
-    """The complete state of an episode between two control steps. Arrays of the team have a leading drone axis."""
+    """Complete state of an episode between two control steps. Arrays of the team have a leading drone axis."""
 
     params: Params
-    """Parameters of the team, as drawn for this episode; action types and policies do not see them."""
+    """Parameters of the team in this episode; hidden from action types and policies."""
     drones: State
     """State of the team."""
     variables: Any
-    """The task's own variables: goals, the next gate, a random curve."""
+    """Variables of the task, for example goals, the next gate or a random curve."""
     memory: Any
     """Memory of the action type's controller."""
     actions: Array
-    """(n, h, a) the last h actions, the newest last; zeros before the first."""
+    """(n, h, a) last h actions, newest last; initially zero."""
     step: Array
     """() number of control steps since the start."""
     dt: float = flax.struct.field(pytree_node=False)
@@ -55,11 +55,11 @@ class World(PyTreeNode):
     sensors: dict[str, Any] = flax.struct.field(default_factory=dict)
     """Memories of the sensors, by name."""
     readings: dict[str, Any] = flax.struct.field(default_factory=dict)
-    """The latest readings of the sensors by name: arrays, or pytrees of arrays."""
+    """Latest readings of the sensors by name: arrays, or pytrees of arrays."""
     images: dict[str, Array] = flax.struct.field(default_factory=dict)
-    """The images that the cameras show, by name: those of `jaxdrones.make(vision=...)`."""
+    """Latest camera images by name, those of `jaxdrones.make(vision=...)`."""
     poses: Any = None
-    """(k, n, 7) poses at the last k control steps, oldest first, from which images are still to come."""
+    """(k, n, 7) poses at the last k control steps, oldest first, for images that are not yet observed."""
 
     @property
     def time(self) -> Array:
@@ -68,7 +68,7 @@ class World(PyTreeNode):
 
     @property
     def action(self) -> Array:
-        """(n, a) the newest action."""
+        """(n, a) newest action."""
         return self.actions[:, -1]
 
 
@@ -85,15 +85,15 @@ class ObservationTerm:
     """One term of an observation."""
 
     observe: Callable[[Task, World], Float[Array, "n d"]]
-    """(task, world with the state as the sensors show it) -> the numbers of every drone."""
+    """(task, world with the measured state) -> entries of every drone."""
     bound: float | tuple[float, ...]
-    """Largest magnitude, of all entries or of each; what is beyond is clipped."""
+    """Largest magnitude, of all entries or of each, for clipping."""
     history: int = 2
-    """Number of past actions that the term needs."""
+    """Number of past actions in the term."""
     entries: Entries = ()
-    """What each number of a drone stands for, for `jaxdrones.explain`; none where the term does not say."""
+    """Description of each entry of a drone, for `jaxdrones.explain`; optional."""
     name: str = ""
-    """The name by which an environment knows the term; `jaxdrones.make` sets it."""
+    """Name of the term, set by `jaxdrones.make`."""
 
     def __post_init__(self):
         _check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
@@ -104,12 +104,12 @@ class ObservationTerm:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """How an episode starts, where drones should be, what is rewarded, and when it ends; all functions of one world.
+    """Start, target, rewards and terminations of an episode, as functions of one world.
 
-    Rewards, conditions and metrics are functions `(task, world)`. The task is the one that the environment flies, so
-    `task.target_now(world)` is its target, also where `dataclasses.replace` has given it another one.
+    Rewards, conditions and metrics are functions `(task, world)`. The task is that of the environment, so
+    `task.target_now(world)` is its target, also after `dataclasses.replace`.
 
-    An episode is the whole team's: it ends when a condition is true for one drone.
+    An episode belongs to the whole team: it ends when a condition is true for one drone.
     """
 
     name: str
@@ -118,42 +118,42 @@ class Task:
     duration: float
     """Time after which an episode is truncated, s."""
     start: Callable[..., tuple[State, Any]]
-    """(key, params) -> the team at the start, and the task's variables. Optional parameters are `scene` and `progress`,
-    the progress of training in [0, 1], which is 1 outside of training."""
+    """(key, params) -> initial state of the team, and the task's variables. Optional parameters are `scene` and
+    `progress`, the progress of training in [0, 1], which is 1 outside of training."""
     target: Callable[[Any, Array], Setpoint]
-    """(variables, time in s) -> where every drone should be; the time may be later than now."""
+    """(variables, time in s) -> set-points of the team; the time may be in the future."""
     rewards: Mapping[str, tuple[float, Term]]
     """Name -> (scale, term); the reward is the sum of scale times term."""
     terminations: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
-    """Name -> condition that terminates the episode: the states that follow have no value."""
+    """Name -> condition that terminates the episode in a state without future value."""
     truncations: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
-    """Name -> condition that truncates the episode, though it could go on."""
+    """Name -> condition that truncates the episode."""
     advance: Callable[[Task, World], Any] = lambda task, world: world.variables
-    """(task, world after a step with the variables before it) -> the task's variables after the step."""
+    """(task, world after a step with the variables before it) -> variables of the task after the step."""
     metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)
-    """Quantities that are reported but not rewarded, beside the `error` (m) and `speed` (m/s) of every task."""
+    """Reported quantities without reward, beside the `error` (m) and `speed` (m/s) of every task."""
     success: Callable[[Mapping[str, Array], float], Array] | None = None
     """(metrics over an episode (T, n), control period) -> (n,): success of every drone. Metrics keep their last values
     after the end of an episode. An episode that ends by a failure is no success."""
     success_terminations: tuple[str, ...] = ()
-    """Names of the terminations by which an episode may end in success, such as a goal that is reached. Every other
-    termination, and every truncation but that of the time, is a failure."""
+    """Names of the terminations that are no failure, such as a reached goal. Every other termination, and every
+    truncation but that of the time, is a failure."""
     observations: Mapping[str, ObservationTerm] = dataclasses.field(default_factory=dict)
-    """Observation terms that only this task has, by name."""
+    """Observation terms of this task by name."""
     randomize: tuple[Callable[[jax.Array, Params], Params], ...] = ()
-    """Randomizations that belong to the task: (key, params) of one drone -> its parameters in an episode."""
+    """Randomizations of the task: (key, params) of one drone -> its parameters in an episode."""
     control_hz: float = 100.0
-    """Control steps per second, unless the environment says otherwise."""
+    """Default control steps per second."""
     substeps: int = 5
-    """Physics steps per control step, unless the environment says otherwise."""
+    """Default physics steps per control step."""
     scene: Scene | Callable[[jax.Array], Scene] = dataclasses.field(default_factory=Scene)
     """Obstacles and ground, or a function `(key) -> Scene` that draws them for every episode."""
     obstacles_terminate: bool = False
     """Whether a hit of an obstacle terminates the episode, so that contact forces are not needed."""
     camera: Camera | None = None
-    """The camera of every drone, unless the environment says otherwise; `Camera()` when left out."""
+    """Default camera of every drone; `None` for `Camera()`."""
     vision: tuple[str, ...] = ()
-    """Names of the images that are observed, unless the environment says otherwise."""
+    """Names of the default images."""
     contact: tuple[str, ...] = ()
     """Contact forces of the explicit backend: `ground`, `drones`, `obstacles` (unless `obstacles_terminate`)."""
     action: str = "rpm"
@@ -161,7 +161,7 @@ class Task:
     observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
     """Names of the default observation terms."""
     extra_steps: int = 0
-    """Control steps that an episode goes on after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
+    """Control steps of an episode after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
 
     def __post_init__(self):
         kinds = {"name": str, "summary": str, "camera": Camera | None}
@@ -187,7 +187,7 @@ class Task:
                 raise UserError(f"observations[{name!r}] is {short_repr(term)}; give an ObservationTerm")
 
     def _check_functions(self) -> None:
-        """Raise unless the functions of the task are functions of so many arguments."""
+        """Raise unless the task's functions take the right number of arguments."""
         _check_function("start", bind(self.start, scene=None, progress=1.0), ("key", "params"))
         _check_function("target", self.target, ("variables", "time"))
         _check_function("advance", self.advance, _OF_A_WORLD)
@@ -208,49 +208,49 @@ class Task:
             _check_function("scene", self.scene, ("key",))
 
     def begin(self, key: jax.Array, params: Params, scene: Scene, progress: Any = 1.0) -> tuple[State, Any]:
-        """The team at the start of an episode in a scene, and the task's variables."""
+        """Initial state of the team in a scene, and the task's variables."""
         return bind(self.start, scene=scene, progress=jnp.asarray(progress, jnp.float32))(key, params)
 
     def measure(self, world: World) -> dict[str, Float[Array, " n"]]:
-        """All metrics by name; the task's own metrics replace standard ones of the same name."""
+        """All metrics by name; the task's metrics override standard ones."""
         standard = {"error": distance(self, world), "speed": norm(world.drones.vel)}
         return standard | {name: metric(self, world) for name, metric in self.metrics.items()}
 
     def succeeded(self, metrics: Mapping[str, Array], ends: Mapping[str, Array], dt: float) -> Bool[Array, ""]:
-        """Whether every drone met the criterion of success in an episode that no failure ended.
+        """Whether every drone met the criterion of success in an episode without a failure.
 
         Args:
-            metrics: (T, n) metrics over the longest possible episode, which keep their last values after its end.
-            ends: () by name, whether a termination or truncation of the task held in the last step of the episode.
+            metrics: (T, n) metrics over the longest possible episode, with their last values after its end.
+            ends: () by name, terminations and truncations in the last step of the episode.
             dt: control period, s.
         """
-        assert self.success is not None, "asked only of tasks with a criterion"
+        assert self.success is not None, "the task has no criterion of success"
         failures = [jnp.asarray(ended) for name, ended in ends.items() if name not in self.success_terminations]
         return jnp.all(self.success(metrics, dt)) & ~functools.reduce(jnp.logical_or, failures, jnp.zeros((), bool))
 
     def target_now(self, world: World) -> Setpoint:
-        """Where every drone should be at this moment."""
+        """Present set-points of the team."""
         return self.target(world.variables, world.time)
 
 
 def _mapping(field: str, value: Any, example: str) -> Mapping[str, Any]:
-    """A mapping by name, or an error that says what to give."""
+    """Validated mapping by name."""
     if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
         raise UserError(f"{field} is {short_repr(value)}; give a dictionary of names, {{'name': {example}}}")
     return value
 
 
 def _check_function(field: str, value: Any, arguments: tuple[str, ...]) -> None:
-    """Raise unless a field holds a function that can be called with so many arguments."""
+    """Raise unless a field is a function of these arguments."""
     if not callable(value) or isinstance(value, type):
         raise UserError(f"{field} is {short_repr(value)}; give a function of ({', '.join(arguments)})")
     check_arguments(field, value, arguments)
 
 
 Term = Callable[[Task, World], Float[Array, " n"]]
-"""A number for every drone: a reward or a metric."""
+"""Number for every drone: a reward or a metric."""
 Condition = Callable[[Task, World], Bool[Array, " n"]]
-"""Whether something is the case, for every drone."""
+"""Boolean for every drone."""
 
 
 def norm(v: Float[Array, "n 3"]) -> Float[Array, " n"]:
@@ -274,10 +274,10 @@ def upright(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def out_of_control(reach: float, center: tuple[float, float, float] | None = None) -> dict[str, Condition]:
-    """Conditions of a flight that cannot be recovered or whose state is not finite.
+    """Conditions of an unrecoverable flight or a state that is not finite.
 
-    `lost`: a drone is further than `reach` (m) from `center` (m, world) along some axis; from its target when `center`
-    is left out. `spinning`: it turns faster than 100 rad/s about some axis.
+    `lost`: a drone is farther than `reach` (m) from `center` (m, world; by default its target) along some axis.
+    `spinning`: it rotates faster than 100 rad/s about some axis.
     """
 
     def lost(task: Task, world: World) -> Bool[Array, " n"]:
@@ -291,7 +291,7 @@ def out_of_control(reach: float, center: tuple[float, float, float] | None = Non
     place = "the target" if center is None else f"({', '.join(f'{x:g}' for x in center)}) m"
     return {
         "lost": described(f"A drone is {reach:g} m or more from {place} along some axis.", lost),
-        "spinning": described(f"A drone turns at {MAX_SPIN:g} rad/s or faster about some axis.", spinning),
+        "spinning": described(f"A drone rotates at {MAX_SPIN:g} rad/s or faster about some axis.", spinning),
     }
 
 

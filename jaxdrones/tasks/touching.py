@@ -1,4 +1,4 @@
-"""What the drones of a world touch."""
+"""Collision flags of a world."""
 
 import jax
 import jax.numpy as jnp
@@ -14,19 +14,19 @@ from jaxdrones.state import State
 from jaxdrones.tasks.task import World, norm
 from jaxdrones.vector import safe_sqrt
 
-_MARGIN = 1e-3  # m: gap that still counts as touching
-_ONE_IN = 8  # worlds: in forests and rooms something is mostly near in fewer
+_MARGIN = 1e-3  # m: largest gap that counts as contact
+_ONE_IN = 8  # worlds: in forests and rooms usually fewer have something nearby
 
 
 def touches(world: World, before: Float[Array, "n 3"], scene: Scene | None = None) -> Collisions:
-    """The collision flags of a world, by `jaxdrones.sensing.collisions`, and obstacles on the way since the last step.
+    """Collision flags of a world by `jaxdrones.sensing.collisions`, with a sweep since the last step.
 
-    Of many worlds, only those are computed in which something is so near that it may be touched.
+    Under `vmap`, only worlds with something within reach are computed.
 
     Args:
-        world: of which only the poses matter.
-        before: positions at the last control step, m, world; the way from there is swept along a straight line.
-        scene: what may be touched; that of the world when left out.
+        world: only its poses matter.
+        before: positions at the last control step, m, world, for a sweep along a straight line.
+        scene: obstacles and ground; by default those of the world.
     """
     scene = world.scene if scene is None else scene
     args = jax.lax.stop_gradient((world.params, world.drones, before, scene))

@@ -1,4 +1,4 @@
-"""Track a curve."""
+"""Task: track a curve."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Task, out_of_control
 
 HEIGHT = 2.0  # m
-SPACING = 4.0  # m between the centres of neighboring curves
-_CAUGHT_UP = 1.0  # s: from then on the error counts
-_MIN_PERIOD = 0.1  # s; a period in which a circle of 1 m radius is flown at 63 m/s
+SPACING = 4.0  # m between the centers of neighboring curves
+_CAUGHT_UP = 1.0  # s: start of the error's evaluation
+_MIN_PERIOD = 0.1  # s; 63 m/s on a circle of 1 m radius
 
 
 def tracking(
@@ -33,7 +33,7 @@ def tracking(
     """Track a periodic curve.
 
     Args:
-        drones: number of drones; the centres of their curves are 4 m apart in y.
+        drones: number of drones; the centers of their curves are 4 m apart in y.
         curve: a name of `jaxdrones.tasks.curves.SHAPES`.
         period: period of the curve, s, at least 0.1.
         duration: duration of an episode, s; of 1 s or less there is no criterion of success.
@@ -47,7 +47,7 @@ def tracking(
     shape = SHAPES[curve]
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """The point that moves along the curve."""
+        """Moving point on the curve."""
 
         def one(center, u, phase):
             return setpoint_on(lambda t: center + shape(u, phase + t / period), t)

@@ -1,4 +1,4 @@
-"""Flights: demonstrations of control, logs, and identification of vehicles from logs."""
+"""Demonstration flights, logs, and identification of vehicles from logs."""
 
 from jaxdrones.flights.closed_loop import ClosedLoopResult, simulate_closed_loop
 from jaxdrones.flights.files import read_log, save_csv, save_npz

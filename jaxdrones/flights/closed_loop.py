@@ -1,4 +1,4 @@
-"""Closed-loop simulation: the firmware's PID flies a vehicle on the set-points of a recorded flight."""
+"""Closed-loop simulation with the firmware's PID on the set-points of a recorded flight."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from jaxdrones.thrust_curves import thrust_at
 
 _SUBSTEPS = 5  # per row: the firmware's attitude and rate loops run at 500 Hz
 _THRUST_PER_OUTPUT = 1000.0  # gain from the output of the firmware's vertical velocity loop to its thrust command
-_BLOCK = 500  # rows; inputs are padded to a multiple of it, so that flights share a compiled program
-_CLIMB_TOLERANCE = 0.15  # m, distance to the height of the set-point at which the climb is over
+_BLOCK = 500  # rows; inputs are padded to a multiple of it, to share compiled programs between flights
+_CLIMB_TOLERANCE = 0.15  # m, distance to the height of the set-point at the end of the climb
 _MIN_HEIGHT = 0.3  # m; below it the drone takes off or lands
 _SATURATED_FRACTION = 0.01  # fraction of the rows with a saturated motor above which a flight counts as saturated
 
 
 @dataclasses.dataclass(frozen=True)
 class ClosedLoopResult:
-    """A recorded flight and its closed-loop simulation in the K rows between climb and landing."""
+    """Recorded flight and its closed-loop simulation in the K rows between climb and landing."""
 
     flight: str
     """Name of the log."""
@@ -69,12 +69,12 @@ class ClosedLoopResult:
 
 
 class ClosedLoopInputs(NamedTuple):
-    """Inputs of a closed-loop simulation: initial state, and K rows of set-points and battery from take-off on."""
+    """Inputs of a closed-loop simulation: initial state, and K rows of set-points and battery from take-off."""
 
     start: State
-    """Initial state: upright and at rest on the ground, or the logged one where the log begins in flight."""
+    """Initial state: upright and at rest on the ground, or the logged one for a log that begins in flight."""
     ground: Float[Array, ""]
-    """Height at which the drone stands, m; minus infinity where the log begins in flight."""
+    """Height at rest on the ground, m; minus infinity for a log that begins in flight."""
     setpoint: Setpoint
     """Set-points, (K,) on every array."""
     battery: Float[Array, " K"]
@@ -87,7 +87,7 @@ def closed_loop_columns(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndar
     """Set-points of position (K, 3) and heading (K,), PWM (K, 4) and battery voltage (K,) of a log.
 
     Raises:
-        UserError: the log lacks one of them.
+        UserError: a missing column.
     """
     if not log.has("target_pos", "pwm", "vbat"):
         raise UserError(f"{log.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop")
@@ -95,7 +95,7 @@ def closed_loop_columns(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def rows_after_climb(log: FlightLog) -> slice:
-    """The rows from the end of the climb to the landing.
+    """Rows from the end of the climb to the landing.
 
     Raises:
         ValueError: the log has no set-points and battery, or the drone is never near the height of its set-point.
@@ -111,7 +111,7 @@ def rows_after_climb(log: FlightLog) -> slice:
 
 
 def closed_loop_inputs(log: FlightLog) -> ClosedLoopInputs:
-    """Initial state, set-points and battery of a log, from the row in which the motors start."""
+    """Initial state, set-points and battery of a log, from the start of the motors."""
     stop = rows_after_climb(log).stop
     begin = motor_start_row(log)
     ref_pos, ref_yaw, _, vbat = closed_loop_columns(log)
@@ -127,7 +127,7 @@ def closed_loop_inputs(log: FlightLog) -> ClosedLoopInputs:
 
 
 def motor_start_row(log: FlightLog) -> int:
-    """The first row in which all motors run."""
+    """First row with all motors running."""
     return int(np.argmax(log.in_flight))
 
 
@@ -137,9 +137,8 @@ def simulate_closed_loop(
     """Simulate a vehicle in closed loop on the set-points of a log.
 
     The firmware's PID starts on the ground, with empty integrators, when the motors of the log start. Until the landing
-    it gets the logged set-points and the logged voltage of the battery, and nothing else. Where a log begins in flight,
-    the simulation starts in that state, with the vertical integrator at its value in hover. The result has the rows
-    after the climb.
+    its only inputs are the logged set-points and battery voltage. For a log that begins in flight, the simulation
+    starts in that state, with the vertical integrator at its value in hover. The result has the rows after the climb.
 
     Args:
         log: flight with set-points, PWM and battery voltage.
@@ -187,7 +186,7 @@ def simulate(
 
 
 def _above_ground(inputs: ClosedLoopInputs, state: State) -> State:
-    """The state, or below the ground the initial state with the present rotor speeds."""
+    """State, or below the ground the initial state with the present rotor speeds."""
     standing = inputs.start.replace(rpm=state.rpm)
     return jax.tree.map(lambda a, b: jnp.where(state.pos[2] < inputs.ground, a, b), standing, state)
 
@@ -195,7 +194,7 @@ def _above_ground(inputs: ClosedLoopInputs, state: State) -> State:
 def _hover_integral(
     vehicle: Vehicle, motors: Motors, gains: firmware_pid.Gains, inputs: ClosedLoopInputs
 ) -> Float[Array, ""]:
-    """Integral of the vertical velocity error, m, with which the firmware's thrust command equals the weight."""
+    """Integral of the vertical velocity error, m, for a thrust command equal to the weight."""
     battery = inputs.battery[0]
     duty = motors.voltage(vehicle.params.weight / 4) / vehicle.instruments.motor_supply(battery, inputs.sag)
     command = thrust_at(gains.motor.thrust, duty * battery) / gains.motor.max_thrust * FULL_PWM

@@ -1,4 +1,4 @@
-"""Conditions of a flight: what is flown, with which vehicle, physics and controller."""
+"""Conditions of a flight: kind, vehicle, physics and controller."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from jaxdrones.limits import check_at_most, check_memory, check_seed
 
 BACKENDS = ("explicit", "bullet")
 CONTROLLERS = (*control.CONTROLLERS, *optimal.CONTROLLERS)
-PHYSICS_HZ = 240  # lowest rate; raised to a multiple of the control rate
+PHYSICS_HZ = 240  # lowest rate; rounded up to a multiple of the control rate
 
 _FIRMWARE_HZ = 500  # of the inner loops of the firmware's controllers
 
-_MAX_HZ = 20_000  # above it the step of 1 mm/s is lost in the rounding of a float32 position of 1 m
-_MAX_DURATION = 1e5  # s; from there on float32 times are further apart than control steps at 120 Hz
+_MAX_HZ = 20_000  # above it a step of 1 mm/s is below the rounding of a float32 position of 1 m
+_MAX_DURATION = 1e5  # s; beyond, the resolution of float32 times is coarser than control steps at 120 Hz
 _LOG_BYTES = 400  # per drone and control step: trajectory, log, figure
 _PAIR_BYTES = 32  # per pair of drones, while the effects between them are summed
 _VARIANTS = ("_2021", "_world_axes")  # suffixes of the names of other models of the same effect
@@ -29,10 +29,10 @@ _VARIANTS = ("_2021", "_world_axes")  # suffixes of the names of other models of
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """A flight and its options; `None` is replaced by the default of the flight.
+    """Options of a flight; `None` is replaced by the default of the flight.
 
     Raises:
-        ValueError: an unknown name or a number out of range; says what, what was given, what to do.
+        ValueError: an unknown name or a number out of range.
     """
 
     flight: str
@@ -43,10 +43,10 @@ class Conditions:
     effects: tuple[str, ...] | None = None
     """Names of `EFFECTS` and `PAIRS`."""
     controller: str | None = None
-    """A name of `CONTROLLERS`; the vehicle's own when left out."""
+    """A name of `CONTROLLERS`; by default the vehicle's."""
     feedforward: bool | None = None
-    """Whether the controller receives velocity and acceleration of the target beside position and heading. When left
-    out, all but `pid` do: the examples of gym-pybullet-drones (2021) command positions alone."""
+    """Whether the controller receives velocity and acceleration of the target beside position and heading. By default
+    all but `pid` do: the examples of gym-pybullet-drones (2021) command positions alone."""
     control_hz: int | None = None
     duration: float | None = None
     """Duration of the flight, s."""
@@ -57,9 +57,9 @@ class Conditions:
     backend: str = "explicit"
     """`explicit` or `bullet`."""
     obstacles: bool = False
-    """Whether the obstacles of gym-pybullet-drones (2021) are there; in Bullet only."""
+    """Whether to add the obstacles of gym-pybullet-drones (2021), in Bullet only."""
     seed: int | None = None
-    """Seed of a random displacement of the start, 1 cm standard deviation; none when left out."""
+    """Seed of a random displacement of the start, 1 cm standard deviation; by default none."""
 
     def __post_init__(self):
         check_choice("flight", self.flight, FLIGHTS)
@@ -154,7 +154,7 @@ class Conditions:
 
 
 def _check_once(effects: tuple[str, ...]) -> None:
-    """Raise if an effect would be counted twice."""
+    """Raise for duplicate effects."""
     seen: dict[str, str] = {}
     for effect in effects:
         kind = effect

@@ -1,8 +1,8 @@
-"""Tests of a flight log against itself: which columns contradict each other, and what would explain it.
+"""Consistency tests of flight logs: contradictions between columns, and likely causes.
 
 The velocity is the derivative of the position, the angular velocity that of the attitude, the acceleration follows the
-thrust, which acts along body z, and the angular acceleration follows the motors. A test is only made where the log
-moves enough for it. `docs/reality.md` has the margins on recorded flights.
+thrust along body z, and the angular acceleration follows the motors. A test needs sufficient motion in the log.
+`docs/reality.md` has the margins on recorded flights.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from jaxdrones.flights.motor_order import check_motors
 
 _PERIOD = 0.01  # s
 _GRAVITY = 9.81  # m/s^2
-_SHIFT_ROWS, _TURN_ROWS, _FORCE_ROWS = 50, 25, 25  # rows over which positions, attitudes and velocities change
+_SHIFT_ROWS, _TURN_ROWS, _FORCE_ROWS = 50, 25, 25  # rows between compared positions, attitudes and velocities
 _MAX_WINDOWS = 1500
 _MIN_WINDOWS = 10
-_MIN_SHIFT, _MIN_TURN, _MIN_ACC = 0.02, 0.01, 0.25  # m, rad, m/s^2, rms; a test needs more motion than that
+_MIN_SHIFT, _MIN_TURN, _MIN_ACC = 0.02, 0.01, 0.25  # m, rad, m/s^2, rms; smallest motion for a test
 _MAX_SHIFT_MISFIT, _MAX_SHIFT_ERROR = 0.05, 0.03  # misfit; m, rms
 _MAX_TURN_MISFIT, _MAX_TURN_ERROR = 0.45, 0.04  # misfit; rad, median
 _MAX_FORCE_MISFIT, _MAX_FORCE_ERROR = 0.45, 0.3  # misfit; m/s^2, median
-_MIN_UP = 0.5  # cosine of the mean tilt; drones do not fly tilted by more than 60 degrees on average
+_MIN_UP = 0.5  # cosine of the mean tilt; the mean tilt of a flight is below 60 degrees
 _HORIZONTAL_RATIO, _VERTICAL_RATIO = (0.87, 1.08), (0.94, 1.06)  # of distances in the positions and by the velocities
 _TURN_RATIO = (0.88, 1.14)  # of turns of the attitudes and by the rates
 _ACC_RATIO = (0.5, 1.5)  # of accelerations and those of the tilted thrust
-_MAX_CLOCK_MISFIT = 0.1  # a ratio is meaningful up to this misfit
+_MAX_CLOCK_MISFIT = 0.1  # largest misfit for a meaningful ratio
 _NED, _SWAPPED = np.array([1, -1, -1]), np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
-_MAX_RISE = 0.1  # V, by which a battery may rise when the motors start
+_MAX_RISE = 0.1  # V; largest rise of a battery when the motors start
 
 
 Change = tuple[str, Callable[[Any], Any]]
 
 
 class Motion(NamedTuple):
-    """The motion of one drone in T rows, see `FlightLog`."""
+    """Motion of one drone in T rows, see `FlightLog`."""
 
     pos: np.ndarray
     """(T, 3)"""
@@ -57,7 +57,7 @@ _HALF_TURN = Rotation.from_quat([1.0, 0, 0, 0])  # about x: between z-up and z-d
 
 
 def _turned(attitude: Rotation) -> Rotation:
-    """Attitudes of z-up axes from those of z-down axes in world and body."""
+    """Convert attitudes from z-down to z-up axes in world and body."""
     return _HALF_TURN * attitude * _HALF_TURN
 
 
@@ -85,10 +85,10 @@ _ALL_NED = "all columns look like NED axes (z down in world and body)"
 
 
 def contradictions(motion: Motion, thrusts: np.ndarray, sag: float) -> list[str]:
-    """Contradictions within a flight, a sentence each with the likely cause; none for a sound one.
+    """Contradictions within a flight, a sentence each with the likely cause.
 
     Args:
-        motion: of the T rows in which the motors run.
+        motion: of the T rows with running motors.
         thrusts: (T, 4) relative thrusts of the motors.
         sag: of the battery at take-off, V.
     """
@@ -106,7 +106,7 @@ def _starts(rows: int, length: int) -> np.ndarray:
 
 
 class _Test(NamedTuple):
-    """What a log has (n, 3) and what its other columns imply (n, 3), with the bounds on their difference."""
+    """Comparison of logged values (n, 3) with values implied by other columns (n, 3)."""
 
     has: np.ndarray
     implied: np.ndarray
@@ -116,18 +116,18 @@ class _Test(NamedTuple):
 
     @property
     def observable(self) -> bool:
-        """Whether either moves enough to be compared."""
+        """Whether there is enough motion for a comparison."""
         return len(self.has) >= _MIN_WINDOWS and max(_rms(self.has), _rms(self.implied)) > self.min_motion
 
     @property
     def misfit(self) -> float:
-        """0 for equal ones, 1 for unrelated ones, 2 for opposite ones; single glitches do not count."""
+        """Robust misfit: 0 for equal, 1 for unrelated, 2 for opposite values."""
         scale = _typical(self.has) + _typical(self.implied)
         return _typical(self.has - self.implied) / max(scale, 1e-12)
 
     @property
     def passes(self) -> bool:
-        """Whether the log fits, or does not move enough to tell."""
+        """Whether the log is consistent, or the motion too small for the test."""
         error = np.sqrt(_typical(self.has - self.implied))
         return not self.observable or self.misfit < self.max_misfit or float(error) < self.max_error
 
@@ -137,13 +137,13 @@ def _rms(x: np.ndarray) -> float:
 
 
 def _typical(x: np.ndarray) -> float:
-    """Mean square without the tenth of the largest."""
+    """Mean square without the largest tenth."""
     squares = np.sort(np.sum(x**2, axis=-1))
     return float(np.mean(squares[: max(1, int(0.9 * len(squares)))]))
 
 
 def shift_test(pos: np.ndarray, vel: np.ndarray) -> _Test:
-    """Changes of the position, m, and the integrals of the velocity."""
+    """Compare changes of the position with integrals of the velocity, m."""
     starts = _starts(len(pos), _SHIFT_ROWS)
     path = np.concatenate([np.zeros((1, 3)), np.cumsum((vel[1:] + vel[:-1]) / 2 * _PERIOD, axis=0)])
     ends = starts + _SHIFT_ROWS
@@ -151,7 +151,7 @@ def shift_test(pos: np.ndarray, vel: np.ndarray) -> _Test:
 
 
 def turn_test(attitude: Rotation, omega: np.ndarray) -> _Test:
-    """Rotation vectors of the attitude in the body frame, rad, and those of the integrated rates."""
+    """Compare rotation vectors of the attitude with those of the integrated rates, rad, body."""
     starts = _starts(len(omega), _TURN_ROWS)
     turned = Rotation.identity(len(starts))
     for row in range(_TURN_ROWS):
@@ -161,7 +161,7 @@ def turn_test(attitude: Rotation, omega: np.ndarray) -> _Test:
 
 
 def force_test(vel: np.ndarray, attitude: Rotation) -> _Test:
-    """Horizontal accelerations, m/s^2, and those of a thrust along body z that carries the weight, without means."""
+    """Compare horizontal accelerations with those of a thrust along body z that carries the weight, m/s^2, no means."""
     starts = _starts(len(vel), _FORCE_ROWS)
     ends = starts + _FORCE_ROWS
     acc = (vel[ends] - vel[starts]) / (_FORCE_ROWS * _PERIOD)
@@ -192,7 +192,7 @@ def _failures(motion: Motion) -> list[str]:
 
 
 def _check_axes(logged: Motion) -> tuple[list[str], Motion]:
-    """What does not fit, with the simplest reading of the columns that explains it, and the columns so read."""
+    """Failures with the simplest explanation by other conventions of columns, and the columns in these."""
     failures = _failures(logged)
     if not failures:
         return [], logged
@@ -204,7 +204,7 @@ def _check_axes(logged: Motion) -> tuple[list[str], Motion]:
 
 
 def _readings(logged: Motion):
-    """Other readings of the columns, those with the fewest changes first: their causes, and the columns so read."""
+    """Other conventions of the columns, fewest changes first: causes, and converted columns."""
     every = [(name, cause, change) for name, changes in _READINGS.items() for cause, change in changes]
     yield ["vel looks like body axes"], logged._replace(vel=logged.attitude.apply(logged.vel))
     yield (
@@ -219,7 +219,7 @@ def _readings(logged: Motion):
 
 
 def _ratio(test: _Test, axes: slice) -> float | None:
-    """Ratio of what a log has to what is implied along some axes; `None` where they move or agree too little."""
+    """Ratio of logged to implied values along some axes; `None` for too little motion or agreement."""
     has, implied = test.has[:, axes], test.implied[:, axes]
     if len(has) < _MIN_WINDOWS or max(_rms(has), _rms(implied)) < 2 * test.min_motion:
         return None
@@ -230,7 +230,7 @@ def _ratio(test: _Test, axes: slice) -> float | None:
 
 
 def _check_scales(motion: Motion) -> list[str]:
-    """Whether distances and turns are as large as the velocities and rates imply; a wrong clock scales both."""
+    """Check the scales of distances and rotations against velocities and rates; a wrong clock scales both."""
     pos, attitude, vel, omega = motion
     shifts = shift_test(pos, vel)
     ratios = {

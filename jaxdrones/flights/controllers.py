@@ -1,4 +1,4 @@
-"""Controllers of the demonstrations and the set-points that they receive."""
+"""Controllers of the demonstrations and the set-points they receive."""
 
 import functools
 from collections.abc import Callable
@@ -19,11 +19,11 @@ from jaxdrones.state import State
 from jaxdrones.tasks.curves import setpoint_on
 from jaxdrones.urdf import load_params
 
-_SCALED = (firmware_pid, mellinger)  # to vehicles that are no Crazyflies
+_SCALED = (firmware_pid, mellinger)  # to vehicles other than the Crazyflie
 
 
 class Controller(NamedTuple):
-    """A controller of a team."""
+    """Controller of a team."""
 
     init: Callable[[Params, State], Any]
     """Constants and start of a team -> memory."""
@@ -32,7 +32,7 @@ class Controller(NamedTuple):
 
 
 def controller_of(conditions: Conditions) -> Controller:
-    """The controller of a flight."""
+    """Controller of a flight."""
     if conditions.controller in optimal.CONTROLLERS:
         return _optimal(conditions)
     n = conditions.drones
@@ -59,7 +59,7 @@ def setpoints(conditions: Conditions, t: jax.Array) -> Any:
 
 
 def _gains(module: ModuleType, vehicle: str) -> Any:
-    """The gains of a controller for a vehicle."""
+    """Gains of a controller for a vehicle."""
     if module in (pid, velocity):
         return pid.gains(vehicle)
     if module is mrac or (module in _SCALED and vehicle not in pid.VEHICLES):
@@ -68,7 +68,7 @@ def _gains(module: ModuleType, vehicle: str) -> Any:
 
 
 def _optimal(conditions: Conditions) -> Controller:
-    """One that plans over the step of the flight, each drone as if it were alone, towards the set-points to come."""
+    """Optimal controller with the step of the flight as its model, for each drone alone."""
     n, module = conditions.drones, optimal.CONTROLLERS[conditions.controller]
     step = make_step(
         effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],

@@ -1,4 +1,4 @@
-"""The four control examples of gym-pybullet-drones (2021), figures 6 to 9 of its paper."""
+"""Four control examples of gym-pybullet-drones (2021), figures 6 to 9 of its paper."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,7 +18,7 @@ _HEADINGS = np.array([0, np.pi / 3, np.pi / 4, np.pi / 2])  # rad
 
 @dataclasses.dataclass(frozen=True)
 class Flight:
-    """One of the examples and its defaults."""
+    """Example flight and its defaults."""
 
     summary: str
     start: Callable[[int], State]
@@ -29,8 +29,8 @@ class Flight:
     duration: float  # s
     control_hz: int
     effects: tuple[str, ...] = ()
-    settling_time: float = 2.0  # s; results are taken from here on
-    panels: tuple[str, ...] = ()  # panels of the figure; all when empty
+    settling_time: float = 2.0  # s; start of the evaluation
+    panels: tuple[str, ...] = ()  # panels of the figure; empty for all
     labels: tuple[str, ...] = ()  # names of the drones, for a team of fixed size
     change_params: Callable[[Params], Params] = lambda team: team
 
@@ -42,7 +42,7 @@ def _circle() -> Flight:
         return jnp.arange(n) * (jnp.pi / 2) / n
 
     return Flight(
-        summary="a circle at staggered heights, each drone with a heading of its own (PID)",
+        summary="a circle at staggered heights, with a different heading for each drone (PID)",
         start=lambda n: State.at_rest(curve.positions(n), yaw(n)),
         target=lambda n, t, duration: Setpoint.at(curve.positions(n, t), yaw=yaw(n)),
         drones=4,
@@ -96,7 +96,7 @@ def _downwash() -> Flight:
         return curves.crossing(n)
 
     return Flight(
-        summary="drones that cross above each other, subject to downwash (equation 6)",
+        summary="drones crossing above each other, with downwash (equation 6)",
         start=lambda n: State.at_rest(curve(n).positions(n)),
         target=lambda n, t, duration: Setpoint.at(curve(n).positions(n, t)),
         drones=2,

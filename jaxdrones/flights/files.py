@@ -1,4 +1,4 @@
-"""Reading and writing logs: .npz, .csv, and bags of ROS 2."""
+"""Log files: .npz, .csv, and ROS 2 bags."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ _DAMAGE = (OSError, ValueError, EOFError, KeyError, NotImplementedError, Runtime
 
 
 def find_log(path: str | os.PathLike) -> Path:
-    """The log of a path: a bundled log by its name, a file, a bag, or the log in a folder of `jaxdrones fly`.
+    """Find a log: a bundled one by its name, a file, a bag, or the log in a folder of `jaxdrones fly`.
 
     Raises:
-        UserError: there is no log.
+        UserError: no log.
     """
     path = assets.flights().get(os.fspath(path), Path(path))
     if path.is_file() or (path / "metadata.yaml").is_file():
@@ -60,16 +60,16 @@ def find_log(path: str | os.PathLike) -> Path:
 def read_log(path: str | os.PathLike) -> FlightLog:
     """Read the log of a flight.
 
-    Arrays are those of `FlightLog` by name; `gyro`, `ref_pos` and `ref_yaw` stand for `omega`, `target_pos` and
-    `target_yaw`. The arrays of a single drone may lack the drone axis. Other arrays are ignored.
+    Arrays are those of `FlightLog` by name; `gyro`, `ref_pos` and `ref_yaw` are aliases of `omega`, `target_pos` and
+    `target_yaw`. The drone axis is optional for a single drone. Other arrays are ignored.
 
     Args:
-        path: an .npz or .csv file, a bag of ROS 2, a folder of `jaxdrones fly`, or the name of a bundled log.
+        path: an .npz or .csv file, a ROS 2 bag, a folder of `jaxdrones fly`, or the name of a bundled log.
 
     Raises:
-        UserError: there is no log, or it is damaged: an array is missing, has another shape, is not finite, or time
-            does not increase.
-        ImportError: a bag is given and rosbags is not installed.
+        UserError: no log, or a damaged one: an array is missing, has another shape, is not finite, or time does not
+            increase.
+        ImportError: a bag without rosbags.
     """
     file = find_log(path)
     arrays = _bag(file) if file.is_dir() else _csv(file) if file.suffix == ".csv" else _npz(file)
@@ -102,10 +102,10 @@ def read_log(path: str | os.PathLike) -> FlightLog:
 
 
 def arrays_of(log: FlightLog, pwm: bool = False) -> dict[str, np.ndarray]:
-    """The log by name; conditions, parameters and scene are JSON; `pwm` adds the Crazyflie's PWM signals.
+    """Arrays of a log by name; conditions, parameters and scene are JSON; `pwm` adds the Crazyflie's PWM signals.
 
     Raises:
-        UserError: PWM is asked for and the vehicle is no Crazyflie.
+        UserError: PWM of a vehicle other than the Crazyflie.
     """
     if pwm:
         check_pwm(log.conditions.vehicle)
@@ -131,7 +131,7 @@ def save_npz(log: FlightLog, path: Path, pwm: bool = False) -> None:
 
 
 def save_csv(log: FlightLog, path: Path, pwm: bool = False) -> None:
-    """Write a log as one line per time and drone."""
+    """Write a log with one line per time and drone."""
     arrays = {name: x for name, x in arrays_of(log, pwm).items() if name in (*_WIDTHS, "rpy")}
     names = [f"{name}_{axis}".rstrip("_") for name in arrays for axis in _AXES.get(name, "xyz")]
     rows = np.concatenate([x.reshape(len(log.t), len(log.labels), -1) for x in arrays.values()], axis=-1)
@@ -142,7 +142,7 @@ def save_csv(log: FlightLog, path: Path, pwm: bool = False) -> None:
 
 
 def check_pwm(vehicle: str) -> None:
-    """Raise `UserError` unless a vehicle has the motors of the Crazyflie, whose PWM is known."""
+    """Raise `UserError` unless a vehicle has the motors of the Crazyflie, with known PWM."""
     if vehicle not in VEHICLES:
         raise UserError(
             f"PWM is asked for with {vehicle!r}; it is known for {' and '.join(VEHICLES)} only, leave it out"
@@ -158,7 +158,7 @@ def _npz(file: Path) -> dict[str, np.ndarray]:
 
 
 def _csv(file: Path) -> dict[str, np.ndarray]:
-    """The arrays of a table as `save_csv` writes it; without the column `drone` it is of one drone."""
+    """Arrays of a table of `save_csv`; without the column `drone` it is of one drone."""
     try:
         with file.open(newline="") as lines:
             reader = csv.DictReader(lines)
@@ -180,7 +180,7 @@ def _csv(file: Path) -> dict[str, np.ndarray]:
 
 
 def _bag(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a bag: poses and twists of /drone_0/odom, ... and rotor speeds of /drone_0/motors, ..."""
+    """Arrays of a bag: poses and twists of /drone_0/odom, ... and rotor speeds of /drone_0/motors, ..."""
     try:
         from rosbags.rosbag2 import Reader
         from rosbags.typesys import Stores, get_typestore
@@ -222,7 +222,7 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
 
 
 def _columns(name: str, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Times and arrays (K, n, ...) of a log, with the shapes that belong together."""
+    """Times and arrays (K, n, ...) of a log, with consistent shapes."""
     for column in ("t", *STATE):
         if column not in arrays:
             raise UserError(f"{name}: has no column {column!r}: {_MEANINGS[column]}; add it to the log")
@@ -245,7 +245,7 @@ def _columns(name: str, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _check(log: FlightLog) -> None:
-    """Raise unless time increases, and states are finite until they break for good."""
+    """Raise unless time increases, and states are finite up to a possible divergence."""
     steps = np.diff(log.t)
     if not np.isfinite(log.t).all() or not (steps > 0).all():
         row = int(np.argmin(np.append(steps, 1) > 0)) + 1

@@ -1,4 +1,4 @@
-"""Output-error identification: estimates parameters of a vehicle from recorded flights."""
+"""Output-error identification of vehicle parameters from recorded flights."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ from jaxdrones.params import Params
 
 _STRIDE = 25  # rows between the starts of windows
 _INITIAL_SCALE = np.array([0.05, 0.25, 0.1, 0.4])  # of residuals at the last horizon: m, m/s, rad, rad/s
-_INACTIVE = 1e3  # factor on the scale of a horizon whose residuals are not used yet
-_ROUNDS = 4  # rounds with robust scales, which are estimated anew after each
+_INACTIVE = 1e3  # factor on the scale of a horizon with unused residuals
+_ROUNDS = 4  # rounds with robust scales, re-estimated after each
 _STEPS_PER_ROUND = 4
-_PRIOR_PRECISION = 1e-2  # inverse variance of x, which keeps parameters finite that are not identifiable
+_PRIOR_PRECISION = 1e-2  # inverse variance of x, which keeps unidentifiable parameters finite
 _LOG_PRIOR_PRECISION = 1.0  # inverse variance of x where x is a logarithm
 _PRIOR_REMAINDER = 1e-3  # fraction of the prior in the information matrix, which keeps it invertible
 _MAX_RELATIVE_ERROR = 0.5  # standard error over value of an identifiable parameter: two standard errors exclude zero
-_RATIOS = ("position_scale", "estimate_tilt")  # parameters that are 1 without an error, not 0
-_MIN_SPEED = 0.01  # m/s rms, of a log that flies
+_RATIOS = ("position_scale", "estimate_tilt")  # parameters with an ideal value of 1, not 0
+_MIN_SPEED = 0.01  # m/s rms, of a log in flight
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,9 +61,9 @@ class Estimate:
     std_error: float
     """Standard error from the Gauss-Newton matrix, which assumes independent residuals, SI units."""
     identifiable: bool
-    """Whether the flights identify the parameter: zero is at least two standard errors away.
+    """Whether the parameter is identified: zero is at least two standard errors away.
 
-    Ratios that are 1 for ideal instruments need a standard error below the scale of their coordinate."""
+    Ratios with an ideal value of 1 need a standard error below the scale of their coordinate."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,15 +71,15 @@ class Report:
     """Result of `fit`."""
 
     vehicle: Vehicle
-    """The fitted vehicle."""
+    """Fitted vehicle."""
     parameters: dict[str, Estimate]
     """Estimates by name of the parameter."""
     per_flight: dict[str, dict[str, float]]
     """Values of the per-flight parameters, by flight and name, SI units."""
     losses: tuple[float, ...]
-    """Loss after each round: of the validation flights, or of the fitted ones where there are none."""
+    """Loss after each round: of the validation flights, or without these of the fitted ones."""
     errors: dict[str, np.ndarray]
-    """Open-loop errors (horizons, 4) of the fitted vehicle by flight, with those of the validation flights."""
+    """Open-loop errors (horizons, 4) of the fitted vehicle by flight, validation flights included."""
 
 
 def fit(
@@ -95,22 +95,22 @@ def fit(
 
     The vehicle is simulated over windows of half a second from their logged starts, and Levenberg-Marquardt steps
     minimize the squared differences from the log after 0.1, 0.25 and 0.5 s: first at the nearest horizon, then at all
-    of them. Each residual is divided by its robust scale in its flight, and a Cauchy loss gives less weight to windows
-    that fit badly. Flights on set-points without rotor speeds are simulated as a whole, in closed loop with the
-    firmware's PID, unless parameters are named: see `fit_path`.
+    of them. Each residual is divided by its robust scale in its flight, and a Cauchy loss reduces the weight of
+    outlying windows. Without `names`, flights on set-points without rotor speeds are simulated as a whole, in closed
+    loop with the firmware's PID: see `fit_path`.
 
     Args:
         logs: flights to fit, all with rotor speeds or all without.
         params: initial parameters of one drone.
-        names: names of `PARAMETERS` to fit; those that such logs identify when left out.
-        validate: flights that are not fitted, on which the best round is chosen.
-        motors: motors for logs of PWM; those of the Crazyflie 2.1+ when left out.
+        names: names of `PARAMETERS` to fit; by default those identifiable from such logs.
+        validate: held-out flights for the choice of the best round.
+        motors: motors for logs of PWM; by default those of the Crazyflie 2.1+.
         progress: called with a line after each round.
-        gains: gains of the firmware that flew on set-points; those with 2.1+ propellers when left out.
+        gains: gains of the recorded firmware; by default those for 2.1+ propellers.
 
     Raises:
-        ValueError: there are no flights, one is given twice or rests, some have rotor speeds and others do not, or the
-            flights do not identify a named parameter.
+        ValueError: no flights, a duplicate or resting flight, flights with and without rotor speeds, or a named
+            parameter that is not identifiable.
     """
     named = bool(names)
     if not logs:
@@ -148,7 +148,7 @@ def _fit_paths(
 
 
 def _estimate(vehicle: Vehicle, name: str, error: float) -> Estimate:
-    """The estimate of a parameter, from the standard error of its coordinate x."""
+    """Estimate of a parameter from the standard error of its coordinate x."""
     value, scale = value_of(vehicle, name), scale_of(vehicle, name)
     std_error = error * scale
     limit = scale if name in _RATIOS else _MAX_RELATIVE_ERROR * abs(value)
@@ -156,7 +156,7 @@ def _estimate(vehicle: Vehicle, name: str, error: float) -> Estimate:
 
 
 class _Problem:
-    """The least-squares problem; x has the shared parameters, then the per-flight parameters of each flight."""
+    """Least-squares problem; x has the shared parameters, then the per-flight parameters of each flight."""
 
     def __init__(self, logs: Sequence[FlightLog], params: Params, names: tuple[str, ...], motors: Motors):
         self.logs, self.start = logs, Vehicle.of(params)
@@ -176,12 +176,12 @@ class _Problem:
         )
 
     def indices(self, flight: int) -> np.ndarray:
-        """Indices in x of the coordinates of a flight: the shared ones, then its own."""
+        """Indices in x of the coordinates of a flight: shared, then per-flight."""
         first = len(self.shared) + flight * len(self.per_flight)
         return np.concatenate([np.arange(len(self.shared)), np.arange(first, first + len(self.per_flight))])
 
     def normal(self, x: np.ndarray, scales: list[np.ndarray]) -> Normal:
-        """Normal equations of all flights with the prior, and the robust scales of each flight's residuals."""
+        """Normal equations of all flights with the prior, and robust scales of each flight's residuals."""
         matrix, gradient, robust = np.diag(self.prior), self.prior * x, []
         loss = float(self.prior @ x**2)
         coordinates = [self.indices(i) for i in range(len(self.flights))]
@@ -198,7 +198,7 @@ class _Problem:
         return normal_equations(self.start, self.names, x, scale, windows, mask, self.pwm_motors)
 
     def vehicle(self, x: np.ndarray) -> Vehicle:
-        """The vehicle with the shared parameters and the medians of the per-flight parameters."""
+        """Vehicle with the shared parameters and the medians of the per-flight parameters."""
         per_flight = x[len(self.shared) :].reshape(len(self.flights), len(self.per_flight))
         return with_parameters(
             self.start, self.names, list(np.concatenate([x[: len(self.shared)], np.median(per_flight, axis=0)]))
@@ -207,7 +207,7 @@ class _Problem:
     def solve(self, validate: Sequence[FlightLog], named: bool, progress: Callable[[str], None]) -> Report:
         """Fit the near horizons first, then all of them with robust scales, and return the best round.
 
-        The best round is that of the least validation loss; without validation flights it is the last one.
+        The best round has the least validation loss; without validation flights it is the last one.
         """
         initial = np.array(HORIZONS)[:, None] / HORIZONS[-1] * _INITIAL_SCALE
         active = [np.where(np.arange(len(HORIZONS)) <= k, 1, _INACTIVE)[:, None] for k in range(len(HORIZONS))]
@@ -264,5 +264,5 @@ class _Problem:
 
 
 def _padded(windows: Windows, count: int) -> Windows:
-    """The windows, padded with the last one to a common count, so that flights share a compiled program."""
+    """Windows, padded with the last one to a common count, to share compiled programs between flights."""
     return jax.tree.map(lambda x: jnp.pad(x, [(0, count - len(x))] + [(0, 0)] * (x.ndim - 1), mode="edge"), windows)

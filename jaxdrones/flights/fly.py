@@ -1,4 +1,4 @@
-"""Flying the control examples on either backend."""
+"""`fly`: the control examples on either backend."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,7 +21,7 @@ from jaxdrones.sensing import Scene, obstacles_2021
 from jaxdrones.state import State
 from jaxdrones.urdf import load_params
 
-_START_SPREAD = 0.01  # m; standard deviation of the start when a seed is given
+_START_SPREAD = 0.01  # m; standard deviation of the start with a seed
 
 
 def fly(
@@ -36,13 +36,12 @@ def fly(
     Args:
         flight: `circle`, `velocity`, `ground-effect` or `downwash`.
         gui: show the flight in Bullet's window, in real time.
-        progress: function that is called with the share of the flight that is done, at most a hundred times.
-        watch: function that is given each thirtieth of a second of the flight as soon as it is flown, and the time at
-            which the flight ends, s.
-        options: the other fields of `Conditions`.
+        progress: function of the completed fraction of the flight, called at most a hundred times.
+        watch: function `(leg, end)`, called with each 1/30 s of the flight and the end time of the flight, s.
+        options: other fields of `Conditions`.
 
     Raises:
-        ValueError: an unknown name or a number out of range; says what, what was given, what to do.
+        ValueError: an unknown name or a number out of range.
     """
     conditions = Conditions(flight, **options)
     example, n, dt, steps = FLIGHTS[flight], conditions.drones, conditions.dt, conditions.steps
@@ -95,7 +94,7 @@ def scene_of(conditions: Conditions) -> Scene:
 def _flown(
     conditions: Conditions, gui: bool, control: Control, params: Params, start: State, memory: Any, whole: bool
 ) -> Iterator[State]:
-    """The trajectory on the chosen backend, whole or in legs."""
+    """Trajectory on the chosen backend, whole or in legs."""
     length = conditions.steps if whole else leg_length(conditions.dt)
     common: dict[str, Any] = dict(
         effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
@@ -126,7 +125,7 @@ def _start(flight: Flight, n: int, seed: int | None) -> State:
 
 
 def _report(k: jax.Array, steps: int, progress: Callable[[float], None]) -> None:
-    """Report the share of the flight that is done to the host, at every hundredth of it."""
+    """Report the completed fraction of the flight to the host, in steps of 1 %."""
     every = max(1, steps // 100)
 
     def report():
@@ -136,7 +135,7 @@ def _report(k: jax.Array, steps: int, progress: Callable[[float], None]) -> None
 
 
 def _commanded(target: Setpoint | jax.Array, params: Params) -> dict[str, jax.Array]:
-    """The positions or the velocities that are commanded over time."""
+    """Commanded positions or velocities over time."""
     if isinstance(target, Setpoint):
         return {"target_pos": target.pos}
     return {"target_vel": jax.vmap(jax.vmap(velocity.commanded), (None, 0))(params, target)}

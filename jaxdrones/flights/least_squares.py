@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt, and normal equations of a robust sum of squares over the windows of a flight."""
+"""Levenberg-Marquardt, and normal equations of a robust sum of squares over windows of a flight."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class Normal(NamedTuple):
 def levenberg_marquardt(
     normal: Callable[[np.ndarray], Normal], x: np.ndarray, steps: int, min_decrease: float = 0.0
 ) -> tuple[np.ndarray, Normal]:
-    """Minimize a sum of squares; returns the best coordinates and the normal equations there.
+    """Minimize a sum of squares; return the best coordinates and their normal equations.
 
     Args:
-        normal: the normal equations at coordinates (n,).
+        normal: function of coordinates (n,) for the normal equations.
         x: (n,) initial coordinates.
-        steps: largest number of steps; steps that do not decrease the loss count.
-        min_decrease: relative decrease of the loss below which a step is the last one.
+        steps: largest number of steps, rejected ones included.
+        min_decrease: relative decrease of the loss at which to stop.
     """
     best, damping = normal(x), _INITIAL_DAMPING
     for _ in range(steps):
@@ -115,5 +115,5 @@ def normal_equations(
 
 
 def standard_errors(information: np.ndarray) -> np.ndarray:
-    """Standard errors of parameters with this information matrix (n, n), the inverse of their covariance."""
+    """Standard errors of parameters from their information matrix (n, n), the inverse of the covariance."""
     return np.sqrt(np.diag(np.linalg.inv(information)))

@@ -1,4 +1,4 @@
-"""The log of a flight: states, rotor speeds, commands, and the conditions under which it was flown."""
+"""Flight logs: states, rotor speeds, commands and conditions."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from jaxdrones.urdf import load_params
 STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3}
 """Arrays of the state and their widths."""
 OPTIONAL = {"rpm": 4, "pwm": 4, "vbat": 0, "target_pos": 3, "target_vel": 3, "target_yaw": 0}
-"""Arrays that a log may lack and their widths; 0 is a number per drone."""
+"""Optional arrays and their widths; 0 for a number per drone."""
 
-_TAKE_OFF = slice(150, 350)  # rows after the motors start, over which the voltage at take-off is averaged
-_RUNNING_PWM = 100.0  # a motor with more PWM than this runs
+_TAKE_OFF = slice(150, 350)  # rows after the motors start, for the mean voltage at take-off
+_RUNNING_PWM = 100.0  # PWM above which a motor runs
 
 
 class ImageSequence(NamedTuple):
     """Images of the drones' cameras."""
 
     t: np.ndarray
-    """(F,) when each was taken or, of an episode, observed first, s."""
+    """(F,) time of each exposure or, in an episode, of its first observation, s."""
     frames: np.ndarray
-    """(F, n, height, width, ...): of colors uint8 with 3 or 4 channels, of depth in m, of segmentation numbers."""
+    """(F, n, height, width, ...): uint8 colors with 3 or 4 channels, depths in m, or segmentation labels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoggedConditions:
-    """The conditions of a flight as its log has them."""
+    """Conditions of a flight from its log."""
 
     entries: dict[str, Any]
     about: str
-    """The same in words."""
+    """Title."""
 
     @property
     def vehicle(self) -> str:
@@ -62,7 +62,7 @@ def _unknown() -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class FlightLog:
-    """The log of a flight of n drones over K rows; row k is the state at time t[k]. Unknown numbers are NaN."""
+    """Log of n drones over K rows; row k is the state at time t[k]. Unknown numbers are NaN."""
 
     t: np.ndarray
     """(K,) time, s."""
@@ -91,13 +91,13 @@ class FlightLog:
     conditions: Any = dataclasses.field(default_factory=lambda: LoggedConditions({}, ""))
     """Conditions of the flight, with `as_dict()` for JSON."""
     params: Params = None  # type: ignore[assignment]  # filled in below
-    """Constants of the team, with a leading axis of length n; those of cf2x when left out."""
+    """Constants of the team, with a leading axis of length n; by default those of cf2x."""
     scene: Scene = dataclasses.field(default_factory=Scene)
     images: Mapping[str, ImageSequence] = dataclasses.field(default_factory=dict)
     """Images of the on-board cameras, by kind."""
     name: str = "flight"
     file: Path | None = None
-    """The file that the log was read from."""
+    """File of the log."""
 
     def __post_init__(self):
         rows, drones = np.shape(self.pos)[:2]
@@ -115,22 +115,22 @@ class FlightLog:
         return all(bool(np.isfinite(getattr(self, name)).any()) for name in names)
 
     def drone(self, i: int) -> FlightLog:
-        """The log of one drone of a team."""
+        """Log of one drone of a team."""
         arrays: dict[str, Any] = {name: getattr(self, name)[:, i : i + 1] for name in STATE | OPTIONAL}
         params = jax.tree.map(lambda x: x[i : i + 1], self.params)
         return dataclasses.replace(self, **arrays, labels=self.labels[i : i + 1], params=params)
 
     @property
     def in_flight(self) -> np.ndarray:
-        """(K,) whether all motors run; true in all rows of a log without PWM."""
+        """(K,) whether all motors run; true for a log without PWM."""
         return np.min(self.pwm, axis=(1, 2)) > _RUNNING_PWM if self.has("pwm") else np.ones(len(self.t), bool)
 
     @property
     def sag(self) -> float:
         """Drop of the battery voltage of the first drone from rest to take-off, V; 0 for a log that begins in flight.
 
-        The voltage at rest is the highest one before the motors start, that at take-off the mean from 1.5 to 3.5 s
-        after they start, at 100 rows per second.
+        The voltage at rest is the highest one before the motors start; the voltage at take-off is the mean from 1.5 to
+        3.5 s after, at 100 rows per second.
         """
         begin, voltage = int(np.argmax(self.in_flight)), self.vbat[:, 0]
         return (
@@ -144,7 +144,7 @@ class FlightLog:
 
     @property
     def last_quarter(self) -> np.ndarray:
-        """(K,) which times are in the last quarter of the flight."""
+        """(K,) mask of the last quarter of the flight."""
         return self.t >= self.t[-1] * 3 / 4
 
     @property
@@ -159,7 +159,7 @@ class FlightLog:
         return self.pos - self.target_pos, "m"
 
     def not_finite(self) -> dict[str, str]:
-        """Drones whose state is not finite at some time: label -> what happened and when."""
+        """Drones with a state that is not finite: label -> message."""
         states = [getattr(self, name) for name in (*STATE, *["rpm"] * self.has("rpm"))]
         broken = np.any([~np.isfinite(x).all(-1) for x in states], axis=0)
         return {

@@ -1,4 +1,4 @@
-"""The order of the motors in a log: whether roll and pitch accelerate as the documented order implies."""
+"""Check of the order of the motors in a log by roll and pitch accelerations."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _PATTERNS = {
     "+": np.array([[0, -1, 0, 1], [-1, 0, 1, 0]]) / np.sqrt(2),
 }
 _NAMES = ("front right", "back right", "back left", "front left")
-_MAX_MOTOR_ROWS = 6000  # a minute of flight shows the order of the motors
+_MAX_MOTOR_ROWS = 6000  # a minute of flight suffices
 _RIDGE = 1e-9  # of the trace of the moment matrix, where motors or velocities are constant
-_LAGS = range(-1, 7)  # rows by which motors act later than they are logged
-_MOTOR_ROWS, _TREND_ROWS = 4, 101  # of the angular acceleration; of the slow part that is removed
-_MIN_EXPLAINED = 0.15  # share of the angular acceleration that the motors explain
+_LAGS = range(-1, 7)  # rows of delay between the log and the effect of motors
+_MOTOR_ROWS, _TREND_ROWS = 4, 101  # of the angular acceleration; of the removed slow part
+_MIN_EXPLAINED = 0.15  # fraction of the angular acceleration explained by the motors
 
 
 def check_motors(squares: np.ndarray, attitude: Rotation, vel: np.ndarray, omega: np.ndarray) -> list[str]:
-    """Whether roll and pitch accelerate as the documented order of the motors implies."""
+    """Check roll and pitch accelerations against the documented order of the motors."""
     effect = motor_effects(squares, attitude, vel, omega)
     if effect is None:
         return []
@@ -42,7 +42,7 @@ def _likeness(effect: np.ndarray, pattern: np.ndarray) -> float:
 
 
 def motor_effects(squares: np.ndarray, attitude: Rotation, vel: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
-    """(2, 4) relative effect of each motor on roll and pitch, rows of length 1; `None` where it is not observable."""
+    """(2, 4) relative effect of each motor on roll and pitch, unit rows; `None` if not observable."""
     n = _MOTOR_ROWS
     squares, vel, omega = (x[:_MAX_MOTOR_ROWS] for x in (squares, vel, omega))
     if len(squares) < 2 * _TREND_ROWS:

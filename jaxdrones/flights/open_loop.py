@@ -1,4 +1,4 @@
-"""Open-loop prediction: a model starts in a logged state and gets the recorded inputs; its errors against the log."""
+"""Open-loop prediction from logged states with recorded inputs, and its errors."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ EFFECTS = (drag, flapping_moment, rate_damping, trim_torque)
 """Effects that act on a vehicle in addition to its rotors and its weight."""
 
 _LENGTH = HORIZONS[-1]
-_WARM_UP = 30  # rows before the start, in which lagging rotors reach their speed
+_WARM_UP = 30  # rows before the start, for the spin-up of lagging rotors
 _MAX_DELAY = 6  # rows, largest delay of the inputs
 _HALF_ROW = 0.5
-_BLOCK = 1000  # windows; those of a flight are padded to a multiple of it, so that flights share a compiled program
+_BLOCK = 1000  # windows; padded to a multiple of it, to share compiled programs between flights
 
 
 class Windows(NamedTuple):
-    """Windows of a flight, each from its start to the last horizon; every array has a leading axis over n windows."""
+    """Windows of a flight from start to last horizon; every array has a leading axis over n windows."""
 
     start: State
     """(n,) logged states of one drone at the start."""
@@ -50,7 +50,7 @@ class Windows(NamedTuple):
 
 
 def cut_windows(log: FlightLog, starts: np.ndarray) -> Windows:
-    """Cut the windows of a log that begin in the given rows.
+    """Cut windows of a log at the given rows.
 
     Args:
         log: log of the flight.
@@ -68,10 +68,10 @@ def cut_windows(log: FlightLog, starts: np.ndarray) -> Windows:
 
 
 def window_starts(log: FlightLog, stride: int = 1) -> np.ndarray:
-    """Every `stride`-th row from which the drone is in flight up to the last horizon.
+    """Every `stride`-th row with the drone in flight up to the last horizon.
 
     Raises:
-        ValueError: there is no such row.
+        ValueError: no such row.
     """
     flying = np.convolve(~log.in_flight, np.ones(_LENGTH + 1), mode="valid") == 0
     starts = np.flatnonzero(flying)[::stride]
@@ -81,14 +81,13 @@ def window_starts(log: FlightLog, stride: int = 1) -> np.ndarray:
 
 
 def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows columns"], motors: Motors | None) -> State:
-    """Predicted states of one drone at the horizons, as its instruments would log them.
+    """Predicted states of one drone at the horizons, in terms of its log.
 
     Args:
         vehicle: parameters of the drone and of its instruments.
         start: logged state at the start.
         command: recorded inputs of one window, see `Windows.command`.
-        motors: the map from duty cycle to thrust, which the rotors follow with the vehicle's lag; `None` where the
-            command is the measured rotor speeds.
+        motors: map from duty cycle to thrust, followed with the vehicle's rotor lag; `None` for measured rotor speeds.
     """
     params, instruments = vehicle.params, vehicle.instruments
     speed, rate = _rotor_speed(vehicle, command, motors)
@@ -114,7 +113,7 @@ def predict(vehicle: Vehicle, start: State, command: Float[Array, "rows columns"
 def residuals(predicted: State, logged: State) -> Float[Array, "4 3"]:
     """Errors of one state: position (m) and velocity (m/s), world; rotation (rad) and angular velocity (rad/s), body.
 
-    The rotation error is a vector along the axis, whose length is twice the sine of half the angle.
+    The rotation error is along the axis, with twice the sine of half the angle as its length.
     """
     error = rotation.multiply(rotation.conjugate(logged.quat), predicted.quat)
     rotation_error = 2 * jnp.where(error[3] < 0, -1, 1) * error[:3]
@@ -139,14 +138,14 @@ def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.nda
 
 
 def hold_errors(log: FlightLog) -> np.ndarray:
-    """`open_loop_errors` of *hold*, the persistence model: it stays in the state of the start."""
+    """`open_loop_errors` of *hold*, the persistence model with a constant state."""
     windows, weights = _all_windows(log)
     held = jax.tree.map(lambda x, y: jnp.broadcast_to(x[:, None], y.shape), windows.start, windows.logged)
     return np.asarray(mean_errors(held, windows.logged, weights))
 
 
 def _all_windows(log: FlightLog) -> tuple[Windows, Float[Array, " n"]]:
-    """The windows from every start of a log, with padding, and their weights, which are zero for the padding."""
+    """All windows of a log with padding, and their weights, zero for the padding."""
     starts = window_starts(log)
     indices = np.arange(-(-len(starts) // _BLOCK) * _BLOCK)
     weights = jnp.asarray(indices < len(starts), float) / len(starts)
@@ -162,7 +161,7 @@ def mean_errors(
     Args:
         predicted: predicted states (n, horizons, ...).
         logged: logged states at the same times.
-        weights: weights of the windows, which add up to one; equal when left out.
+        weights: weights of the windows with sum one; by default equal.
     """
     errors = jax.vmap(jax.vmap(_error))(predicted, logged)
     return jnp.mean(errors, axis=0) if weights is None else jnp.tensordot(weights, errors, 1)
@@ -213,7 +212,7 @@ def _shifted(x: Float[Array, "rows n"], delay: Array) -> Float[Array, "inner n"]
 
 
 def equations_of_motion(rpm_rate: Float[Array, "4"]) -> Derivative:
-    """The equations of motion of a team of one drone whose rotors have the commanded speed and this rate, RPM/s."""
+    """Equations of motion of a team of one drone with given rotor speeds and rates, RPM/s."""
 
     def prescribed(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Array, Array]:
         return command, rpm_rate

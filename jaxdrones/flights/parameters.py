@@ -1,4 +1,4 @@
-"""Parameters of a vehicle that can be identified from flights, by name, and vehicles with other values of them."""
+"""Identifiable parameters of a vehicle by name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HOVER_SUMMED_SPEED = 6900.0  # rad/s, sum of the four rotor speeds, about that 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A scalar parameter of a vehicle and the coordinate x in which it is searched; x is 0 at the initial value.
+    """Scalar parameter of a vehicle and its search coordinate x, zero at the initial value.
 
     A positive parameter is its initial value times exp(x), any other its initial value plus `scale` times x.
     """
@@ -29,7 +29,7 @@ class Parameter:
     field: str
     """Field of `Params` or `Instruments`; or `center_of_mass`; or `rotor_lag`, both time constants of the rotors."""
     index: int | slice | tuple[()]
-    """Entries of the field's array that have this value."""
+    """Entries of the field's array with this value."""
     scale: float | None = None
     """Change of the parameter for a step of 1 in x, SI units; `None` for a positive parameter with logarithmic x."""
     per_flight: bool = False
@@ -66,26 +66,26 @@ PARAMETERS = {
         Parameter("estimate_delay", "estimate_delay", (), 0.01),
     )
 }
-"""All parameters that can be fitted, by name."""
+"""All parameters by name."""
 
-# Open-loop windows do not identify these beside a delay.
+# Not identifiable from open-loop windows together with a delay.
 _CLOSED_LOOP_ONLY = ("rotor_lag", "unfelt_sag", "estimate_tilt", "estimate_delay")
-# A flight identifies only the ratios of thrust to mass and of yaw torque to inertia: one parameter of each is fixed.
+# Only the ratios of thrust to mass and of yaw torque to inertia are identifiable: one parameter of each is fixed.
 # PWM identifies thrusts, not rotor speeds.
 _FROM_ROTOR_SPEEDS = tuple(name for name in PARAMETERS if name not in ("mass", "inertia_z", *_CLOSED_LOOP_ONLY))
 _FROM_PWM = tuple(name for name in PARAMETERS if name not in ("kf", "inertia_z", "rotor_inertia", *_CLOSED_LOOP_ONLY))
 
 
 def default_parameters(has_rotor_speeds: bool) -> tuple[str, ...]:
-    """Names of the parameters that are fitted when none are named."""
+    """Names of the parameters of a fit by default."""
     return _FROM_ROTOR_SPEEDS if has_rotor_speeds else _FROM_PWM
 
 
 def select_parameters(names: Sequence[str]) -> tuple[str, ...]:
-    """Names of the parameters that names of parameters or fields stand for: `inertia` stands for all three axes.
+    """Expand names of parameters or fields to parameters, for example `inertia` to three axes.
 
     Raises:
-        ValueError: a name is unknown, or there are too many parameters.
+        ValueError: an unknown name, or too many parameters.
     """
     fields = {parameter.field for parameter in PARAMETERS.values()}
     selected: dict[str, None] = {}
@@ -97,14 +97,14 @@ def select_parameters(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def with_parameters(vehicle: Vehicle, names: Sequence[str], x: Sequence[ArrayLike]) -> Vehicle:
-    """The vehicle whose named parameters have the coordinates x, where `vehicle` has x = 0."""
+    """Vehicle with the coordinates x of named parameters, relative to `vehicle`."""
     for name, value in zip(names, x, strict=True):
         vehicle = _with(vehicle, PARAMETERS[name], value)
     return vehicle
 
 
 def value_of(vehicle: Vehicle, name: str) -> float:
-    """The value of a parameter, SI units; the center of mass is relative to the mean position of the rotors."""
+    """Value of a parameter, SI units; the center of mass is relative to the mean position of the rotors."""
     parameter = PARAMETERS[name]
     if parameter.field == "center_of_mass":
         return float(-jnp.mean(vehicle.params.rotor_pos[:, parameter.index]))
@@ -115,7 +115,7 @@ def value_of(vehicle: Vehicle, name: str) -> float:
 
 
 def scale_of(vehicle: Vehicle, name: str) -> float:
-    """The magnitude of the derivative of a parameter with respect to its coordinate x, SI units."""
+    """Magnitude of the derivative of a parameter with respect to its coordinate x, SI units."""
     scale = PARAMETERS[name].scale
     return abs(value_of(vehicle, name)) if scale is None else scale
 
@@ -124,7 +124,7 @@ _PARAMS = frozenset(field.name for field in dataclasses.fields(Params))
 
 
 def _owner(parameter: Parameter) -> str:
-    """The attribute of `Vehicle` that has the parameter's field."""
+    """Attribute of `Vehicle` with the parameter's field."""
     return "params" if parameter.field in _PARAMS else "instruments"
 
 

@@ -1,4 +1,4 @@
-"""Closed-loop identification: estimates parameters of a vehicle from the paths of flights on set-points."""
+"""Closed-loop identification of vehicle parameters from the paths of flights on set-points."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from jaxdrones.flights.preparation import PERIOD
 from jaxdrones.flights.vehicle import Vehicle
 
 BALANCE_PARAMETERS = ("mass", "unfelt_sag")
-"""Parameters that are estimated from the balance of vertical forces."""
+"""Parameters estimated from the balance of vertical forces."""
 PATH_PARAMETERS = ("drag_coeff_x", "drag_coeff_y", "flapping_coeff_x", "flapping_coeff_y", "rotor_lag", "estimate_tilt")
-"""Parameters that are estimated from the horizontal path."""
+"""Parameters estimated from the horizontal path."""
 
-_BALANCE_ROWS = 100  # rows over which the balance of vertical forces is averaged: one second
+_BALANCE_ROWS = 100  # rows of the averaged balance of vertical forces: one second
 _FORCE_STD = 0.02  # standard deviation of the averaged vertical balance, fraction of the weight
 _PATH_STD = 0.05  # m, standard deviation of the horizontal position along an axis
 _STRIDE = 20  # rows between the compared points of a path
 _CAUCHY_SCALE_SQUARED = 9.0  # c^2 of the Cauchy loss c^2 log(1 + r^2 / c^2)
 _PRIOR_PRECISION = 1.0  # inverse variance of x
 _MAX_STEPS = 8
-_MIN_DECREASE = 1e-3  # relative; a step that decreases the loss by less is the last one
+_MIN_DECREASE = 1e-3  # relative decrease of the loss at which to stop
 
 Residuals = Callable[[Array], Float[Array, " n"]]
 
@@ -61,7 +61,7 @@ def fit_path(
         logs: flights with set-points, PWM and battery voltage.
         start: the vehicle with the initial values.
         motors: motors of the vehicle.
-        gains: gains of the firmware that flew.
+        gains: gains of the recorded firmware.
         progress: called with a line after each of the two fits.
 
     Returns:
@@ -111,7 +111,7 @@ def _balance_residuals(
 def _path_data(logs: Sequence[FlightLog]) -> tuple[ClosedLoopInputs, Array, Array]:
     """Inputs of equal length, the recorded horizontal paths (flights, points, 2), m, and a mask (flights, points).
 
-    The mask is 1 at the points that are compared, 0 elsewhere.
+    The mask is 1 at compared points, 0 elsewhere.
     """
     inputs = [closed_loop_inputs(log) for log in logs]
     rows = max(len(each.battery) for each in inputs)
@@ -147,7 +147,7 @@ def _path_residuals(
 
 
 def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float) -> tuple[Array, np.ndarray]:
-    """Levenberg-Marquardt from x = 0; returns the coordinates of the least loss and their standard errors.
+    """Levenberg-Marquardt from x = 0; return the coordinates of the least loss and their standard errors.
 
     The loss is the Cauchy loss; with an infinite scale it is the sum of squares.
     """

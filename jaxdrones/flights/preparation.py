@@ -1,4 +1,4 @@
-"""Logs for identification: one drone each, at 100 Hz, with plausible units and columns that agree with each other."""
+"""Preparation of logs for identification: one drone each, at 100 Hz, with plausible units and consistent columns."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
 PERIOD = 0.01
 """Time between the rows of a prepared log, s."""
 
-_MAX_PERIOD = 0.012 + 1e-8  # s; rows further apart do not show the motion of a small quadrotor
+_MAX_PERIOD = 0.012 + 1e-8  # s; larger steps do not resolve the motion of a small quadrotor
 _MAX_GAP = 0.05  # s
-_MAX_JITTER = 0.5e-3  # s, by which the times of rows that are not resampled differ from 100 Hz
+_MAX_JITTER = 0.5e-3  # s, tolerance of times at 100 Hz without resampling
 _MIN_ROWS = 100
 _FULL_PWM = 65535
 _MAX_RATE = 60.0  # rad/s; gyroscopes of small quadrotors saturate at 35
 _MIN_VOLTAGE, _MAX_VOLTAGE = 1.0, 60.0  # V
 _MAX_RPM = 1e6
-_MIN_MEDIAN_RPM = 2700.0  # small quadrotors do not fly at a lower median speed; 16,000 RPM are 1,700 rad/s
-_MAX_PERCENT = 100.0  # PWM that never exceeds this is a percentage
+_MIN_MEDIAN_RPM = 2700.0  # lowest median speed of small quadrotors; 16,000 RPM are 1,700 rad/s
+_MAX_PERCENT = 100.0  # PWM below this is a percentage
 
 
 def load_flights(*files: str | os.PathLike, allow_inconsistent: bool = False) -> list[FlightLog]:
-    """Read logs for identification: one for each drone, resampled to 100 Hz, with different names.
+    """Read logs for identification: one for each drone, resampled to 100 Hz, with unique names.
 
     Args:
         files: see `read_log`.
-        allow_inconsistent: whether to accept logs whose columns contradict each other, see `inconsistencies`.
+        allow_inconsistent: whether to accept logs with contradictory columns, see `inconsistencies`.
 
     Raises:
-        UserError: a log cannot be read, has no inputs, implausible units, or a rate that is too low; or its columns
-            contradict each other.
+        UserError: a log that cannot be read, without inputs, with implausible units, too low a rate, or contradictory
+            columns.
     """
     return named_apart([drone for file in files for drone in prepare(read_log(file), allow_inconsistent)])
 
 
 def prepare(log: FlightLog, allow_inconsistent: bool = False) -> list[FlightLog]:
-    """The drones of a log, each as `load_flights` returns it."""
+    """Logs of the drones of a log, see `load_flights`."""
     drones = [log.drone(i) for i in range(len(log.labels))]
     if len(drones) > 1:
         drones = [dataclasses.replace(one, name=f"{log.name}, {one.labels[0]}") for one in drones]
@@ -60,22 +60,22 @@ def prepare(log: FlightLog, allow_inconsistent: bool = False) -> list[FlightLog]
 
 
 def inconsistencies(log: FlightLog) -> list[str]:
-    """Contradictions between the columns of a prepared log, a sentence each with the likely cause."""
+    """Contradictions between columns of a prepared log, a sentence each with the likely cause."""
     flying = np.flatnonzero(log.in_flight)
     rows = slice(int(flying[0]), int(flying[-1]) + 1) if len(flying) else slice(0)
     pos, quat, vel, omega = (np.array(getattr(log, name)[rows, 0]) for name in STATE)  # SciPy needs writable arrays
     motion = Motion(pos, Rotation.from_quat(quat), vel, omega)
     thrusts = (log.rpm**2 if log.has("rpm") else log.pwm)[rows, 0]
-    if log.conditions.as_dict():  # simulated here: the order of the motors is known, and smooth flights do not show it
+    if log.conditions.as_dict():  # simulated here, with a known order of the motors
         thrusts = thrusts[:0]
     return contradictions(motion, thrusts, log.sag)
 
 
 def named_apart(logs: Sequence[FlightLog]) -> list[FlightLog]:
-    """The logs with different names: equal ones get the folders of their files that differ, or a number.
+    """Logs with unique names: equal names get the differing folders of their files, or a number.
 
     Raises:
-        UserError: a drone of a file is given twice.
+        UserError: a duplicate drone of a file.
     """
     given = [(log.file.resolve(), log.labels) for log in logs if log.file is not None]
     for twice in (one for one in given if given.count(one) > 1):
@@ -96,7 +96,7 @@ def named_apart(logs: Sequence[FlightLog]) -> list[FlightLog]:
 
 
 def _resampled(log: FlightLog) -> FlightLog:
-    """The log at 100 Hz by its times; rows that are at 100 Hz already stay as they are."""
+    """Log resampled to 100 Hz; rows at 100 Hz are unchanged."""
     times = log.t
     if np.max(np.abs(times - times[0] - PERIOD * np.arange(len(times)))) <= _MAX_JITTER:
         return log
@@ -115,7 +115,7 @@ def _resampled(log: FlightLog) -> FlightLog:
 
 
 def _checked(log: FlightLog) -> FlightLog:
-    """The log in float64, with unit quaternions and one kind of input; raises `UserError` on invalid data."""
+    """Validated log in float64, with unit quaternions and one kind of input."""
     inputs = ("rpm",) if log.has("rpm") else ("pwm", "vbat")
     for name in inputs:
         if not log.has(name):
@@ -149,7 +149,7 @@ def _check_times(name: str, t: np.ndarray) -> None:
 
 
 def _check_units(name: str, column: str, x: np.ndarray) -> None:
-    """Raise on values that are implausible in the column's unit; the message names the likely unit."""
+    """Raise for implausible values in the column's unit; the message names the likely unit."""
 
     def require(condition, looks: str, give: str) -> None:
         if not condition:

@@ -1,4 +1,4 @@
-"""Writing the report of a fit: `vehicle.urdf` and `report.json`."""
+"""Report of a fit: `vehicle.urdf` and `report.json`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from jaxdrones.writing import write
 
 
 def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
-    """Write `vehicle.urdf` and `report.json` into a folder, which is created.
+    """Write `vehicle.urdf` and `report.json` into a new or empty folder.
 
     Raises:
-        ValueError: the folder has the files of an earlier fit.
+        ValueError: files of an earlier fit in the folder.
     """
     check_no_fit(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -36,14 +36,14 @@ def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
 
 
 def check_no_fit(folder: Path) -> None:
-    """Raise `ValueError` if a folder has the files of a fit."""
+    """Raise `ValueError` for a folder with the files of a fit."""
     for file in (folder / URDF, folder / REPORT):
         if file.exists():
             raise UserError(f"{file} exists already; remove it, or give another --output")
 
 
 def report_as_dict(report: Report) -> dict[str, Any]:
-    """The result of a fit for JSON, in SI units."""
+    """Result of a fit for JSON, in SI units."""
     instruments = report.vehicle.instruments
     return {
         "parameters": {name: dataclasses.asdict(estimate) for name, estimate in report.parameters.items()},

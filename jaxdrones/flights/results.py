@@ -1,4 +1,4 @@
-"""Results of a flight: errors, settling times, whether it diverged, and how two flights differ."""
+"""Results of a flight: errors, settling times, divergence, and comparison of two flights."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import numpy as np
 
 from jaxdrones.flights.log import FlightLog
 
-_BAND = 0.1  # share of the steady error within which a response counts as settled
+_BAND = 0.1  # settling band, relative to the steady error
 _MIN_BAND = 5e-3  # m or m/s
-_LOST = 1.0  # m or m/s above the error at the start, at which a drone has diverged
+_LOST = 1.0  # m or m/s above the initial error, at which a drone has diverged
 
 
 def diverged(log: FlightLog) -> dict[str, str]:
-    """Drones that did not follow their commands: label -> what happened.
+    """Drones that diverged from their commands: label -> message.
 
     A drone diverged if its state is not finite at some time, or if at some time in the last quarter of the flight
     it is upside down, or its error (the distance to the target position or the difference to the target velocity)
-    is 1 m or 1 m/s above its error at the start. The four examples with their defaults stay below 0.6 m or m/s
-    and within 30 degrees of level; an unstable drone is hundreds of meters off.
+    is 1 m or 1 m/s above its initial error. The four examples with their defaults stay below 0.6 m or m/s and
+    within 30 degrees of level; an unstable drone is hundreds of meters off.
     """
     difference, unit = log.difference()
     with np.errstate(over="ignore", invalid="ignore"):
@@ -35,11 +35,12 @@ def diverged(log: FlightLog) -> dict[str, str]:
 
 
 def results(log: FlightLog, after: float) -> list[dict[str, float | str | None]]:
-    """One row of numbers per drone, over the flight from time `after` (s) on, or its second half if it is shorter.
+    """Table with a row per drone, from time `after` (s), or over the second half of a shorter flight.
 
     The error is the distance to the target position, or the difference to the target velocity. The steady error
-    is its mean over the last quarter of the flight. The drone has settled when the error stays within 10 % (or
-    5 mm, 5 mm/s) of that; `None` if it does not before the last quarter. Numbers that are not finite are `None`.
+    is its mean over the last quarter of the flight. The settling time is the first time after which the error stays
+    within 10 % (or 5 mm, 5 mm/s) of that; `None` if not before the last quarter. Numbers that are not finite are
+    `None`.
     """
     difference, unit = log.difference()
     unit = unit.replace("/", "_")
@@ -64,7 +65,7 @@ def results(log: FlightLog, after: float) -> list[dict[str, float | str | None]]
 
 
 def definitions(log: FlightLog, after: float) -> str:
-    """Definitions of the numbers of `results` and the times from which they count; three lines."""
+    """Definitions of the columns of `results`, in three lines."""
     unit = "mm" if log.difference()[1] == "m" else "mm/s"
     band = f"{100 * _BAND:g} % or {1000 * _MIN_BAND:g} {unit}"
     return (
@@ -75,7 +76,7 @@ def definitions(log: FlightLog, after: float) -> str:
 
 
 def divergence(log: FlightLog, other: FlightLog, rows: int = 12) -> list[dict[str, float]]:
-    """How two flights of the same conditions diverge: the largest differences over the drones, at `rows` times."""
+    """Largest differences over the drones of two flights of the same conditions, at `rows` times."""
     at = np.unique(np.linspace(0, len(log.t) - 1, rows).round().astype(int))
 
     def largest(difference: np.ndarray) -> list[float]:
@@ -95,7 +96,7 @@ def divergence(log: FlightLog, other: FlightLog, rows: int = 12) -> list[dict[st
 
 
 def _counted_from(log: FlightLog, after: float) -> float:
-    """Time from which on results count, s."""
+    """Start of the evaluation, s."""
     return after if after < log.t[-1] else float(log.t[-1]) / 2
 
 

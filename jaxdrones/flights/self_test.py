@@ -1,4 +1,4 @@
-"""A short flight whose end is known in closed form: it shows that physics, compiler and device work together."""
+"""Self-test of physics, compiler and device: a short flight with a closed-form solution."""
 
 from __future__ import annotations
 
@@ -17,26 +17,25 @@ from jaxdrones.urdf import load_params
 
 _STEPS, _DT = 240, 1 / 240
 _HEIGHT = 1.0  # m, at the start
-_FAST, _SLOW = 1.2, 1.15  # over the hover speed: of the two rotors that turn one way, and of the other two
+_FAST, _SLOW = 1.2, 1.15  # over the hover speed: of the two rotors with one direction of rotation, and of the other two
 _TOLERANCE = 1e-3  # relative; float32 and 240 steps stay below 1e-4
 
 
 def self_test(backend: str) -> str | None:
-    """Fly a level drone for a second with rotors at constant speeds, and compare its end with the closed form.
+    """Fly a level drone for one second at constant rotor speeds, and compare its final state with the closed form.
 
-    The rotors of one direction of rotation are faster than the others. The thrust lifts the drone at a constant
-    acceleration a, and the difference of torques turns it about its vertical axis at a constant angular acceleration:
-    after k steps of dt the semi-implicit Euler method has moved it by a dt^2 k (k + 1) / 2, exactly. On the explicit
-    backend the gradient of the climb in the mass is compared, too.
+    The rotors with one direction of rotation are faster than the others. The drone climbs at a constant acceleration a
+    and yaws at a constant angular acceleration: after k steps of dt the semi-implicit Euler method has moved it by
+    exactly a dt^2 k (k + 1) / 2. On the explicit backend the gradient of the climb in the mass is compared, too.
 
     Args:
         backend: `explicit` or `bullet`.
 
     Returns:
-        `None` if all is well, else what is not.
+        `None` on success, else a message.
 
     Raises:
-        ImportError: the Bullet backend is asked for and pybullet is not installed.
+        ImportError: the Bullet backend without pybullet.
     """
     single = load_params("cf2x")
     single = single.replace(rotor_inertia=jnp.zeros_like(single.rotor_inertia))

@@ -1,4 +1,4 @@
-"""A vehicle together with the measurement model of its logs, and the folder of an identified vehicle."""
+"""Vehicles with a measurement model of their logs, and folders of identified vehicles."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from jaxdrones.vector import components
 URDF, REPORT = "vehicle.urdf", "report.json"
 """Files in the folder of `jaxdrones fit`."""
 
-_SAG_THRESHOLD = 0.55  # V; up to this sag at take-off a Crazyflie's motors get the voltage that is logged
+_SAG_THRESHOLD = 0.55  # V; up to this sag at take-off a Crazyflie's motors get the logged voltage
 
 
 class Instruments(PyTreeNode):
-    """How the arrays of a log differ from the flight; `Instruments.ideal()` has no errors."""
+    """Measurement model of a log; `Instruments.ideal()` has no errors."""
 
     delay: Array
-    """() time by which rotor speeds or PWM act later than they are logged, s; negative where they are logged late."""
+    """() delay from the log to the effect of rotor speeds or PWM, s; negative for a late log."""
     tilt: Array
     """(2,) rotation about body x and y from the logged attitude to that of the rotors, rad."""
     position_scale: Array
     """() ratio of the horizontal distance in the logged positions to the integral of the logged velocities."""
     unfelt_sag: Array
-    """() fraction of the battery's sag at take-off beyond 0.55 V that is in the log but does not reach the motors."""
+    """() fraction of the battery's sag at take-off beyond 0.55 V that is logged without effect on the motors."""
     estimate_tilt: Array
     """() ratio of the tilt in the onboard state estimate to the true tilt."""
     estimate_delay: Array
@@ -46,20 +46,20 @@ class Instruments(PyTreeNode):
         return cls(jnp.zeros(()), jnp.zeros(2), jnp.ones(()), jnp.zeros(()), jnp.ones(()), jnp.zeros(()))
 
     def true_attitude(self, logged: Float[Array, "4"]) -> Float[Array, "4"]:
-        """The attitude of the rotors, from the logged one."""
+        """Attitude of the rotors, from the logged one."""
         return rotation.multiply(logged, rotation.exp(jnp.append(self.tilt, 0.0)))
 
     def logged_attitude(self, true: Float[Array, "4"]) -> Float[Array, "4"]:
-        """The attitude that the log shows, from that of the rotors."""
+        """Logged attitude, from that of the rotors."""
         return rotation.multiply(true, rotation.exp(jnp.append(-self.tilt, 0.0)))
 
     def logged_position(self, true: Float[Array, "3"], start: Float[Array, "3"]) -> Float[Array, "3"]:
-        """The position that the log shows in a flight from `start`, m, world."""
+        """Logged position in a flight from `start`, m, world."""
         scale = jnp.stack([self.position_scale, self.position_scale, jnp.ones_like(self.position_scale)])
         return start + scale * (true - start)
 
     def motor_supply(self, logged: Float[Array, "*n"], sag: Float[Array, "*#n"]) -> Float[Array, "*n"]:
-        """The voltage that reaches the motors at full PWM, V.
+        """Voltage of the motors at full PWM, V.
 
         Args:
             logged: voltage of the battery, V.
@@ -68,7 +68,7 @@ class Instruments(PyTreeNode):
         return logged + self.unfelt_sag * jnp.maximum(sag - _SAG_THRESHOLD, 0)
 
     def estimate(self, state: State) -> State:
-        """The onboard state estimate of one drone in a true state."""
+        """Onboard state estimate of one drone in a true state."""
         late = rotation.multiply(state.quat, rotation.exp(-self.estimate_delay * state.omega))
         x, y, _ = components(rotation.z_axis(late))
         more_tilt = (self.estimate_tilt - 1) * jnp.stack([-y, x, jnp.zeros_like(x)])
@@ -78,14 +78,14 @@ class Instruments(PyTreeNode):
 
 
 class Vehicle(PyTreeNode):
-    """Parameters of one drone, and of the instruments that log its flights."""
+    """Parameters of one drone and of its instruments."""
 
     params: Params
     instruments: Instruments
 
     @classmethod
     def of(cls, params: Params) -> Vehicle:
-        """A vehicle with ideal instruments."""
+        """Vehicle with ideal instruments."""
         return cls(params, Instruments.ideal())
 
 
@@ -93,7 +93,7 @@ def load_vehicle(vehicle: str | os.PathLike) -> Vehicle:
     """Load a bundled vehicle or a URDF, with ideal instruments, or a folder of `jaxdrones fit` with fitted ones.
 
     Raises:
-        UserError: there is no such vehicle, or its files are invalid.
+        UserError: an unknown vehicle, or invalid files.
     """
     folder = Path(vehicle)
     if not folder.is_dir():

@@ -1,10 +1,10 @@
-"""Optimal control of one drone over the simulator's own step: LQR, iLQR with motor limits, and MPPI.
+"""Optimal control of one drone with the simulator's step: LQR, iLQR with motor limits, and MPPI.
 
 Each module has `settings(step, ...)`, `init(settings, params, state)` (of `mppi` also with a random key) and
-`control(settings, params, memory, state, setpoints, dt=...) -> (memory, rpm)`, all of one drone; `setpoints` holds the
-target at the present and the next `settings.horizon` control steps. A team, or many worlds, is `jax.vmap`.
-`tune` finds the gains of the controllers of `jaxdrones.control` for a vehicle. `twin.casadi_model` makes the physics a
-function of CasADi, and `mpc.Mpc` follows setpoints with it; both need the extra `casadi`.
+`control(settings, params, memory, state, setpoints, dt=...) -> (memory, rpm)`, all for one drone; `setpoints` holds the
+target at the present and the next `settings.horizon` control steps. Use `jax.vmap` for teams and worlds.
+`tune` tunes the gains of the controllers of `jaxdrones.control` for a vehicle. `twin.casadi_model` converts the physics
+to a CasADi function, and `mpc.Mpc` tracks setpoints with it; both need the extra `casadi`.
 """
 
 from jaxdrones.optimal import ilqr, lqr, mppi

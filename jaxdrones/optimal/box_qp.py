@@ -20,7 +20,7 @@ def box_qp(
         high: (m,) upper bounds, not below the lower ones.
 
     Returns:
-        The minimum (m,), and which of its components are between their bounds.
+        The minimizer (m,), and the mask of its free components, between their bounds.
     """
     sizes = jnp.asarray(_STEP_SIZES, gradient.dtype)
 
@@ -44,7 +44,7 @@ def box_qp(
 
 
 def solve_free(hessian: Float[Array, "m m"], right: Float[Array, "m *n"], free: Bool[Array, " m"]) -> Array:
-    """The solution of H x = right in the free components; the other ones are zero."""
+    """Solution of H x = right in the free components, zero in the others."""
     both = free[:, None] & free[None, :]
     part = jnp.where(both, hessian, jnp.eye(len(hessian), dtype=hessian.dtype))
     return jnp.linalg.solve(part, jnp.where(free.reshape(-1, *[1] * (right.ndim - 1)), right, 0))

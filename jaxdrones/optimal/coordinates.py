@@ -1,8 +1,8 @@
-"""States of one drone as vectors without a constraint: the differences that linear and quadratic models are about.
+"""State differences of one drone as unconstrained vectors, for linear and quadratic models.
 
-A unit quaternion has four components and three degrees of freedom. Linearized in its components, the drone would have
-a direction that no command moves, and no Riccati equation a solution. Attitudes are therefore compared in the tangent
-space: by three numbers.
+A unit quaternion has four components and three degrees of freedom. A linearization in its components would have an
+uncontrollable direction, and its Riccati equation no solution. Attitude differences are therefore vectors (3,) of the
+tangent space.
 """
 
 from collections.abc import Callable
@@ -23,11 +23,11 @@ SingleStep = Callable[[Params, State, Float[Array, "4"]], State]
 """`(params, state, rpm) -> state` of one drone."""
 
 SIZE = 16
-"""Numbers in a difference of states without models."""
+"""Length of a difference of states without models."""
 
 
 def single(step: Callable) -> SingleStep:
-    """A step or a derivative of a team as one of a single drone."""
+    """Convert a step or a derivative of a team to one of a single drone."""
 
     def step_of_one(params: Params, state: State, rpm: Float[Array, "4"]) -> State:
         team = jax.tree.map(lambda x: jnp.asarray(x)[None], (params, state))
@@ -37,10 +37,10 @@ def single(step: Callable) -> SingleStep:
 
 
 def command_unit(params: Params) -> Float[Array, ""]:
-    """The rotor speed in which commands and rotor speeds are counted here: that of hover, RPM.
+    """Unit of commands and rotor speeds here: the hover speed, RPM.
 
     Raises:
-        ValueError: parameters of a team, or no gravity, so that nothing hovers.
+        ValueError: parameters of a team, or no gravity.
     """
     check_shape("params.mass", params.mass, (), "optimal control is about one drone; use jax.vmap for a team")
     if is_concrete(params.gravity) and not np.asarray(params.gravity) > 0:
@@ -52,12 +52,12 @@ def command_unit(params: Params) -> Float[Array, ""]:
 
 
 def difference(params: Params, state: State, reference: State) -> Float[Array, " d"]:
-    """The difference between two states of one drone as a vector.
+    """Difference between two states of one drone as a vector.
 
     Args:
         params: of the drone.
         state: of the drone.
-        reference: what is subtracted.
+        reference: subtracted state.
 
     Returns:
         (d,) in this order: position, m, world; rotation from the reference to the state, twice the vector part of its
@@ -79,7 +79,7 @@ def difference(params: Params, state: State, reference: State) -> Float[Array, "
 
 
 def displaced(params: Params, state: State, vector: Float[Array, " d"]) -> State:
-    """The state of one drone that differs from a given one by a vector; to first order the inverse of `difference`."""
+    """Displace the state of one drone by a vector; to first order the inverse of `difference`."""
     parts = (state.pos, state.pos, state.vel, state.omega, state.rpm, state.aux)
     pos, turn, vel, omega, rpm, aux = ravel_pytree(parts)[1](vector)
     return state.replace(
@@ -93,9 +93,9 @@ def displaced(params: Params, state: State, vector: Float[Array, " d"]) -> State
 
 
 def tracking_error(params: Params, state: State, reference: State) -> Float[Array, " d"]:
-    """The `difference` with position and velocity along the heading of the reference instead of the world's axes.
+    """`difference` with position and velocity along the heading of the reference instead of the world's axes.
 
-    One set of weights and one gain then serve all headings.
+    Weights and gains are then independent of the heading.
     """
     vector = difference(params, state, reference)
     x_axis = rotation.axes(reference.quat)[0]
@@ -112,7 +112,7 @@ def tracking_error(params: Params, state: State, reference: State) -> Float[Arra
 def linearize_step(
     step: SingleStep, params: Params, state: State, rpm: Float[Array, "4"]
 ) -> tuple[Float[Array, "d d"], Float[Array, "d 4"]]:
-    """The matrices A and B of z' = A z + B u about a state and a command of one drone.
+    """Matrices A and B of z' = A z + B u about a state and a command of one drone.
 
     Args:
         step: of one drone, such as `single(make_step(...))`.
@@ -137,7 +137,7 @@ def linearize_step(
 def linearize(
     derivative: SingleStep, params: Params, state: State, rpm: Float[Array, "4"]
 ) -> tuple[Float[Array, "d d"], Float[Array, "d 4"]]:
-    """The matrices A and B of the continuous law z' = A z + B u about the motion through a state of one drone.
+    """Matrices A and B of the continuous model z' = A z + B u about the motion through a state of one drone.
 
     Args:
         derivative: of one drone, such as `single(make_derivative(...))`.

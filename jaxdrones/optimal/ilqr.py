@@ -1,7 +1,7 @@
-"""Iterative LQR over the simulator's step, with the limits of the motors as bounds (control-limited DDP).
+"""Iterative LQR with the simulator's step and motor limits as bounds (control-limited DDP).
 
-Tassa, Mansard, Todorov 2014, "Control-limited differential dynamic programming", with Gauss-Newton second derivatives:
-those of the dynamics are left out, as iLQR does (Li, Todorov 2004). Attitudes are in the tangent space.
+Tassa, Mansard, Todorov 2014, "Control-limited differential dynamic programming", with Gauss-Newton Hessians: second
+derivatives of the dynamics are neglected, as in iLQR (Li, Todorov 2004). Attitudes are in the tangent space.
 """
 
 from __future__ import annotations
@@ -28,41 +28,41 @@ from jaxdrones.status import Status, check_on_failure, is_finite, raise_unless_o
 
 _STEP_SIZES = tuple(0.5**k for k in range(8))  # of the line search
 _MIN_REGULARIZATION, _MAX_REGULARIZATION = 1e-6, 1e6
-_LESS, _MORE = 0.2, 10.0  # factors of the regularization after an iteration that improved the cost, or did not
+_LESS, _MORE = 0.2, 10.0  # factors of the regularization after an iteration with and without an improvement
 
 
 class Settings(PyTreeNode):
-    """What the planner knows of the world, what it minimizes, and how long it tries."""
+    """Model, weights, horizon and iterations of the planner."""
 
     weights: Weights
     step: Any = flax.struct.field(pytree_node=False)
-    """The step of a team, `(params, state, rpm) -> state`, over one control period."""
+    """Step of a team, `(params, state, rpm) -> state`, over one control period."""
     horizon: int = flax.struct.field(pytree_node=False)
-    """H, control steps that are planned."""
+    """H, planned control steps."""
     iterations: int = flax.struct.field(pytree_node=False)
     """Iterations per call of `control`."""
 
 
 class Memory(PyTreeNode):
-    """What is kept between calls: the plan, and the cost of what comes after it."""
+    """State of the planner between calls."""
 
     correction: Array
     """(H, 4) planned commands minus those of the reference, over the rotor speed of hover."""
     lqr: lqr.Memory
-    """The regulator about hover: its value is the cost at the end of the horizon, its gain the first guess."""
+    """Regulator about hover, for the terminal cost and the first guess."""
     started: Array
-    """() whether there is a plan of the call before."""
+    """() whether there is a plan of the previous call."""
     rpm: Array
-    """(4,) the last safe command, RPM; at first that of hover."""
+    """(4,) last safe command, RPM; initially that of hover."""
     status: Array
-    """() a `Status` as an integer: how the last call planned."""
+    """() `Status` of the last call, an integer."""
 
 
 class Solution(PyTreeNode):
-    """A plan of H steps."""
+    """Plan of H steps."""
 
     states: State
-    """(H + 1, ...) from the present state on."""
+    """(H + 1, ...) states, the present one first."""
     rpm: Array
     """(H, 4) commands, RPM."""
     gains: Array
@@ -70,7 +70,7 @@ class Solution(PyTreeNode):
     cost: Array
     """()."""
     costs: Array
-    """(iterations,) the cost after each iteration; it never grows."""
+    """(iterations,) cost after each iteration, never increasing."""
 
 
 def settings(step: Any, weights: Weights | None = None, horizon: int = 25, iterations: int = 2) -> Settings:
@@ -78,9 +78,9 @@ def settings(step: Any, weights: Weights | None = None, horizon: int = 25, itera
 
     Args:
         step: of a team, over one control period: that of the simulation, or a simpler one.
-        weights: of the errors; `problem.weights()` when left out.
-        horizon: control steps that are planned; what comes after is taken for flight by the regulator of `lqr`.
-        iterations: per call of `control`, each from the plan of the one before.
+        weights: of the errors; by default `problem.weights()`.
+        horizon: planned control steps. The terminal cost is that of the regulator of `lqr`.
+        iterations: per call of `control`, starting from the previous plan.
     """
     check_callable("step", step, "jaxdrones.make_step(...)")
     check_whole("horizon", horizon, 2)
@@ -89,7 +89,7 @@ def settings(step: Any, weights: Weights | None = None, horizon: int = 25, itera
 
 
 def init(settings: Settings, params: Params, state: State) -> Memory:
-    """The memory of one drone before its first call."""
+    """Memory of one drone before its first call."""
     regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
     always = jnp.ones((), bool)
     correction = jnp.zeros((settings.horizon, 4), regulator.gain.dtype)
@@ -108,22 +108,22 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of a plan over the horizon.
 
-    The plan of the call before is the guess, one step later; the first guess is flight by the regulator of `lqr`.
+    The guess is the previous plan, shifted by one step, and at first a flight with the regulator of `lqr`.
 
     Args:
         settings: of the planner.
         params: of the drone.
-        memory: of `init` or the call before.
+        memory: of `init` or the previous call.
         state: of the drone.
         setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
         dt: time between calls, s.
-        on_failure: where there is no new plan, `hold` repeats the last safe command and `raise` raises. Inside
-            `jax.jit` only `hold` is possible. The memory has the status of the call.
+        on_failure: without a new plan, `hold` repeats the last safe command and `raise` raises. Inside `jax.jit` only
+            `hold` is possible. The memory has the status of the call.
 
     Raises:
         PlanningError: there is no new plan, and `on_failure` is `raise`.
-        ValueError: arrays of a team (use `jax.vmap`), a number of setpoints that does not fit the horizon, or `dt` is
-            not the period of the step.
+        ValueError: arrays of a team (use `jax.vmap`), a wrong number of setpoints, or a `dt` other than the period of
+            the step.
     """
     check_single(params, state)
     check_period(settings.step, dt)
@@ -152,7 +152,7 @@ def control(
 def regulated(
     step: Any, params: Params, state: State, target: Reference, gain: Float[Array, "4 d"]
 ) -> Float[Array, "H 4"]:
-    """Commands of a flight by the regulator, RPM."""
+    """Commands of a flight with the regulator, RPM."""
     one_step = single(step)
 
     def advance(state: State, target: Reference) -> tuple[State, Array]:
@@ -170,13 +170,13 @@ def solve(
     rpm: Float[Array, "H 4"],
     value: Float[Array, "d d"],
 ) -> Solution:
-    """The best plan that some iterations find from a guess.
+    """Improve a guess by some iterations; return the best plan.
 
     Args:
         settings: of the planner.
         params: of the drone.
         state: of the drone, at the start.
-        target: H + 1 states and commands to be near to.
+        target: H + 1 states and commands to track.
         rpm: (H, 4) the guess, RPM.
         value: (d, d) weight of the tracking error at the end.
     """
@@ -190,7 +190,7 @@ def solve(
     matrices = jnp.concatenate([jnp.broadcast_to(q, (len(rpm) - 1, *q.shape)), value[None]])
 
     def fly(commands: Array, states: State | None, gains: Array | None) -> tuple[State, Array, Array]:
-        """States after every step, commands, and cost; with gains about the states of another flight."""
+        """States after every step, commands, and cost, with feedback about the states of another flight."""
 
         def advance(now: State, given: tuple) -> tuple[State, tuple]:
             command, planned, gain, wanted, nominal, matrix = given

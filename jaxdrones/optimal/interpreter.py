@@ -1,7 +1,7 @@
-"""Traced programs of JAX, evaluated on symbols of CasADi.
+"""Evaluation of traced JAX programs on CasADi symbols.
 
-An array is a NumPy array: of numbers, or of objects that are numbers and scalar `casadi.SX`. Equations of numbers alone
-are evaluated by JAX. Equations that only move numbers about are evaluated by JAX on their positions.
+An array is a NumPy array of numbers, or of objects: numbers and scalar `casadi.SX`. Equations of numbers alone are
+evaluated by JAX. Equations that only rearrange entries are evaluated by JAX on their indices.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.compiler import CALLS, Equation, is_literal
 from jaxdrones.optimal.primitives import ELEMENTWISE, REDUCTIONS, casadi, select
 
-_MOVES = frozenset(  # primitives whose results hold their inputs' numbers in other places
+_MOVES = frozenset(  # primitives that rearrange the entries of their inputs
     "broadcast_in_dim concatenate copy gather pad reshape rev slice split squeeze stack transpose "
     "expand_dims unstack dynamic_slice dynamic_update_slice scatter".split()
 )
 _MOVED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}  # others: indices
-_UNCHANGED = frozenset(  # primitives that change what JAX knows of a number, not the number
+_UNCHANGED = frozenset(  # primitives that leave values unchanged
     "convert_element_type stop_gradient optimization_barrier copy_start copy_done reduce_precision name".split()
 )
 
 
 def on_symbols(function: Callable, **arguments: Any) -> tuple[list, Any]:
-    """A function that JAX can trace, evaluated on symbols.
+    """Evaluate a traceable function on symbols.
 
     Args:
         function: of pytrees of arrays.
-        arguments: by a name for its symbols and in the order of the function: pytrees of the shapes that it takes.
+        arguments: pytrees with the shapes of the arguments, by name of the symbols and in order.
 
     Returns:
-        One vector of symbols per argument, `casadi.SX`, and the vector of the results' numbers.
+        One vector of symbols per argument, `casadi.SX`, and the vector of the results.
     """
     with jax.enable_x64(True):
         program, consts, _ = compiler.trace(function, *arguments.values())
@@ -48,7 +48,7 @@ def on_symbols(function: Callable, **arguments: Any) -> tuple[list, Any]:
 
 
 def _symbols(name: str, tree: Any) -> tuple[Any, list[np.ndarray]]:
-    """A vector of symbols, and the same symbols as arrays in the shapes of a pytree's leaves."""
+    """Vector of symbols, and the same symbols in the shapes of a pytree's leaves."""
     shapes = [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
     ends = np.cumsum([0, *(int(np.prod(shape, dtype=int)) for shape in shapes)]).tolist()
     vector = casadi.SX.sym(name, ends[-1])
@@ -59,10 +59,10 @@ def _symbols(name: str, tree: Any) -> tuple[Any, list[np.ndarray]]:
 
 
 def evaluate(program: Any, consts: Sequence, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The results of a traced program.
+    """Results of a traced program.
 
     Raises:
-        NotImplementedError: a primitive that has no counterpart here; says which, and what to do.
+        NotImplementedError: an unsupported primitive.
     """
     values: dict[Any, np.ndarray] = dict(zip(program.constvars, map(np.asarray, consts), strict=True))
     values |= zip(program.invars, inputs, strict=True)
@@ -116,7 +116,7 @@ def _array(items: Sequence, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _moved(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """The results of an equation that moves numbers, by what it does to their positions."""
+    """Results of a rearranging equation, by its effect on indices."""
     moving = _MOVED.get(equation.primitive.name, tuple(range(len(inputs))))
     if any(_is_symbolic(x) for i, x in enumerate(inputs) if i not in moving):
         raise NotImplementedError(
@@ -168,7 +168,7 @@ def _cond(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _scan(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """A loop of a known length, written out."""
+    """Unrolled loop of known length."""
     constants, carried = compiler.scan_counts(equation)
     program, own = compiler.opened(equation.params["jaxpr"])
     same, carry, stacks = inputs[:constants], inputs[constants : constants + carried], inputs[constants + carried :]
@@ -201,4 +201,4 @@ _WHOLE: dict[str, Callable[[Equation, list[np.ndarray]], list[np.ndarray]]] = {
     "cond": _cond,
     "scan": _scan,
 }
-"""Primitives that are more than a function of each number."""
+"""Primitives that are not elementwise."""

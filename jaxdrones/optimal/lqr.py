@@ -1,4 +1,4 @@
-"""Linear quadratic regulator about hover, with the motion of the target as feedforward."""
+"""Linear quadratic regulator about hover with feedforward of the target's motion."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _DOUBLINGS = 20  # a million control steps
 
 
 class Settings(PyTreeNode):
-    """What the regulator knows of the world, and what it minimizes."""
+    """Model and weights of the regulator."""
 
     weights: Weights
     step: Any = flax.struct.field(pytree_node=False)
-    """The step of a team, `(params, state, rpm) -> state`, over one control period."""
+    """Step of a team, `(params, state, rpm) -> state`, over one control period."""
     horizon: int = flax.struct.field(pytree_node=False, default=2)
-    """Setpoints after the present one that `control` is given: two, for the angular acceleration of the target."""
+    """Future setpoints of `control`: two, for the angular acceleration of the target."""
 
 
 class Memory(PyTreeNode):
-    """The solution of the regulator's problem; it depends on the drone alone."""
+    """Solution of the regulator's problem, a function of the drone alone."""
 
     gain: Array
     """(4, d) K of u = -K z, z a `tracking_error`."""
     value: Array
-    """(d, d) P of the cost z P z / 2 that is still to come."""
+    """(d, d) P of the cost to go, z P z / 2."""
 
 
 def settings(step: Any, weights: Weights | None = None) -> Settings:
@@ -47,14 +47,14 @@ def settings(step: Any, weights: Weights | None = None) -> Settings:
 
     Args:
         step: of a team, over one control period: that of the simulation, or a simpler one.
-        weights: of the errors; `problem.weights()` when left out.
+        weights: of the errors; by default `problem.weights()`.
     """
     check_callable("step", step, "jaxdrones.make_step(...)")
     return Settings(default_weights() if weights is None else weights, step)
 
 
 def init(settings: Settings, params: Params, state: State) -> Memory:
-    """The regulator of one drone: the linearization about hover, and the solution of its Riccati equation.
+    """Regulator of one drone: linearization about hover, and solution of its Riccati equation.
 
     Args:
         settings: of the regulator.
@@ -82,7 +82,7 @@ def control(
         dt: time between calls, s.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` is not the period of the step.
+        ValueError: arrays of a team (use `jax.vmap`), or a `dt` other than the period of the step.
     """
     check_single(params, state)
     check_period(settings.step, dt)
@@ -93,27 +93,27 @@ def control(
 def feedback(
     params: Params, gain: Float[Array, "4 d"], state: State, target: State, rpm: Float[Array, "4"]
 ) -> Float[Array, "4"]:
-    """The command of a reference, corrected by the gain times the tracking error and limited, RPM."""
+    """Command of a reference with feedback of the tracking error, limited, RPM."""
     return limited(params, rpm - command_unit(params) * (gain @ tracking_error(params, state, target)))
 
 
 def gain(
     a: Float[Array, "d d"], b: Float[Array, "d m"], r: Float[Array, "m m"], value: Float[Array, "d d"]
 ) -> Float[Array, "m d"]:
-    """The gain K of u = -K z that minimizes u R u + z' P z', with z' = A z + B u."""
+    """Gain K of u = -K z that minimizes u R u + z' P z', with z' = A z + B u."""
     return jnp.linalg.solve(r + b.T @ value @ b, b.T @ value @ a)
 
 
 def riccati(
     a: Float[Array, "d d"], b: Float[Array, "d m"], q: Float[Array, "d d"], r: Float[Array, "m m"]
 ) -> Float[Array, "d d"]:
-    """The stabilizing solution P of the discrete algebraic Riccati equation.
+    """Stabilizing solution P of the discrete algebraic Riccati equation.
 
     P = Q + A' P A - A' P B (R + B' P B)^-1 B' P A, by the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang
     2004): iteration k has the cost of 2^k steps, so it converges quadratically.
 
     Args:
-        a: (d, d) A of z' = A z + B u; what B does not reach must decay.
+        a: (d, d) A of z' = A z + B u, stabilizable.
         b: (d, m) B.
         q: (d, d) weight of z, symmetric, not negative.
         r: (m, m) weight of u, symmetric, positive.

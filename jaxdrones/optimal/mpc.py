@@ -1,4 +1,4 @@
-"""Nonlinear model predictive control of one drone by CasADi: multiple shooting over the symbolic twin."""
+"""Nonlinear model predictive control of one drone with CasADi: multiple shooting with the symbolic twin."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ SOLVERS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 100, "mu_init": 1e-3}},
     "fatrop": {"structure_detection": "auto", "fatrop": {"print_level": 0, "tol": 1e-6, "max_iter": 100}},
 }
-"""Solvers of nonlinear programs that come with CasADi, and their options.
+"""Nonlinear programming solvers of CasADi and their options.
 
-Ipopt is given the Gauss-Newton Hessian; fatrop, which takes none, has the exact one, and uses the structure in time.
+Ipopt uses the Gauss-Newton Hessian; fatrop uses the exact one, and the structure in time.
 """
 
-_LARGEST = 1e3  # m, m/s, rad/s; solvers may never return from a state that is farther from its targets
+_LARGEST = 1e3  # m, m/s, rad/s; solvers may never return from larger errors
 _INSIDE = 1e-6  # distance of the bounds from the limits of the motors, over the largest rotor speed
 
 
 class Mpc:
-    """A controller on the host: `mpc(state, setpoints) -> rpm`. It keeps the last plan as the next guess."""
+    """Controller on the host, `mpc(state, setpoints) -> rpm`, warm-started with the last plan."""
 
     def __init__(
         self,
@@ -46,15 +46,15 @@ class Mpc:
         terminal: float = 10.0,
         solver: str = "ipopt",
     ):
-        """Write down the nonlinear program and make its solver.
+        """Build the nonlinear program and its solver.
 
         Args:
             model: of one drone.
-            dt: control period, s: the length of one interval of the plan, over which the command holds. The law of
-                motion is integrated over it by one step of the classical Runge-Kutta method.
+            dt: control period, s: the length of an interval of the plan, with a constant command and one step of the
+                classical Runge-Kutta method.
             horizon: intervals of the plan.
-            weights: of the errors; `jaxdrones.optimal.weights()` when left out.
-            terminal: factor of the weights of the state at the end.
+            weights: of the errors; by default `jaxdrones.optimal.weights()`.
+            terminal: factor of the terminal weights of the state.
             solver: a name of `SOLVERS`.
 
         Raises:
@@ -67,11 +67,11 @@ class Mpc:
         check_shape("model.params.mass", model.params.mass, (), "the controller is of one drone; make one for each")
         self.model, self.horizon = model, horizon
         self.seconds = float("nan")
-        """Seconds that the last call of the solver took."""
+        """Duration of the last call of the solver, s."""
         self.status = Status.OK
-        """How the last call planned."""
+        """Status of the last call."""
         self.message = "not called"
-        """What the solver said at its last call."""
+        """Message of the solver in its last call."""
         self._unit = float(model.params.hover_rpm)
         self._reference = jax.jit(lambda setpoints: reference(model.params, setpoints, model.start.aux, dt))
         self._kept = _moving(model)
@@ -120,7 +120,7 @@ class Mpc:
             options["equality"] = [True] * constraint.numel()
         self._solver = casadi.nlpsol("mpc", solver, program, options)
         limit = float(model.params.max_rpm) / self._unit
-        # Solvers relax bounds a little, and beyond the limits of the motors the model does not depend on the commands.
+        # Solvers relax bounds a little, and beyond the motor limits the model is independent of the commands.
         free, bounded = np.full(n, np.inf), [np.full(4, _INSIDE * limit), np.full(4, (1 - _INSIDE) * limit)]
         self._low = np.concatenate([*[-free, bounded[0]] * self.horizon, -free])
         self._high = np.concatenate([*[free, bounded[1]] * self.horizon, free])
@@ -151,12 +151,12 @@ class Mpc:
         Args:
             state: of the drone.
             setpoints: at this and the next H control steps, arrays (H + 1, ...).
-            params: constants that the model keeps as symbols are taken from here; those of the model when left out.
-            on_failure: where there is no new plan, `hold` repeats the last safe command, which is that of hover at
-                first, and `raise` raises. `status` and `message` say how the call planned.
+            params: values of the model's symbolic constants; by default those of the model.
+            on_failure: without a new plan, `hold` repeats the last safe command, initially that of hover, and `raise`
+                raises. See `status` and `message`.
 
         Raises:
-            ValueError: arrays of a team, or a number of setpoints that does not fit the horizon.
+            ValueError: arrays of a team, or a wrong number of setpoints.
             PlanningError: there is no new plan, and `on_failure` is `raise`.
         """
         n = len(self._kept)
@@ -175,7 +175,7 @@ class Mpc:
         return self._held.copy()
 
     def _solved(self, state: State, setpoints: Setpoint, params: Params | None) -> np.ndarray | None:
-        """States and commands of the plan, one after the other; `None` where the solver does not converge."""
+        """Concatenated states and commands of the plan; `None` without convergence."""
         model = self.model
         target = jax.device_get(self._reference(setpoints))
         rows = [jax.tree.map(lambda x, k=k: x[k], target) for k in range(self.horizon + 1)]
@@ -199,7 +199,7 @@ class Mpc:
         return plan if said["success"] and np.isfinite(plan).all() else None
 
     def _guess(self, now: np.ndarray, targets: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """The last plan, one interval later; the reference, where there is none."""
+        """Last plan, shifted by one interval; at first the reference."""
         n = len(self._kept)
         if self._plan is None:
             states = targets[:, self._kept] / self._scale[None]
@@ -209,26 +209,26 @@ class Mpc:
         return np.concatenate([self._plan[n + 4 :], self._plan[-n - 4 :]])
 
     def reset(self) -> None:
-        """Forget the last plan and command, before another flight."""
+        """Clear the last plan and command, before another flight."""
         self._plan = None
         self._held = np.full(4, min(self._unit, float(self.model.params.max_rpm)))
 
 
 def _is_flyable(state: State, setpoints: Setpoint) -> bool:
-    """Whether all numbers are finite, and errors and velocities small enough for a solver."""
+    """Whether all values are finite, and errors and velocities small enough for a solver."""
     sizes = jax.device_get((state.pos[None] - setpoints.pos, state.vel, state.omega))
     return bool(is_finite((state, setpoints))) and max(np.abs(x).max() for x in sizes) <= _LARGEST
 
 
 def _moving(model: CasadiModel) -> np.ndarray:
-    """Numbers of the state that change or that something depends on; not the speeds of rotors without a lag."""
+    """Indices of the dynamic entries of the state, without the speeds of rotors without a lag."""
     sparsity = casadi.jacobian_sparsity(model.xdot, model.x)
     acts = {int(column) for column in sparsity.get_triplet()[1]}
     return np.array([i for i in range(model.x.numel()) if i in acts or not model.xdot[i].is_zero()])
 
 
 def _error(model: CasadiModel) -> Any:
-    """The tracking error of `jaxdrones.optimal`, as a function of two vectors."""
+    """Tracking error of `jaxdrones.optimal`, as a function of two vectors."""
 
     def error(state: State, target: State) -> Any:
         return tracking_error(model.params, state, target)
@@ -238,9 +238,9 @@ def _error(model: CasadiModel) -> Any:
 
 
 def _gauss_newton(x: Any, p: Any, residual: Any, constraint: Any) -> Any:
-    """The Hessian of half a sum of squares without the second derivatives of what is squared, nor of the constraints.
+    """Gauss-Newton Hessian of half a sum of squares, without the constraints.
 
-    It is as good near the targets, never indefinite, and an order of magnitude cheaper than the exact one.
+    It is accurate near the targets, positive semidefinite, and an order of magnitude cheaper than the exact one.
     """
     weight, multipliers = casadi.MX.sym("lam_f"), casadi.MX.sym("lam_g", constraint.numel())
     jacobian = casadi.jacobian(residual, x)

@@ -1,9 +1,9 @@
-"""Model predictive path integral control: plans that are sampled around feedback, and averaged by their cost.
+"""Model predictive path integral control with feedback.
 
 Williams et al. 2017, "Information theoretic MPC for model-based reinforcement learning": the samples are weighted by
-exp(-cost / temperature). Here every sample is flown with the regulator's feedback, so that what is sampled are
-corrections of a stable flight, not rotor speeds of an unstable body (as in tube-based MPPI, Williams et al. 2018).
-The temperature is a share of the spread of the costs, and the term of the noise's own cost is left out.
+exp(-cost / temperature). Every sample is simulated with the regulator's feedback, so the samples are corrections of a
+stable flight, not rotor speeds of an unstable body (as in tube-based MPPI, Williams et al. 2018). The temperature is
+relative to the spread of the costs, and the cost of the noise itself is left out.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from jaxdrones.status import Status, check_on_failure, is_finite, raise_unless_o
 
 
 class Settings(PyTreeNode):
-    """What the planner knows of the world, what it minimizes, and how it samples."""
+    """Model, weights, horizon and sampling of the planner."""
 
     weights: Weights
     noise: Array
@@ -38,28 +38,28 @@ class Settings(PyTreeNode):
     temperature: Array
     """() in standard deviations of the samples' costs."""
     step: Any = flax.struct.field(pytree_node=False)
-    """The step of a team, `(params, state, rpm) -> state`, over one control period."""
+    """Step of a team, `(params, state, rpm) -> state`, over one control period."""
     horizon: int = flax.struct.field(pytree_node=False)
-    """H, control steps that are planned."""
+    """H, planned control steps."""
     samples: int = flax.struct.field(pytree_node=False)
-    """Plans that are flown per call of `control`."""
+    """Samples per call of `control`."""
     hold: int = flax.struct.field(pytree_node=False)
-    """Control steps for which a sampled number holds."""
+    """Control steps between samples of the noise."""
 
 
 class Memory(PyTreeNode):
-    """What is kept between calls."""
+    """State of the planner between calls."""
 
     key: Array
     """Random key of the next call."""
     correction: Array
     """(H, 4) planned corrections of the feedback's commands, over the rotor speed of hover."""
     lqr: lqr.Memory
-    """The regulator about hover: the feedback, and the cost at the end of the horizon."""
+    """Regulator about hover, for feedback and terminal cost."""
     rpm: Array
-    """(4,) the last safe command, RPM; at first that of hover."""
+    """(4,) last safe command, RPM; initially that of hover."""
     status: Array
-    """() a `Status` as an integer: how the last call planned."""
+    """() `Status` of the last call, an integer."""
 
 
 def settings(
@@ -74,11 +74,11 @@ def settings(
 
     Args:
         step: of a team, over one control period: that of the simulation, or a simpler one.
-        weights: of the errors; `problem.weights()` when left out.
-        horizon: control steps that are planned; what comes after is taken for flight by the regulator of `lqr`.
-        samples: plans that are flown per call.
-        temperature: in standard deviations of the samples' costs; the lower, the more the best sample counts.
-        hold: control steps for which a sampled number holds: noise that changes at every step hardly moves a drone.
+        weights: of the errors; by default `problem.weights()`.
+        horizon: planned control steps. The terminal cost is that of the regulator of `lqr`.
+        samples: samples per call.
+        temperature: in standard deviations of the samples' costs; a lower value favors the best sample.
+        hold: control steps between samples of the noise: noise at every step hardly moves a drone.
     """
     check_callable("step", step, "jaxdrones.make_step(...)")
     check_whole("horizon", horizon, 2)
@@ -98,7 +98,7 @@ def settings(
 
 
 def init(settings: Settings, params: Params, state: State, key: Array) -> Memory:
-    """The memory of one drone before its first call.
+    """Memory of one drone before its first call.
 
     Args:
         settings: of the planner.
@@ -127,17 +127,17 @@ def control(
     Args:
         settings: of the planner.
         params: of the drone.
-        memory: of `init` or the call before.
+        memory: of `init` or the previous call.
         state: of the drone.
         setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
         dt: time between calls, s.
-        on_failure: where there is no new plan, `hold` repeats the last safe command and `raise` raises. Inside
-            `jax.jit` only `hold` is possible. The memory has the status of the call.
+        on_failure: without a new plan, `hold` repeats the last safe command and `raise` raises. Inside `jax.jit` only
+            `hold` is possible. The memory has the status of the call.
 
     Raises:
         PlanningError: there is no new plan, and `on_failure` is `raise`.
-        ValueError: arrays of a team (use `jax.vmap`), a number of setpoints that does not fit the horizon, or `dt` is
-            not the period of the step.
+        ValueError: arrays of a team (use `jax.vmap`), a wrong number of setpoints, or a `dt` other than the period of
+            the step.
     """
     check_single(params, state)
     check_period(settings.step, dt)
@@ -153,7 +153,7 @@ def control(
     costs = jax.vmap(lambda plan: cost(settings, params, state, target, plan, memory.lqr))(plans)
     plan = jnp.tensordot(importance(costs, settings.temperature), plans, 1)
     status = status_of(valid, jnp.any(jnp.isfinite(costs)) & is_finite(plan))
-    plan = jnp.where(status == Status.OK, plan, 0)  # the next call plans as if it were the first
+    plan = jnp.where(status == Status.OK, plan, 0)  # the next call starts without a plan
     now = jax.tree.map(lambda x: x[0], target)
     rpm = now.rpm + command_unit(params) * plan[0]
     command = lqr.feedback(params, memory.lqr.gain, state, now.state, rpm)
@@ -166,7 +166,7 @@ def control(
 def importance(costs: Float[Array, " k"], temperature: Float[Array, ""]) -> Float[Array, " k"]:
     """Weights of the samples, exp(-cost / (temperature x standard deviation of the costs)); their sum is one.
 
-    A sample whose cost is not finite counts nothing; without a finite cost all weights are the same.
+    A sample with a cost that is not finite has weight zero; without any finite cost all weights are equal.
     """
     finite = jnp.isfinite(costs)
     lowest = jnp.min(jnp.where(finite, costs, jnp.inf))
@@ -184,7 +184,7 @@ def cost(
     plan: Float[Array, "H 4"],
     regulator: lqr.Memory,
 ) -> Float[Array, ""]:
-    """The cost of a flight over the horizon by the regulator's feedback with the corrections of a plan."""
+    """Cost of a flight over the horizon with the regulator's feedback and the corrections of a plan."""
     step, unit = single(settings.step), command_unit(params)
     q = settings.weights.state_matrix(len(regulator.value))
     r = settings.weights.command_matrix()

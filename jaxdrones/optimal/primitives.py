@@ -1,4 +1,4 @@
-"""Primitives of JAX as functions of scalars of CasADi. Truth is one, falsehood zero."""
+"""JAX primitives as functions of CasADi scalars. True is one, false zero."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ except ImportError as error:
 
 
 def select(which: Any, *cases: Any) -> Any:
-    """The case with the number `which`, from 0 on; a truth value chooses between two."""
+    """Case number `which`, from 0; a boolean selects one of two."""
     if not isinstance(which, casadi.SX):
         return cases[int(which)]
     if len(cases) == 2:
@@ -96,7 +96,7 @@ ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "tanh": _of_one(casadi.tanh),
     "xor": _of_two(operator.ne),
 }
-"""Functions of each number, with the parameters of the equation as keywords."""
+"""Elementwise functions, with the parameters of the equation as keywords."""
 
 REDUCTIONS: dict[str, Callable[[list], Any]] = {
     "reduce_and": lambda row: functools.reduce(casadi.logic_and, row),
@@ -106,4 +106,4 @@ REDUCTIONS: dict[str, Callable[[list], Any]] = {
     "reduce_prod": lambda row: functools.reduce(operator.mul, row),
     "reduce_sum": lambda row: functools.reduce(operator.add, row),
 }
-"""Functions of the numbers along some axes."""
+"""Reductions along axes."""

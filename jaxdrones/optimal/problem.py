@@ -1,4 +1,4 @@
-"""What optimal controllers minimize, and the motion that they follow."""
+"""Cost functions and reference motions of optimal controllers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jaxdrones.vector import along_z, cross, dot, safe_sqrt
 
 
 class Weights(PyTreeNode):
-    """Weights of squared errors; an error of one over the root of its weight costs as much as any other such error."""
+    """Weights of squared errors."""
 
     pos: Array
     """(3,) 1/m^2, along the heading of the target."""
@@ -33,15 +33,15 @@ class Weights(PyTreeNode):
     omega: Array
     """(3,) 1/(rad/s)^2, body."""
     command: Array
-    """(4,) of the command's distance from that of the reference, over the rotor speed of hover."""
+    """(4,) of the command's difference from the reference, over the hover speed."""
 
     def state_matrix(self, size: int) -> Float[Array, "d d"]:
-        """The matrix Q of the cost z Q z / 2 of a state that is off by z; rotor speeds and models cost nothing."""
+        """Matrix Q of the state cost z Q z / 2; rotor speeds and models have zero weight."""
         weighted = jnp.concatenate([self.pos, self.attitude, self.vel, self.omega])
         return jnp.diag(jnp.pad(weighted, (0, size - len(weighted))))
 
     def command_matrix(self) -> Float[Array, "4 4"]:
-        """The matrix R of the cost u R u / 2 of a command that is off by u."""
+        """Matrix R of the command cost u R u / 2."""
         return jnp.diag(self.command)
 
 
@@ -57,16 +57,16 @@ def weights() -> Weights:
 
 
 class Reference(PyTreeNode):
-    """A motion to follow, at the times of H + 1 control steps."""
+    """Reference motion at H + 1 control steps."""
 
     state: State
     """States of one drone, arrays (H + 1, ...)."""
     rpm: Array
-    """(H + 1, 4) rotor speeds that produce the motion without drag and other effects, RPM."""
+    """(H + 1, 4) rotor speeds of the motion without drag and other effects, RPM."""
 
 
 def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Reference:
-    """The motion of a drone whose center of mass follows setpoints, by differential flatness (Mellinger, Kumar 2011).
+    """Reference motion through setpoints by differential flatness (Mellinger, Kumar 2011).
 
     Thrust and attitude are those of the acceleration and heading; angular velocities and torques are differences of
     attitudes in time. The angular velocity of the setpoints is not used.
@@ -74,7 +74,7 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
     Args:
         params: of the drone.
         setpoints: H + 1 setpoints of one drone, arrays (H + 1, ...), H >= 2.
-        aux: states of models, which the reference shares.
+        aux: states of models of the reference.
         dt: time between setpoints, s.
     """
     check_shape("setpoints.pos", setpoints.pos, ("H + 1", 3), "the setpoints of one drone over the horizon")
@@ -97,7 +97,7 @@ def _upright(params: Params, acc: Float[Array, "3"], yaw: Float[Array, ""]) -> t
 
 
 def _turn(quat: Float[Array, "4"], after: Float[Array, "4"]) -> Float[Array, "3"]:
-    """The rotation between two attitudes that are near each other, rad, body."""
+    """Small rotation between two attitudes, rad, body."""
     error = rotation.multiply(rotation.conjugate(quat), after)
     return jnp.where(error[3] < 0, -2, 2) * error[:3]
 
@@ -107,7 +107,7 @@ def _with_last(x: Float[Array, "k 3"], times: int = 1) -> Float[Array, "_ 3"]:
 
 
 def hover(params: Params, state: State) -> State:
-    """A level state of one drone at rest that heads along x, its rotors at hover speed, with the models of `state`."""
+    """Level hover of one drone at the origin, heading along x, with the models of `state`."""
     zero = jnp.zeros_like(state.pos)
     quat = jnp.zeros_like(state.quat).at[3].set(1)
     return state.replace(
@@ -118,7 +118,7 @@ def hover(params: Params, state: State) -> State:
 def replaced_unless(
     valid: Bool[Array, ""], params: Params, state: State, setpoints: Setpoint
 ) -> tuple[State, Setpoint]:
-    """A state and set-points, or where they are not valid hover at the origin: so no NaN gets into plan or gradient."""
+    """State and setpoints, replaced by hover at the origin where invalid, to keep NaN out of plans and gradients."""
     rest = hover(params, state)
     rest = rest.replace(aux=jax.tree.map(jnp.zeros_like, rest.aux))
     zero = jax.tree.map(jnp.zeros_like, setpoints)
@@ -126,7 +126,7 @@ def replaced_unless(
 
 
 def check_period(step: Any, dt: float) -> None:
-    """Raise `ValueError` unless the time between calls is positive, and that of the step where it is known."""
+    """Raise `ValueError` unless the time between calls is positive, and equal to the step's period if known."""
     check_positive("dt", dt, "s")
     period = getattr(step, "period", None)
     if period is not None and not math.isclose(period, dt, rel_tol=1e-6):
@@ -134,6 +134,6 @@ def check_period(step: Any, dt: float) -> None:
 
 
 def quadratic(params: Params, matrix: Float[Array, "d d"], state: State, target: State) -> Float[Array, ""]:
-    """The cost z M z / 2 of the tracking error z."""
+    """Cost z M z / 2 of the tracking error z."""
     z = tracking_error(params, state, target)
     return z @ (matrix @ z) / 2

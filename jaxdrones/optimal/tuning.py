@@ -1,4 +1,4 @@
-"""Gains of a controller for a vehicle, by the gradient of the simulation through test flights."""
+"""Gradient-based tuning of a controller's gains in simulated test flights."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ _TUNED: dict[ModuleType, dict[str, int]] = {
     | {"rate_p": 1, "rate_i": 2, "rate_d": 0},
     mellinger: {"pos_p": 2, "pos_i": 3, "pos_d": 1, "attitude_p": 2, "attitude_i": 3, "rate_p": 1, "rate_d": 0},
 }
-"""Tuned gains, each with the power k of 1/s in its unit: a loop that is s times faster has gains s^k times as large.
+"""Tuned gains, each with the power k of 1/s in its unit: a loop s times as fast has gains s^k times as large.
 
 Limits and the nominal vehicle parameters of a controller are not tuned.
 """
 _OUTER = ("pos", "vel")  # prefixes of the gains of the outer loop; the other gains are of the inner loop
-_OUTER_SPEEDS = (1.0, 0.6, 0.3)  # tested loop speeds, times those of the start
+_OUTER_SPEEDS = (1.0, 0.6, 0.3)  # tested loop speeds relative to the initial gains
 _INNER_SPEEDS = (2.0, 1.0, 0.5, 0.25)
 
 _SECONDS = 3.0  # s, duration of the flights for the gradient
-_EVALUATION_SECONDS = 8.0  # s, duration of the final evaluation, in which slow instabilities show
-_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the step from the start to the optimized gains, in logarithms
+_EVALUATION_SECONDS = 8.0  # s, duration of the final evaluation, long enough for slow instabilities
+_FRACTIONS = (0.0, 0.25, 0.5, 0.75, 1.0)  # fractions of the step from the initial to the optimized gains, in logarithms
 _SMOOTHING = 2e-3  # m; below it the penalty on the distance is quadratic
 _CURVES = (("circle", 5.0), ("figure-eight", 4.0), ("lissajous", 7.0))  # period, s
 _LAG_FACTOR = 1.5  # rotor lag of the heavy vehicle over that of the vehicle
@@ -62,27 +62,27 @@ _EFFORT_WEIGHT = 1e-5  # m s^2; of the squared rate of the rotor speeds over hov
 
 
 def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500, iterations: int = 40) -> Any:
-    """Tuned gains of a controller for a vehicle, in steps, a turn, a tilted start and three curves.
+    """Tune the gains of a controller for a vehicle, in steps, a turn, a tilted start and three curves.
 
     The optimization starts from two sets of gains: the controller's own, scaled to the vehicle, and the best of several
-    sets with faster or slower loops. It follows the gradient of the mean error of flights of 3 s with drag, which three
-    vehicles fly: the vehicle itself, one with instant rotors, and one with a fifth more mass and inertia and with
-    rotors that lag by half more. The optimized gains, and those a quarter, half and three quarters of the way from the
-    start to them, are then evaluated in flights of 8 s. The result is the best set with no flight much worse than at
-    the start; it may be the start itself. A second vehicle needs no second compilation.
+    sets with faster or slower loops. It minimizes the mean error of flights of 3 s with drag of three vehicles: the
+    vehicle itself, one with instant rotors, and one with 20 % more mass and inertia and 50 % more rotor lag. The
+    optimized gains, and those at a quarter, half and three quarters of the step to them, are then evaluated in flights
+    of 8 s. The result is the best set without a much worse flight than with the initial gains, possibly these. Another
+    vehicle needs no compilation.
 
     Args:
         params: parameters of one drone.
-        controller: a name of `jaxdrones.control.CONTROLLERS`, or its module; not `mrac`, which adapts its own gains.
-        control_hz: calls of the controller per second; use the gains at this rate or a higher one.
+        controller: a name of `jaxdrones.control.CONTROLLERS`, or its module; except `mrac`, which adapts its gains.
+        control_hz: calls of the controller per second, a lower bound for the use of the gains.
         iterations: number of iterations of Adam.
 
     Returns:
         Gains for the `control` of the controller.
 
     Raises:
-        ValueError: an unknown controller, one without gains to tune, one that cannot fly the vehicle, or parameters of
-            a team.
+        ValueError: an unknown controller, one without gains to tune, one that is unstable with the vehicle, or
+            parameters of a team.
     """
     module = _tunable(controller)
     check_params(params)
@@ -96,7 +96,7 @@ def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500,
 
 
 def start(module: ModuleType, params: Params) -> Any:
-    """The gains from which `tune` starts: those of the controller, scaled to the vehicle."""
+    """Initial gains of `tune`: those of the controller, scaled to the vehicle."""
     if module in (firmware_pid, mellinger):
         return module.gains(params)
     if module is pid and not pid.fits(params):
@@ -111,7 +111,7 @@ def start(module: ModuleType, params: Params) -> Any:
 
 
 def _tunable(controller: str | ModuleType) -> ModuleType:
-    """The module of a controller that can be tuned."""
+    """Module of a tunable controller."""
     if isinstance(controller, str):
         check_choice("controller", controller, control.CONTROLLERS)
         controller = control.CONTROLLERS[controller]
@@ -127,7 +127,7 @@ def _name(module: Any) -> str:
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
 def _descend(module: ModuleType, hz: int, iterations: int, params: Params, start: Any) -> tuple[Any, Float[Array, ""]]:
-    """The best gains of two descents, from the start and from its best loop speeds, and their evaluated error."""
+    """Best gains of two descents, from the initial gains and from the best loop speeds, and their error."""
 
     def gains_of(logarithms: dict[str, Array]) -> Any:
         return start.replace(**{name: getattr(start, name) * jnp.exp(x) for name, x in logarithms.items()})
@@ -184,7 +184,7 @@ def _costs(errors: Float[Array, "gains flights"]) -> Float[Array, " gains"]:
 
 
 def _clipped(gradient: dict[str, Array]) -> dict[str, Array]:
-    """The gradient of a flight, clipped to `_MAX_GRAD_NORM`; zero if it is not finite, as in a tumbling flight."""
+    """Gradient of a flight, clipped to `_MAX_GRAD_NORM`; zero if not finite, as in a tumbling flight."""
     length = optax.tree.norm(gradient)
     share = jnp.minimum(1, _MAX_GRAD_NORM / jnp.maximum(length, _MAX_GRAD_NORM))
     return jax.tree.map(lambda x: jnp.where(jnp.isfinite(length), share * x, 0), gradient)
@@ -193,7 +193,7 @@ def _clipped(gradient: dict[str, Array]) -> dict[str, Array]:
 def _test_flights(
     module: ModuleType, params: Params, hz: int, seconds: float
 ) -> tuple[int, Callable[[Any], Float[Array, " flights"]]]:
-    """The number of flights, and the function from the gains of each flight to the errors of the flights."""
+    """Number of flights, and function from the gains of each flight to the errors of the flights."""
 
     def lagging(times: float) -> Params:
         names = ("rotor_rise_time", "rotor_fall_time")

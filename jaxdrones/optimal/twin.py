@@ -1,4 +1,4 @@
-"""The symbolic twin: the law of motion that JAX simulates, as a function of CasADi."""
+"""Symbolic twin: the equations of motion as a CasADi function."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _BARE = Scene()
 
 @dataclasses.dataclass(frozen=True)
 class CasadiModel:
-    """The law of motion x' = f(x, u, p) of a drone or a team, with the symbols that it is written in."""
+    """Equations of motion x' = f(x, u, p) of a drone or a team, with their symbols."""
 
     function: Any
-    """`casadi.Function` with the inputs `x`, `u` and, if constants stay symbols, `p`, and the output `xdot`."""
+    """`casadi.Function` with the inputs `x`, `u` and, with symbolic constants, `p`, and the output `xdot`."""
     x: Any
     """(nx,) `casadi.SX`, the state: see `names`."""
     u: Any
     """(4 n,) `casadi.SX`, commanded rotor speeds, RPM, drone after drone."""
     p: Any
-    """(np,) `casadi.SX`, constants that stay symbols: see `parameter_names`."""
+    """(np,) `casadi.SX`, symbolic constants: see `parameter_names`."""
     xdot: Any
     """(nx,) `casadi.SX`, the rate of the state, per second."""
     params: Params
@@ -50,17 +50,17 @@ class CasadiModel:
     parameter_names: tuple[str, ...]
     """(np) entries of p."""
     start: State
-    """A state of the same structure, NumPy arrays: level, at rest at the origin."""
+    """State of the same structure, NumPy arrays: level, at rest at the origin."""
 
     def vector(self, state: State) -> np.ndarray:
-        """(nx,) the numbers of a state in the order of `names`."""
+        """(nx,) vector of a state, in the order of `names`."""
         given, wanted = (jax.tree.map(np.shape, s) for s in (state, self.start))
         if given != wanted:
             raise UserError(f"the state has shapes {short_repr(str(given))}; expected {short_repr(str(wanted))}")
         return np.concatenate([np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(state)])
 
     def state(self, vector: ArrayLike) -> State:
-        """The state whose numbers stand in a vector (nx,)."""
+        """State of a vector (nx,)."""
         numbers = np.asarray(vector, float).ravel()
         check_shape("vector", numbers, (len(self.names),), "the numbers of a state")
         leaves, structure = jax.tree.flatten(self.start)
@@ -69,7 +69,7 @@ class CasadiModel:
         return jax.tree.unflatten(structure, shaped)
 
     def parameters(self, params: Params) -> np.ndarray:
-        """(np,) the numbers of constants that stay symbols, of the same drone or team with other values."""
+        """(np,) values of the symbolic constants of the same drone or team."""
         fields = dict.fromkeys(name.partition("[")[0] for name in self.parameter_names)
         return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(getattr(params, name), float)) for name in fields)])
 
@@ -85,10 +85,10 @@ def casadi_model(
     scene: Scene = _BARE,
     parameters: Sequence[str] = (),
 ) -> CasadiModel:
-    """The law of motion as a function of CasADi, made from the traced program of `jaxdrones.make_derivative`.
+    """Convert the equations of motion of `jaxdrones.make_derivative` to a CasADi function.
 
-    There is no second copy of the physics: whatever JAX can trace, of the package or a user's own, is evaluated on
-    symbols in double precision. It is for one drone, or for a team where the constants are a team's.
+    The traced program, with built-in or custom effects, is evaluated on symbols in double precision. It is for one
+    drone, or for a team with the constants of a team.
 
     Args:
         vehicle: a bundled vehicle, the path of a URDF, or constants of a drone or a team.
@@ -97,14 +97,14 @@ def casadi_model(
         team_effects: as for `make_derivative`; they need a team.
         models: as for `make_derivative`.
         rotors: as for `make_derivative`.
-        scene: what stands around.
-        parameters: names of fields of `Params` that stay symbols instead of becoming numbers, such as `("wind",)`.
+        scene: scene of effects with a `scene` parameter.
+        parameters: names of fields of `Params` to keep as symbols, such as `("wind",)`.
 
     Returns:
         The function, its symbols, and the mapping between a `State` and a vector.
 
     Raises:
-        NotImplementedError: an effect or model uses a primitive of JAX that has no counterpart here.
+        NotImplementedError: an effect or model with an unsupported JAX primitive.
         ValueError: an unknown vehicle or parameter, or something else than what `make_derivative` takes.
     """
     for name in parameters:
@@ -143,7 +143,7 @@ def _as_double(leaf: Any) -> Any:
 
 
 def _names(tree: Any) -> tuple[str, ...]:
-    """One name for every number of a pytree."""
+    """Name of every entry of a pytree."""
     names = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         name = ".".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)

@@ -1,1 +1,1 @@
-"""Training at the command line: presets, recipes, runs on disk and the training loop."""
+"""Training runs of the command line: presets, recipes, files and training loop."""

@@ -1,6 +1,6 @@
-"""The table of learners; a new learner is a module, and a line here.
+"""Table of learners.
 
-The table holds names, so that the command line can list them without importing the learners.
+It holds names of modules, so that the command line can list them without importing the learners.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ ALGORITHMS = {
 
 
 class Learner(Protocol):
-    """What the module of a learner defines.
+    """Interface of a learner module.
 
     Its `Config` is a frozen dataclass with at least `updates`, `worlds` and `horizon`. Its training state is a pytree
     with at least `step`, `policy` and `worlds`. The metrics of an update include `nonfinite_gradients`, the number of
-    gradients that were not finite.
+    gradients that are not finite.
     """
 
     Config: type[Any]
 
     def init(self, key: jax.Array, env: Env, config: Any) -> Any:
-        """The training state before the first update."""
+        """Training state before the first update."""
 
     def update(self, env: Env, config: Any, state: Any) -> tuple[Any, dict[str, jax.Array]]:
-        """The training state after one more update, and metrics."""
+        """Training state after one update, and metrics."""
 
     def train(self, key: jax.Array, env: Env, config: Any) -> Any:
-        """The result of all updates."""
+        """Result of all updates."""
 
 
 def learner(algorithm: str) -> Learner:
-    """The module of a learner.
+    """Module of a learner.
 
     Raises:
-        ValueError: unknown algorithm; lists the known ones.
+        ValueError: unknown algorithm.
     """
     check_choice("algorithm", algorithm, ALGORITHMS)
     return cast(Learner, importlib.import_module(ALGORITHMS[algorithm]))

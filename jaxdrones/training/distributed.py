@@ -1,4 +1,4 @@
-"""Training in several processes, called hosts: each runs the same program on its own devices."""
+"""Training in several processes, called hosts, each with the same program on its own devices."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from jax.experimental import multihost_utils
 from jaxdrones.checks import check_whole
 from jaxdrones.errors import UserError
 
-_TIMEOUT = 60.0  # s that hosts wait for each other at the start
-_SHUTDOWN_TIMEOUT = 10  # s that a host waits for the others at the end; JAX then ends those that still run
+_TIMEOUT = 60.0  # s; timeout of the connection at the start
+_SHUTDOWN_TIMEOUT = 10  # s; timeout at the end, after which JAX ends the other hosts
 _PAUSE = 0.1  # s between two attempts to connect
-_READY = b"ready"  # the answer of host 0
+_READY = b"ready"  # answer of host 0
 
 
 @contextlib.contextmanager
 def join_hosts(hosts: int, host: int, coordinator: str, timeout: float = _TIMEOUT) -> Iterator[None]:
-    """Make this process one of several hosts; this has to be entered before anything else is done with JAX.
+    """Context of one of several hosts; enter it before any other use of JAX.
 
     Args:
         hosts: number of hosts.
         host: number of this host, from 0.
-        coordinator: address of host 0 and a port that is free there, such as 127.0.0.1:9911.
+        coordinator: address and free port of host 0, such as 127.0.0.1:9911.
         timeout: time to wait for the other hosts, s.
 
     Raises:
-        ValueError: an argument is wrong, or the other hosts did not connect.
+        ValueError: an invalid argument, or a host without connection.
     """
     check_whole("hosts", hosts)
     if not 0 <= host < hosts:
@@ -42,7 +42,7 @@ def join_hosts(hosts: int, host: int, coordinator: str, timeout: float = _TIMEOU
     if not (name and port.isdecimal() and 0 < int(port) < 2**16):
         raise UserError(f"coordinator is {coordinator!r}; give ADDRESS:PORT of host 0, for example 127.0.0.1:9911")
     deadline, address = time.monotonic() + timeout, (name, int(port))
-    try:  # before JAX connects, since it ends the process when it has waited too long
+    try:  # before JAX connects, as its timeout ends the process
         _accept_hosts(address, hosts, deadline) if host == 0 else _connect(address, host, deadline)
     except (OSError, TypeError, UnicodeError) as error:  # the last two come from an impossible name
         raise UserError(
@@ -58,7 +58,7 @@ def join_hosts(hosts: int, host: int, coordinator: str, timeout: float = _TIMEOU
         shutdown_timeout_seconds=_SHUTDOWN_TIMEOUT,
     )
     try:
-        with _stdout_to_stderr():  # Gloo, with which CPUs communicate, prints when it connects
+        with _stdout_to_stderr():  # Gloo, the communication library of CPUs, prints on connection
             wait_for_hosts("start")
         yield
     finally:
@@ -73,7 +73,7 @@ def wait_for_hosts(barrier: str) -> None:
 
 @contextlib.contextmanager
 def fail_together() -> Iterator[None]:
-    """Stop all hosts if one of them raises in this context, so that the others do not wait for it."""
+    """Context that stops all hosts if one of them raises."""
     raised = None
     try:
         yield
@@ -88,7 +88,7 @@ def fail_together() -> Iterator[None]:
 
 
 def from_first_host(number: float) -> float:
-    """The number of the first host, on every host, so that all decide alike by a time that each has measured."""
+    """Value of the first host, on every host, for common decisions."""
     if jax.process_count() == 1:
         return number
     return float(multihost_utils.broadcast_one_to_all(np.float32(number)))
@@ -96,7 +96,7 @@ def from_first_host(number: float) -> float:
 
 @contextlib.contextmanager
 def _stdout_to_stderr() -> Iterator[None]:
-    """Redirect standard output to standard error, also for libraries that are not written in Python."""
+    """Redirect standard output to standard error, also of native libraries."""
     sys.stdout.flush()
     original = os.dup(1)
     os.dup2(2, 1)
@@ -108,7 +108,7 @@ def _stdout_to_stderr() -> Iterator[None]:
 
 
 def _accept_hosts(address: tuple[str, int], hosts: int, deadline: float) -> None:
-    """On host 0: wait until all other hosts have connected, then answer them."""
+    """On host 0: wait for all other hosts, then answer them."""
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(socket.create_server(address))
         connections: dict[str, socket.socket] = {}
@@ -126,7 +126,7 @@ def _accept_hosts(address: tuple[str, int], hosts: int, deadline: float) -> None
 
 
 def _connect(address: tuple[str, int], host: int, deadline: float) -> None:
-    """On the other hosts: try to connect to host 0 until it answers."""
+    """On the other hosts: connect to host 0 and wait for its answer."""
     while True:
         remaining = max(deadline - time.monotonic(), _PAUSE)
         try:

@@ -1,4 +1,4 @@
-"""Flying one episode with a policy, on either backend, and its log."""
+"""One episode with a policy, on either backend, and its log."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from jaxdrones.visualization.viewer.show import records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
 """(hidden_state, observations) -> (hidden_state, actions)"""
-_LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states that a `FlightLog` holds
+_LOGGED = ("pos", "quat", "vel", "omega", "rpm")  # states of a `FlightLog`
 
 
 class EpisodeLog(PyTreeNode):
-    """K control steps of n drones, up to the end of the episode."""
+    """Episode of n drones over K control steps."""
 
     t: np.ndarray
     """(K,) time, s."""
@@ -40,22 +40,22 @@ class EpisodeLog(PyTreeNode):
     reward: np.ndarray
     """(K, n)"""
     metrics: dict[str, np.ndarray]
-    """(K, n) for each of the task's metrics."""
+    """(K, n) by metric of the task."""
     ended_by: tuple[str, ...]
-    """Names of the terminations and truncations that ended the episode; none if its time was up."""
+    """Names of the terminations and truncations at the end; empty at the time limit."""
     images: dict[str, np.ndarray]
-    """(K, n, ...) images that the policy observed, by kind; none of an environment without vision."""
+    """(K, n, ...) observed images by kind; empty without vision."""
     params: Params
-    """Parameters of the team (n, ...), as drawn for this episode."""
+    """Parameters of the team (n, ...) in this episode."""
     scene: Scene
-    """What stood around, as drawn for this episode."""
+    """Scene of this episode."""
     success: bool | None
-    """Whether all drones met the task's criterion of success; `None` if the task has none."""
+    """Whether all drones met the task's criterion of success; `None` without one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeConditions:
-    """The conditions under which a policy flew an episode, for a `FlightLog`."""
+    """Conditions of an episode, for a `FlightLog`."""
 
     run: str
     task: str
@@ -82,7 +82,7 @@ class EpisodeConditions:
 
 
 def to_record(log: EpisodeLog, conditions: EpisodeConditions | LoggedConditions) -> FlightLog:
-    """The log of an episode in the form that demonstration flights have too."""
+    """Convert an episode to a `FlightLog`."""
     drones = jax.tree.map(np.asarray, log.drones)
     return FlightLog(
         **{name: getattr(drones, name) for name in _LOGGED},
@@ -96,7 +96,7 @@ def to_record(log: EpisodeLog, conditions: EpisodeConditions | LoggedConditions)
 
 
 def _renewed(t: np.ndarray, frames: np.ndarray) -> ImageSequence:
-    """Those of some images that differ from the one before."""
+    """Images that differ from the one before."""
     new = np.flatnonzero(np.any(frames[1:] != frames[:-1], axis=tuple(range(1, frames.ndim)))) + 1
     rows = np.concatenate([[0], new])
     return ImageSequence(t[rows], frames[rows])
@@ -125,9 +125,8 @@ def fly_episode(
         policy: observations (n, d), or a dictionary with images, -> actions (n, a); or a recurrent policy, see
             `learning.networks`.
         key: random key of the start and of the noise.
-        on_progress: function that shows which fraction of the longest possible episode is flown; called on Bullet only.
-        watch: function that is given each thirtieth of a second of the episode as soon as it is flown, and the time at
-            which the longest possible episode ends, s.
+        on_progress: function of the completed fraction of the longest possible episode; called on Bullet only.
+        watch: function `(leg, end)`, called with each 1/30 s of the episode and the latest possible end time, s.
     """
     start_key, key = jax.random.split(key)
     keys = jax.random.split(key, env.steps)
@@ -164,7 +163,7 @@ def fly_episode(
     decide: Decide = functools.partial(act, policy)
     if isinstance(env.physics, HostStep):
         decide, fly = jax.jit(decide), loop
-    elif isinstance(policy, PyTreeNode):  # an argument, so that other policies of its shape need no other program
+    elif isinstance(policy, PyTreeNode):  # an argument, to share the program between policies of one shape
         fly = functools.partial(_compiled_leg(), env, policy)
     else:
         fly = jax.jit(functools.partial(_leg, env, policy))
@@ -186,7 +185,7 @@ def fly_episode(
 
 
 def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple, tuple]:
-    """One control step of an episode: what the next one needs, and what is logged of this one with whether it ends."""
+    """One control step of an episode: carry of the next step, and log of this one with its end flag."""
     hidden_state, obs, world = carry
     hidden_state, action = decide(hidden_state, obs)
     obs, world, reward, terminated, truncated, info = env.step(key, world, action)
@@ -202,7 +201,7 @@ def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple
 
 
 def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
-    """As many control steps as there are keys, in one program."""
+    """One control step per key, in one program."""
     return jax.lax.scan(functools.partial(_step, env, functools.partial(act, policy)), carry, keys)
 
 
@@ -212,7 +211,7 @@ def _compiled_leg() -> Callable:
 
 
 def _success(env: Env, drones: State, metrics: dict[str, np.ndarray], ends: dict[str, np.ndarray]) -> bool | None:
-    """Whether an episode is a success, as `evaluate` counts it."""
+    """Whether an episode is a success, by the criterion of `evaluate`."""
     if env.task.success is None:
         return None
     missing = env.steps - len(drones.pos)

@@ -1,4 +1,4 @@
-"""The lock of a folder, with which only one training at a time writes to it."""
+"""Lock of a folder against concurrent trainings."""
 
 from __future__ import annotations
 
@@ -13,23 +13,22 @@ from pathlib import Path
 from jaxdrones.errors import UserError
 
 _NAME = ".lock"
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of file systems that have none
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of file systems without locks
 
 
 @contextlib.contextmanager
 def locked(folder: Path, warn: Callable[[str], None]) -> Iterator[None]:
-    """A context in which no other process can lock the folder; a folder that is still empty at its end is removed.
+    """Context with an exclusive lock of the folder; an empty folder is removed at its end.
 
-    The operating system ends the lock with its process, however that ends, so that no lock is left behind. On NFS the
-    lock holds for all machines.
+    The operating system releases the lock when its process ends. On NFS the lock holds for all machines.
 
     Args:
-        folder: folder, which is made.
-        warn: function that is told if the file system has no locks; then nothing is locked.
+        folder: folder, created if missing.
+        warn: function of a message, called if the file system has no locks; then nothing is locked.
 
     Raises:
-        ValueError: another process has locked the folder; says which.
-        OSError: the folder cannot be written; the error names it.
+        ValueError: a lock of another process.
+        OSError: a folder without write access.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
@@ -38,7 +37,7 @@ def locked(folder: Path, warn: Callable[[str], None]) -> Iterator[None]:
         try:
             yield
         finally:
-            (folder / _NAME).unlink(missing_ok=True)  # while it is locked, so that it is nobody else's
+            (folder / _NAME).unlink(missing_ok=True)  # while locked
             os.close(descriptor)
     finally:
         with contextlib.suppress(OSError):
@@ -47,7 +46,7 @@ def locked(folder: Path, warn: Callable[[str], None]) -> Iterator[None]:
 
 
 def _locked_file(folder: Path, warn: Callable[[str], None]) -> int:
-    """The descriptor of the locked file, which names the process that holds the lock."""
+    """Descriptor of the locked file, which names the locking process."""
     file = folder / _NAME
     while True:
         try:
@@ -75,7 +74,7 @@ def _locked_file(folder: Path, warn: Callable[[str], None]) -> int:
 
 
 def _is_same(descriptor: int, file: Path) -> bool:
-    """Whether a path still leads to the open file."""
+    """Whether a path still refers to the open file."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.stat(file))
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The training loop of one seed: updates, progress, evaluations, checkpoints, and resuming from them."""
+"""Training loop of one seed: updates, progress, evaluations, checkpoints, and resumption."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from jaxdrones.training.run import Run, report_as_dict
 from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM, Score, best_of, score_of
 from jaxdrones.training.trainer import Trainer
 
-_CALL_SECONDS = 0.3  # aimed at for one call of the compiled program, during which Ctrl-C has to wait
-_SAVE_SECONDS = 30.0  # longest time between two training states on disk
+_CALL_SECONDS = 0.3  # target duration of a call of the compiled program, which delays Ctrl-C
+_SAVE_SECONDS = 30.0  # longest time between training states on disk
 _EVALUATED = ("success", "evaluated_return", "evaluated_error")
 
 OnProgress = Callable[[int, dict[str, float]], None]
-"""(number of updates made, newest metrics) -> None: shows progress."""
+"""(number of updates, newest metrics) -> None: displays progress."""
 
 
 def train(
@@ -41,21 +41,21 @@ def train(
     deadline: float | None = None,
     loggers: Sequence[Callback] = (),
 ) -> None:
-    """Train one seed to the end, from the start or from the state that the run holds; evaluate the best policy.
+    """Train one seed to the end, from the start or from the state of the run; evaluate the best policy.
 
     Args:
         trainer: compiled programs.
-        run: run whose folder was prepared.
-        seed: seed of everything that is random.
-        on_progress: function that shows progress.
-        deadline: time of `time.perf_counter` at which everything has to be written, s; the number of updates then
-            follows from the time that updates and evaluations take, and is at least one more.
+        run: run with a prepared folder.
+        seed: seed of all random numbers.
+        on_progress: function that displays progress.
+        deadline: end of the training, s on the clock of `time.perf_counter`; the number of updates then follows from
+            the measured durations of updates and evaluations, and is at least one more.
         loggers: called with the metrics of every update, such as those of `learning.loggers`.
 
     Raises:
         Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so far is
             kept.
-        KeyboardInterrupt: passed on after the state was saved, unless other hosts would have to help.
+        KeyboardInterrupt: re-raised after saving the state, unless there are other hosts.
     """
     recipe = trainer.recipe
     try:
@@ -70,22 +70,22 @@ def train(
             raise
         loop.finish()
     finally:
-        trainer.recipe = recipe  # whose number of updates a deadline or a success rate has changed
+        trainer.recipe = recipe  # with the number of updates set by a deadline or a success rate
 
 
 def check_resumable(trainer: Trainer, run: Run) -> None:
     """Check that training can continue from the files of a run.
 
     Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is damaged, or the files belong to different trainings.
+        FileNotFoundError: a missing file.
+        ValueError: a damaged file, or files of different trainings.
     """
     _load(trainer, run)
     run.history()
 
 
 def _load(trainer: Trainer, run: Run) -> Any:
-    """The training state of a run, whose files were all checked."""
+    """Training state of a run with checked files."""
     state = run.load_state(trainer.shapes)
     if not _is_finite(state):
         raise UserError(f"{run.folder / 'state'} holds numbers that are not finite; train anew with --overwrite")
@@ -94,17 +94,17 @@ def _load(trainer: Trainer, run: Run) -> Any:
 
 
 class _Loop:
-    """The training of one seed: its state, and the results so far."""
+    """State and results of the training of one seed."""
 
     def __init__(self, trainer: Trainer, run: Run, seed: int, deadline: float | None = None):
-        """Start a training, or continue the one that the run holds."""
+        """Start a training, or continue that of the run."""
         self.trainer, self.run, self.seed = trainer, run, seed
         self.key = jax.random.key(seed)
         self.evaluation_seconds, self.last_evaluation_seconds = 0.0, 0.0
-        self.nonfinite_streak = 0  # updates in a row, up to the newest, with numbers that were not finite
+        self.nonfinite_streak = 0  # latest consecutive updates with numbers that are not finite
         self.best: Score | None = None
         self.highest_success = 0.0
-        self.reached = 0  # evaluations in a row, up to the newest, that reached the success rate to stop at
+        self.reached = 0  # latest consecutive evaluations with the success rate to stop at
         self.seconds, self.update = 0.0, 0
         self.plan: TimePlan | None = None
         if run.started:
@@ -122,7 +122,7 @@ class _Loop:
             self._set_updates(max(self.updates, self.update + 1))  # until an update was timed
 
     def run_updates(self, on_progress: OnProgress, loggers: Sequence[Callback]) -> None:
-        """Make all updates that remain."""
+        """Run all remaining updates."""
         saved, length = self.seconds, 1
         with Progress(self.run, self._columns(), self.update, loggers) as progress:
             while self.update < self.updates:
@@ -152,10 +152,10 @@ class _Loop:
                 length = max(1, round(_CALL_SECONDS / seconds * length))
 
     def advance(self, length: int) -> tuple[Any, list[dict[str, float]], float]:
-        """The state after some more updates, a row of progress for each, and the seconds that they took.
+        """State after some more updates, a row of progress for each, and their duration, s.
 
         Raises:
-            Diverged: parameters are not finite, or too many updates in a row had numbers that were not finite.
+            Diverged: parameters, or the gradients of too many updates in a row, are not finite.
         """
         start = time.perf_counter()
         state, metrics = self.trainer.advance(self.state, length)
@@ -177,7 +177,7 @@ class _Loop:
         return state, rows, seconds
 
     def evaluate(self, policy: Policy, update: int) -> dict[str, float]:
-        """Evaluate a policy, always in the same episodes, and save it if it is the best."""
+        """Evaluate a policy in a fixed set of episodes, and save it if it is the best."""
         policy = sharding.gather(self.trainer.mesh, policy)
         report = self._evaluate(policy, SELECTION_STREAM)
         score = score_of(report.success, report.mean_return)
@@ -203,7 +203,7 @@ class _Loop:
         self.run.save_state(state, **about, **progress)
 
     def finish(self) -> None:
-        """Evaluate the best policy, in other episodes than those that chose it, and write the report."""
+        """Evaluate the best policy in new episodes, and write the report."""
         report = self._evaluate(self.run.policy(), REPORT_STREAM)
         seconds = {
             "training": self.seconds,
@@ -241,7 +241,7 @@ class _Loop:
         return config.worlds * config.horizon * self.trainer.env.drones
 
     def _about(self, update: int) -> dict[str, Any]:
-        """What every file of this training says of it; `run_id` is a random number that no other training has."""
+        """Metadata of the files of this training; `run_id` is a unique random number."""
         about = {"run_id": self.id, "recipe": self.trainer.recipe.as_dict(), "seed": self.seed}
         return about | {"episodes": self.trainer.episodes, "update": update}
 
@@ -261,6 +261,6 @@ def _diverged(what: str, update: int) -> Diverged:
 
 
 def _is_finite(state: Any) -> bool:
-    """Whether all parameters are finite. Worlds do not count: one that diverges ends its episode."""
+    """Whether all parameters are finite. Worlds are ignored: divergence ends an episode."""
     trained = [getattr(state, name) for name in ("policy", "critic") if hasattr(state, name)]
     return all(np.isfinite(x).all() for x in jax.tree.leaves(trained))

@@ -1,4 +1,4 @@
-"""When a training evaluates its policy and when it ends: by the number of updates, by success, or by the clock."""
+"""Schedule of evaluations and end of a training: by updates, success rate or time."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.training import distributed
 
 EVALUATIONS = 10
-"""Number of evaluations in the course of a training."""
+"""Number of evaluations of a training."""
 STOPPING_EVALUATIONS = 30
-"""The same of a training that stops at a success rate."""
+"""Number of evaluations of a training with a success rate to stop at."""
 IN_A_ROW = 3
-"""Number of evaluations in a row that have to reach this rate."""
-_EVALUATION_SHARE = 0.25  # largest share of a time budget for evaluations, but for the first and the last two
+"""Number of consecutive evaluations with this rate to stop at."""
+_EVALUATION_SHARE = 0.25  # largest fraction of a time budget for evaluations, except for the first and the last two
 
 
 def check_stop_at(stop_at: float | None, has_success: bool, episodes: int) -> None:
-    """Raise unless evaluations of so many episodes can reach a lower bound of the success rate.
+    """Raise unless evaluations with this number of episodes can reach a lower bound of the success rate.
 
     Raises:
-        ValueError: they cannot, or the task has no criterion of success.
+        ValueError: too few episodes, or a task without a criterion of success.
     """
     if stop_at is None:
         return
@@ -41,38 +41,38 @@ def check_stop_at(stop_at: float | None, has_success: bool, episodes: int) -> No
 
 
 def next_evaluation(updates: int, made: int, evaluations: int) -> int:
-    """The update after which the policy is evaluated next, of evaluations that share all updates evenly."""
+    """Next update with an evaluation, for evenly spaced evaluations."""
     return next(update for i in range(evaluations) if (update := updates * (i + 1) // evaluations) > made)
 
 
 @dataclasses.dataclass
 class TimePlan:
-    """Shares the time until a deadline between updates, evaluations and the final report, as it measures them."""
+    """Allocation of the time until a deadline to updates, evaluations and the final report."""
 
     deadline: float
-    """Time of `time.perf_counter` at which everything has to be written, s."""
+    """End of the training, s on the clock of `time.perf_counter`."""
     evaluated: int
     """Update of the last evaluation."""
     evaluations: int = EVALUATIONS
-    """Number of evaluations to come, but for the final report."""
+    """Number of remaining evaluations, without the final report."""
     evaluation_seconds: float = 0.0
-    """Seconds that an evaluation takes, with writing its results."""
+    """Duration of an evaluation, including writing its results, s."""
     _calls: int = 0
     _updates: int = 0
     _seconds: float = 0.0
 
     def add_updates(self, updates: int, seconds: float) -> None:
-        """Take into account that some updates took so many seconds; the first call counts only until the second."""
+        """Record the duration of updates, s; the second call replaces the first."""
         if self._calls == 1:
             self._updates, self._seconds = 0, 0.0
         self._calls, self._updates, self._seconds = self._calls + 1, self._updates + updates, self._seconds + seconds
 
     def add_evaluation(self, update: int, seconds: float) -> None:
-        """Take into account that the evaluation after an update took so many seconds."""
+        """Record the duration of the evaluation after an update, s."""
         self.evaluated, self.evaluations, self.evaluation_seconds = update, self.evaluations - 1, seconds
 
     def updates(self, made: int) -> int:
-        """The number of updates that can be made in all, at least those that were made."""
+        """Total number of updates until the deadline, at least the completed ones."""
         left = distributed.from_first_host(self.deadline - time.perf_counter())
         evaluation = distributed.from_first_host(self.evaluation_seconds)
         for_updates = max(0.0, left - 2 * evaluation)  # the last evaluation and the report have to follow
@@ -83,5 +83,5 @@ class TimePlan:
         return made + int(for_updates * self._updates / max(self._seconds, 1e-9))
 
     def next_evaluation(self, updates: int, made: int) -> int:
-        """The update after which the policy is evaluated next, of `updates` in all."""
+        """Next update with an evaluation, of `updates` in total."""
         return max(made + 1, self.evaluated + math.ceil((updates - self.evaluated) / self.evaluations))

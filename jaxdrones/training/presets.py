@@ -1,4 +1,4 @@
-"""Settings that were found to work, for each task and learner."""
+"""Tuned settings by task and learner."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DELAYED_OBSERVATION = (
     "rotor_speed",
     last_actions(5),
 )
-"""With rotor lag and a delay of up to four control steps, rotor speeds and recent actions are part of the state."""
+"""Additional observations with rotor lag and a delay of up to four control steps."""
 
 _ANY_VEHICLE = {"action": "angular_acceleration"}
 """The same rotor speeds turn the largest vehicles up to 30 times more slowly than the smallest ones."""
@@ -47,7 +47,7 @@ _ONE_D_PPO = {
     "min_std": 0.2,
     "final_std": 0.05,
 }
-"""The tasks of (2021) are slow: all rotor speeds are within 5 % of hover, so that an action shows after seconds."""
+"""The tasks of (2021) are slow: all rotor speeds are within 5 % of hover, so actions take seconds to have an effect."""
 
 _FOREST = dict(
     worlds=128,
@@ -90,16 +90,16 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
 _ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {("hover", "bptt"): dict(updates=1200)}
 
 _UNFINISHED = {("room", "bptt")}
-"""Settings that are the best found, and with which about half of the episodes succeed."""
+"""Best known settings, with a success rate of about one half."""
 _BY_DEFAULT: dict[str, tuple[str, ...]] = {"hover": ("ppo", "shac"), "landing": ("bptt",)}
-"""Learners that master a task with their default settings."""
+"""Tasks and learners that work with default settings."""
 _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {"gates": dict(random_start=True)}
-"""Options of the environment to train in, for tasks that are trained with other options than they are flown with."""
+"""Options of the environment in training, where they differ from those in flight."""
 _DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo", "swap-goals": "ppo"}
 
 
 def default_algorithm(task: str) -> str:
-    """The learner to try first: bptt, but ppo for tasks whose rewards jump."""
+    """Default learner: bptt, or ppo for tasks with discontinuous rewards."""
     return _DEFAULT_ALGORITHMS.get(task, "bptt")
 
 
@@ -110,16 +110,15 @@ def preset(
     practice: bool = False,
     **options: Any,
 ) -> tuple[Env, Any]:
-    """An environment and the settings of a learner for it.
+    """Environment and tuned settings of a learner.
 
     Args:
-        task: a name of `jaxdrones.envs.TASKS`, or a function that returns a task; for such a one no settings are known,
-            and the learner has its own.
+        task: a name of `jaxdrones.envs.TASKS`, or a function that returns a task, with the learner's default settings.
         algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
-        realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters, or `any` with another
-            vehicle in every episode, which then commands angular accelerations; the policy also observes rotor speeds
+        realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters, or `any` with a
+            random vehicle in every episode and commanded angular accelerations; the policy also observes rotor speeds
             and its last five actions.
-        practice: whether to make the environment to train in, which may have easier starts than the one to fly in.
+        practice: whether to make the environment of training, possibly with easier starts than that of flight.
         **options: options of `jaxdrones.make`.
 
     Raises:
@@ -137,7 +136,7 @@ def preset(
 
 
 def realism(realistic: bool | str) -> str:
-    """How realistic a task is, for titles: an addition to its name, which may be empty."""
+    """Suffix of titles for realistic tasks, possibly empty."""
     return f", realistic{', any vehicle' if realistic == 'any' else ''}" if realistic else ""
 
 
@@ -150,7 +149,7 @@ def settings_known(task: str, algorithm: str, any_vehicle: bool = False) -> bool
 
 
 def _settings(task: str, algorithm: str, realistic: bool | str) -> dict[str, Any]:
-    """The settings of a learner that differ from its defaults."""
+    """Settings of a learner that differ from its defaults."""
     known = _CONFIGS.get((task, algorithm), {})
     known = known | (_REALISTIC_CONFIGS.get((task, algorithm), {}) if realistic else {})
     return known | (_ANY_VEHICLE_CONFIGS.get((task, algorithm), {}) if realistic == "any" else {})

@@ -1,4 +1,4 @@
-"""The progress of a run on disk, a CSV file, and in loggers."""
+"""Progress of a run: CSV file and loggers."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from jaxdrones.training.run import Run
 
 
 class Progress:
-    """progress.csv of a run, open for more rows, and loggers that get the same rows."""
+    """Writer of progress.csv of a run, and of the same rows to loggers."""
 
     def __init__(self, run: Run, columns: Sequence[str], update: int, loggers: Sequence[Callback] = ()):
-        """Continue after an update; the rows of later updates, which a killed process left, are dropped."""
+        """Continue after an update; rows of later updates are dropped."""
         rows = [row for row in run.history() if row["update"] <= update] if update else []
         self._columns, self._loggers, path = columns, loggers, run.folder / "progress.csv"
         with writing.replaced(path) as new, new.open("w", newline="") as file:
@@ -27,7 +27,7 @@ class Progress:
         self._file = path.open("a", newline="")
 
     def add(self, rows: list[dict[str, float]]) -> None:
-        """Write rows, each with at least `update`; a number that is NaN was not measured and stays empty."""
+        """Write rows, each with at least `update`; NaN is written as an empty field."""
         rows = [{name: x for name, x in row.items() if not math.isnan(x)} for row in rows]
         self._write(self._file, rows)
         self._file.flush()
@@ -35,7 +35,7 @@ class Progress:
             logger(int(row["update"]), {name: x for name, x in row.items() if name != "update"}, None)
 
     def synchronize(self) -> None:
-        """Wait until all rows are on the disk."""
+        """Flush all rows to the disk."""
         os.fsync(self._file.fileno())
 
     def _write(self, file: IO[str], rows: list[dict[str, float]]) -> None:

@@ -1,4 +1,4 @@
-"""A recipe: the task, the learner and the settings of a training."""
+"""Recipes of trainings: task, learner and settings."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from jaxdrones.training import user_files
 from jaxdrones.training.algorithms import learner
 from jaxdrones.training.presets import preset
 
-_DRONE_BYTES = 256  # memory that the parameters and the state of a drone take
+_DRONE_BYTES = 256  # memory of the parameters and the state of a drone
 
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """The task, the learner and the settings of a training."""
+    """Task, learner and settings of a training."""
 
     task: str
     """A name of `jaxdrones.envs.TASKS`, or `file.py:function` of a file in `files`."""
     algorithm: str
     realistic: bool | str
-    """Whether, or `any`, as of `jaxdrones.make`."""
+    """As in `jaxdrones.make`."""
     options: dict[str, Any]
     """Options of `jaxdrones.make`."""
     config: Any
     """Settings of the learner, its `Config`."""
     files: user_files.Files = dataclasses.field(default_factory=dict)
-    """Texts of the user's files that task and vehicle are in."""
+    """Texts of the user's files of task and vehicle."""
     stop_at: float | None = None
-    """Lower bound of the success rate at which to stop; `None` to make all updates."""
+    """Lower bound of the success rate to stop at; `None` for all updates."""
 
     @classmethod
     def of(
@@ -47,7 +47,7 @@ class Recipe:
         realistic: bool | str = False,
         **changes: Any,
     ) -> Recipe:
-        """A preset with changes.
+        """Preset with changes.
 
         Args:
             task: a name of `jaxdrones.envs.TASKS`, or `file.py:function` of a function that returns a task.
@@ -73,23 +73,23 @@ class Recipe:
         return cls(task, algorithm, realistic, options, config, files | vehicle)
 
     def env(self, practice: bool = False, **options: Any) -> Env:
-        """The environment to fly in or to train in; options of `jaxdrones.make` replace those of the recipe."""
+        """Environment of flight or of training; options of `jaxdrones.make` override those of the recipe."""
         task = user_files.task_of(self.task, self.files)
         options = user_files.options_of(self.options | options, self.files)
         return preset(task, self.algorithm, self.realistic, practice, **options)[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """The recipe for JSON."""
+        """Entries for JSON."""
         config = {name: x for name, x in dataclasses.asdict(self.config).items() if x is not None}
         entries = dataclasses.asdict(self) | {"config": config}
         return entries if self.files else {name: x for name, x in entries.items() if name != "files"}
 
     @classmethod
     def from_dict(cls, entries: dict[str, Any]) -> Recipe:
-        """The recipe of which `as_dict` gave the entries.
+        """Recipe from the entries of `as_dict`.
 
         Raises:
-            ValueError: they are damaged, or of another version of this library.
+            ValueError: entries that are damaged, or of another version of this library.
         """
         try:
             user_files.task_of(entries["task"], entries.get("files", {}))
@@ -103,10 +103,10 @@ class Recipe:
 def split_changes(
     task: str | Callable[..., Task], changes: dict[str, Any], known: Collection[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Options of the environment, and settings of the learner, whose names are `known`.
+    """Split changes into options of the environment and settings of the learner, with names `known`.
 
     Raises:
-        ValueError: a name is neither; lists both.
+        ValueError: an unknown name.
     """
     options = {*inspect.signature(make).parameters, *inspect.signature(task_function(task)).parameters}
     options -= {"task", "backend", "realistic", "options", "vision"}
@@ -119,7 +119,7 @@ def split_changes(
 def checked_preset(
     task: str | Callable[..., Task], algorithm: str, realistic: bool | str, options: dict[str, Any]
 ) -> tuple[Env, Any]:
-    """The result of `preset`; options of wrong types raise a `ValueError`."""
+    """Result of `preset`; options of wrong types raise a `ValueError`."""
     drones = options.get("drones")
     if isinstance(drones, int):
         check_memory(f"a team of {drones:,} drones", drones * _DRONE_BYTES, "give fewer drones")
@@ -133,10 +133,10 @@ def checked_preset(
 
 
 def convert_setting(name: str, value: Any, current: Any) -> Any:
-    """A setting converted to the type of its current value, where that loses nothing.
+    """Convert a setting to the type of its current value, if lossless.
 
     Raises:
-        ValueError: it is of another type.
+        ValueError: another type.
     """
     if isinstance(current, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)

@@ -1,12 +1,12 @@
-"""A training run as a folder.
+"""Folders of training runs.
 
     best, last       policies: the best one in an evaluation, and the newest
-    state            everything that training needs to continue, bit for bit
+    state            complete state of the training, to continue bit for bit
     progress.csv     a row for each update
-    report.json      the evaluation of the best policy, and the time that training took
+    report.json      evaluation of the best policy, and duration of the training
 
-Each of best, last and state is a .msgpack and a .json that describes it. All name the training that they are of, and
-files of different trainings in one folder are refused.
+Each of best, last and state is a .msgpack file with a .json sidecar. All contain the id of their training, and files of
+different trainings in one folder are rejected.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ CHECKPOINTS = ("best", "last", "state")
 
 
 class Run:
-    """The folder of the training of one seed."""
+    """Folder of the training of one seed."""
 
     def __init__(self, folder: str | os.PathLike):
-        """Refer to a folder; nothing is read or made yet."""
+        """Refer to a folder, without access to it."""
         self.folder = Path(folder)
 
     @property
     def files(self) -> list[Path]:
-        """The files of a run that exist: checkpoints, progress, report."""
+        """Existing files of a run: checkpoints, progress, report."""
         names = [f"{name}.{suffix}" for name in CHECKPOINTS for suffix in ("msgpack", "json")]
         whole = [self.folder / name for name in (*names, "progress.csv", "report.json")]
         candidates = (*whole, *map(writing.beside, whole))
         return [file for file in candidates if file.exists()]
 
     def prepare(self, size: int) -> None:
-        """Make the folder and check that `size` bytes can be written to it.
+        """Create the folder and check that `size` bytes can be written to it.
 
         Raises:
-            OSError: they cannot; the error names the folder and the reason.
+            OSError: no access or no space.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         probe = self.folder / ".probe"
@@ -63,16 +63,16 @@ class Run:
             probe.unlink(missing_ok=True)
 
     def clear(self) -> None:
-        """Remove the files of an earlier run, and no others."""
+        """Remove the files of an earlier run."""
         for file in self.files:
             file.unlink()
 
     def sidecar(self, name: str = "best") -> dict[str, Any]:
-        """The description of the checkpoint `best`, `last` or `state`."""
+        """Sidecar of the checkpoint `best`, `last` or `state`."""
         return files.read_sidecar(self.folder / name)
 
     def sidecar_entry(self, name: str, entry: str) -> Any:
-        """One entry of the description of a checkpoint.
+        """Entry of the sidecar of a checkpoint.
 
         Raises:
             FileNotFoundError: there is no such checkpoint.
@@ -85,7 +85,7 @@ class Run:
         return sidecar[entry]
 
     def verify(self, name: str) -> None:
-        """Check that a checkpoint is not damaged, and of the same training as the others.
+        """Check that a checkpoint is intact, and of the same training as the others.
 
         Raises:
             FileNotFoundError: there is no such checkpoint.
@@ -95,7 +95,7 @@ class Run:
         files.load_bytes(self.folder / f"{name}.msgpack", self.sidecar(name))
 
     def check_identity(self, name: str) -> None:
-        """Check that a checkpoint is of the same training as all that is readable beside it.
+        """Check that a checkpoint is of the same training as all readable files beside it.
 
         Raises:
             FileNotFoundError: there is no such checkpoint.
@@ -106,7 +106,7 @@ class Run:
             try:
                 found = self._report() if other == "report" else self.sidecar(other)
             except (FileNotFoundError, ValueError):
-                continue  # what is damaged is refused where it is used
+                continue  # damaged files are rejected at their use
             if found.get("run_id") != own:
                 raise UserError(
                     f"{self.folder / name}.json and {other}.json are of two trainings; restore the files of one, or "
@@ -114,16 +114,16 @@ class Run:
                 )
 
     def recipe(self, name: str = "best") -> Recipe:
-        """The recipe of the training; raises as `check_identity` does."""
+        """Recipe of the training; raises like `check_identity`."""
         self.check_identity(name)
         return Recipe.from_dict(self.sidecar_entry(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Policy:
-        """The policy `best` or `last`.
+        """Policy `best` or `last`.
 
         Raises:
             FileNotFoundError: there is no such policy.
-            ValueError: it is damaged, of another training than the files beside it, or does not fit `env`.
+            ValueError: it is damaged, of another training than the files beside it, or for another environment.
         """
         self.check_identity(name)
         policy = checkpoint.load(self.folder / name)
@@ -133,16 +133,16 @@ class Run:
         return policy
 
     def check_sizes(self, name: str, env: Env, sizes: tuple[int, int], expected: tuple[int, int]) -> None:
-        """Raise if a policy takes observations or gives actions of other sizes than the environment does.
+        """Raise unless a policy has the observation and action sizes of the environment.
 
         Args:
             name: `best` or `last`.
             env: environment.
-            sizes: numbers in an observation and in an action of the policy.
-            expected: the same of the environment.
+            sizes: lengths of observation and action of the policy.
+            expected: lengths of observation and action of the environment.
 
         Raises:
-            ValueError: they differ.
+            ValueError: different sizes.
         """
         if sizes != expected:
             raise UserError(
@@ -152,24 +152,24 @@ class Run:
 
     @property
     def started(self) -> bool:
-        """Whether there is a training state to continue from."""
+        """Whether there is a training state."""
         return (self.folder / "state.json").exists()
 
     @property
     def finished(self) -> bool:
-        """Whether a training came to its end."""
+        """Whether the training is complete."""
         return (self.folder / "report.json").exists()
 
     def save_policy(self, name: str, policy: Policy, **about: Any) -> None:
-        """Write `best` or `last`, with entries of its description."""
+        """Write `best` or `last` with entries of its sidecar."""
         checkpoint.save(self.folder / name, policy, **about)
 
     def save_state(self, state: Any, **about: Any) -> None:
-        """Write the training state, with entries of its description."""
+        """Write the training state with entries of its sidecar."""
         checkpoint.save_tree(self.folder / "state", state, **about)
 
     def load_state(self, like: Any) -> Any:
-        """The training state; `like` is a tree with its shapes."""
+        """Training state; `like` is a tree with its shapes."""
         return checkpoint.load_tree(self.folder / "state", like)
 
     def save_report(self, report: dict[str, Any]) -> None:
@@ -181,7 +181,7 @@ class Run:
         (self.folder / "report.json").unlink(missing_ok=True)
 
     def report(self) -> dict[str, Any] | None:
-        """The content of report.json; `None` for a run that did not finish.
+        """Content of report.json; `None` for an unfinished run.
 
         Raises:
             ValueError: the file is damaged.
@@ -205,9 +205,9 @@ class Run:
             raise UserError(f"{file} cannot be read: {why}; remove it and --resume, which writes it anew") from error
 
     def history(self) -> list[dict[str, float]]:
-        """The rows of progress.csv, each without the numbers that were not measured in its update.
+        """Rows of progress.csv, each without the missing values of its update.
 
-        A last line that was cut short, as a killed process leaves it, is no row.
+        A truncated last line, as left by a killed process, is ignored.
 
         Raises:
             ValueError: the file is damaged.
@@ -228,7 +228,7 @@ class Run:
 
 
 def report_as_dict(report: Report) -> dict[str, Any]:
-    """An evaluation for JSON."""
+    """Evaluation for JSON."""
     entries = {field.name: getattr(report, field.name) for field in dataclasses.fields(report)}
     entries |= {"successes": None if report.success is None else round(report.success * report.episodes)}
     percentiles = {str(q): x for q, x in report.final_error_percentiles.items()}
@@ -236,5 +236,5 @@ def report_as_dict(report: Report) -> dict[str, Any]:
 
 
 def size_of(tree: Any) -> int:
-    """Bytes of the arrays of a tree, or of their shapes."""
+    """Bytes of the arrays of a tree, or of its shapes."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))

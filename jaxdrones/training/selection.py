@@ -1,4 +1,4 @@
-"""The choice of the policy that a training keeps."""
+"""Selection of the best policy of a training."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from collections.abc import Sequence
 from jaxdrones.learning.evaluation import wilson_interval
 
 SELECTION_STREAM, REPORT_STREAM = 2**31, 2**31 + 1
-"""Numbers to fold into the key of a seed, for the episodes that choose a policy and for those of the final report.
-Splitting the key gives the streams 0, 1, 2, ..., which these numbers do not reach."""
+"""Numbers to fold into the key of a seed, for the episodes of the selection and of the final report.
+They are distinct from the streams 0, 1, 2, ... of a split."""
 
-_STANDARD_ERRORS = 1.0  # half the width of the intervals within which two success rates count as equal
+_STANDARD_ERRORS = 1.0  # half width of the intervals, in standard errors, for a statistical tie of two success rates
 
 Score = tuple[float, float]
 """Success rate and mean return of an evaluation."""
 
 
 def score_of(success: float | None, mean_return: float) -> Score:
-    """The score of an evaluation; a task without success counts as 0, a return that is not a number is the worst."""
+    """Score of an evaluation; missing success is 0, a return that is NaN is the worst."""
     return success or 0.0, mean_return if math.isfinite(mean_return) else -math.inf
 
 
 def best_of(scores: Sequence[Score], episodes: int, highest_success: float = 0.0) -> int:
     """Index of the policy to keep.
 
-    Of the policies whose success rate is the highest up to chance, this is the one with the highest return; of equal
-    returns it is the first. Two success rates are equal up to chance where their Wilson intervals of one standard error
-    overlap: for 1,000 episodes, a difference of 1 decides nothing, and a difference of 5 decides.
+    It is the first one with the highest return among policies whose success rate is statistically tied for first. Two
+    success rates are tied if their Wilson intervals of one standard error overlap: for 1,000 episodes, a difference of
+    1 is a tie, and a difference of 5 is not.
 
     Args:
         scores: scores of all policies to choose from.
         episodes: number of episodes of each evaluation.
-        highest_success: highest success rate of earlier evaluations, with as many episodes. With it, small losses do
-            not add up from one choice to the next.
+        highest_success: highest success rate of earlier evaluations, with as many episodes. It keeps small losses from
+            accumulating over selections.
     """
 
     def interval(success: float) -> tuple[float, float]:

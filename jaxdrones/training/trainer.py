@@ -1,4 +1,4 @@
-"""The compiled programs with which a recipe is trained."""
+"""Compiled programs of a recipe."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from jaxdrones.training.plan import check_stop_at
 from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.run import Run, size_of
 
-_DISK_FACTOR = 4  # the disk must have space for so many training states
+_DISK_FACTOR = 4  # number of training states that must fit on the disk
 
 
 class Trainer:
-    """The compiled programs of a recipe; all seeds share them, and all devices of all hosts share the worlds."""
+    """Compiled programs of a recipe, shared by all seeds; worlds are sharded over all devices of all hosts."""
 
     def __init__(self, recipe: Recipe, episodes: int = 1000):
         """Prepare the programs; `compile` compiles them.
 
         Args:
-            recipe: what to train.
+            recipe: task, learner and settings.
             episodes: number of episodes of an evaluation.
 
         Raises:
-            ValueError: the devices cannot share the worlds equally, or have too little memory for them, or no
-                evaluation reaches the success rate to stop at.
+            ValueError: a number of worlds that is not a multiple of the devices or does not fit in memory, or too few
+                episodes for the success rate to stop at.
         """
         self.recipe, self.episodes = recipe, episodes
         self.mesh = sharding.make_mesh(recipe.config.worlds)
@@ -60,7 +60,7 @@ class Trainer:
         self.compile_seconds = time.perf_counter() - start
 
     def prepare(self, run: Run) -> None:
-        """Make the folder of a run and check that its files can be written.
+        """Create the folder of a run and check that its files can be written.
 
         Raises:
             OSError: they cannot be written.
@@ -68,17 +68,17 @@ class Trainer:
         run.prepare(_DISK_FACTOR * size_of(self.shapes))
 
     def start(self, key: jax.Array) -> Any:
-        """The training state before the first update."""
+        """Training state before the first update."""
         return self._start(key)
 
     def advance(self, state: Any, updates: int) -> tuple[Any, dict[str, np.ndarray]]:
-        """Make at most `MAX_CALL` updates in one call: the state after them, and (updates,) of every metric."""
+        """Run at most `MAX_CALL` updates in one call: the next state, and (updates,) of every metric."""
         total = jnp.asarray(self.recipe.config.updates, jnp.int32)
         state, metrics = self._advance(state, jnp.asarray(updates, jnp.int32), total)
         return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
 
     def _check_memory(self) -> None:
-        """Raise if the worlds, with their observations and actions in an update, need more memory than there is."""
+        """Raise if the trajectories of an update do not fit in memory."""
         config, env = self.recipe.config, self.env
         actions = config.worlds * env.drones * env.action_size * jnp.zeros(()).dtype.itemsize
         step = actions + size_of((self.shapes.worlds.obs, self.shapes.worlds.hidden_state))
@@ -90,5 +90,5 @@ class Trainer:
         return self.learner.init(key, self.practice_env, self.recipe.config)
 
     def _updates(self, state, count, total):
-        """Make `count` updates of a training of `total` updates; both may change without compiling again."""
+        """Run `count` updates of a training of `total` updates; both can change without recompilation."""
         return advance(self.learner.update, self.practice_env, self.recipe.config, state, count, total)

@@ -1,7 +1,7 @@
-"""A user's files in a recipe: the Python file of a task, the URDF of a vehicle.
+"""User files in a recipe: the Python file of a task, the URDF of a vehicle.
 
-A recipe names them without their folder and holds their text. So a run flies what it was trained on, wherever its
-folder is and whatever becomes of the files. The text of a task is executed when its run is opened.
+A recipe has their names without folders, and their text. A run is thus independent of the original files. The text of a
+task is executed when its run is opened.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from jaxdrones.tasks.task import Task
 from jaxdrones.urdf import parse_params
 
 Files = dict[str, str]
-"""Name of a file, without its folder -> its text."""
+"""Name of a file without its folder -> its text."""
 
 
 def take_task(task: str, kept: Mapping[str, str] | None = None) -> tuple[str, Files]:
-    """The name of a task as a recipe has it, and the file that it is in.
+    """Name of a task for a recipe, and its file.
 
     Args:
         task: a name of `jaxdrones.envs.TASKS`, or `folder/file.py:function`.
-        kept: files of a run; they stand in for those that are no longer there.
+        kept: files of a run, in place of missing ones.
 
     Raises:
-        ValueError: a file that cannot be read, or no function is named.
+        ValueError: a file that cannot be read, or a missing function name.
     """
     if not user_code.is_reference(task):
         return task, {}
@@ -38,11 +38,11 @@ def take_task(task: str, kept: Mapping[str, str] | None = None) -> tuple[str, Fi
 
 
 def take_vehicle(options: dict[str, Any], kept: Mapping[str, str] | None = None) -> tuple[dict[str, Any], Files]:
-    """Options of `jaxdrones.make` as a recipe has them, and the file that the vehicle is in.
+    """Options of `jaxdrones.make` for a recipe, and the file of the vehicle.
 
     Args:
-        options: with a `vehicle` that is a bundled one or the path of a URDF, or without one.
-        kept: files of a run; they stand in for those that are no longer there.
+        options: optionally with a `vehicle`, a bundled one or the path of a URDF.
+        kept: files of a run, in place of missing ones.
 
     Raises:
         ValueError: a file that cannot be read.
@@ -55,10 +55,10 @@ def take_vehicle(options: dict[str, Any], kept: Mapping[str, str] | None = None)
 
 
 def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
-    """The task of a recipe as `jaxdrones.make` takes it: a name, or the function that a file of the recipe defines.
+    """Task of a recipe for `jaxdrones.make`: a name, or the function of a file.
 
     Raises:
-        ValueError: an unknown name, or a file that is missing, cannot be executed or does not define the function.
+        ValueError: an unknown name, or a file that is missing, cannot be executed or lacks the function.
     """
     if not user_code.is_reference(task):
         check_choice("task", task, TASKS)
@@ -70,7 +70,7 @@ def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
 
 
 def options_of(options: dict[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
-    """The options of a recipe as `jaxdrones.make` takes them: a vehicle of a file by its constants.
+    """Options of a recipe for `jaxdrones.make`, with the constants of a vehicle file.
 
     Raises:
         ValueError: a URDF that cannot be flown.
@@ -82,10 +82,10 @@ def options_of(options: dict[str, Any], files: Mapping[str, str]) -> dict[str, A
 
 
 def check_unchanged(folder: Path, kept: Mapping[str, str], found: Mapping[str, str]) -> None:
-    """Raise unless the files that were found have the texts that a run keeps.
+    """Raise if files have changed since the start of a run.
 
     Raises:
-        ValueError: one has changed; says what to do.
+        ValueError: a changed file.
     """
     for name, text in found.items():
         if kept.get(name, text) != text:

@@ -1,4 +1,4 @@
-"""A policy of a user's file, which flies a task as the policy of a run does."""
+"""Policies from users' files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxdrones.learning.networks import AnyPolicy, RecurrentPolicy
 
 @dataclasses.dataclass(frozen=True)
 class UserPolicy:
-    """A policy of a user's file and the task that it flies: what is asked of a run, and of its recipe."""
+    """Policy of a user's file and its task, with the interface of `Run` and `Recipe`."""
 
     reference: str
     """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a recurrent policy."""
@@ -33,22 +33,22 @@ class UserPolicy:
         return self.reference
 
     def as_dict(self) -> dict[str, Any]:
-        """The policy and the task for JSON."""
+        """Policy and task for JSON."""
         return dataclasses.asdict(self)
 
     def recipe(self) -> UserPolicy:
-        """What says which environment is flown: this."""
+        """Recipe of the environment: this object."""
         return self
 
     def env(self, **options: Any) -> Env:
-        """The environment to fly in; options of `jaxdrones.make` replace those given."""
+        """Environment; options of `jaxdrones.make` override those of the policy."""
         return make(self.task, realistic=self.realistic, **self.options | options)
 
     def policy(self, env: Env) -> AnyPolicy:
-        """The policy.
+        """Policy.
 
         Raises:
-            ValueError: the file cannot be read or executed, or the name is not that of a policy.
+            ValueError: a file that cannot be read or executed, or a name that is not a policy.
         """
         policy = user_code.load(self.reference)
         sizes = (env.drones, env.observation_size), (env.drones, env.action_size)

@@ -79,7 +79,7 @@ def test_what_contradicts_any_vehicle_is_refused(capsys):
     line = refused(capsys, *TRAIN, "--realistic", "any", "--vehicle", "hb")
     assert "vehicle='hb' is given, but every episode draws a vehicle already; leave out one of them" in line
     line = refused(capsys, "eval", "runs/hover", "--realistic", "any")
-    assert "--realistic is given beside the run runs/hover, which says what is flown; leave it out" in line
+    assert "--realistic is given beside the run runs/hover, which determines it; leave it out" in line
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The command line: `jaxdrones fly`, `train`, `eval` and the others; a file per command."""
+"""Command line: `jaxdrones fly`, `train`, `eval` and others; a file per command."""
 
 import argparse
 import sys
@@ -19,7 +19,7 @@ from jaxdrones.cli import (
     train,
     view,
 )
-from jaxdrones.cli.common import EXIT_CODES, Parser, lasting_interrupts, print_failure
+from jaxdrones.cli.common import Parser, lasting_interrupts, print_failure
 from jaxdrones.cli.settings import task_first, with_config
 
 
@@ -43,11 +43,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="jaxdrones",
         description="Simulate teams of quadrotors.",
-        epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    text = "show the traceback of an error, also of a mistake"
+    text = "show the traceback of every error"
     parser.add_argument("--debug", action="store_true", help=text)
     parser.add_argument("--version", action="version", version=f"jaxdrones {machine.version('jaxdrones')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)

@@ -12,6 +12,7 @@ from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.checks import check_number
 from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
+from jaxdrones.cli.options import add_json
 from jaxdrones.cli.report import as_json
 from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics.aero import drag
@@ -35,18 +36,16 @@ def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "bench",
-        help="how many steps per second this machine makes, in half a minute",
-        description="Measure the throughput of this machine in float32: the plant, the plant under a controller, and\n"
-        "an environment, without the time to compile. The last line is one to share.",
+        help="measure steps per second of this machine in half a minute",
+        description="Measure the throughput of this machine in float32: the plant, the plant under a controller, and "
+        "an environment, without compilation. The last line is a summary to share.",
         allow_abbrev=False,
     )
     parser.add_argument(
         "--worlds", type=int, nargs="+", metavar="N", help="numbers of worlds (1024 16384; more on an accelerator)"
     )
-    parser.add_argument(
-        "--seconds", type=float, default=25.0, metavar="S", help="begin no measurement that would end later (25)"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    parser.add_argument("--seconds", type=float, default=25.0, metavar="S", help="time limit, s (25)")
+    add_json(parser)
     parser.set_defaults(run=_bench)
 
 
@@ -81,7 +80,7 @@ def _bench(options: argparse.Namespace) -> int:
 
 
 def _measurements(worlds: Sequence[int]) -> Iterator[tuple[str, int, Callable[[], float]]]:
-    """What is measured, in how many worlds, and the function that measures it, steps per second."""
+    """Kinds, numbers of worlds, and functions that measure steps per second."""
     for count in worlds:
         for kind in _MEANINGS:
             yield kind, count, functools.partial(_rate, kind, count)
@@ -105,7 +104,7 @@ def _rate(kind: str, worlds: int) -> float:
 
 
 def _line(result: dict[str, Any]) -> str:
-    """One line with the best rate of each kind, the machine and the versions."""
+    """Summary of the best rate of each kind, the machine and the versions."""
     best: dict[str, dict[str, Any]] = {}
     for row in result["rates"]:
         best[row["what"]] = max(best.get(row["what"], row), row, key=lambda row: row["per_s"])

@@ -1,4 +1,4 @@
-"""What the commands share: arguments, error messages, progress bars and tables."""
+"""Parser, error messages, exit codes and progress bars of the commands."""
 
 import argparse
 import contextlib
@@ -20,10 +20,9 @@ from jaxdrones.errors import UserError
 DIVERGED, MISTAKE, FAULT, INTERRUPTED = 1, 2, 70, 130
 EXIT_CODES = """exit codes:
     0  done
-    1  a flight or a training diverged, commands ceased, success is below `eval --fail-below`, or `doctor` found
-       something wrong
-    2  a mistake in what was asked, or in a file of yours: one line says what to do
-   70  a fault of jaxdrones, with its traceback: please report it
+    1  diverged flight or training, lost commands, success below `eval --fail-below`, or a problem found by `doctor`
+    2  invalid arguments, or an error in your file, with a message of one line
+   70  internal error, with its traceback: please report it
   130  interrupted"""
 
 _AGAIN = 0.05  # s after which a lost Ctrl-C is repeated
@@ -32,21 +31,24 @@ _DEBUG = {"JAX_DEBUG_NANS", "JAX_DEBUG_INFS"}
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose error messages are one line."""
+    """Parser with error messages of one line, and exit codes in its help."""
+
+    def format_help(self):  # noqa: D102
+        return f"{super().format_help()}\n{EXIT_CODES}\n"
 
     def error(self, message):  # noqa: D102
         self.exit(print_error(f"{shortened(message)}; see {self.prog} --help"))
 
 
 def print_error(message: str, code: int = MISTAKE) -> int:
-    """Write an error message of one line to stderr; returns the exit code."""
+    """Write an error message of one line to stderr; return the exit code."""
     print(f"jaxdrones: {'' if code == INTERRUPTED else 'error: '}{shortened(message)}", file=sys.stderr)
     return code
 
 
 @contextlib.contextmanager
 def lasting_interrupts():
-    """A context in which no Ctrl-C is lost: one that Python had to drop, as in a callback of its garbage collector."""
+    """Context that repeats a Ctrl-C dropped by Python, for example in a callback of its garbage collector."""
     before, timers = sys.unraisablehook, []
 
     def interrupt_again(dropped):
@@ -66,13 +68,13 @@ def lasting_interrupts():
 
 
 def print_failure(error: BaseException, debug: bool) -> int:
-    """Write to stderr what ended a command; returns the exit code.
+    """Write the error of a command to stderr; return the exit code.
 
-    A user's mistake is one line, and so is an error in a user's file. Whatever else is a fault of this library.
+    A user's mistake or an error in a user's file is one line. Everything else is an internal error.
 
     Args:
-        error: what was raised.
-        debug: whether to write the traceback first, whatever was raised.
+        error: exception of the command.
+        debug: whether to write the traceback of every error.
     """
     if debug:
         traceback.print_exception(error)
@@ -92,7 +94,7 @@ def print_failure(error: BaseException, debug: bool) -> int:
 
 
 def _explained(error: BaseException) -> str | None:
-    """What to do about an error that is no fault of this library; `None` if it may be one."""
+    """Message of an error outside this library; `None` for a possible internal error."""
     if isinstance(error, UserError | UnexpectedKeyword):
         return str(error)
     if isinstance(error, ImportError) and not (error.name or "").startswith("jaxdrones"):
@@ -116,28 +118,28 @@ def print_warning(message: str) -> None:
 
 
 def shortened(message: str) -> str:
-    """A message on one line; the middle of a very long one is left out."""
+    """Message on one line, with the middle of a very long one elided."""
     line = " ".join(message.split("\n"))
     return line if len(line) <= _MAX_MESSAGE else f"{line[: _MAX_MESSAGE // 2]} ... {line[-_MAX_MESSAGE // 2 :]}"
 
 
 def folder(text: str) -> Path:
-    """The path that an option gives; an empty one, for example from an unset variable, is refused."""
+    """Path of an option; an empty one, for example from an unset variable, is an error."""
     if not text:
         raise argparse.ArgumentTypeError("the path is empty; name one, or leave the option out")
     return Path(text)
 
 
 def run_folder(task: str, ending: str = "") -> Path:
-    """The default folder of a run: `runs/hover`, or `runs/moving_box` of the task `my_task.py:moving_box`."""
+    """Default folder of a run: `runs/hover`, or `runs/moving_box` for the task `my_task.py:moving_box`."""
     return Path("runs") / (task.rpartition(":")[2] + ending)
 
 
 def check_writable(file: Path) -> None:
-    """Raise unless a file can be written; its folder is made, an old file stays until it is replaced.
+    """Raise unless a file can be written; create its folder.
 
     Raises:
-        OSError: the file cannot be written; names it.
+        OSError: the file cannot be written.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.is_dir():
@@ -151,7 +153,7 @@ def check_writable(file: Path) -> None:
 
 
 def bar(total: int | None, what: str, unit: str, initial: int = 0):
-    """A context with a progress bar on stderr, which is silent without a terminal; with `None` without tqdm."""
+    """Context with a progress bar on stderr, silent without a terminal; with `None` without tqdm."""
     try:
         from tqdm import tqdm
     except ImportError:

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import check_writable, folder
+from jaxdrones.cli.common import check_writable
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
+from jaxdrones.cli.options import add_json, add_no_figure, add_output
 from jaxdrones.cli.report import as_json, table
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
@@ -26,25 +27,21 @@ def add(commands) -> None:
         "compare",
         help="fly an example on both backends, or by several controllers, and print how they differ",
         description="Fly an example on two backends from the same start and print their divergence over time, or fly "
-        "it by several controllers, which receive the same set-points, and print the errors of each. With --output "
-        "draw paths and errors of all, too.",
+        "it by several controllers with the same set-points and print the errors of each. With --output draw paths "
+        "and errors of all, too.",
         allow_abbrev=False,
     )
     parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
     add_conditions(parser)
-    parser.add_argument("--backends", metavar="A,B", help=f"two of {', '.join(BACKENDS)} ({_BACKENDS})")
-    parser.add_argument(
+    compared = parser.add_argument_group("comparison")
+    files = parser.add_argument_group("files and output")
+    compared.add_argument("--backends", metavar="A,B", help=f"two of {', '.join(BACKENDS)} ({_BACKENDS})")
+    compared.add_argument(
         "--controllers", metavar="A,B", help=f"in place of --backends: two or more of {', '.join(CONTROLLERS)}"
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=folder,
-        metavar="DIR",
-        help="folder of the figure and the log of each flight (none)",
-    )
-    parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    add_output(files, "folder of figure and logs (none)")
+    add_no_figure(files)
+    add_json(files)
     parser.set_defaults(run=_compare)
 
 
@@ -82,7 +79,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.Namespace, str]]]:
-    """What differs, `backends` or `controllers`, and by its name the options and the backend of each flight."""
+    """Kind of comparison, `backends` or `controllers`, and options and backend of each flight by name."""
     if options.controllers is None:
         names = _names("backends", options.backends or _BACKENDS)
         if len(names) != 2:
@@ -104,10 +101,10 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
 
 
 def _names(option: str, text: str) -> list[str]:
-    """Names between commas.
+    """Comma-separated names.
 
     Raises:
-        ValueError: one is given twice.
+        ValueError: a duplicate name.
     """
     names = [name.strip() for name in text.split(",")]
     if len(set(names)) < len(names):
@@ -116,7 +113,7 @@ def _names(option: str, text: str) -> list[str]:
 
 
 def _logs(options: argparse.Namespace, names: list[str]) -> dict[str, Path]:
-    """Where the log of each flight is to be written, by name; raises before the flights if a file cannot be."""
+    """Paths of the logs by name; raise before the flights if a file cannot be written."""
     if options.output is None:
         return {}
     if not options.no_figure:
@@ -129,7 +126,7 @@ def _logs(options: argparse.Namespace, names: list[str]) -> dict[str, Path]:
 
 
 def _results(records: Mapping[str, FlightLog], after: float) -> list[dict[str, Any]]:
-    """One row of numbers per controller: the largest over the drones; `None` where one of them has none."""
+    """One row per controller: the largest value over the drones; `None` if any drone lacks it."""
     rows = []
     for name, record in records.items():
         drones = results.results(record, after)

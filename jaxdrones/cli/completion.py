@@ -10,7 +10,7 @@ from jaxdrones.cli.settings import REALISTIC_KINDS
 from jaxdrones.errors import UserError, install
 
 SHELLS = ("bash", "zsh", "fish")
-_KINDS = {  # argument -> kind of the names that it takes
+_KINDS = {  # argument -> kind of its names
     "task": "tasks",
     "flight": "flights",
     "vehicle": "vehicles",
@@ -24,12 +24,12 @@ _FOLDERS, _FILES = ("DIR", "RUN", "BAG"), ("FILE",)  # metavars
 
 
 def add(commands, root: argparse.ArgumentParser) -> None:
-    """Add the command; the script completes all commands of `root`."""
+    """Add the command, with completions for all commands of `root`."""
     parser = commands.add_parser(
         "completion",
-        help="print a script that completes commands and names in a shell",
+        help="print a completion script for a shell",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Print a script with which the tab key completes commands, options and names.\n\n"
+        description="Print a script for the completion of commands, options and names by the tab key.\n\n"
         "  bash   source <(jaxdrones completion bash)     in ~/.bashrc\n"
         "  zsh    jaxdrones completion zsh > ~/.zfunc/_jaxdrones     with ~/.zfunc in $fpath before compinit\n"
         "  fish   jaxdrones completion fish > ~/.config/fish/completions/jaxdrones.fish",
@@ -60,7 +60,7 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
-    """The arguments of a parser and of its commands."""
+    """Arguments of a parser and of its commands."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for command in action.choices.values():

@@ -7,10 +7,11 @@ import shutil
 import time
 from typing import Any
 
+from jaxdrones.cli.options import add_json
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError, install
 
-_LEFT_OUT = ("all", "dev", "docs")  # extras that only join others, or are for developers
+_LEFT_OUT = ("all", "dev", "docs")  # extras of extras, or for developers
 _COMPARISONS = {
     "<=": lambda a, b: a <= b,
     ">=": lambda a, b: a >= b,
@@ -24,12 +25,12 @@ def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "doctor",
-        help="versions, devices, extras, and a self-test of two seconds",
-        description="Print the versions, the devices and which extras are installed, and fly a second whose end is "
-        "known in closed form. The exit code is 1 where something is wrong; a missing extra is not.",
+        help="check versions, devices, extras, and run a self-test",
+        description="Print versions, devices and installed extras, and fly a self-test with a closed-form solution. "
+        "Missing extras are no problem.",
         allow_abbrev=False,
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    add_json(parser)
     parser.set_defaults(run=_doctor)
 
 
@@ -65,7 +66,7 @@ def _text(result: dict[str, Any]) -> str:
 
 
 def _requirements(wrong: list[str]) -> tuple[dict[str, str], dict[str, list[re.Match]]]:
-    """What the package needs, and what its extras need, as its own metadata say: name -> versions."""
+    """Requirements of the package and of its extras from the metadata: name -> versions."""
     try:
         texts = importlib.metadata.requires("jaxdrones") or []
     except importlib.metadata.PackageNotFoundError:
@@ -87,7 +88,7 @@ def _requirements(wrong: list[str]) -> tuple[dict[str, str], dict[str, list[re.M
 
 
 def _extra(extra: str, libraries: list[re.Match], wrong: list[str]) -> dict[str, Any]:
-    """Which libraries of an extra are missing, and how to install them."""
+    """Missing libraries of an extra, and how to install them."""
     import platform
 
     missing, unavailable = [], []
@@ -108,7 +109,7 @@ def _extra(extra: str, libraries: list[re.Match], wrong: list[str]) -> dict[str,
 
 
 def _unfit(name: str, wanted: str) -> list[str]:
-    """What is wrong with the version of a library; nothing if it is one of those wanted."""
+    """Problem with the version of a library; empty for a supported one."""
     found = _version(name)
     if found is None:
         return [f'{name} is not installed; pip install "{name}{wanted}"']
@@ -128,7 +129,7 @@ def _version(name: str) -> str | None:
 
 
 def _numbers(version: str) -> tuple[int, ...]:
-    """The numbers of a version, without what follows the release, such as `rc1`."""
+    """Release numbers of a version, without suffixes such as `rc1`."""
     found = re.match(r"\d+(\.\d+)*", version)
     return tuple(map(int, found[0].split("."))) if found else ()
 
@@ -144,14 +145,14 @@ def _devices(wrong: list[str]) -> list[str]:
 
 
 def _notes(devices: list[str]) -> list[str]:
-    """What could be better though nothing is wrong."""
+    """Hints beside problems."""
     if devices and shutil.which("nvidia-smi") and all(device.startswith("cpu") for device in devices):
         return ['an NVIDIA driver is there, but jax computes on the CPU; pip install "jax[cuda12]" for the GPU']
     return []
 
 
 def _self_tests(extras: dict[str, dict[str, Any]], wrong: list[str]) -> dict[str, str]:
-    """The result of the self-test on every backend that is installed."""
+    """Result of the self-test on every installed backend."""
     from jaxdrones.flights.self_test import self_test
 
     results = {}

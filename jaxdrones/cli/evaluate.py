@@ -6,13 +6,14 @@ from typing import Any
 
 from jaxdrones.checks import check_choice, check_number
 from jaxdrones.cli.common import DIVERGED, folder, print_error
+from jaxdrones.cli.options import add_backend, add_drones, add_json, add_set, add_vehicle
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.report import as_json, described, evaluation_table, percent
 from jaxdrones.cli.settings import add_realistic, asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
 
-_FIRST_SEED = 1_000_000  # so that episodes differ from those of the training
+_FIRST_SEED = 1_000_000  # distinct from the seeds of trainings
 
 
 def add(commands) -> None:
@@ -20,9 +21,8 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "eval",
         help="evaluate a trained policy over many episodes",
-        description="Fly many episodes with the best policy of a run, or with a policy of your own (file.py:name). "
-        "Prints the success rate with its 95 % interval, which counts repetitions of a flight once, errors, and how "
-        "episodes ended.",
+        description="Fly many episodes with the best policy of a run, or with your own policy (file.py:name). Print "
+        "the success rate with its 95 % interval over distinct episodes, errors, and ends of episodes.",
         allow_abbrev=False,
     )
     parser.add_argument(
@@ -31,24 +31,22 @@ def add(commands) -> None:
         metavar="RUN",
         help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed",
     )
-    parser.add_argument("--task", metavar="TASK", help="with file.py:name: the task to fly, as for `jaxdrones train`")
-    add_realistic(parser, "with file.py:name: ")
-    parser.add_argument("--vehicle", help="with file.py:name: a bundled vehicle or a .urdf file (cf2x)")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="with file.py:name: option of the environment (action, observation, drones, ...)",
-    )
-    parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
-    parser.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
-    parser.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
-    parser.add_argument(
+    own = parser.add_argument_group("policies of your own")
+    evaluation = parser.add_argument_group("evaluation")
+    where = "with file.py:name: "
+    own.add_argument("--task", metavar="TASK", help=f"{where}task to fly, as for `jaxdrones train`")
+    add_drones(own, where=where)
+    add_vehicle(own, where=where)
+    add_realistic(own, where)
+    add_set(own, f"{where}option of the environment (action, observation, ...)")
+    add_backend(evaluation)
+    evaluation.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
+    evaluation.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
+    evaluation.add_argument(
         "--fail-below", type=float, metavar="RATE", help="exit code 1 if the success rate is lower, for example 0.9"
     )
-    parser.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    evaluation.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
+    add_json(evaluation)
     parser.set_defaults(run=_evaluate)
 
 

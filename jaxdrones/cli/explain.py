@@ -2,34 +2,28 @@
 
 import argparse
 
-from jaxdrones import assets
+from jaxdrones.cli.options import add_backend, add_drones, add_json, add_set, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.envs import TASKS, explain, make
-from jaxdrones.flights.conditions import BACKENDS
 
 
 def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "explain",
-        help="what every number of a task's observation and action is, its rewards, ends and physics",
-        description="Print what every number of the observation and action of an environment is (name, unit, frame, "
-        "range, what -1, 0 and 1 stand for), what is rewarded, when an episode ends, and what is simulated.",
+        help="describe the observation, action, rewards, terminations and physics of a task",
+        description="Print a table of every entry of observation and action (name, unit, frame, range, meaning of -1, "
+        "0 and 1), the rewards, the terminations, and the simulation of an environment.",
         allow_abbrev=False,
     )
     parser.add_argument("task", metavar="TASK", help=f"{', '.join(TASKS)}, or file.py:function")
-    parser.add_argument("--vehicle", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
-    parser.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
+    add_drones(parser)
+    add_vehicle(parser)
     add_realistic(parser)
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="option of the environment (vehicle, action, observation, drones, period, ...)",
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_backend(parser)
+    add_set(parser, "option of the environment (action, observation, period, ...)")
+    add_json(parser)
     parser.set_defaults(run=_explain)
 
 

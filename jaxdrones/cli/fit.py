@@ -1,4 +1,4 @@
-"""The command `jaxdrones fit`."""
+"""`jaxdrones fit`."""
 
 import argparse
 import sys
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxdrones.cli.common import check_writable, folder, print_warning
+from jaxdrones.cli.options import add_json, add_no_figure, add_output, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import install
 
@@ -18,45 +19,32 @@ def add(commands) -> None:
         "fit",
         help="identify a vehicle from recorded flights",
         description="Estimate parameters of a vehicle from flights: logs of `jaxdrones fly`, .npz or .csv files with "
-        "t, pos, quat, vel, omega and rpm (or pwm and vbat), or bags of ROS 2. Prints each with its standard error, "
-        "and writes a folder with vehicle.urdf, report.json and a figure. "
+        "t, pos, quat, vel, omega and rpm (or pwm and vbat), or bags of ROS 2. Print each with its standard error, "
+        "and write a folder with vehicle.urdf, report.json and a figure. "
         "Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
         allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="flights to fit")
-    parser.add_argument(
-        "--vehicle",
-        default="cf2x",
-        metavar="NAME|URDF",
-        help="initial values: a bundled vehicle or URDF (cf2x)",
-    )
-    parser.add_argument(
+    model = parser.add_argument_group("model and data")
+    files = parser.add_argument_group("files and output")
+    add_vehicle(model, "cf2x", "initial values: ")
+    model.add_argument(
         "--parameters",
-        metavar="NAME,...",
-        help="parameters to fit, such as kf,inertia,drag_coeff (those that such logs identify)",
+        metavar="A,B",
+        help="parameters to fit, such as kf,inertia,drag_coeff (those identifiable from such logs)",
     )
-    parser.add_argument(
+    model.add_argument(
         "--validate",
         nargs="+",
         type=folder,
         default=[],
         metavar="FLIGHT",
-        help="flights that are not fitted, on which the best round is chosen",
+        help="held-out flights for the choice of the best round",
     )
-    parser.add_argument(
-        "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
-    )
-    add_consistency(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=folder,
-        default=Path("runs/fit"),
-        metavar="DIR",
-        help="(runs/fit); no earlier fit is replaced",
-    )
-    parser.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    add_log_options(model)
+    add_output(files, "folder of the fit, without an earlier fit (runs/fit)", Path("runs/fit"))
+    add_no_figure(files)
+    add_json(files)
     parser.set_defaults(run=_fit)
 
 
@@ -96,17 +84,20 @@ def _fit(options: argparse.Namespace) -> int:
     return 0
 
 
-def add_consistency(parser: argparse.ArgumentParser) -> None:
-    """Add the option that takes logs whose columns contradict each other."""
-    parser.add_argument(
+def add_log_options(group) -> None:
+    """Add --propellers and --allow-inconsistent."""
+    group.add_argument(
+        "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
+    )
+    group.add_argument(
         "--allow-inconsistent",
         action="store_true",
-        help="take logs whose columns contradict each other (wrong clock, axes, order of motors), with a warning",
+        help="accept logs with contradictory columns (wrong clock, axes, order of motors), with a warning",
     )
 
 
 def load_logs(files: Sequence[Path], allow_inconsistent: bool) -> list:
-    """The drones of logs, with different names; warns of contradictions that are allowed."""
+    """Load the drones of logs with unique names; warn of allowed contradictions."""
     from jaxdrones.flights import inconsistencies, load_flights
 
     logs = load_flights(*files, allow_inconsistent=allow_inconsistent)
@@ -117,7 +108,7 @@ def load_logs(files: Sequence[Path], allow_inconsistent: bool) -> list:
 
 
 def parameter_table(report) -> str:
-    """Lines of text with the estimate and standard error of each parameter."""
+    """Table of the estimate and standard error of each parameter."""
     width = max(map(len, report.parameters))
     lines = [
         f"  {name.ljust(width)}  {e.value: .4g} +- {e.std_error:.2g}"

@@ -1,11 +1,11 @@
-"""Options of `jaxdrones fly` and `jaxdrones compare`: the conditions of a flight."""
+"""Options of `jaxdrones fly` and `jaxdrones compare` for the conditions of a flight."""
 
 import argparse
 import contextlib
 from typing import Any
 
-from jaxdrones import assets
 from jaxdrones.cli.common import bar, print_error
+from jaxdrones.cli.options import add_drones, add_vehicle
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.flights.conditions import CONTROLLERS, Conditions
 from jaxdrones.flights.fly import fly
@@ -14,28 +14,35 @@ from jaxdrones.urdf import load_params
 
 
 def add_conditions(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a flight but its name."""
+    """Add the options of a flight."""
     group = parser.add_argument_group("flight")
-    group.add_argument("--drones", type=int, metavar="N", help="number of drones")
-    group.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
+    add_drones(group)
+    add_vehicle(group, "cf2x")
     group.add_argument("--effects", metavar="A,B", help=f"{', '.join(EFFECTS | PAIRS)}, or none")
-    group.add_argument("--controller", help=f"{', '.join(CONTROLLERS)} (the vehicle's own)")
+    group.add_argument("--controller", metavar="NAME", help=f"{', '.join(CONTROLLERS)} (the vehicle's own)")
     group.add_argument(
         "--feedforward",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="whether the controller receives velocity and acceleration of the target (all do but pid, which receives "
-        "them in a comparison of controllers)",
+        help="feed velocity and acceleration of the target to the controller (yes; for pid only in a comparison of "
+        "controllers)",
     )
     group.add_argument("--control-hz", type=int, metavar="HZ", help="control rate; physics runs at 240 Hz or above")
-    group.add_argument("--duration", type=float, metavar="S", help="simulated time in seconds")
-    group.add_argument("--rotors", default="instant", help=f"{', '.join(ROTORS)} (instant)")
-    group.add_argument("--integrator", default="semi_implicit_euler", help=f"{', '.join(INTEGRATORS)}")
-    group.add_argument("--seed", type=int, help="start 1 cm (standard deviation) off, drawn with this seed")
+    group.add_argument("--duration", type=float, metavar="S", help="simulated time, s")
+    group.add_argument("--rotors", default="instant", metavar="NAME", help=f"{', '.join(ROTORS)} (instant)")
+    group.add_argument(
+        "--integrator",
+        default="semi_implicit_euler",
+        metavar="NAME",
+        help=f"{', '.join(INTEGRATORS)} (semi_implicit_euler)",
+    )
+    group.add_argument(
+        "--seed", type=int, metavar="K", help="seed of a random start, 1 cm standard deviation, or of an episode"
+    )
 
 
 def fly_options(options: argparse.Namespace, **more: Any) -> FlightLog:
-    """The record of the flight that the options describe; a progress bar shows how far it is.
+    """Fly with the options of the command line and a progress bar; return the log.
 
     Args:
         options: options of the command line.
@@ -46,7 +53,7 @@ def fly_options(options: argparse.Namespace, **more: Any) -> FlightLog:
 
 
 def check_conditions(options: argparse.Namespace, **more) -> None:
-    """Raise `ValueError` if the options describe no flight."""
+    """Raise `ValueError` for invalid options of a flight."""
     conditions = Conditions(options.flight, **_conditions(options), **more)
     load_params(conditions.vehicle)
 
@@ -58,7 +65,7 @@ def _conditions(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def warn(diverged: dict[str, str]) -> int:
-    """Write to stderr that a flight diverged, if it did; returns the exit code.
+    """Write a warning for a diverged flight to stderr; return the exit code.
 
     Args:
         diverged: result of `diverged`.
@@ -78,6 +85,6 @@ def _names(text: str | None) -> list[str] | None:
 
 @contextlib.contextmanager
 def progress(what: str = "flying"):
-    """A progress bar, as a function of the share that is done; `None` without tqdm, silent without a terminal."""
+    """Progress bar as a function of the completed fraction; `None` without tqdm, silent without a terminal."""
     with bar(100, what, "%") as shown:
         yield None if shown is None else lambda share: shown.update(round(100 * share) - shown.n)

@@ -11,9 +11,10 @@ from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import check_writable, folder, print_error, run_folder
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
+from jaxdrones.cli.options import add_backend, add_json, add_no_figure, add_output, add_set
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.report import as_json, table
-from jaxdrones.cli.settings import parse_settings
+from jaxdrones.cli.settings import add_realistic, parse_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
 from jaxdrones.flights.conditions import BACKENDS
@@ -44,11 +45,11 @@ def add(commands) -> None:
         help="fly one of the control examples, or a trained policy",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Fly one of the control examples of gym-pybullet-drones (2021), or an episode of a trained policy\n"
-        "(--policy RUN); writes a log and a figure, prints a table of results.\n\n"
+        "(--policy RUN). Write a log and a figure, print a table of results.\n\n"
         + "\n".join(f"  {name:14} {flight.summary}" for name, flight in FLIGHTS.items()),
         epilog="Every example has its own defaults. `jaxdrones list` shows the names to choose from.\n\n"
-        "Exit code 1 says that a flight diverged: at the end a drone is upside down, or its error is 1 m (or 1 m/s)\n"
-        "larger than at the start. Files of an earlier flight in --output are replaced, other files stay.",
+        "A flight has diverged if at its end a drone is upside down, or its error is 1 m (or 1 m/s) larger than at\n"
+        "the start. Files of an earlier flight in --output are replaced.",
         allow_abbrev=False,
     )
     parser.add_argument("flight", metavar="FLIGHT", nargs="?", help=", ".join(FLIGHTS))
@@ -63,36 +64,31 @@ def add(commands) -> None:
         metavar="RUN",
         help="in place of FLIGHT: a folder of `jaxdrones train`, or file.py:name, whose code is executed",
     )
-    policy.add_argument("--task", metavar="TASK", help="with --policy file.py:name: the task to fly")
-    policy.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="with --policy file.py:name: option of the environment (action, observation, ...)",
-    )
-    bullet.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
+    policy.add_argument("--task", metavar="TASK", help="with file.py:name: task to fly, as for `jaxdrones train`")
+    add_realistic(policy, "with file.py:name: ")
+    add_set(policy, "with file.py:name: option of the environment (action, observation, ...)")
+    add_backend(bullet)
     bullet.add_argument(
         "--obstacles", action="store_true", help="add the obstacles of gym-pybullet-drones (2021) (bullet)"
     )
     bullet.add_argument("--gui", action="store_true", help="show Bullet's window, with motor sliders (bullet)")
-    shown.add_argument("--video", type=folder, metavar="FILE", help="film the flight as .mp4 or .gif; either backend")
+    shown.add_argument("--video", type=folder, metavar="FILE", help="film of the flight, .mp4 or .gif")
     shown.add_argument(
-        "--renderer", help=f"of the film: {', '.join(films.RENDERERS)} (page where Chromium is installed, else jax)"
+        "--renderer",
+        metavar="NAME",
+        help=f"of the film: {', '.join(films.RENDERERS)} (page if Chromium is installed, else jax)",
     )
-    add_live(shown, "show the flight in the browser while it is flown, in real time")
+    add_live(shown, "show the flight in the browser in real time")
     shown.add_argument(
         "--cameras",
         action="store_true",
-        help="write the pictures of each drone's camera as PNG and into the log; either backend",
+        help="write the images of each drone's camera as PNG and into the log",
     )
-    files.add_argument(
-        "-o", "--output", type=folder, metavar="DIR", help="folder of log and figure (runs/FLIGHT, RUN/flight)"
-    )
+    add_output(files, "folder of log and figure (runs/FLIGHT, RUN/flight)")
     files.add_argument("--csv", action="store_true", help="write the log as CSV too")
     files.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM signals too (cf2x, cf2p)")
-    files.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
-    files.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    add_no_figure(files)
+    add_json(files)
     parser.set_defaults(run=functools.partial(_fly, parser))
 
 
@@ -110,7 +106,7 @@ def _fly(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
 
 
 def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Raise for options that the policy, or the example, says itself."""
+    """Raise for options that contradict the policy or the example."""
     if options.renderer is not None and options.video is None:
         raise UserError(f"--renderer {options.renderer} is given without --video FILE; give both or none")
     if options.policy is None:
@@ -118,13 +114,15 @@ def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Non
             raise UserError(f"--set {options.set[0]} is given without --policy file.py:name; give both or none")
         if options.task is not None:
             raise UserError(f"--task {options.task} is given without --policy file.py:name; leave it out, or give both")
+        if options.realistic:
+            raise UserError("--realistic is given without --policy file.py:name; leave it out, or give both")
         return
     own = is_user_policy(options.policy)
     names = ["flight", *([] if own else ["drones", "vehicle"]), *_OF_EXAMPLES]
     for name in names:
         if getattr(options, name) != parser.get_default(name):
             what = "the task" if own else "the run"
-            raise UserError(f"{name} {getattr(options, name)} is given beside --policy; {what} says what is flown")
+            raise UserError(f"{name} {getattr(options, name)} is given beside --policy; {what} determines it")
 
 
 def _fly_example(options: argparse.Namespace) -> int:
@@ -151,7 +149,8 @@ def _fly_policy(options: argparse.Namespace) -> int:
     from jaxdrones.training.episode import EpisodeConditions, fly_episode, to_record
 
     check_choice("backend", options.backend, BACKENDS)
-    run, seed = open_policy(options.policy, options.task, False, _options_of_task(options)), options.seed or 0
+    run = open_policy(options.policy, options.task, options.realistic, _options_of_task(options))
+    seed = options.seed or 0
     recipe = run.recipe()
     check_seed("seed", seed)
     vehicle = "any vehicle" if recipe.realistic == "any" else str(recipe.options.get("vehicle", "cf2x"))
@@ -192,7 +191,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
 
 
 def _options_of_task(options: argparse.Namespace) -> dict[str, Any]:
-    """The options of `jaxdrones.make` for a policy of a user's file; for a run what --set gives, which is refused."""
+    """Options of `jaxdrones.make` for a policy of a user's file; for a run those of --set, an error."""
     chosen = parse_settings(options.set)
     for name in ("drones", "vehicle"):
         if name in chosen:
@@ -210,7 +209,7 @@ def _report(
     diverged: dict[str, str],
     end: dict | None = None,
 ) -> None:
-    """Print the results from a time on, s; `end` describes how an episode of a policy ended."""
+    """Print the results after a time, s; `end` describes the end of an episode."""
     rows = results.results(record, after)
     if options.json:
         about = record.conditions.as_dict() | (end or {})
@@ -227,7 +226,7 @@ def _report(
 
 
 def _check_files(options: argparse.Namespace, output: Path) -> None:
-    """Raise if a file that is asked for cannot be written, before the flight."""
+    """Raise before the flight if an output file cannot be written."""
     names = ["log.npz", *["log.csv"] * options.csv, *["flight.png"] * (not options.no_figure)]
     for name in names:
         check_writable(output / name)
@@ -243,7 +242,7 @@ def _check_files(options: argparse.Namespace, output: Path) -> None:
 def _write(
     record: FlightLog, options: argparse.Namespace, output: Path, title: str, panels: Sequence[str]
 ) -> list[Path]:
-    """Write log, figure, film and pictures, as asked for; returns their paths."""
+    """Write log, figure, film and pictures; return their paths."""
     files = [output / "log.npz"]
     save_npz(record, files[0], options.pwm)
     if options.csv:

@@ -1,4 +1,4 @@
-"""Option --live of `jaxdrones fly` and `jaxdrones train`: the browser shows what happens while it happens."""
+"""Option --live of `jaxdrones fly` and `jaxdrones train`: a live view in the browser."""
 
 import argparse
 import contextlib
@@ -10,21 +10,21 @@ from jaxdrones.cli.report import percent
 from jaxdrones.visualization.viewer.live import Live
 
 WAIT = 60.0
-"""How long a flight waits for the first viewer, s."""
+"""Wait of a flight for the first viewer, s."""
 
 
 def add_live(parser: argparse._ActionsContainer, what: str) -> None:
-    """Add the option, which gives the port: 0, which is any free one, where it is given alone."""
-    text = f"{what}; prints the address, which only this machine reaches (at a free PORT)"
+    """Add --live, with an optional port; the default of 0 is any free port."""
+    text = f"{what}; prints its local address (at a free PORT)"
     parser.add_argument("--live", type=int, nargs="?", const=0, metavar="PORT", help=text)
 
 
 @contextlib.contextmanager
 def live_server(port: int | None, quiet: bool, title: str | None = None) -> Iterator[Live | None]:
-    """A context with a server whose address is printed, on stderr if `quiet`; with `None` without a port.
+    """Context with a server, or `None` without a port; prints the address, on stderr if `quiet`.
 
     Raises:
-        ValueError: the port is taken.
+        ValueError: a port in use.
     """
     if port is None:
         yield None
@@ -39,17 +39,17 @@ def live_server(port: int | None, quiet: bool, title: str | None = None) -> Iter
 
 
 class LiveTraining:
-    """Shows an episode of the newest policy, and the learning curve, after every evaluation of a training."""
+    """Live view of a training: learning curve and an episode of the newest policy after every evaluation."""
 
     def __init__(self, live: Live, trainer: Any, run: Any, what: str, then: Callable[[int, dict[str, float]], None]):
-        """Prepare; nothing is flown yet.
+        """Prepare, without a flight.
 
         Args:
-            live: where it is shown.
+            live: live view.
             trainer: trainer of the run.
-            run: run, which holds the newest policy.
-            what: what is trained, for the title.
-            then: function that is given the progress afterwards.
+            run: run with the newest policy.
+            what: title.
+            then: function for the progress afterwards.
         """
         self._live, self._trainer, self._run, self._what = live, trainer, run, what
         self._then = then
@@ -57,7 +57,7 @@ class LiveTraining:
         self._curve: list[tuple[float, float]] = []
 
     def update(self, count: int, now: dict[str, float]) -> None:
-        """Pass the progress on; fly and show an episode, if the newest metrics are those of an evaluation."""
+        """Forward the progress; fly and show an episode after an evaluation."""
         if "evaluated_return" in now:
             self._show(count, now)
         self._then(count, now)

@@ -1,4 +1,4 @@
-"""The versions of the libraries, and the machine."""
+"""Versions of libraries, and description of the machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NOT_INSTALLED = "not installed"
 
 
 def version(library: str) -> str:
-    """The version of an installed library, by the name under which it is installed."""
+    """Version of an installed library by its distribution name."""
     try:
         return importlib.metadata.version(library)
     except importlib.metadata.PackageNotFoundError:
@@ -24,7 +24,7 @@ def version(library: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """The versions of this library, of what it is built on, and of Python."""
+    """Versions of this library, of its main dependencies, and of Python."""
     return {library: version(library) for library in LIBRARIES} | {"python": platform.python_version()}
 
 
@@ -37,19 +37,19 @@ def processor() -> str:
 
 
 def devices() -> list[str]:
-    """The devices that JAX computes on, such as `gpu: NVIDIA H200`.
+    """Devices of JAX, such as `gpu: NVIDIA H200`.
 
     Raises:
-        UserError: JAX finds none, for example none of the platforms that `JAX_PLATFORMS` names.
+        UserError: no device, for example of the platforms in `JAX_PLATFORMS`.
     """
     try:
         return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
-    except (AssertionError, RuntimeError) as error:  # an assertion, where the only platform asked for has no driver
+    except (AssertionError, RuntimeError) as error:  # an assertion, if the only requested platform has no driver
         platforms = os.environ.get("JAX_PLATFORMS", "")
         why = str(error) or f"JAX_PLATFORMS is {platforms!r}"
         raise UserError(f"jax finds no device: {why}; JAX_PLATFORMS=cpu leaves accelerators out") from error
 
 
 def cores() -> int:
-    """Number of processor cores that this process may use."""
+    """Number of processor cores for this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -4,6 +4,7 @@ import argparse
 import json
 
 from jaxdrones import assets
+from jaxdrones.cli.options import add_json
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
@@ -14,14 +15,14 @@ from jaxdrones.training.algorithms import ALGORITHMS
 def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
-        "list", help="vehicles, effects, tasks, actions, ... to choose from", allow_abbrev=False
+        "list", help="print the names of vehicles, effects, tasks, actions, ...", allow_abbrev=False
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.set_defaults(run=_list)
 
 
 def known_names() -> dict[str, list[str]]:
-    """The names to choose from, by kind."""
+    """Known names by kind."""
     return {
         "flights": list(FLIGHTS),
         "vehicles": list(assets.vehicles()),

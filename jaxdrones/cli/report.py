@@ -1,4 +1,4 @@
-"""Results as text: tables, JSON, success rates and evaluations."""
+"""Formatting of results: tables, JSON, success rates and evaluations."""
 
 import json
 import math
@@ -31,7 +31,7 @@ _COLUMNS = {  # result: (heading, format)
 
 
 def as_json(results: dict[str, Any]) -> str:
-    """One line of JSON; numbers that are not finite, which JSON lacks, are null."""
+    """One line of JSON, with null for numbers that are not finite."""
     return json.dumps(_finite(results), allow_nan=False)
 
 
@@ -44,7 +44,7 @@ def _finite(x):
 
 
 def table(results: list[dict]) -> str:
-    """Results as text: columns aligned under their headings, one line per drone."""
+    """Table of results, one line per drone."""
     names = list(results[0])
     rows = [[_COLUMNS[name][0] for name in names]]
     rows += [
@@ -56,13 +56,13 @@ def table(results: list[dict]) -> str:
 
 
 def described(recipe) -> str:
-    """The task, the learner and the options that differ from their defaults, such as `hover by bptt`."""
+    """Title of a recipe: task, learner and options, such as `hover by bptt`."""
     options = "".join(f", {name} {x}" for name, x in recipe.options.items())
     return f"{recipe.task} by {recipe.algorithm}{realism(recipe.realistic)}{options}"
 
 
 def evaluation_table(report: dict) -> str:
-    """The entries of `report_as_dict` as lines of text."""
+    """Table of the entries of `report_as_dict`."""
     episodes, error = report["episodes"], report["final_error_percentiles"]
     ends = ", ".join(f"{name} {percent(share, episodes)}" for name, share in report["end_rates"].items()) or "none"
     others = ", ".join(f"{name} {x:.3g}" for name, x in report["final_metrics"].items() if name not in ("error",))
@@ -96,7 +96,7 @@ def success(report: dict) -> str:
 
 
 def _counted(report: dict) -> str:
-    """The number of episodes, and of distinct ones if some are repetitions."""
+    """Number of episodes, and of distinct ones if different."""
     episodes, distinct = report["episodes"], report["distinct_episodes"]
     if distinct == episodes:
         return f"{episodes:,}"
@@ -105,12 +105,12 @@ def _counted(report: dict) -> str:
 
 
 def percent(share: float, episodes: int) -> str:
-    """A fraction of the episodes in percent, with enough digits to tell all of them from all but one."""
+    """Fraction of the episodes in percent, with enough digits to resolve one episode."""
     return f"{100 * share:.{_digits(episodes)}f} %"
 
 
 def _digits(episodes: int) -> int:
-    """Decimals of a percentage with which one episode is at least one unit of the last digit."""
+    """Decimals of a percentage that resolve one episode."""
     return max(1, math.ceil(math.log10(episodes)) - 2)
 
 

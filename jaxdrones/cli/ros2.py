@@ -7,9 +7,9 @@ import math
 import time
 from typing import Any
 
-from jaxdrones import assets
 from jaxdrones.checks import check_choice, check_number, check_positive, check_whole
 from jaxdrones.cli.common import folder, print_error, print_warning
+from jaxdrones.cli.options import add_backend, add_drones, add_json, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
@@ -37,38 +37,49 @@ def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser("ros2", help="fly a team on the topics of ROS 2", allow_abbrev=False)
     team = parser.add_argument_group("team")
-    team.add_argument("--drones", type=int, default=1, metavar="N", help="number of drones (1)")
-    team.add_argument("--vehicle", default="cf2x", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
-    team.add_argument("--backend", default="explicit", help=f"{', '.join(BACKENDS)} (explicit)")
-    team.add_argument("--controller", help=f"of positions, velocities: {', '.join(CONTROLLERS)} (the vehicle's own)")
+    add_drones(team, 1)
+    add_vehicle(team, "cf2x")
+    add_backend(team)
+    team.add_argument(
+        "--controller", metavar="NAME", help=f"of positions, velocities: {', '.join(CONTROLLERS)} (the vehicle's own)"
+    )
     team.add_argument("--control-hz", type=int, default=100, metavar="HZ", help="control and message rate (100)")
-    team.add_argument("--height", type=float, default=1.0, metavar="M", help="at which the drones start (1)")
+    team.add_argument("--height", type=float, default=1.0, metavar="M", help="initial height, m (1)")
     watch = parser.add_argument_group("clock and failsafe")
     wire = parser.add_argument_group("messages")
     pace = watch.add_mutually_exclusive_group()
     pace.add_argument("--lockstep", action="store_true", help="advance by calls of the service /step")
     pace.add_argument("--real-time", action="store_true", help="advance by the clock (default)")
     watch.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
-    watch.add_argument("--duration", type=float, metavar="S", help="simulated seconds (until it is interrupted)")
-    wire.add_argument("--camera", metavar="WxH", help="a camera on every drone, of this resolution (none)")
+    watch.add_argument("--duration", type=float, metavar="S", help="simulated time, s (until Ctrl-C)")
+    wire.add_argument("--camera", metavar="WxH", help="resolution of a camera on every drone, pixels (none)")
     wire.add_argument("--camera-hz", type=float, default=10.0, metavar="HZ", help="images per second (10)")
     watch.add_argument(
-        "--timeout", type=float, default=1.0, metavar="S", help="time without a command before the failsafe acts (1)"
+        "--timeout", type=float, default=1.0, metavar="S", help="seconds without a command before the failsafe acts (1)"
     )
-    watch.add_argument("--wait", type=float, default=30.0, metavar="S", help="seconds until the first command (30)")
-    watch.add_argument("--failsafe", default="hover", help=f"without commands: {', '.join(ACTIONS)} (hover)")
-    wire.add_argument("--transport", default="auto", help=f"{', '.join(TRANSPORTS)} (rclpy if there, or cyclonedds)")
+    watch.add_argument("--wait", type=float, default=30.0, metavar="S", help="the same before the first command (30)")
+    watch.add_argument("--failsafe", default="hover", metavar="NAME", help=f"{', '.join(ACTIONS)} (hover)")
+    _add_transport(wire)
     wire.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
-    wire.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    add_json(wire)
     parser.set_defaults(run=_run)
     commands = parser.add_subparsers(metavar="[replay]", title="commands")
     replay = commands.add_parser("replay", help="publish the messages of a bag", allow_abbrev=False)
     replay.add_argument("bag", type=folder, metavar="BAG", help="folder of a bag; nothing is simulated")
     replay.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
-    replay.add_argument("--transport", default="auto", help=f"{', '.join(TRANSPORTS)} (rclpy if there, or cyclonedds)")
-    replay.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    _add_transport(replay)
+    add_json(replay)
     replay.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     replay.set_defaults(run=functools.partial(_replay, parser))
+
+
+def _add_transport(group) -> None:
+    group.add_argument(
+        "--transport",
+        default="auto",
+        metavar="NAME",
+        help=f"{', '.join(TRANSPORTS)} (rclpy if installed, else cyclonedds)",
+    )
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -105,7 +116,7 @@ def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:
 
 
 def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Simulation:
-    """The team, hovering side by side."""
+    """Team in hover, side by side."""
     n, hz = options.drones, options.control_hz
     check_whole("drones", n)
     check_positive("speed", options.speed, "")
@@ -140,7 +151,7 @@ def _camera(options: argparse.Namespace) -> Camera | None:
 
 
 def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    """Publish a bag at the pace at which it was recorded."""
+    """Publish a bag at its recorded pace."""
     for name in vars(options):
         if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
             raise UserError(f"--{name.replace('_', '-')} is an option of flights; leave it out of `replay`")

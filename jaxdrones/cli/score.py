@@ -1,11 +1,12 @@
-"""The command `jaxdrones score`."""
+"""`jaxdrones score`."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.common import bar, check_writable, folder
-from jaxdrones.cli.fit import add_consistency, load_logs
+from jaxdrones.cli.fit import add_log_options, load_logs
+from jaxdrones.cli.options import add_json
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
 
@@ -18,8 +19,8 @@ def add(commands) -> None:
         "score",
         help="compare a vehicle with recorded flights",
         description="Simulate a vehicle from every state of flight logs on the recorded inputs (open loop), and print "
-        "its errors after 0.1, 0.25 and 0.5 s. A model that stays where it starts and the nominal vehicle are printed "
-        "for comparison. A log with set-points is also simulated as a whole, with the firmware's PID (closed loop).",
+        "its errors after 0.1, 0.25 and 0.5 s, beside those of a constant state and of the nominal vehicle. A log with "
+        "set-points is also simulated as a whole, with the firmware's PID (closed loop).",
         allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="logs, see `jaxdrones fit`")
@@ -32,12 +33,9 @@ def add(commands) -> None:
     parser.add_argument(
         "--nominal", default=_NOMINAL, metavar="NAME|URDF", help=f"the vehicle to compare with ({_NOMINAL})"
     )
-    parser.add_argument(
-        "--propellers", default="2.1+", metavar="NAME", help="propellers of the Crazyflie, for logs with PWM (2.1+)"
-    )
-    add_consistency(parser)
+    add_log_options(parser)
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw recorded and simulated paths (.png or .pdf)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    add_json(parser)
     parser.set_defaults(run=_score)
 
 
@@ -98,7 +96,7 @@ def _score(options: argparse.Namespace) -> int:
 
 
 def open_loop_table(models: dict[str, Any]) -> str:
-    """Lines of text with the open-loop errors of each model after each horizon."""
+    """Table of the open-loop errors of each model after each horizon."""
     lines = ["model     after (s)  position (m)  velocity (m/s)  attitude (rad)  rates (rad/s)"]
     for model, horizons in models.items():
         for rows, e in horizons.items():
@@ -108,7 +106,7 @@ def open_loop_table(models: dict[str, Any]) -> str:
 
 
 def closed_loop_table(models: dict[str, list[dict[str, Any]]]) -> str:
-    """Lines of text with path distances, tracking errors and mean PWM of each vehicle in each flight."""
+    """Table of path distances, tracking errors and mean PWM of each vehicle in each flight."""
     lines = ["model     flight                            xy (m)  xyz (m)  tracking real, sim (m)  PWM real, sim"]
     for model, flights in models.items():
         for e in flights:

@@ -1,4 +1,4 @@
-"""Settings and options that several commands take: --set NAME=VALUE, --vehicle and --realistic."""
+"""Settings shared by several commands: --set, --drones, --vehicle, --realistic and --config."""
 
 import argparse
 import ast
@@ -14,16 +14,16 @@ from jaxdrones.envs.named_tasks import task_function
 from jaxdrones.errors import UserError
 from jaxdrones.user_code import blame, is_reference
 
-# Arguments of `Recipe.of` that are options of the command.
+# Arguments of `Recipe.of` with their own options.
 _NO_SETTINGS = ("cls", "task", "algorithm", "realistic")
 
 
 REALISTIC_KINDS = ("any",)
-"""What may follow --realistic."""
+"""Arguments of --realistic."""
 
 
 def add_realistic(parser: argparse.ArgumentParser, where: str = "") -> None:
-    """Add the option --realistic, or --realistic any; `where` begins its help."""
+    """Add --realistic, with the optional argument `any`; `where` is a prefix of its help."""
     parser.add_argument(
         "--realistic",
         nargs="?",
@@ -31,7 +31,7 @@ def add_realistic(parser: argparse.ArgumentParser, where: str = "") -> None:
         default=False,
         type=_kind,
         metavar="any",
-        help=f"{where}simulate rotor lag, drag, delay, sensor noise and random parameters; with `any` another vehicle "
+        help=f"{where}simulate rotor lag, drag, delay, sensor noise and random parameters; with `any` a random vehicle "
         "of 20 g to 3 kg in every episode",
     )
 
@@ -43,7 +43,7 @@ def _kind(text: str) -> str:
 
 
 def task_first(arguments: list[str]) -> list[str]:
-    """The arguments with `--realistic TASK` as `TASK --realistic`, whose task is not meant to say how."""
+    """Reorder `--realistic TASK` to `TASK --realistic`."""
     arguments = list(arguments)
     for i, (option, word) in enumerate(itertools.pairwise(arguments)):
         if option == "--realistic" and (word in TASKS or is_reference(word)):
@@ -52,10 +52,10 @@ def task_first(arguments: list[str]) -> list[str]:
 
 
 def with_config(arguments: list[str]) -> list[str]:
-    """The arguments of `train` with the options of `--config FILE`, which those of the command line override.
+    """Insert the options of `train --config FILE`; options of the command line override them.
 
     Raises:
-        UserError: the file is missing or is not TOML.
+        UserError: a missing file, or one that is not TOML.
     """
     command = next((i for i, word in enumerate(arguments) if not word.startswith("-")), None)
     if command is None or arguments[command] != "train" or "--config" not in arguments[:-1]:
@@ -78,12 +78,12 @@ def with_config(arguments: list[str]) -> list[str]:
 
 
 def _listed(values: list[Any]) -> str:
-    """Values as --sweep takes them."""
+    """Values in the syntax of --sweep."""
     return ",".join(map(str, values))
 
 
 def parse_settings(texts: list[str]) -> dict[str, Any]:
-    """The name and value of every --set; of a name that is given twice, the last value."""
+    """Name and value of every --set; the last value of a repeated name."""
     changes: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -98,21 +98,21 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
 
 
 def asked_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """What --set and --vehicle give.
+    """Settings of --set, --drones and --vehicle.
 
     Raises:
-        ValueError: both give the vehicle, or a --set is no NAME=VALUE.
+        ValueError: a duplicate, or a --set that is not NAME=VALUE.
     """
     changes = parse_settings(options.set)
-    if options.vehicle is None:
-        return changes
-    if "vehicle" in changes:
-        raise UserError(f"--set vehicle={changes['vehicle']} is given beside --vehicle; give one of them")
-    return changes | {"vehicle": options.vehicle}
+    given = {name: getattr(options, name) for name in ("drones", "vehicle") if getattr(options, name) is not None}
+    for name in given:
+        if name in changes:
+            raise UserError(f"--set {name}={changes[name]} is given beside --{name}; give one of them")
+    return changes | given
 
 
 def _value(text: str) -> Any:
-    """A Python literal, or else a string; `nan` and `inf` are numbers."""
+    """Python literal, or else a string; `nan` and `inf` are numbers."""
     try:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError, RecursionError, MemoryError):
@@ -121,10 +121,10 @@ def _value(text: str) -> Any:
 
 @contextlib.contextmanager
 def user_mistakes(changes: dict[str, Any], task: str):
-    """Turn errors that options of a task cause into errors that name these options.
+    """Context that converts errors caused by options of a task to a `UserError` with their names.
 
     Raises:
-        UserError: in place of an error of Python or JAX that did not arise in a user's file.
+        UserError: in place of an error of Python or JAX outside of a user's file.
     """
     try:
         yield

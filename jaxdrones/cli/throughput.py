@@ -1,4 +1,4 @@
-"""Programs whose steps are counted, and a timer: the plant, the plant under a controller, and an environment."""
+"""Benchmark programs and timers: the plant, the plant under a controller, and an environment."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SHORTEST = 0.02  # s, of a measurement
 
 
 def crazyflies(worlds: int, drones: int) -> tuple[Params, State, Float[Array, "w n 4"]]:
-    """A team of Crazyflies, its starts in all worlds, and rotor speeds near hover to hold, RPM."""
+    """Team of Crazyflies, its starts in all worlds, and constant rotor speeds near hover, RPM."""
     params = repeat(load_params("cf2x"), drones)
     i = jnp.arange(drones)
     start = State.at_rest(jnp.stack([0.2 * i, 0.0 * i, 1.0 + 0.3 * i], axis=-1))
@@ -33,7 +33,7 @@ def crazyflies(worlds: int, drones: int) -> tuple[Params, State, Float[Array, "w
 
 
 def held(step: Step, params: Params, length: int) -> Callable[[State, Float[Array, "n 4"]], Float[Array, "n 3"]]:
-    """`(start, rpm) -> final positions` of one world that holds its rotor speeds for `length` steps."""
+    """`(start, rpm) -> final positions` of one world with constant rotor speeds for `length` steps."""
 
     def fly(start: State, rpm: Array) -> Array:
         return jax.lax.scan(lambda state, _: (step(params, state, rpm), None), start, length=length)[0].pos
@@ -42,7 +42,7 @@ def held(step: Step, params: Params, length: int) -> Callable[[State, Float[Arra
 
 
 def controlled(step: Step, params: Params, length: int, dt: float) -> Callable[[State], Float[Array, "n 3"]]:
-    """`start -> final positions` of one world in which the PID holds every drone in its place for `length` steps."""
+    """`start -> final positions` of one world with a position hold by the PID for `length` steps."""
     pilot = functools.partial(pid.control, pid.gains("cf2x"), dt=dt)
 
     def fly(start: State) -> Array:
@@ -56,13 +56,12 @@ def controlled(step: Step, params: Params, length: int, dt: float) -> Callable[[
 
 
 def episodes(env: Env, worlds: int, length: int) -> tuple[Callable[[Any, Array], Any], Any]:
-    """The steps of many worlds of an environment with random actions, and the episodes that they begin with.
+    """Steps of many worlds of an environment with random actions and automatic resets.
 
-    Every episode that ends is followed by a new one; they begin out of step. All that a learner takes is stored in
-    each step.
+    Episodes are out of step. All inputs of a learner are stored in each step.
 
     Returns:
-        `fly(episodes, key)`, which makes `length` control steps in every world, and the episodes.
+        `fly(episodes, key)` for `length` control steps in every world, and the initial episodes.
     """
     auto = AutoReset(env)
     _, begun = jax.jit(jax.vmap(auto.reset))(jax.random.split(jax.random.key(0), worlds))
@@ -83,14 +82,14 @@ def episodes(env: Env, worlds: int, length: int) -> tuple[Callable[[Any, Array],
 
 
 def first_call(function: Callable, *arguments: Any) -> float:
-    """Seconds of the first call, in which a function compiles itself."""
+    """Duration of the first call, with compilation, s."""
     start = time.perf_counter()
     jax.block_until_ready(function(*arguments))
     return time.perf_counter() - start
 
 
 def seconds(program: Callable, *arguments: Any, repeats: int) -> dict[str, float]:
-    """Median and best seconds of a call, after calls that warm up; short calls are timed many at a time."""
+    """Median and best duration of a call after warm-up, s; short calls are timed in groups."""
 
     def of_calls(calls: int) -> float:
         start = time.perf_counter()

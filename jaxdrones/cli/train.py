@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jaxdrones import assets
-from jaxdrones.cli.common import INTERRUPTED, folder, print_error, print_warning, run_folder
+from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS
+from jaxdrones.cli.options import add_drones, add_json, add_no_figure, add_output, add_set, add_vehicle
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic, user_mistakes
 from jaxdrones.cli.train_output import (
@@ -30,7 +30,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.visualization import plots
 
 _HOSTS_HELP = (
-    "All devices share the worlds. A CPU counts as N devices with\n"
+    "Worlds are sharded over all devices. A CPU counts as N devices with\n"
     "XLA_FLAGS=--xla_force_host_platform_device_count=N. On several hosts, start the same command on each, with a\n"
     "different --host. Host 0 writes the files; to --resume, each host needs a copy of the folder:\n"
     "  jaxdrones train hover --hosts 2 --host 0 --coordinator 127.0.0.1:9911"
@@ -43,100 +43,98 @@ def add(commands) -> None:
         "train",
         help="train a policy for a task",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Train a policy with settings that were found to work, and evaluate the best one.\n\n"
+        description="Train a policy with tuned settings, and evaluate the best one.\n\n"
         "The command writes these files:\n\n"
         "  best, last     policies, each a .msgpack and a .json\n"
-        "  state          everything that --resume needs to continue, bit for bit\n"
+        "  state          complete state of the training, for --resume\n"
         "  progress.csv   a row for each update\n"
         "  curve.png      learning curves\n"
-        "  report.json    the evaluation of the best policy, and the time that training took\n\n"
+        "  report.json    evaluation of the best policy, and duration of the training\n\n"
         "Ctrl-C keeps the best policy and the state. A run in --output, finished or not, is replaced only with\n"
         "--overwrite.\n\n"
         "  --resume                     continue a run that was stopped, with its own settings\n"
         "  --resume --budget 100        train a finished run for 100 more updates\n"
         "  --resume --budget 60s        train a stopped or finished run for 60 s more\n"
         "  --resume --set updates=400   train to 400 updates in total\n\n"
-        "A longer training continues as if all its updates had been asked for at the start: the learning rate rises\n"
-        "to its value at this point of the longer schedule. The best policy is replaced only by a better one.\n\n"
-        "A run of a task or vehicle of your own keeps the text of its file, and flies that text when it is resumed,\n"
-        "evaluated or flown: open runs of people you trust alone.",
-        epilog="JAX_COMPILATION_CACHE_DIR=folder keeps compiled programs, so that the next training starts sooner.\n\n"
+        "An extended training follows the schedule of its new length: the learning rate rises to its value at this\n"
+        "point of that schedule. The best policy is replaced only by a better one.\n\n"
+        "A run with your own task or vehicle keeps the text of its file, and executes that text when it is resumed,\n"
+        "evaluated or flown: open only runs that you trust.",
+        epilog="JAX_COMPILATION_CACHE_DIR=folder caches compiled programs for a faster start of the next training.\n\n"
         + _HOSTS_HELP,
         allow_abbrev=False,
     )
     parser.add_argument(
-        "task", metavar="TASK", help=f"{', '.join(TASKS)}; or file.py:function, a function of yours that returns a task"
+        "task", metavar="TASK", help=f"{', '.join(TASKS)}; or file.py:function, a function that returns a task"
     )
-    parser.add_argument("--vehicle", help=f"{', '.join(assets.vehicles())} or a .urdf file (cf2x)")
-    parser.add_argument("--algo", help=f"{', '.join(ALGORITHMS)} (bptt; gates: ppo)")
-    add_realistic(parser)
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds, each in DIR/seed-K (1)")
-    parser.add_argument("--seed", type=int, metavar="K", help="the first seed (0)")
-    parser.add_argument(
+    task = parser.add_argument_group("task and learner")
+    schedule = parser.add_argument_group("schedule")
+    files = parser.add_argument_group("files and output")
+    several = parser.add_argument_group("several hosts")
+    add_drones(task)
+    add_vehicle(task)
+    add_realistic(task)
+    task.add_argument("--algo", metavar="NAME", help=f"{', '.join(ALGORITHMS)} (bptt; gates: ppo)")
+    add_set(
+        task, "setting of the learner (worlds, horizon, learning_rate) or option of the environment (period, action)"
+    )
+    schedule.add_argument("--seeds", type=int, default=1, metavar="N", help="train N seeds, each in DIR/seed-K (1)")
+    schedule.add_argument("--seed", type=int, metavar="K", help="first seed (0)")
+    schedule.add_argument(
         "--budget",
         metavar="N|Ns",
-        help="number of updates, such as 300, or time per seed, such as "
-        "60s, 5m, 2h, for everything: compiling, updates, evaluations and files",
+        help="number of updates, such as 300, or total time per seed, such as 60s, 5m or 2h",
     )
-    parser.add_argument(
+    schedule.add_argument(
         "--stop-at",
         type=float,
         metavar="RATE",
-        help="stop when the lower bound of the success rate, such as 0.99, was reached in three evaluations in a row; "
+        help="stop when three consecutive evaluations reach this lower bound of the success rate, such as 0.99; "
         "evaluates more often",
     )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="setting of the learner (worlds, horizon, learning_rate) or of the environment (vehicle, period, drones)",
-    )
-    parser.add_argument(
+    schedule.add_argument(
         "--sweep",
         action="append",
         default=[],
         metavar="NAME=VALUE,VALUE",
-        help="train once for each value of a setting, such as learning_rate=1e-3,3e-3, each in a folder of its own in "
-        "the folder of the run; several sweeps train all combinations",
+        help="train once for each value of a setting, such as learning_rate=1e-3,3e-3, each in its own folder in DIR; "
+        "several sweeps train all combinations",
     )
-    parser.add_argument(
+    schedule.add_argument("--episodes", type=int, metavar="N", help="episodes per evaluation (1000)")
+    files.add_argument(
         "--config",
         metavar="FILE",
         help="TOML file of options by their long names, such as seeds = 3, with tables [set] and [sweep]; options of "
         "the command line override it",
     )
-    parser.add_argument("--episodes", type=int, metavar="N", help="episodes of every evaluation (1000)")
-    parser.add_argument("--output", type=folder, metavar="DIR", help="folder of the run (runs/TASK)")
-    parser.add_argument(
+    add_output(files, "folder of the run (runs/TASK)")
+    files.add_argument(
         "--resume", action="store_true", help="continue the run in --output; with --budget train a finished one longer"
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
-    parser.add_argument(
+    files.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
+    files.add_argument(
         "--log",
         metavar="NAME,NAME",
         help="log the metrics of every update with tensorboard, wandb or mlflow, if installed",
     )
-    add_live(parser, "show an episode in the browser after every evaluation, and the learning curve")
-    parser.add_argument("--hosts", type=int, metavar="N", help="number of processes that train together (1)")
-    parser.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
-    parser.add_argument(
-        "--coordinator", metavar="ADDRESS:PORT", help="address of host 0, and a port that is free there"
-    )
-    parser.add_argument("--no-figure", action="store_true", help="draw no learning curves; needs no matplotlib")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    add_live(files, "show learning curve and an episode in the browser after every evaluation")
+    add_no_figure(files)
+    add_json(files)
+    several.add_argument("--hosts", type=int, metavar="N", help="number of processes (1)")
+    several.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
+    several.add_argument("--coordinator", metavar="ADDRESS:PORT", help="address and free port of host 0")
     parser.set_defaults(run=_on_hosts)
 
 
 def _on_hosts(options: argparse.Namespace) -> int:
-    """Train on one host or several; all but the first print nothing and write to a temporary folder."""
+    """Train on one or several hosts; only the first one prints and keeps its files."""
     hosts = (options.hosts, options.host, options.coordinator)
     if hosts == (None, None, None):
         return _train(options)
     if None in hosts:
         raise UserError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")
     if options.live is not None:
-        raise UserError("--live is given with --hosts, whose trainings are not shown; leave one of them out")
+        raise UserError("--live is given with --hosts; leave one of them out")
     from jaxdrones.training import distributed
 
     with contextlib.ExitStack() as stack:

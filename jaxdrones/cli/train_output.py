@@ -14,7 +14,7 @@ from jaxdrones.visualization import learning_curves
 
 
 def warn_of_unknown_settings(recipe) -> None:
-    """Warn that there are no tuned settings for a learner on a task."""
+    """Warn of missing tuned settings for a learner on a task."""
     task = recipe.task + " on any vehicle" * (recipe.realistic == "any")
     print_warning(
         f"there are no tuned settings for {recipe.algorithm} on {task}; if it fails, try "
@@ -23,7 +23,7 @@ def warn_of_unknown_settings(recipe) -> None:
 
 
 def warn_of_failure(run, report: dict[str, Any]) -> None:
-    """Say that a training did not succeed, if that is so, and what to try."""
+    """Warn of an unsuccessful training, with advice."""
     advice = "try --seeds 3, a longer --budget, another --algo, or a smaller --set learning_rate"
     evaluation = report["evaluation"]
     successes, success, episodes = (evaluation[name] for name in ("successes", "success", "episodes"))
@@ -37,26 +37,26 @@ def warn_of_failure(run, report: dict[str, Any]) -> None:
 
 
 _FIGURE_SECONDS = 2.0  # to draw the learning curves
-_TOLERANCE = 1.1  # times the budget from which on it was missed
+_TOLERANCE = 1.1  # times the budget, tolerance
 
 
 class Deadlines:
-    """Deadlines of the seeds, which share the time of --budget evenly."""
+    """Deadlines of the seeds, with equal shares of the time of --budget."""
 
     def __init__(self, request: Request, begin: float):
-        """Prepare; the command began at the time `begin` of `time.perf_counter`, s."""
+        """Prepare, with the start of the command at `begin`, s on the clock of `time.perf_counter`."""
         self.seconds, self._text, self._begin = request.seconds, request.budget, begin
         self._end = begin + request.seeds * (request.seconds or 0.0)
         self._figure = _FIGURE_SECONDS * request.figure
         self._left = request.seeds
 
     def start(self) -> None:
-        """Say so if compiling took the time of a whole run."""
+        """Warn if compilation took the time of a whole run."""
         if self.seconds is not None and time.perf_counter() - self._begin > self.seconds:
             print_warning(f"compiling took all of --budget {self._text}; one update is made, --resume continues it")
 
     def next(self) -> float | None:
-        """The time of `time.perf_counter` at which the next training has to be over, s; `None` without a limit."""
+        """End of the next training, s on the clock of `time.perf_counter`; `None` without a limit."""
         if self.seconds is None:
             return None
         now = time.perf_counter()
@@ -65,7 +65,7 @@ class Deadlines:
         return deadline
 
     def warn_if_missed(self) -> None:
-        """Say so if everything took longer than the budget."""
+        """Warn if the total time exceeds the budget."""
         spent, budget = time.perf_counter() - self._begin, self._end - self._begin
         if self.seconds is not None and spent > _TOLERANCE * budget + 1:
             print_warning(
@@ -75,16 +75,16 @@ class Deadlines:
 
 
 class ProgressDisplay(contextlib.ExitStack):
-    """A progress bar, and a line for every evaluation."""
+    """Progress bar, with a line for every evaluation."""
 
     def __init__(self, total: int | None, what: str, episodes: int, print_line):
         """Prepare; the bar appears with the first call of `update`.
 
         Args:
-            total: number of updates of the whole training; `None` if it is not known.
+            total: number of updates of the whole training; `None` if unknown.
             what: label, such as the seed.
             episodes: number of episodes of an evaluation.
-            print_line: function that prints a line.
+            print_line: function to print a line.
         """
         super().__init__()
         self._total, self._what, self._episodes, self._print_line = total, what, episodes, print_line
@@ -92,7 +92,7 @@ class ProgressDisplay(contextlib.ExitStack):
         self._evaluated, self._started = "", False
 
     def update(self, count: int, now: dict[str, float]) -> None:
-        """Move the bar, and print the results of an evaluation."""
+        """Update the bar, and print the results of an evaluation."""
         if not self._started:
             self._started = True
             self._bar = self.enter_context(bar(self._total, self._what, "update", initial=count))
@@ -115,7 +115,7 @@ class ProgressDisplay(contextlib.ExitStack):
 
 
 def _training_return(now: dict[str, float]) -> str:
-    """The mean return in training, where it is measured."""
+    """Mean return in training, if measured."""
     if "return" not in now:
         return ""
     return "no episode ended yet" if math.isnan(now["return"]) else f"in training {now['return']:.1f}"
@@ -126,16 +126,16 @@ def _speed(steps_per_s: float) -> str:
 
 
 def quiet(_: str) -> None:
-    """Print nothing: with --json, stdout is for the JSON object."""
+    """Print nothing, for --json."""
 
 
 def remaining_best(run) -> str:
-    """A phrase that names the best policy that an unfinished training leaves."""
+    """Phrase for the best policy of an unfinished training."""
     return f"{run.folder / 'best'}.msgpack is the best policy, of update {run.sidecar_entry('best', 'update')}"
 
 
 def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
-    """Draw the learning curves, unless --no-figure is given."""
+    """Draw the learning curves, unless with --no-figure."""
     from jaxdrones.learning.evaluation import wilson_interval
 
     if not request.figure:
@@ -154,7 +154,7 @@ def show_results(request: Request, runs: dict) -> int:
     """Draw learning curves, choose the best seed, and print the results.
 
     Args:
-        request: request, whose folder gets the figure and, with several seeds, the best policy.
+        request: request with the folder for the figure and, with several seeds, the best policy.
         runs: run of each seed.
     """
     from jaxdrones.training.run import Run
@@ -194,7 +194,7 @@ def show_results(request: Request, runs: dict) -> int:
 
 
 def _early(run, report: dict[str, Any]) -> str:
-    """A phrase that says that a training stopped early because its policy was good enough."""
+    """Phrase for an early stop at the success rate."""
     if not report["stopped_at_success"]:
         return ""
     return f"; stopped at update {report['updates']}, success {run.recipe('last').stop_at:g} was reached"

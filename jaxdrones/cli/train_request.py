@@ -1,4 +1,4 @@
-"""The request of `jaxdrones train`: its options, parsed and checked once, and the runs and the recipe that follow."""
+"""Request of `jaxdrones train`: validated options, runs and recipe."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """A training as it was requested; `None` stands for an option that was left out."""
+    """Requested training; `None` for options left out."""
 
     task: str
     algorithm: str | None
@@ -32,7 +32,7 @@ class Request:
     episodes: int | None
     budget: str | None
     seconds: float | None
-    """Time per run that --budget gives, s."""
+    """Time per run of --budget, s."""
     seeds: int
     seed: int | None
     output: Path
@@ -47,10 +47,10 @@ class Request:
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> Request:
-        """The request of a command line.
+        """Request of a command line.
 
         Raises:
-            UserError: options that are out of range or contradict each other.
+            UserError: options that are out of range or contradictory.
         """
         check_at_most("seeds", options.seeds, _MAX_SEEDS)
         if options.seed is not None:
@@ -81,10 +81,10 @@ class Request:
         )
 
     def swept(self, sweep: list[str]) -> list[Request]:
-        """A request for each combination of the values of --sweep, each with a folder of its own.
+        """Request for each combination of the values of --sweep, each with its own folder.
 
         Raises:
-            UserError: a sweep is not NAME=VALUE,VALUE,..., or --set gives its name too.
+            UserError: a sweep that is not NAME=VALUE,VALUE,..., or that is also in --set.
         """
         rows = [parse_sweep(text) for text in sweep]
         for name, _ in rows:
@@ -104,7 +104,7 @@ class Request:
 
     @property
     def folders(self) -> dict[int, Path]:
-        """The folder of each seed; of one seed that of the command."""
+        """Folder of each seed; for one seed that of the command."""
         first = self.seed or 0
         if self.seeds == 1:
             return {first: self.output}
@@ -112,16 +112,16 @@ class Request:
 
     @property
     def again(self) -> str:
-        """The command that continues this training."""
+        """Command that continues this training."""
         command = f"jaxdrones train {self.task} --output {self.output} --resume"
         first = min(self.folders)
         return command + f" --seeds {self.seeds}" * (self.seeds > 1) + f" --seed {first}" * (first > 0)
 
     def runs(self) -> dict:
-        """The run of each seed.
+        """Run of each seed.
 
         Raises:
-            UserError: there is nothing to continue.
+            UserError: nothing to continue.
         """
         from jaxdrones.training.run import Run
 
@@ -135,11 +135,11 @@ class Request:
         return {run.sidecar_entry("state", "seed") if self.resume else self.seed or 0: run}
 
     def recipe(self, runs: dict):
-        """The recipe of the runs: that of a training that is continued, or the requested one."""
+        """Recipe of the runs: that of a continued training, or the requested one."""
         return self._resumed_recipe(runs) if self.resume else self._new_recipe(runs)
 
     def episodes_of(self, runs: dict) -> int:
-        """Episodes of an evaluation; a resumed run keeps their number, so that its evaluations remain comparable."""
+        """Episodes of an evaluation; a resumed run keeps their number, for comparable evaluations."""
         started = (run.sidecar_entry("state", "episodes") for run in runs.values() if run.started and self.resume)
         return next(started, 1000 if self.episodes is None else self.episodes)
 
@@ -156,7 +156,7 @@ class Request:
         return dataclasses.replace(recipe, stop_at=self.stop_at)
 
     def _resumed_recipe(self, runs: dict):
-        """The recipe of the runs with the requested number of updates; all other settings have to be the same."""
+        """Recipe of the runs with the requested number of updates; all other settings must be unchanged."""
         from jaxdrones.training import user_files
         from jaxdrones.training.recipe import Recipe
 
@@ -195,7 +195,7 @@ class Request:
 
 
 def parse_sweep(text: str) -> tuple[str, list[Any]]:
-    """The name and the values that `--sweep NAME=VALUE,VALUE` gives."""
+    """Name and values of `--sweep NAME=VALUE,VALUE`."""
     name, _, values = text.partition("=")
     try:
         parsed = list(ast.literal_eval(f"[{values}]"))
@@ -207,7 +207,7 @@ def parse_sweep(text: str) -> tuple[str, list[Any]]:
 
 
 def parse_budget(text: str | None) -> tuple[int | None, float | None]:
-    """The number of updates, or the seconds, that --budget gives; the other is `None`."""
+    """Number of updates, or seconds, of --budget; the other is `None`."""
     if text is None:
         return None, None
     try:
@@ -225,7 +225,7 @@ def parse_budget(text: str | None) -> tuple[int | None, float | None]:
 
 
 def remaining(runs: dict, updates: int, seconds: float | None) -> dict:
-    """The runs to train: all, or without those that are finished if nothing more is requested.
+    """Runs to train: all, or without the finished ones if nothing more is requested.
 
     Args:
         runs: run of each seed.
@@ -237,7 +237,7 @@ def remaining(runs: dict, updates: int, seconds: float | None) -> dict:
 
 
 def _updates(run) -> int:
-    """Number of updates that the training of a run was to make, or after which it stopped early."""
+    """Number of updates of the training of a run, possibly after an early stop."""
     return run.sidecar_entry("state", "recipe")["config"]["updates"]
 
 
@@ -259,14 +259,13 @@ def _not_free(run) -> UserError:
 
 
 def _total(had: int, requested: int | None, more: bool, finished: bool) -> int:
-    """Total number of updates of a run that is resumed.
+    """Total number of updates of a resumed run.
 
     Args:
         had: total number of updates so far.
         requested: requested number of updates.
-        more: whether it is added to those of a finished run, as with --budget; otherwise, as with --set, it is the
-            total.
-        finished: whether all updates so far were made.
+        more: whether to add it to those of a finished run, as with --budget, or to take it as the total, as with --set.
+        finished: whether the run is finished.
     """
     if requested is None:
         return had

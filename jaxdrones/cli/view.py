@@ -8,6 +8,7 @@ from pathlib import Path
 
 from jaxdrones.checks import check_choice, check_whole
 from jaxdrones.cli.common import check_writable, folder
+from jaxdrones.cli.options import add_json, add_output
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
@@ -20,9 +21,9 @@ def add(commands) -> None:
     """Add the command."""
     parser = commands.add_parser(
         "view",
-        help="write a page that plays recorded flights in three dimensions",
-        description="Write one page of HTML that plays the logs of `jaxdrones fly` in three dimensions, with drones, "
-        "obstacles, targets and plots. Any browser opens it, without a network. Several logs are shown together.",
+        help="write a page with a 3D player of recorded flights",
+        description="Write one HTML page that plays logs of `jaxdrones fly` in 3D, with drones, obstacles, targets and "
+        "plots. It needs no network. Several logs are shown together.",
         allow_abbrev=False,
     )
     parser.add_argument(
@@ -30,19 +31,21 @@ def add(commands) -> None:
         type=folder,
         nargs="+",
         metavar="FLIGHT",
-        help="a folder of `jaxdrones fly`, a run, or a log.npz; others of several are skipped",
+        help="a folder of `jaxdrones fly`, a run, or a log.npz; of several paths, others are skipped",
     )
-    parser.add_argument(
-        "-o", "--output", type=folder, metavar="FILE", help="path of the page (flight.html beside the first log)"
+    page = parser.add_argument_group("page and output")
+    filmed = parser.add_argument_group("film")
+    add_output(page, "path of the page (flight.html beside the first log)", metavar="FILE")
+    page.add_argument(
+        "--others", default="ghosts", metavar="NAME", help=f"layout of further flights: {', '.join(LAYOUTS)} (ghosts)"
     )
-    parser.add_argument("--others", default="ghosts", help=f"how further flights are shown: {', '.join(LAYOUTS)}")
-    parser.add_argument("--title", help="title of the page (the conditions of the first flight)")
-    parser.add_argument("--video", type=folder, metavar="FILE", help="film the page too, .mp4 or .gif (needs Chromium)")
-    parser.add_argument("--camera", default="orbit", help=f"of the film: {', '.join(CAMERAS)}")
-    parser.add_argument("--size", default="1280x720", metavar="WxH", help="of the film, pixels")
-    parser.add_argument("--fps", type=int, default=24, help="frames per second of the film")
-    parser.add_argument("--open", action="store_true", help="open the page in the browser")
-    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
+    page.add_argument("--title", help="title of the page (the conditions of the first flight)")
+    page.add_argument("--open", action="store_true", help="open the page in the browser")
+    add_json(page)
+    filmed.add_argument("--video", type=folder, metavar="FILE", help="film of the page, .mp4 or .gif; needs Chromium")
+    filmed.add_argument("--camera", default="orbit", metavar="NAME", help=f"{', '.join(CAMERAS)} (orbit)")
+    filmed.add_argument("--size", default="1280x720", metavar="WxH", help="size, pixels (1280x720)")
+    filmed.add_argument("--fps", type=int, default=24, metavar="N", help="frames per second (24)")
     parser.set_defaults(run=_view)
 
 
@@ -76,10 +79,10 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _flights(paths: list[Path]) -> tuple[dict[Path, Path], list[Path]]:
-    """The logs of flights by the paths that were given, and those of the paths, as of `runs/compare/*`, without a log.
+    """Logs of flights by path, and paths without a log, as of `runs/compare/*`.
 
     Raises:
-        ValueError: none of them is a flight, or one is not there.
+        ValueError: no flight among the paths, or a missing path.
     """
     skipped = [path for path in paths if path.exists() and not _is_flight(path)]
     if len(skipped) == len(paths) > 1:
@@ -89,7 +92,7 @@ def _flights(paths: list[Path]) -> tuple[dict[Path, Path], list[Path]]:
 
 
 def _is_flight(path: Path) -> bool:
-    """Whether a path leads to a log; a damaged .npz counts, so that it is not passed over."""
+    """Whether a path is a log; a damaged .npz counts, to raise an error."""
     try:
         log = find_log(path)
     except ValueError:
@@ -101,7 +104,7 @@ def _is_flight(path: Path) -> bool:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Width and height of a text such as `1280x720`."""
+    """Width and height from a string such as `1280x720`."""
     width, cross, height = text.partition("x")
     if not (cross and width.isdecimal() and height.isdecimal()) or int(width) % 2 or int(height) % 2:
         raise UserError(f"size of the film is {text!r}; give two even numbers of pixels, for example 1280x720")

@@ -338,11 +338,12 @@ def test_a_fault_of_the_library_shows_its_traceback_and_ends_with_70(error, caps
     assert "this is a fault of jaxdrones, please report it" in err.splitlines()[-1]
 
 
-def test_exit_codes_are_in_the_help(capsys):
+@pytest.mark.parametrize("command", [[], ["fly"], ["ros2", "replay"]])
+def test_exit_codes_are_in_the_help(command, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(["--help"])
+        main([*command, "--help"])
     assert stop.value.code == 0
-    assert re.search(r"\n +2  a mistake.*\n +70  a fault of jaxdrones", capsys.readouterr().out)
+    assert re.search(r"\n +2  invalid arguments.*\n +70  internal error", capsys.readouterr().out)
     with pytest.raises(SystemExit) as stop:
         main(["soar"])
     assert stop.value.code == 2

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.vector import safe_sqrt
 
@@ -29,12 +28,7 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
     b = (T/k_F, tau_x/(k_F L), tau_y/(k_F L), tau_z/k_T). With an infinite `max_rpm` they are this solution for every
     demand, as in gym-pybullet-drones, whose allocation has no upper limit. The allocation is differentiable; the
     derivative of a rotor at a limit is zero.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
     """
-    check_shape("thrust", thrust, (), "one number for one drone; use jax.vmap for a team")
-    check_shape("torque", torque, (3,), "a vector for one drone; use jax.vmap for a team")
     x, y, _ = params.rotor_pos.T
     arm = params.arm
     matrix = jnp.stack([jnp.ones_like(x), y / arm, -x / arm, params.rotor_spin])

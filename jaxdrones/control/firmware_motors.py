@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import vector
-from jaxdrones.checks import check_choice, check_shape
+from jaxdrones.checks import check_choice
 from jaxdrones.control.allocation import mixer
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -112,14 +112,10 @@ def duty_cycles(
         battery: voltage, V; None disables battery compensation, so that a duty cycle equals the command.
         voltage: filtered voltage at the last call, V; zero at the first call.
         dt: time since the last call, s.
-
-    Raises:
-        ValueError: the voltages of a team (use `jax.vmap`).
     """
     commands = mix(thrust, torque)
     if battery is None:
         return voltage, within_range(commands)
-    check_shape("battery", battery, (), "one voltage for one drone; use jax.vmap for a team")
     kept = jnp.where(voltage > 0, _BATTERY_FILTER ** (dt / 0.001), 0)
     voltage = battery + kept * (voltage - battery)
     return voltage, within_range(duty_cycle(motor, commands, voltage))

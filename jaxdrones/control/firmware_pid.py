@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_positive, check_shape
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import (
     Gains,
@@ -26,7 +25,7 @@ from jaxdrones.control.firmware_loops import (
     velocity_loop,
 )
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_memory, check_single, check_state
+from jaxdrones.control.single import check_single
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -149,7 +148,7 @@ def control(
         dt: time between calls, s; 0.002 on the vehicle.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
     check_single(params, state)
     memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
@@ -177,7 +176,7 @@ def pwm(
         dt: time between calls, s.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
     memory, attitude, thrust, torque = _fly(gains, memory, state, setpoint, dt)
     voltage, duty = motors.duty_cycles(gains.motor, thrust, torque, battery, memory.battery, dt)
@@ -188,9 +187,7 @@ def _fly(
     gains: Gains, memory: Memory, state: State, setpoint: AnySetpoint, dt: float
 ) -> tuple[Memory, Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
     """Memory, desired attitude (degrees), thrust and torque (16 bit)."""
-    check_positive("dt", dt, "s")
-    check_state(state)
-    check_memory(memory, init())
+    check_single(None, state, setpoint if isinstance(setpoint, Setpoint) else None)
     memory = _first_measured(gains, memory, state, dt)
     if isinstance(setpoint, Setpoint | Velocity):
         memory = _slow_loops(gains, memory, state, setpoint, dt)
@@ -201,10 +198,8 @@ def _fly(
     else:
         raise UserError(f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude or Rates")
     if isinstance(setpoint, Attitude):
-        check_shape("setpoint.rpy", setpoint.rpy, (3,), "one target for one drone")
         attitude = degrees(setpoint.rpy)
     if isinstance(setpoint, Rates):
-        check_shape("setpoint.omega", setpoint.omega, (3,), "one target for one drone")
         memory, target = memory.replace(rpy=attitude), degrees(setpoint.omega)
     else:
         memory, target = attitude_loop(gains, memory, state, attitude, dt)
@@ -223,11 +218,8 @@ def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Me
 
 def _slow_loops(gains: Gains, memory: Memory, state: State, setpoint: Setpoint | Velocity, dt: float) -> Memory:
     """Memory with new tilt and thrust where the loops of position and velocity are due."""
-    check_shape("setpoint.yaw", setpoint.yaw, (), "one target for one drone")
-    check_shape("setpoint.vel", setpoint.vel, (3,), "one target for one drone")
     period = jnp.maximum(_SLOW, dt)
     if isinstance(setpoint, Setpoint):
-        check_shape("setpoint.pos", setpoint.pos, (3,), "one target for one drone")
         ran, vel = position_loop(gains, memory, state, setpoint.pos, period)
     else:
         ran, vel = memory, in_heading_frame(state.quat, setpoint.vel)

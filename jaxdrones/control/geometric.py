@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_positive
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
@@ -59,12 +58,11 @@ def control(
         memory: returned unchanged; this controller has none.
         state: state of the drone.
         setpoint: target; all of pos, vel, acc, yaw and omega are used.
-        dt: time between calls, s; only checked.
+        dt: time between calls, s; not used.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
-    check_positive("dt", dt, "s")
     check_single(params, state, setpoint)
 
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_positive
 from jaxdrones.control import attitude
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import degrees, low_pass, settled
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_memory, check_setpoint, check_single, check_state
+from jaxdrones.control.single import check_single
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -135,7 +134,7 @@ def control(
         dt: time between calls, s; 0.002 on the vehicle.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
     check_single(params, state)
     memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
@@ -162,7 +161,7 @@ def pwm(
         dt: time between calls, s.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
     memory, axes, thrust, torque = _fly(gains, memory, state, setpoint, dt)
     voltage, duty = motors.duty_cycles(gains.motor, thrust, torque, battery, memory.battery, dt)
@@ -174,10 +173,7 @@ def _fly(
     gains: Gains, memory: Memory, state: State, setpoint: Setpoint, dt: float
 ) -> tuple[Memory, attitude.Axes, Float[Array, ""], Float[Array, "3"]]:
     """Memory, desired body axes, thrust and torque (16 bit)."""
-    check_positive("dt", dt, "s")
-    check_state(state)
-    check_setpoint(setpoint)
-    check_memory(memory, init())
+    check_single(None, state, setpoint)
     first = memory.running == 0
 
     pos_error = setpoint.pos - state.pos

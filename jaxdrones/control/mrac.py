@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_positive, is_concrete
+from jaxdrones.checks import check_number, is_concrete
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_memory, check_single
+from jaxdrones.control.single import check_single
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -128,11 +128,9 @@ def control(
         dt: time between calls, s.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
-    check_positive("dt", dt, "s")
     check_single(params, state, setpoint)
-    check_memory(memory, init())
     x = _state(state)
     model = jnp.where(memory.running > 0, memory.model, x)
     yaw = jnp.zeros(3).at[2].set(setpoint.yaw)

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_positive
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
@@ -132,10 +131,9 @@ def control(
         dt: time between calls, s.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
-    check_positive("dt", dt, "s")
-    check_single(params, state, setpoint, memory)
+    check_single(params, state, setpoint)
     memory, thrust, target = position_loop(gains, params, memory, state, setpoint, dt)
     memory, torque = attitude_loop(gains, memory, state, target, setpoint.omega, dt)
     return memory, rotor_speeds(params, thrust, torque)

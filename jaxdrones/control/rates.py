@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_positive, check_shape
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
@@ -56,12 +55,11 @@ def control(
         memory: returned unchanged; this controller has none.
         state: state of the drone.
         setpoint: target; pos, vel, acc and yaw are used, omega is not.
-        dt: time between calls, s; only checked.
+        dt: time between calls, s; not used.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
-    check_positive("dt", dt, "s")
     collective, omega = command(gains, params, state, setpoint)
     return memory, follow(gains, params, state, collective, omega)
 
@@ -90,8 +88,6 @@ def follow(
     gains: Gains, params: Params, state: State, collective: Float[Array, ""], omega: Float[Array, "3"]
 ) -> Float[Array, "4"]:
     """Inner loop: rotor speeds (RPM, up to `max_rpm`) for a collective thrust per mass and body rates."""
-    check_single(params, state)
-    check_shape("omega", omega, (3,), "body rates of one drone; use jax.vmap for a team")
     gyroscopic = vector.cross(state.omega, params.inertia * state.omega)
     torque = params.inertia * gains.rate * (omega - state.omega) + gyroscopic
     return rpm_from_wrench(params, jnp.maximum(params.mass * collective, 0), torque)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import check_positive
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import check_single
@@ -86,10 +85,9 @@ def control(
         dt: time between calls, s.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
-    check_positive("dt", dt, "s")
-    check_single(params, state, setpoint, memory)
+    check_single(params, state, setpoint)
 
     pos_error = setpoint.pos - state.pos
     pos_integral = memory.pos_integral + pos_error * dt

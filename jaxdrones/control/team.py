@@ -5,14 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxdrones.checks import check_whole
-
 
 def for_team(memory: Any, n: int) -> Any:
-    """Memory of a controller for each of `n` drones, with a leading drone axis on every array.
-
-    Raises:
-        ValueError: `n` < 1.
-    """
-    check_whole("number of drones", n)
+    """Memory of a controller for each of `n` drones, with a leading drone axis on every array."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x))), memory)

@@ -30,10 +30,10 @@ def control(
     The position target is the position of the drone and the yaw target its heading, so only the velocity error acts.
 
     Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or `dt` not positive.
+        ValueError: arrays of a team (use `jax.vmap`).
     """
     check_single(params, state)
-    check_shape("action", action, (4,), "direction (3) and magnitude of one drone; use jax.vmap for a team")
+    check_shape("action", action, (4,), "direction and magnitude of one drone; use jax.vmap for a team")
     return pid.control(gains, params, memory, state, setpoint(params, state, action), dt=dt)
 
 

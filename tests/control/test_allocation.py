@@ -222,12 +222,6 @@ def test_compiled_and_batched_allocations_equal_single_ones():
             np.testing.assert_allclose(other**2 / params.max_rpm**2, squares, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize(("name", "thrust", "torque"), [("thrust", (2,), (3,)), ("torque", (), (2, 3))])
-def test_wrenches_of_a_team_are_refused(name, thrust, torque):
-    with pytest.raises(ValueError, match=rf"{name} has shape .*expected .*use jax\.vmap"):
-        rpm_from_wrench(jaxdrones.load_params("cf2x"), jnp.zeros(thrust), jnp.zeros(torque))
-
-
 @jax.jit
 @partial(jax.vmap, in_axes=(None, 0))
 def wrenches_of(params, rpm):

@@ -98,12 +98,6 @@ def test_only_a_crazyflie_has_gains():
         pid.gains("hb")
 
 
-@pytest.mark.parametrize("n", [0, 2.0])
-def test_memory_is_for_a_whole_number_of_drones(n):
-    with pytest.raises(ValueError, match=r"number of drones is .*whole number of at least 1"):
-        for_team(pid.init(), n)
-
-
 def call(params, state, setpoint, memory=None):
     memory = pid.init() if memory is None else memory
     return pid.control(pid.gains(), params, memory, state, setpoint, dt=1 / 240)

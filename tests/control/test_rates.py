@@ -91,14 +91,6 @@ def test_the_yaw_of_a_setpoint_is_turned_to(yaw):
     assert jnp.all(turned < 0.01**2 / 8)
 
 
-def test_body_rates_of_a_team_are_refused():
-    team = team_of("cf2x", "cf2p")
-    with pytest.raises(ValueError, match=r"omega has shape \(2, 3\); expected \(3,\).*use jax\.vmap"):
-        rates.follow(rates.gains(), one(team), one(hovering(team)), jnp.array(9.8), jnp.zeros((2, 3)))
-    with pytest.raises(ValueError, match=r"state\.pos has shape \(2, 3\).*use jax\.vmap"):
-        rates.follow(rates.gains(), one(team), hovering(team), jnp.array(9.8), jnp.zeros(3))
-
-
 def hold_rates(gains, params, memory, state, omega, *, dt):
     return memory, rates.follow(gains, params, state, params.gravity, omega)
 

@@ -64,14 +64,6 @@ def test_the_length_of_the_direction_and_the_sign_of_the_share_do_not_matter():
     assert jnp.max(jnp.abs(call(jnp.array([0.3, -0.4, 0.5, 0.2])) - rpm)) > 1
 
 
-@pytest.mark.parametrize("shape", [(3,), (1, 4), ()])
-def test_an_action_is_four_numbers(shape):
-    team = team_of("cf2x")
-    memory, state = pid.init(), one(hovering(team))
-    with pytest.raises(ValueError, match=r"action has shape .*expected \(4,\): direction \(3\) and magnitude"):
-        velocity.control(pid.gains(), one(team), memory, state, jnp.zeros(shape), dt=1 / 48)
-
-
 @jax.jit
 @partial(jax.vmap, in_axes=(None, None, 0, 0, 0, 0))
 def call_in_sequence(params, dt, pos, quat, vel, action):

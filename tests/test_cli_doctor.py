@@ -109,7 +109,7 @@ def test_doctor_understands_every_requirement_of_the_project():
 @pytest.mark.slow
 @pytest.mark.float32
 def test_bench_stops_when_its_time_is_up(capsys):
-    assert main(["bench", "--worlds", "4", "8", "--seconds", "1e-6", "--json"]) == 0
+    assert main(["bench", "--worlds", "4,8", "--seconds", "1e-6", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     (row,) = told["rates"]
     assert row["what"] == "plant" and row["worlds"] == 4 and row["per_s"] > 0

@@ -42,11 +42,15 @@ def add(commands) -> None:
         allow_abbrev=False,
     )
     parser.add_argument(
-        "--worlds", type=int, nargs="+", metavar="N", help="numbers of worlds (1024 16384; more on an accelerator)"
+        "--worlds", type=_counts, metavar="N,N", help="numbers of worlds (1024,16384; more on an accelerator)"
     )
     parser.add_argument("--seconds", type=float, default=25.0, metavar="S", help="time limit, s (25)")
     add_json(parser)
     parser.set_defaults(run=_bench)
+
+
+def _counts(text: str) -> list[int]:
+    return [int(count) for count in text.split(",")]
 
 
 def _bench(options: argparse.Namespace) -> int:

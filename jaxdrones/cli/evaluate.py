@@ -31,14 +31,13 @@ def add(commands) -> None:
         metavar="RUN",
         help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed",
     )
-    own = parser.add_argument_group("policies of your own")
+    own = parser.add_argument_group("your own policy", "only with file.py:name")
     evaluation = parser.add_argument_group("evaluation")
-    where = "with file.py:name: "
-    own.add_argument("--task", metavar="TASK", help=f"{where}task to fly, as for `jaxdrones train`")
-    add_drones(own, where=where)
-    add_vehicle(own, where=where)
-    add_realistic(own, where)
-    add_set(own, f"{where}option of the environment (action, observation, ...)")
+    own.add_argument("--task", metavar="TASK", help="task to fly, as for `jaxdrones train`")
+    add_drones(own)
+    add_vehicle(own)
+    add_realistic(own)
+    add_set(own, "option of the environment (action, observation, ...)")
     add_backend(evaluation)
     evaluation.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
     evaluation.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")

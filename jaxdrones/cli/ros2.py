@@ -103,8 +103,7 @@ def _run(options: argparse.Namespace) -> int:
                 node.run(options.duration)
             except PeerLost as error:
                 lost = str(error)
-        report: dict[str, Any] = vars(node.flown) | {"simulated_s": simulation.ns / 1e9}
-        _print(options, report)
+        _print(options, vars(node.flown) | {"simulated_s": simulation.ns / 1e9})
     return 0 if lost is None else print_error(lost, 1)
 
 
@@ -112,7 +111,8 @@ def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:
     if options.json:
         print(as_json(report))
     else:
-        print(", ".join(f"{name} {value:g}" for name, value in report.items()))
+        names = {name: name.replace("_s", " (s)") if name.endswith("_s") else name for name in report}
+        print(", ".join(f"{names[name]} {value:g}" for name, value in report.items()))
 
 
 def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Simulation:

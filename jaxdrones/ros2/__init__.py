@@ -1,4 +1,4 @@
-"""A simulated team on the topics of ROS 2: messages, node, transports, bags, and a backend for Crazyswarm2."""
+"""ROS 2 interface of a simulated team: messages, node, transports, bags, and a backend for Crazyswarm2."""
 
 from jaxdrones.ros2.command import Command, Mode
 from jaxdrones.ros2.failsafe import Failsafe, PeerLost

@@ -1,4 +1,4 @@
-"""Bags of ROS 2: flights written to and read from MCAP files. Needs the extra `ros2`."""
+"""ROS 2 bags: write and read flights as MCAP files. Needs the extra `ros2`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Recorded(NamedTuple):
 
 
 def serialize(message: msg.Message) -> bytes:
-    """A message as ROS 2 encodes it: CDR, little-endian, with its header of four bytes."""
+    """Encode a message as CDR, little-endian, with its header of four bytes."""
     store = msg.typestore()
 
     def array(field: msg.Field, given: Any) -> np.ndarray:
@@ -36,21 +36,21 @@ def serialize(message: msg.Message) -> bytes:
 
 
 def deserialize(data: bytes, name: str) -> msg.Message:
-    """The message of the type `name` that bytes of ROS 2 hold."""
+    """Decode a message of the type `name` from CDR."""
     return msg.decode(name, msg.typestore().deserialize_cdr(data, name))
 
 
 class Recorder:
-    """Writes messages to a new bag; a context manager that finishes it."""
+    """Writer of messages to a new bag; a context manager that finishes it."""
 
     def __init__(self, path: Path):
         """Start a bag.
 
         Args:
-            path: folder that is made, with an MCAP file and `metadata.yaml` in it.
+            path: new folder, for an MCAP file and `metadata.yaml`.
 
         Raises:
-            ValueError: there is something at this path already, or its folder cannot be written.
+            ValueError: an existing path, or a parent without write access.
             ImportError: rosbags is not installed.
         """
         msg.typestore()
@@ -86,10 +86,10 @@ class Recorder:
 
 
 def read(path: Path) -> Iterator[Recorded]:
-    """The messages of a bag in the order of their times; those of types that are not known here are left out.
+    """Read the messages of a bag in the order of their times; unknown types are skipped.
 
     Raises:
-        ValueError: there is no bag at this path, or it is damaged.
+        ValueError: no bag, or a damaged one.
         ImportError: rosbags is not installed.
     """
     msg.typestore()
@@ -108,7 +108,7 @@ def write_flight(record: FlightLog, path: Path) -> None:
     """Write the log of a flight as a bag: clock, poses, twists, odometry and rotor speeds.
 
     Raises:
-        ValueError: there is something at this path already.
+        ValueError: an existing path.
         ImportError: rosbags is not installed.
     """
     with Recorder(path) as recorder:

@@ -1,4 +1,4 @@
-"""Commands of a drone, and the rotor speeds that fly them."""
+"""Commands of a drone, and their control."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from jaxdrones.state import State
 from jaxdrones.vector import sin_cos
 
 CONTROLLERS = {name: module for name, module in ALL_CONTROLLERS.items() if module is not firmware_pid}
-"""The controllers that fly velocities of a `Setpoint`, which the firmware's does not."""
+"""Controllers with velocity control by a `Setpoint`, unlike the firmware's."""
 
 
 class Mode(enum.IntEnum):
-    """Which part of a command counts."""
+    """Kind of a command."""
 
     POSITION = 0
     VELOCITY = 1
@@ -52,7 +52,7 @@ class Command(flax.struct.PyTreeNode):
 
     @classmethod
     def zero(cls, mode: Mode, **given: Any) -> Command:
-        """The command of one drone with everything at zero but what is given."""
+        """Command of one drone with zero defaults."""
         sizes: dict[str, tuple[int, ...]] = {"pos": (3,), "vel": (3,), "omega": (3,), "rpm": (4,)}
         numbers = ("pos", "yaw", "vel", "yaw_rate", "omega", "thrust", "rpm")
         values = {name: np.array(given.get(name, np.zeros(sizes.get(name, ()))), float) for name in numbers}
@@ -65,11 +65,11 @@ class Memory(flax.struct.PyTreeNode):
     controller: Any
     """Memory of the controller of positions and velocities."""
     heading: Array
-    """() heading that velocities are flown along, rad; it turns with the commanded yaw rate."""
+    """() heading of velocity commands, rad; the integral of the commanded yaw rate."""
 
 
 def init(controller: str, state: State) -> Memory:
-    """The memory of one drone at the start."""
+    """Initial memory of one drone."""
     return Memory(CONTROLLERS[controller].init(), rotation.to_rpy(state.quat)[2])
 
 
@@ -78,9 +78,9 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM.
 
-    Positions and velocities are flown by a controller of the package, body rates by the inner loop of `rates`, and
-    rotor speeds go to the engine as they are. A velocity is flown from wherever the drone is, as the velocity input of
-    the paper is.
+    Positions and velocities are tracked by a controller of the package, body rates by the inner loop of `rates`; rotor
+    speeds pass unchanged. A velocity command uses the present position as set-point, as in the velocity input of the
+    paper.
 
     Args:
         controller: a name of `CONTROLLERS`.

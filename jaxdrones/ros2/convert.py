@@ -1,4 +1,4 @@
-"""Pure functions between states and messages, and from messages to commands."""
+"""Conversion of states to messages and of messages to states and commands."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ _AMPERE_HOUR = 3600.0  # A s
 
 
 class Measurement(NamedTuple):
-    """What is published about a team of n drones at an instant: arrays of NumPy, of JAX while it is computed."""
+    """Published data of a team of n drones at an instant, as NumPy or JAX arrays."""
 
     pos: Array | np.ndarray  # (n, 3) m, world
     quat: Array | np.ndarray  # (n, 4) x, y, z, w, body to world
     vel: Array | np.ndarray  # (n, 3) m/s, body
     omega: Array | np.ndarray  # (n, 3) rad/s, body
-    acc: Array | np.ndarray | None  # (n, 3) specific force, m/s^2, body; not known from a log
+    acc: Array | np.ndarray | None  # (n, 3) specific force, m/s^2, body; unknown for a log
     rpm: Array | np.ndarray  # (n, 4) RPM
     battery: dict[str, Array | np.ndarray] | None  # (n,) each; see `Simulation`
 
 
 def stamp(ns: int) -> msg.Time:
-    """A time in ns as a message."""
+    """Convert a time, ns, to a message."""
     return msg.Time(*divmod(ns, _NS))
 
 
 def nanoseconds(time: msg.Time) -> int:
-    """A message's time in ns."""
+    """Time of a message, ns."""
     return time.sec * _NS + time.nanosec
 
 
 def state_messages(now: Measurement, i: int, ns: int) -> dict[str, msg.Message]:
-    """What drone `i` publishes at the simulated time `ns`, by the names of `topics.OUTPUTS`; images apart.
+    """Messages of drone `i` at the simulated time `ns`, by the names of `topics.OUTPUTS`, without images.
 
-    The speeds of the motors have no stamp. They come before the odometry, so that whoever hears it has them.
+    Motor speeds have no stamp. They precede the odometry, so a receiver of the odometry has them.
     """
     world, body = msg.Header(stamp(ns), topics.WORLD), msg.Header(stamp(ns), topics.body_frame(i))
     orientation = msg.Quaternion(*now.quat[i].tolist())
@@ -70,13 +70,13 @@ def state_messages(now: Measurement, i: int, ns: int) -> dict[str, msg.Message]:
 
 
 def motors(rpm: ArrayLike) -> msg.Float64MultiArray:
-    """Rotor speeds (4,), RPM, as a message."""
+    """Message of rotor speeds (4,), RPM."""
     layout = msg.MultiArrayLayout((msg.MultiArrayDimension("rotor, RPM", 4, 4),))
     return msg.Float64MultiArray(layout, tuple(np.asarray(rpm, float).tolist()))
 
 
 def _battery(reading: dict[str, float], header: msg.Header) -> msg.BatteryState:
-    """Readings of a battery; unknown ones are NaN, as the message asks for."""
+    """Message of a battery, with NaN for unknown readings."""
     unknown = math.nan
     charge, capacity = (reading.get(name, unknown) / _AMPERE_HOUR for name in ("charge", "capacity"))
     readings = {
@@ -100,7 +100,7 @@ def _battery(reading: dict[str, float], header: msg.Header) -> msg.BatteryState:
 
 
 def image_messages(rgb: np.ndarray, camera: Camera, i: int, ns: int) -> dict[str, msg.Message]:
-    """The image (h, w, 4) of the camera of drone `i` and its calibration."""
+    """Messages of the image (h, w, 4) of the camera of drone `i` and of its calibration."""
     header = msg.Header(stamp(ns), topics.optical_frame(i))
     height, width = rgb.shape[:2]
     pixels = np.ascontiguousarray(rgb[..., :3])
@@ -109,7 +109,7 @@ def image_messages(rgb: np.ndarray, camera: Camera, i: int, ns: int) -> dict[str
 
 
 def camera_info(camera: Camera, header: msg.Header) -> msg.CameraInfo:
-    """The calibration of a camera: pinhole, no distortion, pixel centers at whole numbers."""
+    """Calibration of a camera: pinhole, no distortion, pixel centers at integers."""
     (width, height), (across, down) = camera.resolution, camera.principal_point
     fx, fy = (pixels / 2 / slope for pixels, slope in zip(camera.resolution, camera.slopes, strict=True))
     cx, cy = width / 2 + across - 0.5, height / 2 + down - 0.5
@@ -126,7 +126,7 @@ def camera_info(camera: Camera, header: msg.Header) -> msg.CameraInfo:
 
 
 def to_state(odometry: Sequence[msg.Odometry], rotors: Sequence[msg.Float64MultiArray]) -> State:
-    """The state of a team from the messages of its drones; the inverse of `state_messages`."""
+    """State of a team from the messages of its drones; the inverse of `state_messages`."""
     quat = np.array([numbers(m.pose.pose.orientation) for m in odometry])
     vel = np.array([numbers(m.twist.twist.linear) for m in odometry])
     arrays: dict[str, Any] = {  # of NumPy: float64, as messages are, whatever the precision of JAX
@@ -151,7 +151,7 @@ def to_body(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 class Refused(UserError):
-    """An invalid message; errors of one `kind` differ in their values only."""
+    """Invalid message; errors of one `kind` differ only in values."""
 
     def __init__(self, field: str, found: str, advice: str):
         super().__init__(f"its {field} {found}; {advice}")
@@ -159,11 +159,10 @@ class Refused(UserError):
 
 
 def to_command(name: str, message: Any) -> Command:
-    """What a message on the topic `name` of `topics.COMMANDS` commands one drone.
+    """Convert a message of the topic `name` of `topics.COMMANDS` to a command of one drone.
 
     Raises:
-        Refused: numbers that are not finite, a frame that is not known, a quaternion of no length, or another
-            number of rotors.
+        Refused: numbers that are not finite, an unknown frame, a zero quaternion, or a wrong number of rotors.
     """
     return _COMMANDS[name](message)
 
@@ -207,7 +206,7 @@ _COMMANDS: dict[str, Callable[[Any], Command]] = {
 
 
 def numbers(vector: Any) -> tuple[float, ...]:
-    """The components of a point, a vector or a quaternion."""
+    """Components of a point, a vector or a quaternion."""
     return tuple(getattr(vector, field.name) for field in msg.fields(vector.NAME))
 
 

@@ -1,8 +1,8 @@
-"""A simulation backend for Crazyswarm2: its server flies this engine in place of its own.
+"""Simulation backend for Crazyswarm2.
 
-Crazyswarm2 imports `crazyflie_sim.backend.<name>` and takes the class `Backend` from it, so one file in that folder,
-`jaxdrones.py`, with the line `from jaxdrones.ros2.crazyswarm import Backend` is all it needs, and `sim: backend:
-jaxdrones` in its `server.yaml`. Parameters of the server, all optional: `sim.jaxdrones.vehicle` (cf2x),
+Crazyswarm2 imports the class `Backend` from `crazyflie_sim.backend.<name>`. Add a file `jaxdrones.py` to that folder,
+with the line `from jaxdrones.ros2.crazyswarm import Backend`, and `sim: backend: jaxdrones` to its `server.yaml`.
+Parameters of the server, all optional: `sim.jaxdrones.vehicle` (cf2x),
 `sim.jaxdrones.dt` (0.0005 s), `sim.jaxdrones.downwash` (true).
 
 The interface is that of Crazyswarm2's own backend `np`, read in its source; it has not been run inside Crazyswarm2.
@@ -51,15 +51,15 @@ class SwarmAction(Protocol):
 
 
 class Backend:
-    """Crazyswarm2's interface of a simulation backend."""
+    """Backend with Crazyswarm2's interface."""
 
     def __init__(self, node: Any, names: list[str], states: Sequence[SwarmState]):
-        """Start a team where Crazyswarm2 puts it, at rest or in motion.
+        """Start a team.
 
         Args:
-            node: the server, a node of rclpy; its parameters configure the backend, and it publishes the clock.
+            node: server, a node of rclpy; its parameters configure the backend, and it publishes the clock.
             names: of the drones.
-            states: of the drones at the start; the same objects are updated and returned by `step`.
+            states: initial states of the drones; the same objects are updated and returned by `step`.
 
         Raises:
             ValueError: a parameter out of range or an unknown vehicle.
@@ -86,12 +86,12 @@ class Backend:
     def step(self, states_desired: Sequence[Any], actions: Sequence[SwarmAction]) -> list[SwarmState]:
         """Advance all drones by `dt` and publish the clock.
 
-        A motor speed of Crazyswarm2 stands for the thrust that its fit gives it. The rotors here turn as fast as that
-        thrust needs, so that the firmware's thrust is flown whatever the coefficients of the vehicle.
+        Crazyswarm2's motor speeds are converted to thrust by its fit, and to rotor speeds of the vehicle, so the
+        firmware's thrust is independent of the vehicle's coefficients.
 
         Args:
-            states_desired: targets, not used.
-            actions: of the drones, in the order of their names; `None`, where there is no controller, stops the motors.
+            states_desired: targets, unused.
+            actions: of the drones, in the order of their names; `None`, without a controller, stops the motors.
 
         Returns:
             The states of the drones.
@@ -109,11 +109,11 @@ class Backend:
         return self._states
 
     def shutdown(self) -> None:
-        """End the flight; there is nothing to give back."""
+        """End the flight."""
 
 
 def thrust_of(rpm: np.ndarray) -> np.ndarray:
-    """Thrust of a Crazyflie's rotor by the fit that Crazyswarm2 simulates it with, N; never negative.
+    """Thrust of a Crazyflie's rotor by the fit of Crazyswarm2, N; never negative.
 
     Args:
         rpm: speeds of any shape, RPM.
@@ -122,16 +122,16 @@ def thrust_of(rpm: np.ndarray) -> np.ndarray:
 
 
 def _parameter(node: Any, name: str, default: Any) -> Any:
-    """A parameter of the server, or the default where it is not set."""
+    """Parameter of the server, or its default."""
     name = f"sim.jaxdrones.{name}"
     return node.get_parameter(name).value if node.has_parameter(name) else default
 
 
 def _rotors_of_motors(places: np.ndarray) -> np.ndarray:
-    """For each rotor of a vehicle (4, 3) the number of the Crazyflie's motor that sits in its quadrant.
+    """Number of the Crazyflie's motor in the quadrant of each rotor (4, 3) of a vehicle.
 
     Raises:
-        ValueError: the vehicle is no X configuration.
+        ValueError: not an X configuration.
     """
     signs = [
         tuple(row) for row in np.sign(np.where(np.abs(places[:, :2]) < 1e-6, 0, places[:, :2])).astype(int).tolist()

@@ -1,4 +1,4 @@
-"""CycloneDDS as the transport, with the names that ROS 2 gives topics and services on DDS. Needs the extra `ros2`."""
+"""CycloneDDS transport, with the DDS names of ROS 2. Needs the extra `ros2`."""
 
 from __future__ import annotations
 
@@ -33,35 +33,35 @@ LOOPBACK = """<CycloneDDS><Domain>
 <Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
-"""Configuration with which nothing leaves this computer."""
+"""Configuration for local communication."""
 
 _LARGEST_DOMAIN = 232  # whose ports are below 65,536
-_MOST = 1000  # messages that are taken at once
+_MOST = 1000  # messages taken at once
 _SERVICE = QoS(depth=10)
-_BLOCK = 0.1  # s for which a writer waits for readers that do not keep up
+_BLOCK = 0.1  # s, wait of a writer for slow readers
 _ANY = ViewState.Any | InstanceState.Any | SampleState.Any
-_domains: dict[int, Domain] = {}  # that this process configured; a domain can be configured once
+_domains: dict[int, Domain] = {}  # configured by this process; a domain can be configured once
 
 
 def _local_only() -> bool:
-    """Whether ROS 2 is told to stay on this computer, and CycloneDDS has no configuration of its own."""
+    """Whether ROS 2 is restricted to this computer, without a configuration of CycloneDDS."""
     told = os.environ.get("ROS_LOCALHOST_ONLY") == "1"
     told = told or os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     return told and "CYCLONEDDS_URI" not in os.environ
 
 
 class CycloneTransport:
-    """A participant of DDS that looks like a node's topics and services to ROS 2.
+    """DDS participant with the topics and services of a ROS 2 node.
 
     The network is that of `CYCLONEDDS_URI`; without it, `ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST` or
-    `ROS_LOCALHOST_ONLY=1` keep to this computer. Services are encoded as rmw_cyclonedds does.
+    `ROS_LOCALHOST_ONLY=1` restrict it to this computer. Services are encoded as in rmw_cyclonedds.
     """
 
     def __init__(self, domain: int | None = None):
-        """Join a domain, that of `ROS_DOMAIN_ID` when left out.
+        """Join a domain, by default that of `ROS_DOMAIN_ID`.
 
         Raises:
-            ValueError: the domain is no whole number of 0 to 232, or cannot be joined.
+            ValueError: a domain that is not an integer from 0 to 232, or cannot be joined.
         """
         given: Any = (os.environ.get("ROS_DOMAIN_ID") or "0") if domain is None else domain
         number = int(given) if isinstance(given, str) and given.isdecimal() else given
@@ -77,8 +77,8 @@ class CycloneTransport:
         self._services: list[tuple[DataReader, DataWriter, Answer]] = []
         self._clients: dict[str, tuple[DataWriter, DataReader]] = {}
         self._writers: dict[str, DataWriter] = {}
-        self._topics: dict[str, tuple[Topic, bool]] = {}  # by names on DDS, and whether it is published here
-        self._ends: list[tuple[Any, bool]] = []  # that were discovered, and whether they publish
+        self._topics: dict[str, tuple[Topic, bool]] = {}  # by DDS name, and whether it is published here
+        self._ends: list[tuple[Any, bool]] = []  # discovered, and whether they publish
         self._objections: list[str] = []
         self._said: set[str] = set()
         self._guid, self._seq = random.getrandbits(63), 0
@@ -89,7 +89,7 @@ class CycloneTransport:
         self._conditions = [self._watch(reader) for reader, _ in self._peers]
 
     def publisher(self, topic: Topic) -> Callable[[msg.Message], None]:
-        """A function that publishes messages."""
+        """Function that publishes messages."""
         name = f"rt/{topic.name}"
         self._topics[name] = topic, True
         writer = self._writer(name, idl.idl_type(topic.type), topic.qos)
@@ -106,14 +106,14 @@ class CycloneTransport:
         return publish
 
     def subscribe(self, topic: Topic, receive: Callable[[Any], None]) -> None:
-        """Have every message of a topic handed to a function."""
+        """Call a function with every message of a topic."""
         name, kind = f"rt/{topic.name}", idl.idl_type(topic.type)
         self._topics[name] = topic, False
         reader = self._reader(name, kind, topic.qos)
         self._readers.append((reader, kind, lambda sample: receive(msg.decode(topic.type, sample))))
 
     def serve(self, name: str, answer: Answer) -> None:
-        """Offer a service. It answers after the messages that arrived before its request are handed over."""
+        """Offer a service. Messages before a request are delivered before its answer."""
         reader = self._reader(f"rq/{name}Request", idl.REQUEST, _SERVICE)
         self._services.append((reader, self._writer(f"rr/{name}Reply", idl.REPLY, _SERVICE), answer))
 
@@ -121,7 +121,7 @@ class CycloneTransport:
         """Call a service of another process.
 
         Raises:
-            TimeoutError: there was no answer within `timeout` s.
+            TimeoutError: no answer within `timeout` s.
         """
         end = time.monotonic() + timeout
         if name not in self._clients:
@@ -147,14 +147,14 @@ class CycloneTransport:
             self.spin(left)
 
     def connect(self, topic: Topic, timeout: float) -> bool:
-        """Whether a subscriber is there, after at most `timeout` s, that hears what is published from now on."""
+        """Wait at most `timeout` s for a connected subscriber; return whether there is one."""
         return self._connect(self._writers[topic.name], idl.encode(msg.message_class(topic.type)()), timeout)
 
     def _connect(self, writer: DataWriter, sample: Any, timeout: float) -> bool:
-        """Wait until a reader knows a writer, and not only the writer the reader.
+        """Wait until a reader has discovered a writer.
 
-        Until then a reader skips what is written. It acknowledges a note without data, which nobody is handed, once it
-        is there.
+        Until then a reader misses messages. The writer sends a dispose note, which is not delivered, and waits for its
+        acknowledgment.
         """
         end = time.monotonic() + timeout
         while not writer.get_matched_subscriptions():
@@ -165,12 +165,12 @@ class CycloneTransport:
         return _acknowledged(writer, end - time.monotonic())
 
     def flush(self, timeout: float) -> bool:
-        """Whether every reader there is received what was published, after at most `timeout` s."""
+        """Wait at most `timeout` s for delivery to all readers; return whether it succeeded."""
         end = time.monotonic() + timeout
         return all(_acknowledged(writer, end - time.monotonic()) for writer in self._writers.values())
 
     def spin(self, timeout: float) -> None:
-        """Hand over what has arrived; wait up to `timeout` s if nothing has."""
+        """Deliver received messages; wait up to `timeout` s for one."""
         self._wake.wait(duration(seconds=max(timeout, 1e-6)))
         requests = [(request, *service) for service in self._services for request in _taken(service[0], idl.REQUEST)]
         for reader, kind, receive in self._readers:
@@ -183,7 +183,7 @@ class CycloneTransport:
             replies.write(idl.REPLY(guid=request.guid, seq=request.seq, success=success, message=message))
 
     def complaints(self) -> list[str]:
-        """What is wrong with other processes' ends of the topics here, such as another type; each is said once."""
+        """New mismatches with endpoints of other processes, such as another type."""
         ends = [(end, way) for end, way in self._ends if getattr(end, "topic_name", None) in self._topics]
         texts = self._objections + [text for end, way in ends if (text := self._mismatch(end, way))]
         found = [text for text in dict.fromkeys(texts) if text not in self._said]
@@ -198,7 +198,7 @@ class CycloneTransport:
         del self._wake, self._participant
 
     def _mismatch(self, end: Any, publishes: bool) -> str | None:
-        """Why an endpoint of another process does not match its topic here."""
+        """Mismatch of an endpoint of another process with its topic here."""
         topic, published = self._topics[end.topic_name]
         does = "publishes" if publishes else "subscribes to"
         who = f"a peer {does} /{topic.name}"
@@ -234,7 +234,7 @@ def _dds_qos(qos: QoS) -> Qos:
 
 
 def _acknowledged(writer: DataWriter, timeout: float) -> bool:
-    """Whether all readers of a writer have what it wrote, after at most `timeout` s."""
+    """Wait at most `timeout` s for the acknowledgments of all readers of a writer."""
     try:
         return writer.wait_for_acks(duration(seconds=max(timeout, 1e-3)))
     except AttributeError:  # cyclonedds 11.0.1 looks for the code of a timeout in Python's own Exception
@@ -242,7 +242,7 @@ def _acknowledged(writer: DataWriter, timeout: float) -> bool:
 
 
 def _taken(reader: DataReader, kind: type) -> list[Any]:
-    """The messages that wait at a reader, without the notes that a writer is gone."""
+    """Pending messages of a reader, without dispose notes."""
     return [sample for sample in reader.take(_MOST) if isinstance(sample, kind)]
 
 

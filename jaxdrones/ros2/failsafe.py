@@ -1,4 +1,4 @@
-"""The failsafe: what a drone does without commands."""
+"""Failsafe without commands."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from jaxdrones.state import State
 ACTIONS = ("hover", "land", "stop")
 
 _SINK_RATE = 0.4  # m/s
-_NEAR_GROUND = 0.03  # m above the height at which a drone rests
+_NEAR_GROUND = 0.03  # m above the height at rest
 
 
 class PeerLost(RuntimeError):
-    """Commands ceased, or could not be understood, and the flight is configured to stop then."""
+    """Missing or invalid commands with the failsafe `stop`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Failsafe:
-    """How long commands may be missing, and what happens then.
+    """Timeouts of commands, and action after them.
 
     Raises:
         ValueError: an unknown action, or a time that is not positive.
     """
 
     action: str = "hover"
-    """`hover`: stay where the last position command was, or else where the drone is. `land`: sink to the ground there
-    and stop the rotors. `stop`: end the flight with an error."""
+    """`hover`: hold the last commanded position, or else the present one. `land`: sink to the ground there and stop the
+    rotors. `stop`: end the flight with an error."""
     timeout: float = 1.0
     """Seconds without a command before the failsafe acts."""
     wait: float = 30.0
-    """Seconds until the first command before the failsafe acts."""
+    """The same before the first command."""
 
     def __post_init__(self):
         check_choice("failsafe", self.action, ACTIONS)
@@ -44,24 +44,24 @@ class Failsafe:
 
 
 class Watch:
-    """A timer of commands to one drone, or of steps in lockstep."""
+    """Timer of commands to one drone, or of steps in lockstep."""
 
     def __init__(self, failsafe: Failsafe, now: float):
         self._failsafe, self._heard, self._ever, self.lost = failsafe, now, False, False
 
     def hear(self, now: float) -> bool:
-        """Restart the timer; returns whether it had run out."""
+        """Restart the timer; return whether it had expired."""
         was_lost, self.lost, self._heard, self._ever = self.lost, False, now, True
         return was_lost
 
     def lose(self, now: float) -> bool:
-        """Whether the timer has run out since the last call."""
+        """Whether the timer has expired since the last call."""
         news = not self.lost and self.remaining(now) <= 0
         self.lost = self.lost or news
         return news
 
     def remaining(self, now: float) -> float:
-        """Time that is left, s."""
+        """Remaining time, s."""
         return self._heard + self.limit - now
 
     @property
@@ -71,12 +71,12 @@ class Watch:
 
 
 def resting_height(params: Params, i: int) -> float:
-    """Height of the center of mass of drone `i` of a team when it stands on the ground, m."""
+    """Height of the center of mass of drone `i` at rest on the ground, m."""
     return float(params.collision_height[i] / 2 - params.collision_offset[i])
 
 
 def hover(command: Command, state: State, i: int) -> Command:
-    """Stay at the last commanded position, or where drone `i` is if it was commanded otherwise."""
+    """Command to hold the last commanded position, or after other commands the present one of drone `i`."""
     if command.mode == Mode.POSITION:
         return command
     x, y, z, w = np.asarray(state.quat[i]).tolist()
@@ -85,7 +85,7 @@ def hover(command: Command, state: State, i: int) -> Command:
 
 
 def sink(command: Command, params: Params, state: State, i: int, dt: float) -> Command:
-    """The next command of a landing: lower by what `dt` (s) allows, and rotors off once drone `i` is on the ground."""
+    """Next command of a landing after `dt` (s), with rotors off once drone `i` is on the ground."""
     ground = resting_height(params, i)
     if command.mode == Mode.MOTORS or float(state.pos[i, 2]) < ground + _NEAR_GROUND:
         return Command.zero(Mode.MOTORS)

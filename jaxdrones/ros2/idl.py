@@ -1,4 +1,4 @@
-"""Message types of CycloneDDS, with the names and the encoding that ROS 2 gives them on DDS."""
+"""CycloneDDS message types, with the DDS names and encoding of ROS 2."""
 
 import functools
 from typing import Any
@@ -19,18 +19,18 @@ _KINDS: dict[str, Any] = {
     "float64": types.float64,
     "string": str,
 }
-_HEADER = {"guid": "uint64", "seq": "int64"}  # of requests and replies in rmw_cyclonedds: who asked, and which time
+_HEADER = {"guid": "uint64", "seq": "int64"}  # of requests and replies in rmw_cyclonedds: client and sequence number
 
 
 def dds_name(name: str) -> str:
-    """The name of a message type on DDS: `geometry_msgs::msg::dds_::Pose_`."""
+    """DDS name of a message type: `geometry_msgs::msg::dds_::Pose_`."""
     package, _, short = name.split("/")
     return f"{package}::msg::dds_::{short}_"
 
 
 @functools.cache
 def idl_type(name: str) -> Any:
-    """The type of CycloneDDS for a message type; encoded as plain CDR."""
+    """CycloneDDS type of a message type, encoded as plain CDR."""
     return _struct(dds_name(name), {field.name: _idl_field(field) for field in msg.fields(name)})
 
 
@@ -50,7 +50,7 @@ def _idl_field(field: msg.Field) -> Any:
 
 
 def encode(message: msg.Message) -> IdlStruct:
-    """A message as CycloneDDS writes it."""
+    """Convert a message to CycloneDDS."""
     return msg.encode(message, idl_type, lambda field, given: given if field.kind == "uint8" else list(given))
 
 
@@ -58,9 +58,9 @@ REQUEST = _struct(
     "std_srvs::srv::dds_::Trigger_Request_",
     {name: _KINDS[kind] for name, kind in (_HEADER | {"structure_needs_at_least_one_member": "uint8"}).items()},
 )
-"""A request of `std_srvs/srv/Trigger`; what is empty in ROS has one byte on DDS."""
+"""Request of `std_srvs/srv/Trigger`; an empty message has one byte on DDS."""
 REPLY = _struct(
     "std_srvs::srv::dds_::Trigger_Response_",
     {name: _KINDS[kind] for name, kind in (_HEADER | {"success": "bool", "message": "string"}).items()},
 )
-"""A reply of `std_srvs/srv/Trigger`."""
+"""Reply of `std_srvs/srv/Trigger`."""

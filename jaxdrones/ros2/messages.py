@@ -1,7 +1,7 @@
-"""The standard ROS 2 messages that are used here, made from the type store of rosbags: `messages.Pose`, and so on.
+"""Standard ROS 2 messages from the type store of rosbags, such as `messages.Pose`.
 
-Numbers are Python numbers, arrays of numbers tuples, and `uint8[]` is bytes. Fields that are left out are zero, and
-rotations are none. Needs the extra `ros2`.
+Numbers are Python numbers, arrays of numbers tuples, and `uint8[]` is bytes. Fields default to zero, rotations to the
+identity. Needs the extra `ros2`.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ MESSAGES = (
 """Names of all message types."""
 
 Message = Any
-"""An instance of a message type; `NAME` is its type, such as `geometry_msgs/msg/Pose`."""
+"""Instance of a message type; `NAME` is its type, such as `geometry_msgs/msg/Pose`."""
 
-_IDENTITY = {("geometry_msgs/msg/Quaternion", "w"): 1.0}  # what the definitions in .msg files give instead of zero
+_IDENTITY = {("geometry_msgs/msg/Quaternion", "w"): 1.0}  # defaults of .msg files other than zero
 
 
 class Field(NamedTuple):
-    """One field of a message."""
+    """Field of a message."""
 
     name: str
     kind: str
-    """`float64` and so on, or the name of a message type."""
+    """`float64` etc., or the name of a message type."""
     length: int | None = None
-    """Entries of an array; 0 of one of any length; `None` where the field is a single value."""
+    """Length of an array; 0 for any length; `None` for a single value."""
 
     @property
     def is_message(self) -> bool:
-        """Whether the field holds messages."""
+        """Whether the field has messages."""
         return "/" in self.kind
 
 
 @functools.cache
 def typestore() -> Any:
-    """The message types of ROS 2 that rosbags knows."""
+    """ROS 2 message types of rosbags."""
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
@@ -71,7 +71,7 @@ def typestore() -> Any:
 
 @functools.cache
 def fields(name: str) -> tuple[Field, ...]:
-    """The fields of the message type of this name, in their order on the wire."""
+    """Fields of a message type by name, in their order on the wire."""
 
     def field(name: str, described: tuple[int, Any]) -> Field:
         kind, of = described  # 1: number or text, 2: message, 3: array, 4: sequence
@@ -84,7 +84,7 @@ def fields(name: str) -> tuple[Field, ...]:
 
 @functools.cache
 def message_class(name: str) -> Any:
-    """The class of the message type of this name, a frozen dataclass."""
+    """Class of a message type by name, a frozen dataclass."""
     entries = [(field.name, Any, _IDENTITY.get((name, field.name), _default(field))) for field in fields(name)]
     return dataclasses.make_dataclass(name.rpartition("/")[2], entries, frozen=True, namespace={"NAME": name})
 
@@ -106,12 +106,12 @@ def __getattr__(name: str) -> Any:
 
 
 def encode(message: Message, class_of: Callable[[str], Any], array: Callable[[Field, Any], Any]) -> Any:
-    """A message as an instance of another library's class.
+    """Convert a message to a class of another library.
 
     Args:
         message: the message.
-        class_of: name of a message type -> the other library's class, which takes the fields as keywords.
-        array: (field, tuple or bytes) -> an array of numbers as the other library wants it.
+        class_of: name of a message type -> class of the other library, with the fields as keywords.
+        array: (field, tuple or bytes) -> array of the other library.
     """
 
     def encoded(field: Field) -> Any:
@@ -126,7 +126,7 @@ def encode(message: Message, class_of: Callable[[str], Any], array: Callable[[Fi
 
 
 def decode(name: str, foreign: Any) -> Message:
-    """A message of the type `name` from an object of another library with its fields."""
+    """Convert an object of another library to a message of the type `name`."""
 
     def decoded(field: Field) -> Any:
         given = getattr(foreign, field.name)

@@ -1,4 +1,4 @@
-"""The choice between the transports."""
+"""Selection of the transport."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def open_transport(name: str = "auto", node: str = "jaxdrones") -> Transport:
     """Join the network of ROS 2 with the domain of `ROS_DOMAIN_ID`.
 
     Args:
-        name: `cyclonedds`, `rclpy`, or `auto`: rclpy where there is one, else CycloneDDS.
-        node: name of the node, where the transport has names of nodes.
+        name: `cyclonedds`, `rclpy`, or `auto`: rclpy if installed, else CycloneDDS.
+        node: name of the node, if the transport has names of nodes.
 
     Raises:
         ValueError: an unknown name.

@@ -1,4 +1,4 @@
-"""The node: a simulated team on the topics of ROS 2, in real time or in lockstep."""
+"""ROS 2 node of a simulated team, in real time or in lockstep."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from jaxdrones.ros2.topics import Topic
 from jaxdrones.ros2.transport import Transport
 from jaxdrones.sensing import Camera
 
-_LATE = 0.1  # s behind the clock from which on the schedule starts anew
-_FAREWELL = 2.0  # s within which the last messages have to arrive
+_LATE = 0.1  # s, largest lag behind the clock before the schedule restarts
+_FAREWELL = 2.0  # s, timeout of the last messages
 
 
 @dataclasses.dataclass
 class Flown:
-    """What happened in a flight."""
+    """Statistics of a flight."""
 
     steps: int = 0
     published: int = 0
     received: int = 0
-    """Commands that were understood."""
+    """Valid commands."""
     refused: int = 0
     late: int = 0
-    """How often the flight fell behind the clock by a tenth of a second."""
+    """Number of times that the flight fell behind the clock by 0.1 s."""
     lost: int = 0
-    """How often a drone, or who steps in lockstep, was not heard of any more."""
+    """Number of expired timeouts of commands or of steps in lockstep."""
     landed: bool = False
 
 
@@ -43,10 +43,10 @@ def _silent(text: str) -> None:
 
 
 class Node:
-    """Publishes the state of a team and flies the commands that it receives.
+    """Node that publishes the state of a team and executes received commands.
 
-    In real time the flight follows the clock. In lockstep it advances by one control step whenever the service
-    `topics.STEP_SERVICE` is called, and answers once the messages of that step are published.
+    In real time the flight follows the clock. In lockstep it advances by one control step for each call of the service
+    `topics.STEP_SERVICE`, and answers once the messages of that step are published.
     """
 
     def __init__(
@@ -65,15 +65,15 @@ class Node:
         """Offer the topics of a team.
 
         Args:
-            simulation: the team in flight.
-            transport: what carries the messages; the caller closes it.
+            simulation: team in flight.
+            transport: transport of messages, closed by the caller.
             lockstep: whether the flight waits for the step service.
-            failsafe: what happens without commands; they are a stream, each to be repeated within the timeout. In
-                lockstep it is the calls of the step service that must not cease.
-            speed: real-time factor, where the clock paces the flight.
-            camera: on every drone; at its `rate`, or every control step. Without it there are no images.
-            recorder: where all messages are written.
-            warn: called with a line of text when something is wrong and the flight goes on.
+            failsafe: action without commands. Commands are a stream, to be repeated within the timeout. In lockstep the
+                timeout is that of the step service.
+            speed: real-time factor.
+            camera: on every drone, at its `rate` or every control step; by default no images.
+            recorder: recorder of all messages.
+            warn: function of a line of text for warnings.
             clock: time, s.
         """
         self._flight, self._transport, self._lockstep = simulation, transport, lockstep
@@ -100,10 +100,10 @@ class Node:
         self._due = now
 
     def run(self, duration: float | None = None) -> Flown:
-        """Fly until the simulated time `duration` (s), for ever when left out, or until all drones have landed.
+        """Fly until the simulated time `duration` (s), by default forever, or until all drones have landed.
 
         Raises:
-            PeerLost: commands ceased or have a wrong type, and the failsafe is to stop.
+            PeerLost: missing or invalid commands with the failsafe `stop`.
         """
         steps = None if duration is None else round(duration * self._flight.control_hz)
         now = self._clock()
@@ -123,7 +123,7 @@ class Node:
         return self.flown
 
     def _has(self, name: str) -> bool:
-        """Whether the team publishes this kind of message."""
+        """Whether the team has this output."""
         if name.startswith("camera/"):
             return self._camera is not None
         return name != "battery" or self._flight.has_battery
@@ -143,7 +143,7 @@ class Node:
             self._warn(f"commands for {topics.drone(i)} are back; it flies them")
 
     def _answer(self) -> tuple[bool, str]:
-        """The step service: one control step; the answer holds the simulated time."""
+        """Step service: one control step; the answer has the simulated time."""
         if self._stepper.hear(self._clock()):
             self._warn("the step service is called again; the flight is in lockstep")
         self._step()
@@ -162,14 +162,14 @@ class Node:
                 self._flight.commands[i] = hover(self._flight.commands[i], self._flight.state, i)
 
     def _await_clock(self) -> None:
-        """Take one step when the clock says so."""
+        """Wait for the clock, then take one step."""
         dt = 1 / self._flight.control_hz
         self._due += dt / self._speed
         while True:
             self._transport.spin(max(self._due - self._clock(), 0))
             if self._clock() >= self._due:
                 break
-        if self._lockstep and not self._stepper.lost:  # it was called meanwhile
+        if self._lockstep and not self._stepper.lost:  # called in the meantime
             return
         self._guard(dt)
         self._step()
@@ -178,7 +178,7 @@ class Node:
             self._due = self._clock()
 
     def _guard(self, dt: float) -> None:
-        """Let drones that nobody commands do what the failsafe says."""
+        """Apply the failsafe to drones without commands."""
         flight, now = self._flight, self._clock()
         down = 0
         for i, watch in enumerate(self._watches):
@@ -198,7 +198,7 @@ class Node:
         self._warn(f"{what}; {then}")
 
     def _object(self, text: str, kind: Hashable) -> None:
-        """Say once for each kind what is wrong with a peer, or stop because of it."""
+        """Warn once for each kind of problem with a peer, or stop."""
         if kind not in self._said:
             self._said.add(kind)
             self._give_up(text, "the flight goes on without it")
@@ -221,7 +221,7 @@ class Node:
                     self._send(topics.output(i, name), message)
 
     def _image_is_due(self, camera: Camera) -> bool:
-        """Whether an image is taken at this control step; the k-th one in the first that does not begin before."""
+        """Whether an image is due at this control step."""
         if camera.rate is None or camera.rate >= self._flight.control_hz:
             return True
         per_step, k = camera.rate / self._flight.control_hz, self._flight.steps

@@ -1,4 +1,4 @@
-"""A client that commands a team over its topics, in Python and without ROS."""
+"""Python client of a team's topics, without ROS."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from jaxdrones.state import State
 
 
 class Peer:
-    """Commands a team of n drones and reads back its state."""
+    """Client that commands a team of n drones and receives its state."""
 
     def __init__(self, transport: Transport, drones: int):
         """Subscribe to the state of a team.
 
         Args:
-            transport: what carries the messages; the caller closes it.
+            transport: transport of messages, closed by the caller.
             drones: size of the team.
         """
         self._transport, self._drones = transport, drones
         self._publishers: dict[str, Callable[[msg.Message], None]] = {}
-        self._odometry: dict[int, msg.Odometry] = {}  # the latest of each drone
+        self._odometry: dict[int, msg.Odometry] = {}  # latest of each drone
         self._motors: dict[int, msg.Float64MultiArray] = {}
         self.stamps: list[list[int]] = [[] for _ in range(drones)]
         """Times of all odometry of each drone, ns."""
-        for i in range(drones):  # first the odometry, so that the motors' speeds, sent before it, are there with it
+        for i in range(drones):  # odometry first, so that the motor speeds, sent before it, are complete with it
             transport.subscribe(topics.output(i, "odom"), functools.partial(self._keep, i))
             transport.subscribe(topics.output(i, "motors"), functools.partial(self._motors.__setitem__, i))
 
@@ -39,10 +39,10 @@ class Peer:
         self.stamps[i].append(convert.nanoseconds(message.header.stamp))
 
     def send(self, i: int, name: str, message: msg.Message, timeout: float = 30.0) -> None:
-        """Publish a message on a topic of `topics.COMMANDS` of drone `i`; the first waits until the node listens.
+        """Publish a message on a topic of `topics.COMMANDS` of drone `i`; the first one waits for the node.
 
         Raises:
-            TimeoutError: no node listens within `timeout` s.
+            TimeoutError: no node within `timeout` s.
         """
         topic = topics.command(i, name)
         if topic.name not in self._publishers:
@@ -61,11 +61,11 @@ class Peer:
             )
 
     def step(self, timeout: float = 5.0) -> State:
-        """Have a flight in lockstep take one step, under all that was sent before; returns the state after it.
+        """Step a flight in lockstep with all commands sent so far; return the state after it.
 
         Raises:
-            TimeoutError: what was sent, the answer or the state did not arrive within `timeout` s.
-            RuntimeError: the node refuses.
+            TimeoutError: no delivery, answer or state within `timeout` s.
+            RuntimeError: rejected by the node.
         """
         if not self._transport.flush(timeout):
             raise TimeoutError(f"commands did not arrive within {timeout:g} s; is the node still there?")
@@ -76,10 +76,10 @@ class Peer:
         return self.state(timeout, since=int(seconds) * 1_000_000_000 + int(fraction))
 
     def state(self, timeout: float = 5.0, since: int = 0) -> State:
-        """The latest state of the team that is whole and at or after the time `since`, ns.
+        """Latest complete state of the team at or after the time `since`, ns.
 
         Raises:
-            TimeoutError: none arrived within `timeout` s.
+            TimeoutError: no state within `timeout` s.
         """
         end, team = time.monotonic() + timeout, range(self._drones)
         while True:

@@ -1,4 +1,4 @@
-"""rclpy as the transport: a thin layer, for computers with an installed and sourced ROS 2."""
+"""Transport by rclpy, for computers with an installed and sourced ROS 2."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from jaxdrones.ros2.topics import QoS, Topic
 from jaxdrones.ros2.transport import Answer
 
 _TYPECODES = {"uint8": "B", "float32": "f", "float64": "d"}
-_LOOK = 1.0  # s between looks at the other ends of the topics
+_LOOK = 1.0  # s between checks of the other endpoints
 
 
 class RclpyTransport:
-    """A node of rclpy, spun by the thread that calls `spin`."""
+    """Node of rclpy, spun by the thread that calls `spin`."""
 
     def __init__(self, name: str = "jaxdrones"):
-        """Start rclpy, unless it is running, and a node of this name."""
+        """Start rclpy if necessary, and a node of this name."""
         self._began = not rclpy.ok()
         if self._began:
             rclpy.init()
@@ -44,14 +44,14 @@ class RclpyTransport:
         self._looked = -_LOOK
 
     def publisher(self, topic: Topic) -> Callable[[msg.Message], None]:
-        """A function that publishes messages."""
+        """Function that publishes messages."""
         publisher = self._node.create_publisher(ros_class(topic.type), f"/{topic.name}", _ros_qos(topic.qos))
         self._publishers[topic.name] = publisher
         self._topics.append((topic, True))
         return lambda message: publisher.publish(msg.encode(message, ros_class, _ros_array))
 
     def subscribe(self, topic: Topic, receive: Callable[[Any], None]) -> None:
-        """Have every message of a topic handed to a function."""
+        """Call a function with every message of a topic."""
 
         def received(message: Any) -> None:
             receive(msg.decode(topic.type, message))
@@ -60,7 +60,7 @@ class RclpyTransport:
         self._topics.append((topic, False))
 
     def serve(self, name: str, answer: Answer) -> None:
-        """Offer a service. A request that waits beside messages is answered after the first of each topic."""
+        """Offer a service. A pending request is answered after the first pending message of each topic."""
 
         def respond(request: Any, response: Any) -> Any:
             response.success, response.message = answer()
@@ -72,7 +72,7 @@ class RclpyTransport:
         """Call a service of another process.
 
         Raises:
-            TimeoutError: there was no answer within `timeout` s.
+            TimeoutError: no answer within `timeout` s.
         """
         if name not in self._clients:
             self._clients[name] = self._node.create_client(_trigger(), f"/{name}")
@@ -87,7 +87,7 @@ class RclpyTransport:
         return reply.success, reply.message
 
     def connect(self, topic: Topic, timeout: float) -> bool:
-        """Whether a subscriber is there after at most `timeout` s."""
+        """Wait at most `timeout` s for a subscriber; return whether there is one."""
         end = time.monotonic() + timeout
         while not self._publishers[topic.name].get_subscription_count():
             if time.monotonic() > end:
@@ -96,7 +96,7 @@ class RclpyTransport:
         return True
 
     def flush(self, timeout: float) -> bool:
-        """Whether every reader there is received what was published, after at most `timeout` s."""
+        """Wait at most `timeout` s for delivery to all readers; return whether it succeeded."""
         end = time.monotonic() + timeout
 
         def acknowledged(publisher: Any) -> bool:
@@ -106,11 +106,11 @@ class RclpyTransport:
         return all(map(acknowledged, self._publishers.values()))
 
     def spin(self, timeout: float) -> None:
-        """Hand over what has arrived; wait up to `timeout` s if nothing has."""
+        """Deliver received messages; wait up to `timeout` s for one."""
         self._executor.spin_once(timeout_sec=max(timeout, 0.0))
 
     def complaints(self) -> list[str]:
-        """What is wrong with other processes' ends of the topics here, such as another type; each is said once."""
+        """New mismatches with endpoints of other processes, such as another type."""
         if time.monotonic() < self._looked + _LOOK:
             return []
         self._looked = time.monotonic()
@@ -127,7 +127,7 @@ class RclpyTransport:
         return found
 
     def close(self) -> None:
-        """Leave the network; rclpy stops if it was started here."""
+        """Leave the network, and stop rclpy if it was started here."""
         self._executor.shutdown()
         self._node.destroy_node()
         if self._began:
@@ -135,7 +135,7 @@ class RclpyTransport:
 
 
 def ros_class(kind: str) -> Any:
-    """The class of a message type in the installed ROS 2.
+    """Class of a message type in the installed ROS 2.
 
     Raises:
         ImportError: its package is not installed.
@@ -152,7 +152,7 @@ def _trigger() -> Any:
 
 
 def _ros_array(field: msg.Field, given: Any) -> Any:
-    """An array of numbers as rclpy takes it: a list where the length is fixed, else an `array.array`."""
+    """Array of numbers for rclpy: a list for a fixed length, else an `array.array`."""
     return list(given) if field.length else array.array(_TYPECODES[field.kind], given)
 
 

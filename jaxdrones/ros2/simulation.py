@@ -1,4 +1,4 @@
-"""A team in flight under commands: the engine's step, the controllers, and what is measured."""
+"""Simulation of a commanded team: step, controllers and measurements."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SECOND = 1_000_000_000  # ns
 
 
 class Simulation:
-    """A team and its engine; `advance` takes one control step."""
+    """Team and its engine; `advance` takes one control step."""
 
     def __init__(
         self,
@@ -41,16 +41,16 @@ class Simulation:
         battery: Battery | None = None,
         scene: Scene | None = None,
     ):
-        """Start a flight; every drone is commanded to stay where it is.
+        """Start a flight with every drone holding its position.
 
         Args:
-            step: of either backend, whose calls last one control period.
+            step: of either backend, for one control period.
             params: of a team.
-            state: of the team at the start.
+            state: initial state of the team.
             control_hz: control steps per second.
-            controller: of positions and velocities, a name of `CONTROLLERS`; the vehicle's own when left out.
-            battery: readings of the battery of one drone, from its state; none are published when left out.
-            scene: obstacles; those of the step when left out, and none in images of the explicit backend.
+            controller: of positions and velocities, a name of `CONTROLLERS`; by default the vehicle's.
+            battery: readings of the battery of one drone as a function of its state; by default none.
+            scene: obstacles; by default those of the step, and none in images of the explicit backend.
         """
         self.controller = controller or ("pid" if pid.fits(params) else "geometric")
         self.params, self.control_hz, self.steps = params, control_hz, 0
@@ -65,7 +65,7 @@ class Simulation:
         yaw = np.asarray(jax.vmap(rotation.to_rpy)(self.state.quat))[:, 2]
         self.commands = [Command.zero(Mode.POSITION, pos=np.asarray(self.state.pos[i]), yaw=yaw[i]) for i in range(n)]
 
-        self._control_team()  # compiles what a control step calls, so that none of them is late for it
+        self._control_team()  # compiles all functions of a control step before the flight
         self._step(self.params, self.state, self._rpm, self._scene)
         self.measure()
 
@@ -85,13 +85,13 @@ class Simulation:
         return self.steps * _SECOND // self.control_hz
 
     def advance(self) -> None:
-        """Take one control step under `commands`, one for each drone."""
+        """Take one control step with `commands`, one for each drone."""
         self._memory, self._rpm = self._control_team()
         self.state = self._step(self.params, self.state, self._rpm, self._scene)
         self.steps += 1
 
     def _control_team(self) -> tuple[commands.Memory, jax.Array]:
-        """The memory of the controllers after this step, and the rotor speeds that they command."""
+        """Memory of the controllers after this step, and commanded rotor speeds."""
         dtype = self.state.pos.dtype
         team = jax.tree.map(
             lambda *x: np.stack(x).astype(np.int32 if x[0].dtype == np.int32 else dtype), *self.commands
@@ -99,16 +99,15 @@ class Simulation:
         return self._control(self.params, self._memory, self.state, team)
 
     def measure(self) -> Measurement:
-        """What is published about the team as it is now.
+        """Published data of the team at present.
 
-        Accelerometers measure the derivative that the engine integrates, under the rotor speeds that were commanded
-        last.
+        Accelerometers measure the derivative of the engine with the last commanded rotor speeds.
         """
         acc = self._step.rate(self.params, self.state, self._rpm, self._scene).vel
         return jax.device_get(self._measure(self.params, self.state, acc, self._battery))
 
     def images(self, camera: Camera) -> np.ndarray:
-        """The images (n, h, w, 4) of the camera on every drone: red, green, blue, opacity."""
+        """Images (n, h, w, 4) of the camera on every drone: red, green, blue, opacity."""
         if isinstance(self._step, HostStep):
             return np.asarray(self._step.camera(self.params, self.state, camera, self._scene).rgb)
         return np.asarray(render(self._scene or Scene(), self.params, self.state, camera).rgb)

@@ -1,8 +1,7 @@
-"""The topics of a team: names, standard message types and quality of service, whatever transports them.
+"""Topics of a team: names, standard message types and quality of service.
 
 Frames follow REP-103: `world` is east, north, up (the world frame of the simulator), a body has x forward, y left and z
-up, and a camera's optical frame has x right, y down and z forward. Units are SI; rotor speeds are RPM, as everywhere in
-this package.
+up, and a camera's optical frame has x right, y down and z forward. Units are SI, except for rotor speeds in RPM.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ STEP_SERVICE = "step"
 
 @dataclasses.dataclass(frozen=True)
 class QoS:
-    """Quality of service: delivery, and how many messages wait for a reader or a writer."""
+    """Quality of service: reliability and queue length."""
 
     depth: int
     reliable: bool = True
@@ -25,14 +24,14 @@ class QoS:
 
 _STATE = QoS(
     depth=200
-)  # 2 s at 100 Hz; the messages that wait stay below the 500 kB at which CycloneDDS holds a writer
+)  # 2 s at 100 Hz; queued messages stay below the 500 kB at which CycloneDDS blocks a writer
 _COMMAND = QoS(depth=100)
-_IMAGE = QoS(depth=5, reliable=False)  # sensor data in ROS: a slow subscriber loses images and holds up nobody
+_IMAGE = QoS(depth=5, reliable=False)  # sensor data in ROS: a slow subscriber loses images without blocking others
 
 
 @dataclasses.dataclass(frozen=True)
 class Topic:
-    """A topic by its full name without the leading slash."""
+    """Topic by its full name without the leading slash."""
 
     name: str
     type: str
@@ -52,7 +51,7 @@ OUTPUTS = {
     "camera/image_raw": ("sensor_msgs/msg/Image", _IMAGE),
     "camera/camera_info": ("sensor_msgs/msg/CameraInfo", _IMAGE),
 }
-"""What every drone publishes, below its own name."""
+"""Outputs of every drone, in its namespace."""
 
 COMMANDS = {
     "cmd_pose": ("geometry_msgs/msg/PoseStamped", _COMMAND),
@@ -60,11 +59,11 @@ COMMANDS = {
     "cmd_rates": ("geometry_msgs/msg/Twist", _COMMAND),
     "cmd_motors": ("std_msgs/msg/Float64MultiArray", _COMMAND),
 }
-"""What every drone listens to, below its own name; the latest message of any of them is flown."""
+"""Command topics of every drone, in its namespace; the latest message of any of them applies."""
 
 
 def drone(i: int) -> str:
-    """The name of a drone, which is the namespace of its topics."""
+    """Name of a drone, the namespace of its topics."""
     return f"drone_{i}"
 
 
@@ -79,10 +78,10 @@ def optical_frame(i: int) -> str:
 
 
 def output(i: int, name: str) -> Topic:
-    """A topic that a drone publishes; `name` is a key of `OUTPUTS`."""
+    """Output topic of a drone; `name` is a key of `OUTPUTS`."""
     return Topic(f"{drone(i)}/{name}", *OUTPUTS[name])
 
 
 def command(i: int, name: str) -> Topic:
-    """A topic that a drone listens to; `name` is a key of `COMMANDS`."""
+    """Command topic of a drone; `name` is a key of `COMMANDS`."""
     return Topic(f"{drone(i)}/{name}", *COMMANDS[name])

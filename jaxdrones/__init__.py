@@ -1,4 +1,4 @@
-"""A vectorised, differentiable simulator of quadrotor teams."""
+"""A vectorized, differentiable simulator of quadrotor teams."""
 
 from jaxdrones import rotation, vector
 from jaxdrones.accelerate.worlds import over_worlds

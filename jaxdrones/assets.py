@@ -1,4 +1,4 @@
-"""Where the bundled files are."""
+"""Paths of bundled files."""
 
 from pathlib import Path
 
@@ -6,16 +6,16 @@ _PACKAGE = Path(__file__).parent
 
 
 def folder() -> Path:
-    """The folder of bundled files: inside the wheel, or `assets/` of the checkout."""
+    """Folder of bundled files: inside the wheel, or `assets/` of the checkout."""
     bundled = _PACKAGE / "_assets"
     return bundled if bundled.is_dir() else _PACKAGE.parent / "assets"
 
 
 def vehicles() -> dict[str, Path]:
-    """The bundled vehicles: name -> URDF."""
+    """Bundled vehicles: name -> URDF."""
     return {path.stem: path for path in sorted(folder().glob("*.urdf"))}
 
 
 def flights() -> dict[str, Path]:
-    """The bundled logs of flights, of NanoBench (BSD-3): name -> .npz."""
+    """Bundled flight logs of NanoBench (BSD-3): name -> .npz."""
     return {path.stem: path for path in sorted((folder() / "flights").glob("*.npz"))}

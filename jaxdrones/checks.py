@@ -1,6 +1,7 @@
-"""Errors that finish the sentence: what was wrong, what was given, what to do.
+"""Validation of arguments.
 
-What JAX traces has no value yet and passes; so do the placeholders with which JAX rebuilds a tree.
+A message names the problem, the given value and the remedy. Traced values pass, as do the placeholders of tree
+transformations.
 """
 
 import difflib
@@ -18,10 +19,10 @@ from jaxdrones.errors import UserError
 
 _SMALLEST = np.finfo(np.float64).tiny
 _LONGEST = 120  # characters of a value in an error
-_UNIT_LENGTH = 1e-3  # by which the length of a unit quaternion may be off; float32 and integrators stay far below
+_UNIT_LENGTH = 1e-3  # tolerance of the length of a unit quaternion, far above float32 and integrator errors
 _NUMBERS = "biuf"  # kinds of dtypes
 POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_rpm")
-"""Constants of a vehicle without which nothing flies."""
+"""Constants of a vehicle that must be positive."""
 _NOT_NEGATIVE = ("km", "gravity", "air_density")
 _MAY_BE_INFINITE = ("max_rpm",)
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
@@ -30,7 +31,7 @@ _UNKNOWN = (jax.core.Tracer, jax.ShapeDtypeStruct)
 
 
 class UnexpectedKeyword(TypeError):
-    """The `TypeError` of Python for a keyword argument that a function does not have, and what to give in its place."""
+    """Python's `TypeError` for an unknown keyword argument, with a hint."""
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -49,7 +50,7 @@ def short_repr(value: Any) -> str:
 
 
 def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: str) -> None:
-    """Raise unless `array` has `shape`; a string entry stands for any length of at least one."""
+    """Raise unless `array` has `shape`; a string entry is any length of at least one."""
     given = np.shape(array)
     fits = len(given) == len(shape) and all(
         n >= 1 if isinstance(wanted, str) else n == wanted for n, wanted in zip(given, shape, strict=True)
@@ -60,7 +61,7 @@ def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: st
 
 
 def check_finite(name: str, tree: Any) -> None:
-    """Raise if a concrete array of `tree` holds NaN or infinity; traced values cannot be looked at."""
+    """Raise if a concrete array of `tree` has NaN or infinity."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if is_concrete(leaf) and not np.all(np.isfinite(leaf)):
             where = name + jax.tree_util.keystr(path)
@@ -78,16 +79,16 @@ def check_number(
     below: float | None = None,
     infinite: bool = False,
 ) -> None:
-    """Raise unless `value` is one real number within the bounds, also once it is rounded to float32.
+    """Raise unless `value` is one real number within the bounds, also after rounding to float32.
 
     Args:
-        name: of what is given.
-        value: number, or something traced, which passes.
-        unit: for the error.
-        at_least: lower bound that is allowed.
-        above: lower bound that is not allowed.
-        at_most: upper bound that is allowed.
-        below: upper bound that is not allowed.
+        name: name of the value.
+        value: number; traced values pass.
+        unit: unit for the message.
+        at_least: inclusive lower bound.
+        above: exclusive lower bound.
+        at_most: inclusive upper bound.
+        below: exclusive upper bound.
         infinite: whether infinity is allowed.
     """
     if not is_concrete(value):
@@ -119,7 +120,7 @@ def _within(value: float, bounds: dict[str, float], infinite: bool) -> bool:
 
 
 def check_positive(name: str, value: float, unit: str) -> None:
-    """Raise unless a number is positive and finite; a traced one cannot be looked at."""
+    """Raise unless a concrete number is positive and finite."""
     check_number(name, value, unit, above=0)
 
 
@@ -155,13 +156,13 @@ def check_keyword(function: str, keyword: str, known: Iterable[str]) -> None:
 
 
 def hint(name: str, known: Iterable[str]) -> str:
-    """What may have been meant by an unknown name; nothing, if none is close."""
+    """Suggestion for an unknown name; empty if none is close."""
     close = difflib.get_close_matches(str(name), known, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def check_sequence(name: str, value: Any, example: str) -> tuple:
-    """The entries of a sequence, or an error if something single stands in its place."""
+    """Validated entries of a sequence."""
     if isinstance(value, str) or callable(value) or not isinstance(value, Iterable):
         raise UserError(f"{name} is {short_repr(value)}; give a sequence, for example ({example},)")
     return tuple(value)
@@ -174,7 +175,7 @@ def check_callable(name: str, value: Any, example: str) -> None:
 
 
 def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], hint: str = "") -> None:
-    """Raise unless a function can be called with so many arguments; one without a signature passes."""
+    """Raise unless a function accepts these arguments; a function without a signature passes."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
@@ -188,7 +189,7 @@ def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], h
 
 
 def takes(function: Callable, name: str) -> bool:
-    """Whether a function has a parameter of this name, with or without a default, that is not bound by `partial`."""
+    """Whether a function has a parameter of this name that is not bound by `partial`."""
     try:
         parameter = inspect.signature(function).parameters.get(name)
     except (TypeError, ValueError):
@@ -203,18 +204,18 @@ def takes_scene(function: Callable) -> bool:
 
 
 def bind(function: Callable, **values: Any) -> Callable:
-    """The function with those of the values bound for which it has a parameter."""
+    """Bind those values to a function for which it has a parameter."""
     bound = {name: value for name, value in values.items() if takes(function, name)}
     return functools.partial(function, **bound) if bound else function
 
 
 def with_scene(function: Callable, scene: Any) -> Callable:
-    """The function with its parameter `scene` bound; the function itself if it takes no scene."""
+    """Bind the parameter `scene` of a function, if it has one."""
     return bind(function, scene=scene)
 
 
 def check_keywords(function: Function) -> Function:
-    """The same function or class; a keyword that it does not have is an error that names the closest one."""
+    """Decorate a function or class to suggest the closest name for an unknown keyword."""
     called: Any = function.__dict__["__init__"] if isinstance(function, type) else function
     name = function.__qualname__
     known = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
@@ -242,11 +243,11 @@ def check_arrays(name: str, tree: Any) -> None:
 
 
 def check_params(params: Any, finite: bool = True) -> None:
-    """Raise if constants of a drone or a team are not those of something that flies, where they can be looked at.
+    """Raise for concrete constants of a drone or a team that cannot fly.
 
     Args:
         params: of a drone or a team.
-        finite: whether to look at all of them, not only at those that must be positive.
+        finite: whether to check all of them, not only those that must be positive.
     """
     constants = vars(params)
     check_arrays("params", params)
@@ -266,7 +267,7 @@ def _without_infinity(leaf: Any) -> Any:
 
 
 def check_quaternion(name: str, quat: Any) -> None:
-    """Raise unless quaternions (..., 4) have unit length, where they can be looked at."""
+    """Raise unless concrete quaternions (..., 4) have unit length."""
     if not is_concrete(quat) or np.shape(quat)[-1:] != (4,):  # what else it is, is said where shapes are checked
         return
     quat = np.asarray(quat, float)
@@ -278,7 +279,7 @@ def check_quaternion(name: str, quat: Any) -> None:
 
 
 def check_key(name: str, key: Any) -> None:
-    """Raise unless `key` is one random key, typed or raw; what is traced has a shape, too."""
+    """Raise unless `key` is one random key, typed or raw, concrete or traced."""
     example = "give a random key, for example jax.random.key(0)"
     if not isinstance(key, jax.Array | np.ndarray):
         raise UserError(f"{name} is {short_repr(key)}; {example}")

@@ -1,4 +1,4 @@
-"""The error of a user's mistake, and the command that installs an extra."""
+"""Error of users' mistakes, and installation hints."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from pathlib import Path
 
 
 class UserError(ValueError):
-    """A mistake in what was asked for, which the message explains: what was wrong, what was given, what to do.
+    """Invalid argument, with a message of the problem, the given value and the remedy.
 
-    The command line prints it as one line. Any other exception is a fault of this library, or of a user's own code, and
-    is shown with its traceback.
+    The command line prints it as one line, and any other exception with its traceback.
     """
 
 
 def install(extra: str) -> str:
-    """The command that installs an extra, from the checkout or the wheel that this package comes from."""
+    """Command that installs an extra, from the checkout or the wheel of this package."""
     place = Path(__file__).parents[1]
     if (place / "pyproject.toml").is_file():
         return f'pip install "{place}[{extra}]"'

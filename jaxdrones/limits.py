@@ -1,4 +1,4 @@
-"""What this computer cannot hold, and what a random key cannot be made of, said before anything is computed."""
+"""Limits on memory, seeds and counts."""
 
 import os
 from pathlib import Path
@@ -7,16 +7,16 @@ from jaxdrones.checks import check_whole
 from jaxdrones.errors import UserError
 
 LARGEST_SEED = 2**31 - 1
-"""JAX would use only 32 bits of a larger one, so that two seeds could mean the same."""
+"""JAX uses only 32 bits of a larger seed, so two seeds could be equivalent."""
 LARGEST_COUNT = 2**31 - 1
-"""What counts updates and steps is an int32."""
+"""Counters of updates and steps are int32."""
 
 _UNKNOWN_MEMORY = 2**40  # bytes
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
 def check_seed(name: str, seed: int) -> None:
-    """Raise unless a random key can be made of a seed, and of no other the same."""
+    """Raise unless a seed gives a unique random key."""
     check_at_most(name, seed, LARGEST_SEED, minimum=0)
 
 
@@ -28,12 +28,12 @@ def check_at_most(name: str, value: int, limit: int, minimum: int = 1) -> None:
 
 
 def check_memory(what: str, size: int, advice: str) -> None:
-    """Raise if `size` bytes are more than this computer has.
+    """Raise if `size` bytes exceed the memory of this computer.
 
     Args:
-        what: would need them; the subject of the sentence.
-        size: bytes, estimated from below.
-        advice: what to do instead.
+        what: subject of the message.
+        size: lower bound, bytes.
+        advice: remedy.
     """
     held = memory()
     if size > held:
@@ -41,7 +41,7 @@ def check_memory(what: str, size: int, advice: str) -> None:
 
 
 def memory() -> int:
-    """Bytes of memory that this process may use: of the machine, or of its container if that is less."""
+    """Memory available to this process, bytes: of the machine, or of its container if less."""
     try:
         held = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError):  # as on Windows, which has no sysconf

@@ -1,4 +1,4 @@
-"""What does not change in flight: the constants of a vehicle and of the air around it."""
+"""Constants of a vehicle and of the air around it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from jaxdrones.pytree import PyTreeNode
 from jaxdrones.vector import safe_sqrt
 
 AIR_DENSITY = 1.225
-"""Density of the air at which the coefficients of rotors hold, kg/m^3: standard atmosphere at sea level. Their sources
-do not state it; in a laboratory it is within a few percent."""
+"""Air density of the rotor coefficients, kg/m^3: standard atmosphere at sea level. Their sources do not state it;
+in a laboratory it is within a few percent."""
 
 
 class Params(PyTreeNode):
     """Constants of one drone, or of a team with a leading drone axis on every array.
 
-    The surroundings (wind, air density, an external force) are here too and may be set anew at every step.
+    Wind, air density and an external force are included, and can change at every step.
     """
 
     mass: Array
@@ -39,13 +39,13 @@ class Params(PyTreeNode):
     km: Array
     """() torque coefficient in air of `AIR_DENSITY`, N m/RPM^2."""
     max_rpm: Array
-    """() highest rotor speed, RPM; does not follow the mass. Infinity stands for motors without a limit."""
+    """() highest rotor speed, RPM, independent of the mass. Infinity for motors without a limit."""
     rotor_rise_time: Array
-    """() time constant of a lagging rotor that speeds up, s."""
+    """() time constant of a lagging rotor when speeding up, s."""
     rotor_fall_time: Array
-    """() time constant of a lagging rotor that slows down, s."""
+    """() time constant of a lagging rotor when slowing down, s."""
     rotor_inertia: Array
-    """() moment of inertia of one rotor about its axis, kg m^2. Zero leaves out what the spin of a rotor does."""
+    """() moment of inertia of one rotor about its axis, kg m^2. Zero disables gyroscopic and reaction torques."""
     gravity: Array
     """() acceleration towards -z, m/s^2."""
     air_density: Array
@@ -57,13 +57,13 @@ class Params(PyTreeNode):
     drag_coeff: Array
     """(3,) rotor drag per axis in air of `AIR_DENSITY`, N per m/s of air speed and rad/s of summed rotor speed."""
     flapping_coeff: Array
-    """(2,) moment of rotors that move along body x and y, N m per m/s of air speed and rad/s of summed rotor speed."""
+    """(2,) moment of rotors moving along body x and y, N m per m/s of air speed and rad/s of summed rotor speed."""
     flapping_climb: Array
     """(3,) share of that moment lost per m/s of climb, along x and y, s/m; share gained per its square, s^2/m^2."""
     rate_damping: Array
     """(3,) torque against the angular velocity, N m per rad/s, body."""
     trim_torque: Array
-    """(3,) constant torque of a vehicle that is not in balance, N m, body."""
+    """(3,) constant torque of an unbalanced vehicle, N m, body."""
     ground_effect_coeff: Array
     """() k_G of equation 5 of the paper."""
     downwash_coeff: Array
@@ -79,9 +79,9 @@ class Params(PyTreeNode):
     collision_height: Array
     """() height of the collision cylinder, m."""
     collision_offset: Array
-    """() height of the cylinder's centre above the centre of mass, m."""
+    """() height of the cylinder's center above the center of mass, m."""
     aux: dict[str, Any] = flax.struct.field(default_factory=dict)
-    """Constants of models that are not in the core, by name: pytrees of arrays."""
+    """Constants of further models by name: pytrees of arrays."""
 
     @property
     def weight(self) -> Array:
@@ -90,27 +90,27 @@ class Params(PyTreeNode):
 
     @property
     def arm(self) -> Array:
-        """() mean horizontal distance of a rotor from the centre of mass, m."""
+        """() mean horizontal distance of a rotor from the center of mass, m."""
         return jnp.mean(jnp.sqrt(jnp.sum(self.rotor_pos[..., :2] ** 2, axis=-1)), axis=-1)
 
     @property
     def relative_density(self) -> Array:
-        """() density of the air over that at which the coefficients hold."""
+        """() air density over that of the coefficients."""
         return self.air_density / AIR_DENSITY
 
     @property
     def hover_rpm(self) -> Array:
-        """() rotor speed at which four rotors carry the weight, RPM.
+        """() rotor speed in hover, RPM.
 
-        This and the following limits are those in air of `AIR_DENSITY`. Like the controllers they do not follow
-        `air_density`, which a vehicle does not know; in other air it hovers at this speed over the square root of
+        This and the following limits are for air of `AIR_DENSITY`. Like the controllers they are independent of
+        `air_density`, which is unknown to a vehicle; in other air it hovers at this speed over the square root of
         `relative_density`.
         """
         return safe_sqrt(self.weight / (4 * self.kf))
 
     @property
     def max_thrust(self) -> Array:
-        """() of the four rotors together, N."""
+        """() total thrust of the four rotors at full speed, N."""
         return 4 * self.kf * self.max_rpm**2
 
     @property
@@ -125,7 +125,7 @@ class Params(PyTreeNode):
 
 
 def stack(team: Sequence[Params]) -> Params:
-    """A team of any vehicles: every array gains a leading drone axis.
+    """Stack drones to a team, with a leading drone axis on every array.
 
     Raises:
         ValueError: an empty sequence, or a member that is already a team or cannot fly.
@@ -137,7 +137,7 @@ def stack(team: Sequence[Params]) -> Params:
 
 
 def repeat(params: Params, n: int) -> Params:
-    """A team of `n` equal drones.
+    """Team of `n` equal drones.
 
     Raises:
         ValueError: `n` < 1, or `params` is already a team or cannot fly.

@@ -1,4 +1,4 @@
-"""The base of the classes that JAX takes apart into arrays."""
+"""Base class of pytrees."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from jax import export
 
 
 class PyTreeNode(flax.struct.PyTreeNode):
-    """A flax `PyTreeNode` that may be an argument or a result of a function that `jax.export` saves.
+    """Flax `PyTreeNode` with support for `jax.export`.
 
-    Fields that are no arrays are saved as JSON. A class that replaces another of its name, as when a cell of a notebook
-    runs again, is not registered: `jax.export` knows the first one.
+    Static fields are saved as JSON. Only the first class of a name is registered, for example when a notebook cell runs
+    twice.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -38,5 +38,5 @@ def _from_bytes(data: bytes | bytearray) -> Any:
 
 
 def _as_tuple(value: Any) -> Any:
-    """JSON's lists are the tuples that were saved."""
+    """Convert JSON's lists back to tuples."""
     return tuple(map(_as_tuple, value)) if isinstance(value, list) else value

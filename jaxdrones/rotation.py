@@ -1,7 +1,7 @@
 """Unit quaternions (x, y, z, w), body to world.
 
-Every function is about one rotation, never a batch: use `jax.vmap` for more. All are differentiable wherever they are
-defined, also at zero rotation.
+Every function is for one rotation: use `jax.vmap` for batches. All are differentiable wherever they are defined, also
+at zero rotation.
 """
 
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.vector import atan2, components, dot, sin_cos
 
-_SMALL = 1e-6  # rad^2; below it the first terms of power series are exact to 1e-18
+_SMALL = 1e-6  # rad^2; below it the leading terms of power series are exact to 1e-18
 _POLE = 3 / 1024  # exact in every precision
 
 
@@ -28,7 +28,7 @@ def multiply(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
 
 
 def conjugate(q: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The inverse rotation of a unit quaternion."""
+    """Inverse rotation of a unit quaternion."""
     x, y, z, w = components(q)
     return jnp.stack([-x, -y, -z, w])
 
@@ -67,13 +67,13 @@ def z_axis(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def normalize(q: Float[Array, "4"]) -> Float[Array, "4"]:
-    """The unit quaternion along q (not zero)."""
+    """Unit quaternion along q (not zero)."""
     norm = jnp.sqrt(dot(q, q))
     return jnp.stack([x / norm for x in components(q)])
 
 
 def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The rotation by |v| rad about v; as smooth at zero as elsewhere."""
+    """Rotation by |v| rad about v; smooth at zero."""
     square = dot(v, v) / 4  # of half the angle
     small = square < _SMALL
     half = jnp.sqrt(jnp.maximum(square, _SMALL))
@@ -83,7 +83,7 @@ def exp(v: Float[Array, "3"]) -> Float[Array, "4"]:
 
 
 def log(q: Float[Array, "4"]) -> Float[Array, "3"]:
-    """The rotation vector (rad) of a unit quaternion, at most half a turn: the inverse of `exp`, as smooth at zero."""
+    """Rotation vector (rad) of a unit quaternion, at most half a turn: the inverse of `exp`; smooth at zero."""
     sign = jnp.where(q[3] < 0, -1, 1)
     v, w = sign * q[:3], sign * q[3]
     square = dot(v, v)  # of the sine of half the angle
@@ -92,12 +92,12 @@ def log(q: Float[Array, "4"]) -> Float[Array, "3"]:
 
 
 def to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """The rotation matrix R."""
+    """Rotation matrix R."""
     return jnp.stack(axes(q), axis=-1)
 
 
 def from_matrix(r: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """The quaternion of a rotation matrix, by Shepperd's method: divides by the largest component."""
+    """Quaternion of a rotation matrix by Shepperd's method, with division by the largest component."""
     trace = r[0, 0] + r[1, 1] + r[2, 2]
     diagonal = jnp.append(2 * jnp.diagonal(r) - trace, trace)  # 4 q_i^2 - 1
     skew = jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])  # 4 w (x, y, z)
@@ -107,7 +107,7 @@ def from_matrix(r: Float[Array, "3 3"]) -> Float[Array, "4"]:
 
 
 def from_rpy(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The quaternion of roll, pitch, yaw (rad) about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Quaternion of roll, pitch, yaw (rad) about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     sin, cos = sin_cos(rpy / 2)
     cr, cp, cy = components(cos)
     sr, sp, sy = components(sin)
@@ -124,14 +124,14 @@ def from_rpy(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
 def to_rpy(q: Float[Array, "4"]) -> Float[Array, "3"]:
     """Roll, pitch, yaw (rad) about fixed axes, in [-pi, pi].
 
-    At pitch +-90 degrees only the sum or difference of roll and yaw is determined; there roll is zero, as Bullet has
-    it. This pole is where the sums or differences of components that vanish at +-90 degrees are at most 0.0029, within
+    At pitch +-90 degrees only the sum or difference of roll and yaw is determined; there roll is zero, as in Bullet.
+    This pole is where the sums or differences of components that vanish at +-90 degrees are at most 0.0029, within
     0.24 to 0.34 degrees of it.
     """
     x, y, z, w = components(q)
     up = (jnp.abs(w - y) <= _POLE) & (jnp.abs(x + z) <= _POLE)
     down = (jnp.abs(w + y) <= _POLE) & (jnp.abs(x - z) <= _POLE)
-    pole = up | down  # of sums, which are rounded in one way only, so that the three angles are of the same branch
+    pole = up | down  # of sums with a common rounding, so that the three angles use the same branch
     sin_roll = jnp.where(pole, 0, 2 * (y * z + w * x))  # times the cosine of pitch
     cos_roll = jnp.where(pole, 1, w * w - x * x - y * y + z * z)
     cos_pitch = jnp.where(pole, 0, jnp.sqrt(sin_roll * sin_roll + cos_roll * cos_roll))

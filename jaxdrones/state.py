@@ -1,4 +1,4 @@
-"""What changes in flight."""
+"""State of a team."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class State(PyTreeNode):
     """Rigid body and rotors of one drone, or of a team with a leading drone axis on every array."""
 
     pos: Array
-    """(3,) position of the centre of mass, m, world."""
+    """(3,) position of the center of mass, m, world."""
     quat: Array
     """(4,) attitude, unit quaternion (x, y, z, w), body to world; the sign is free."""
     vel: Array
@@ -27,15 +27,15 @@ class State(PyTreeNode):
     rpm: Array
     """(4,) rotor speeds, revolutions per minute."""
     aux: dict[str, Any] = flax.struct.field(default_factory=dict)
-    """Continuous states of models by the model's name: pytrees of arrays. `Step.init` puts them there."""
+    """Continuous states of models by the model's name: pytrees of arrays, from `Step.init`."""
 
     @classmethod
     def at_rest(cls, pos: ArrayLike, yaw: ArrayLike | None = None) -> State:
-        """A level team at rest with its rotors standing still.
+        """Level team at rest with stopped rotors.
 
         Args:
             pos: (n, 3) positions, m, world.
-            yaw: (n,) headings, rad; zero when left out.
+            yaw: (n,) headings, rad; by default zero.
 
         Raises:
             ValueError: a wrong shape, no drone, or a number that is not finite.

@@ -1,4 +1,4 @@
-"""What a controller that plans, or a fit, says of its result: one enumeration for all of them."""
+"""Status of planners and fits."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from jaxdrones.checks import check_choice, is_concrete
 from jaxdrones.errors import UserError
 
 ON_FAILURE = ("hold", "raise")
-"""What a planner without a new plan does: repeat the last safe command, or raise."""
+"""Actions of a planner without a new plan: repeat the last safe command, or raise."""
 
 
 class Status(enum.IntEnum):
-    """How a problem was solved; inside `jax.jit` an integer."""
+    """Status of a solution; inside `jax.jit` an integer."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -25,7 +25,7 @@ class Status(enum.IntEnum):
 
     @property
     def sentence(self) -> str:
-        """The status in words."""
+        """Sentence of the status."""
         return _SENTENCES[self]
 
 
@@ -37,7 +37,7 @@ _SENTENCES = {
 
 
 class PlanningError(RuntimeError):
-    """A planner has no new command; `status` says why."""
+    """Planner without a new command; see `status`."""
 
     def __init__(self, status: Status, planner: str):
         """Keep the status beside its sentence."""
@@ -46,7 +46,7 @@ class PlanningError(RuntimeError):
 
 
 def status_of(valid: Bool[Array, ""], solved: Bool[Array, ""]) -> Int[Array, ""]:
-    """The status of a problem that was posed with finite numbers, or not, and solved, or not."""
+    """Status from the validity of a problem and the success of its solution."""
     failed = jnp.where(valid, int(Status.NOT_CONVERGED), int(Status.INVALID_STATE))
     return jnp.where(valid & solved, int(Status.OK), failed).astype(jnp.int32)
 
@@ -58,17 +58,17 @@ def is_finite(tree: Any) -> Bool[Array, ""]:
 
 
 def check_on_failure(on_failure: str, *given: Any) -> None:
-    """Raise `ValueError` unless a planner can do what is asked where it has no new plan.
+    """Raise `ValueError` for an unknown `on_failure`, or for `raise` with traced arguments.
 
     Args:
         on_failure: a name of `ON_FAILURE`.
-        given: arguments of the planner; what is traced has no status that could be looked at.
+        given: arguments of the planner.
     """
     check_choice("on_failure", on_failure, ON_FAILURE)
     if on_failure == "raise" and not all(map(is_concrete, jax.tree.leaves(given))):
         raise UserError(
             "on_failure is 'raise' inside jax.jit or jax.vmap, where no error depends on values; leave it out, and "
-            "look at the status of the memory"
+            "check the status of the memory"
         )
 
 

@@ -1,4 +1,4 @@
-"""Thrust of one motor as a cubic of the mean voltage across it, which rises everywhere."""
+"""Thrust of one motor as a monotonic cubic of its mean voltage."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -20,7 +20,7 @@ def thrust_at(coefficients: Float[Array, "4"], voltage: Float[Array, "*n"]) -> F
 
 
 def voltage_for(coefficients: Float[Array, "4"], thrust: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Voltage that gives a thrust (N), V: the one root of the cubic."""
+    """Voltage for a thrust (N), V: the single root of the cubic."""
     a, b, c, d = components(coefficients)
     middle = -c / (3 * d)  # where the cubic is least steep
     p = b / d - 3 * middle**2

@@ -1,9 +1,8 @@
-"""URDF -> Params.
+"""Load vehicles from URDF files.
 
-Mass and inertia are the base link's, rotor positions are the origins of the fixed joints `rotor0` to
-`rotor3`, the collision cylinder is the base link's, and what URDF has no word for stands in a
-`<properties>` tag. What a file says and `Params` cannot hold (tilted rotors, a mass on another link) is an error,
-and so is a drone that cannot fly.
+Mass, inertia and collision cylinder are those of the base link, rotor positions the origins of the fixed joints
+`rotor0` to `rotor3`, and other constants are in a `<properties>` tag. Features without a counterpart in `Params`
+(tilted rotors, a mass on another link) are errors, as are drones that cannot fly.
 """
 
 import os
@@ -46,7 +45,7 @@ _PROPERTIES = {  # attribute: (length, meaning and unit, range)
     "inflow_loss": (1, "share of thrust lost per m/s of downwash, s/m", (0, 10)),
     "prop_radius": (1, "propeller radius, m", _LENGTH),
 }
-"""The ranges are those of anything from an insect to an airliner; within them single precision holds a flight."""
+"""Ranges from an insect to an airliner, within single precision."""
 _OTHER_WORDS = ("thrust2weight", "max_speed_kmh")  # for `max_rpm` and `max_speed`
 _DEFAULTS = {"rotor_inertia": "0", "flapping_coeff": "0 0"}
 _DEFAULTS |= dict.fromkeys(("flapping_climb", "rate_damping", "trim_torque"), "0 0 0")
@@ -55,7 +54,7 @@ _MASS = (1e-6, 1e6)  # kg
 _INERTIA = (1e-15, 1e9)  # kg m^2
 _MAX_RPM = (10, 1e6)
 _ANGULAR_ACCELERATION = (0.01, 3e4)  # rad/s^2 at the largest torque; the bundled vehicles reach 14 to 600
-_UNBALANCED = 100.0  # rad/s^2 with all rotors at hover speed; controllers cannot be expected to hold more
+_UNBALANCED = 100.0  # rad/s^2 with all rotors at hover speed; limit for controllers
 _CONDITION = 20.0  # of the map from thrusts to thrust and torques; 1 for a cross, 1.3 for the racer
 _DRAG_RATE = 100.0  # 1/s, speed lost to drag with all rotors at full speed
 _BASE = "link[@name='base_link']"
@@ -63,13 +62,13 @@ _ROTORS = tuple(f"rotor{i}" for i in range(4))
 
 
 def load_params(vehicle: str | os.PathLike) -> Params:
-    """The constants of one drone.
+    """Load the constants of one drone.
 
     Args:
         vehicle: a bundled vehicle (`jaxdrones.assets.vehicles()` names all) or the path of a URDF.
 
     Raises:
-        ValueError: an unknown vehicle, or a URDF that lacks something or holds nonsense; says what.
+        ValueError: an unknown vehicle, or a URDF with missing or invalid entries.
     """
     if not isinstance(vehicle, str | os.PathLike):
         raise UserError(f"vehicle is {short_repr(vehicle)}; give the name of a bundled vehicle or the path of a URDF")
@@ -81,10 +80,10 @@ def load_params(vehicle: str | os.PathLike) -> Params:
 
 
 def parse_params(name: str, text: str) -> Params:
-    """The constants of one drone from the text of a URDF; `name` is that of the file, for errors.
+    """Constants of one drone from the text of a URDF; `name` is that of the file, for messages.
 
     Raises:
-        ValueError: the text lacks something or holds nonsense; says what.
+        ValueError: missing or invalid entries.
     """
     return _params(_Urdf(Path(name), text.encode()))
 
@@ -120,7 +119,7 @@ def _params(urdf: "_Urdf") -> Params:
 
 
 def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> None:
-    """Raise unless the rotors lift the drone and turn it about every axis, and the moments are those of a body."""
+    """Raise unless the rotors can lift and rotate the drone, and the moments of inertia are valid."""
 
     def demand(condition, problem: str, remedy: str) -> None:
         if not condition:
@@ -178,7 +177,7 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
 
 
 class _Urdf:
-    """A parsed file whose look-ups raise errors that name the file, the tag and the attribute."""
+    """Parsed file with errors that name the file, the tag and the attribute."""
 
     def __init__(self, path: Path, content: bytes | None = None):
         self.name = path.name
@@ -194,7 +193,7 @@ class _Urdf:
             raise UserError(f"{path}: is no URDF, its root is <{self._root.tag}>; give a file with <robot>")
 
     def check_what_params_cannot_hold(self) -> None:
-        """Raise on what would be flown differently than the file says."""
+        """Raise for features without a counterpart in `Params`."""
         for joint in self._root.iter("joint"):
             if re.fullmatch(r"rotor\d+", joint.get("name", "")) and joint.get("name") not in _ROTORS:
                 raise UserError(
@@ -265,7 +264,7 @@ class _Urdf:
             raise UserError(f"{self.name}: <{path}> {attribute} is {short_repr(values)}; {remedy}")
 
     def _tag(self, path: str) -> ET.Element | None:
-        """The only tag at a path, whose parts are the only ones, too; `None` if it is missing."""
+        """Unique tag at a path; `None` if missing."""
         tag = self._root
         for part in path.split("/"):
             found = tag.findall(part)
@@ -278,7 +277,7 @@ class _Urdf:
 
 
 def _float(word: str) -> float:
-    """The number that a word of XML is; Python's 1_000 is none."""
+    """Parse a number of XML; Python's 1_000 is invalid."""
     if "_" in word:
         raise UserError(word)
     return float(word)

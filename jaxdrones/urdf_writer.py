@@ -1,4 +1,4 @@
-"""Params -> URDF, the inverse of `jaxdrones.load_params`."""
+"""Write vehicles to URDF, the inverse of `jaxdrones.load_params`."""
 
 import re
 from xml.sax.saxutils import quoteattr
@@ -31,14 +31,14 @@ _INVALID = re.compile(r"[^\t\n\r\x20-\uD7FF\uE000-\uFFFD\U00010000-\U0010FFFF]")
 
 
 def to_urdf(params: Params, name: str, comment: str = "") -> str:
-    """The text of a URDF of one drone, which `load_params` reads as these params.
+    """Text of a URDF of one drone, for `load_params`.
 
-    What belongs to the surroundings (gravity, air, wind, forces) and constants in `aux` are not written.
+    Gravity, air, wind, forces and constants in `aux` are not written.
 
     Args:
-        params: of one drone, with a highest rotor speed.
+        params: of one drone, with a finite highest rotor speed.
         name: of the robot.
-        comment: at the top; characters that XML does not allow there are left out or separated.
+        comment: comment at the top, made valid for XML.
     """
     comment, name = re.sub("-(?=-)", "- ", _INVALID.sub("", comment)), _INVALID.sub("", name)
     thrust2weight = 4 * params.kf * params.max_rpm**2 / (params.mass * GRAVITY)

@@ -1,4 +1,4 @@
-"""What a user's Python file defines, named as `file.py:name`."""
+"""Objects of users' Python files, named `file.py:name`."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ import jax
 from jaxdrones.checks import hint
 from jaxdrones.errors import UserError
 
-_modules: set[str] = set()  # names of the modules that files of users became
+_modules: set[str] = set()  # names of the modules of users' files
 _OF_TRACING = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 
 
 def is_reference(text: str) -> bool:
-    """Whether a text names a file of Python, or something in it."""
+    """Whether a string names a Python file, or an object in it."""
     return ".py:" in text or text.endswith(".py")
 
 
 def split_reference(reference: str) -> tuple[Path, str]:
-    """The file of `file.py:name`, and the name.
+    """Split `file.py:name` into file and name.
 
     Raises:
-        ValueError: the name is missing.
+        ValueError: a missing name.
     """
     file, _, name = reference.rpartition(":")
     if not (file and name):
@@ -39,7 +39,7 @@ def split_reference(reference: str) -> tuple[Path, str]:
 
 
 def read_text(file: Path) -> str:
-    """The text of a user's file.
+    """Read the text of a user's file.
 
     Raises:
         ValueError: the file cannot be read.
@@ -53,7 +53,7 @@ def read_text(file: Path) -> str:
 
 
 def load(reference: str) -> Any:
-    """What `file.py:name` names; the file is executed.
+    """Load the object `file.py:name` by executing the file.
 
     Raises:
         ValueError: the file cannot be read or executed, or does not define the name.
@@ -63,12 +63,12 @@ def load(reference: str) -> Any:
 
 
 def definition(file: str, text: str, name: str) -> Any:
-    """What the text of a Python file defines under a name; equal texts are executed once.
+    """Object of a name in the text of a Python file; equal texts are executed once.
 
     Args:
-        file: name of the file, for errors.
-        text: what is executed. It stands alone: it may import libraries, but no files beside it.
-        name: of a function, for example.
+        file: name of the file, for messages.
+        text: code to execute. It may import libraries, but no files beside it.
+        name: name of the object, for example a function.
 
     Raises:
         ValueError: the text cannot be executed, or does not define the name.
@@ -81,7 +81,7 @@ def definition(file: str, text: str, name: str) -> Any:
 
 
 def blame(error: BaseException) -> str | None:
-    """Where in a user's file an error arose and what it says, on one line; `None` if it arose in no such file."""
+    """Location in a user's file and message of an error, on one line; `None` for other errors."""
     frames = [x for x in traceback.walk_tb(error.__traceback__) if x[0].f_globals.get("__name__") in _modules]
     if not frames:
         return None
@@ -93,13 +93,13 @@ def blame(error: BaseException) -> str | None:
 
 
 def place(function: Any) -> str:
-    """The file and line in which a function is defined, such as `my_task.py, line 12`; empty where it has none."""
+    """File and line of a function, such as `my_task.py, line 12`; empty if unknown."""
     code = getattr(inspect.unwrap(getattr(function, "func", function)), "__code__", None)
     return "" if code is None else f"{Path(code.co_filename).name}, line {code.co_firstlineno}"
 
 
 def _said(error: BaseException) -> str:
-    """The type and the message of an error, and what to do about those of JAX."""
+    """Type and message of an error, with a hint for errors of JAX."""
     kind = type(error).__name__
     if isinstance(error, SystemExit):
         return f"{kind}({error.code!r}); a file of yours must not end the program"
@@ -111,11 +111,11 @@ def _said(error: BaseException) -> str:
 
 @functools.cache
 def _executed(file: str, text: str) -> types.ModuleType:
-    """The module that the text of a file is."""
+    """Module of the text of a file."""
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     module = types.ModuleType(f"{Path(file).stem}_{digest}")
     module.__file__ = file
-    sys.modules[module.__name__] = module  # where dataclasses look for the types that they name
+    sys.modules[module.__name__] = module  # for the type lookup of dataclasses
     _modules.add(module.__name__)
     try:
         exec(compile(text, file, "exec", dont_inherit=True), vars(module))

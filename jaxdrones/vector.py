@@ -1,4 +1,4 @@
-"""Vectors of a few components, and elementary functions that are differentiable everywhere."""
+"""Short vectors, and elementary functions with finite derivatives everywhere."""
 
 import math
 from collections.abc import Sequence
@@ -10,12 +10,12 @@ from jaxtyping import Array, Float
 
 
 def components(v: Float[Array, "n *shape"]) -> list[Float[Array, "*shape"]]:
-    """The components of a vector, or the rows of a matrix."""
+    """Components of a vector, or rows of a matrix."""
     return [jnp.squeeze(x, 0) for x in jax.lax.split(v, [1] * len(v))]
 
 
 def total(v: Float[Array, " n"]) -> Float[Array, ""]:
-    """The sum of the components of a short vector."""
+    """Sum of the components of a short vector."""
     return cast(Array, sum(components(v)))
 
 
@@ -32,19 +32,19 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def along_z(x: Float[Array, ""]) -> Float[Array, "3"]:
-    """The vector (0, 0, x)."""
+    """Vector (0, 0, x)."""
     return jnp.stack([jnp.zeros_like(x), jnp.zeros_like(x), x])
 
 
 def unit(v: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The direction of v; zero, with a zero gradient, where v is zero."""
+    """Unit vector along v; zero, with a zero gradient, where v is zero."""
     length = safe_sqrt(dot(v, v))
     return v / jnp.where(length > 0, length, 1)
 
 
 @jax.custom_jvp
 def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The square root; zero, with a zero gradient, of numbers that are not positive. NaN stays NaN."""
+    """Square root; zero, with a zero gradient, for numbers that are not positive. NaN stays NaN."""
     return jnp.sqrt(jnp.maximum(x, 0))
 
 
@@ -62,8 +62,8 @@ _SINE = (1.0, -0.166666567, 0.00833302514, -0.000198074187, 2.60190307e-06)
 def sin_cos(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Sine and cosine of an angle.
 
-    In single precision, where the library's functions keep a loop from using the vector unit of a CPU, a minimax
-    polynomial of the sine on [0, pi/2] is used; its relative error is 5e-9. Whole turns are subtracted first.
+    In single precision, where library functions prevent vectorization on a CPU, a minimax polynomial of the sine on
+    [0, pi/2] is used, with a relative error of 5e-9. Whole turns are subtracted first.
     """
     if _is_double(x):
         return jnp.sin(x), jnp.cos(x)
@@ -87,12 +87,12 @@ _ARCTANGENT = (
 
 @jax.custom_jvp
 def atan2(y: Float[Array, "*n"], x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The angle of the point (x, y), in [-pi, pi]; zero, with a zero gradient, at (0, 0).
+    """Angle of the point (x, y), in [-pi, pi]; zero, with a zero gradient, at (0, 0).
 
-    In single precision, where the library's function keeps a loop from using the vector unit of a CPU, a minimax
-    polynomial of the arctangent on [0, 1] is used; its relative error is 2e-8. Its branches compare x and y alone, and
-    the angle is continuous from one to the next, except for the whole turn between -pi and pi: an angle is right also
-    where a compiled program computes x and y twice and rounds them differently.
+    In single precision, where library functions prevent vectorization on a CPU, a minimax polynomial of the arctangent
+    on [0, 1] is used, with a relative error of 2e-8. Its branches compare x and y alone, and the angle is continuous
+    across branches, except for the turn between -pi and pi. It is therefore correct even if a compiled program computes
+    x and y twice with different rounding.
     """
     if _is_double(x) or _is_double(y):
         return jnp.arctan2(y, x)
@@ -117,7 +117,7 @@ def _is_double(x: Array) -> bool:
 
 
 def _odd(coefficients: Sequence[float], x: Array) -> Array:
-    """The polynomial of x with these coefficients of its odd powers, from the first power on."""
+    """Polynomial of x with these coefficients of odd powers, lowest first."""
     square, value = x * x, jnp.zeros_like(x)
     for coefficient in reversed(coefficients):
         value = value * square + coefficient

@@ -1,6 +1,6 @@
-"""Random realistic quadrotors of 20 g to 3 kg: a mass is drawn, and scaling laws give the other parameters.
+"""Random realistic quadrotors of 20 g to 3 kg: a random mass, and scaling laws for the other parameters.
 
-A scaling law gives the median for a vehicle of this mass. A drawn parameter is the median times a log-normal factor,
+A scaling law gives the median for a vehicle of this mass. A random parameter is the median times a log-normal factor,
 truncated to the range of published vehicles. Medians, spreads and limits are those of a regression over 13 published
 airframes of 31 g to 3.35 kg; tests/test_any_vehicle.py has the table with its sources and repeats the regression. The
 laws have these forms:
@@ -35,7 +35,7 @@ from jaxdrones.urdf import GRAVITY
 
 LIGHTEST, HEAVIEST = 0.02, 3.0  # kg
 _RADIANS_PER_SECOND = 2 * np.pi / 60  # per RPM
-_CORNERS = np.array([[1.0, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])  # signs of rotors 0 to 3, as on the Crazyflie
+_CORNERS = np.array([[1.0, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])  # signs of rotors 0 to 3, as in the Crazyflie
 _SPINS = np.array([-1.0, 1, -1, 1])
 
 
@@ -77,13 +77,13 @@ Vary = Callable[..., Array]
 
 
 def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST) -> Params:
-    """A random quadrotor; its environment (gravity, air, wind, external force) and `aux` do not change.
+    """Random quadrotor; gravity, air, wind, external force and `aux` are those of `params`.
 
     The ground effect is that of Cheeseman and Bennett; the downwash of equation 6 is off.
 
     Args:
         key: random key.
-        params: parameters of one drone, whose environment and `aux` are kept.
+        params: parameters of one drone.
         lightest: smallest mass, kg.
         heaviest: largest mass, kg.
 
@@ -105,7 +105,7 @@ def draw(key: jax.Array, params: Params, lightest: float = LIGHTEST, heaviest: f
 
 
 def median(params: Params, lightest: float = LIGHTEST, heaviest: float = HEAVIEST) -> Params:
-    """The quadrotor of the median mass with the medians of the scaling laws; arguments and errors as for `draw`."""
+    """Quadrotor of the median mass with the medians of the scaling laws; arguments and errors as for `draw`."""
     check_masses(lightest, heaviest)
     mass = jnp.asarray(np.sqrt(lightest * heaviest), params.mass.dtype)
     return _vehicle(params, mass, lambda name, median, low, high: jnp.clip(median, low, high))
@@ -120,7 +120,7 @@ def check_masses(lightest: float, heaviest: float) -> None:
 
 
 def _vehicle(params: Params, mass: Array, vary: Vary) -> Params:
-    """The quadrotor of a mass; `vary(name, median, low, high)` returns a parameter near its median."""
+    """Quadrotor of a mass; `vary(name, median, low, high)` returns a parameter near its median."""
 
     def by_law(name: str, scale: Array | float = 1.0) -> Array:
         law = LAWS[name]

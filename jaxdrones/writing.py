@@ -1,4 +1,4 @@
-"""Whole files: written beside their place and then renamed, so that a crash leaves the old file or the new one."""
+"""Atomic writing of files by renaming."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def replaced(file: str | os.PathLike) -> Iterator[Path]:
-    """A context with the path to write to; what was written there replaces the file at the end of the context.
+    """Context with a temporary path that replaces the file at its end.
 
-    If the context raises, or the process is killed, the old file stays as it was. What is no ordinary file, such as
-    /dev/stdout, is written in place.
+    If the context raises, or the process is killed, the old file is unchanged. Special files, such as /dev/stdout, are
+    written in place.
 
     Raises:
-        OSError: the file cannot be written; the error names it.
+        OSError: the file cannot be written.
     """
     file = Path(file)
     if file.exists() and not file.is_file():
@@ -26,7 +26,7 @@ def replaced(file: str | os.PathLike) -> Iterator[Path]:
     try:
         yield new
         rename(file)
-    except OSError as error:  # that of a full disk names no file
+    except OSError as error:  # the error of a full disk names no file
         new.unlink(missing_ok=True)
         if error.filename in (None, str(new)):
             raise OSError(error.errno, error.strerror or str(error), str(file)) from error
@@ -37,23 +37,23 @@ def replaced(file: str | os.PathLike) -> Iterator[Path]:
 
 
 def write(file: Path, content: bytes) -> None:
-    """Write a whole file, or nothing if that fails.
+    """Write a file atomically.
 
     Raises:
-        OSError: the file cannot be written; the error names it.
+        OSError: the file cannot be written.
     """
     with replaced(file) as new:
         new.write_bytes(content)
 
 
 def beside(file: Path) -> Path:
-    """The path of a file until it is complete: `state.new.json` of `state.json`."""
+    """Temporary path of an incomplete file: `state.new.json` for `state.json`."""
     target = _target(file)
     return target.with_name(f"{target.stem}.new{target.suffix}")
 
 
 def rename(file: Path) -> None:
-    """Replace a file by the complete one beside it, when that is on the disk."""
+    """Flush the new file beside a file to the disk, and rename it."""
     new = beside(file)
     _synchronize(new, os.O_RDWR)
     os.replace(new, _target(file))
@@ -61,12 +61,12 @@ def rename(file: Path) -> None:
 
 
 def _target(file: Path) -> Path:
-    """The file that a link leads to, which stays a link."""
+    """Target of a link, to keep the link."""
     return file.resolve() if file.is_symlink() else file
 
 
 def _synchronize(path: Path, mode: int) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk."""
+    """Flush the content of a file, or the names in a folder, to the disk."""
     descriptor = os.open(path, mode)
     try:
         os.fsync(descriptor)

@@ -1,1 +1,1 @@
-"""Everything that exists for a compiler: many worlds in one kernel, and numbers that are stored, not repeated."""
+"""Program transformations for speed: many worlds in one kernel, stored intermediate results, conditional work."""

@@ -1,4 +1,4 @@
-"""One traced program for many worlds, a chunk of them after another: by `jax.vmap`, or as a single kernel."""
+"""Traced programs for many worlds in chunks, by `jax.vmap` or as a single kernel."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from jaxdrones.accelerate.soa import vmap_for_kernel
 from jaxdrones.checks import check_whole
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
-"""Notes to XLA's CPU compiler: make a single function of what this `jax.jit` calls, loops included. It would otherwise
-run every step of a scan as some twenty kernels, and hand each to a thread."""
+"""Attributes for XLA's CPU compiler: compile this call to a single function, loops included. Otherwise every step of a
+scan is about twenty kernels, each handed to a thread."""
 
 _KERNEL_CHUNK, _VMAP_CHUNK = 128, 512
-"""Worlds whose states stay in the cache during a flight: of a flight as one kernel, and of one as many kernels."""
+"""Number of worlds with states that fit in the cache: for a single kernel, and for many kernels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ChunkedProgram:
-    """A program of one world, and the axes along which its inputs have many."""
+    """Program of one world, with the axes of its inputs over worlds."""
 
     program: Any
     consts: list[Array]
@@ -43,10 +43,10 @@ class ChunkedProgram:
         along: tuple[int, ...],
         chunk: int | None,
     ) -> tuple[ChunkedProgram, Any]:
-        """Trace a function of one world; returns its program and the structure of its result.
+        """Trace a function of one world; return its program and the structure of its result.
 
         Raises:
-            ValueError: `chunk` is given and not a whole number above zero.
+            ValueError: a `chunk` that is not a positive integer.
         """
         if chunk is not None:
             check_whole("chunk", chunk)
@@ -59,14 +59,14 @@ class ChunkedProgram:
         return fits_a_kernel(self.program)
 
     def by_vmap(self, *leaves: Array) -> list[Array]:
-        """The results for many worlds by `jax.vmap`, chunk by chunk unless the program has effects."""
+        """Results for many worlds by `jax.vmap`, chunk by chunk unless the program has effects."""
         return self._by_vmap(self.consts, leaves)
 
     def by_one_kernel(self, *leaves: Array) -> list[Array]:
-        """The results for many worlds, chunk by chunk in a single kernel. Derivatives are those of `by_vmap`.
+        """Results for many worlds, chunk by chunk in a single kernel. Derivatives are those of `by_vmap`.
 
         Raises:
-            NoKernelError: it can be none, which shows only here.
+            NoKernelError: the program cannot be a single kernel.
         """
 
         @_as_one_kernel
@@ -101,7 +101,7 @@ def _as_it_is(program: Any, consts: Sequence[Array], *inputs: Array) -> list[Arr
 
 
 def _chunks(function: Callable, leaves: Sequence[Array], axes: tuple[int, ...], size: int) -> list[Array]:
-    """The results of a function for one chunk of the worlds after another, (chunks, worlds of a chunk, ...)."""
+    """Results of a function chunk by chunk, (chunks, worlds of a chunk, ...)."""
     worlds = leaves[0].shape[axes[0]]
     size = min(size, worlds)
 
@@ -110,12 +110,12 @@ def _chunks(function: Callable, leaves: Sequence[Array], axes: tuple[int, ...], 
             *(jax.lax.dynamic_slice_in_dim(x, first, size, axis) for x, axis in zip(leaves, axes, strict=True))
         )
 
-    # The last chunk is a whole one too: some worlds are flown twice, but one program is compiled.
+    # The last chunk overlaps the one before: some worlds are computed twice, but with one program.
     return jax.lax.map(chunk, jnp.minimum(jnp.arange(0, worlds, size), worlds - size))
 
 
 def _joined(chunks: Array, worlds: int) -> Array:
-    """Join (chunks, worlds of a chunk, ...) along the worlds; of the last chunk only those that no other has."""
+    """Concatenate (chunks, worlds of a chunk, ...) along the worlds, without the overlap of the last chunk."""
     count, size, *shape = chunks.shape
     if count * size == worlds:
         return chunks.reshape(worlds, *shape)
@@ -124,11 +124,10 @@ def _joined(chunks: Array, worlds: int) -> Array:
 
 
 def _as_one_kernel(function: Callable) -> Callable:
-    """The function as a single kernel.
+    """Compile the function to a single kernel.
 
-    XLA would have several threads compute a single large result, and aborts where an argument is not used. So the first
-    number of each argument is returned too. What the function closes over is an argument whose value XLA does not see,
-    because XLA would put its numbers in its place.
+    XLA computes a single large result in several threads, and aborts for an unused argument. So the first number of
+    each argument is returned, too. Closed-over arrays become opaque arguments, because XLA would inline their numbers.
     """
 
     def kernel(consts, leaves):

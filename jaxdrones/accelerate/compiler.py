@@ -1,7 +1,7 @@
-"""Traced programs, notes to XLA and its options: the interfaces that JAX does not promise to keep.
+"""Unstable interfaces of JAX: traced programs, XLA attributes and compiler options.
 
-They are used here and nowhere else. Where a version of JAX lacks one of them, `AVAILABLE` is False or a function raises
-`UnknownError`, and callers do without.
+They are used only here. If a version of JAX lacks one of them, `AVAILABLE` is False or a function raises
+`UnknownError`, with a fallback in the callers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ try:
     from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
     AVAILABLE = True
-    """Whether this version of JAX has all that `over_worlds` needs beside `jax.vmap`."""
+    """Whether this version of JAX supports `over_worlds` beyond `jax.vmap`."""
 except ImportError:
     AVAILABLE = False
 
@@ -27,31 +27,31 @@ except ImportError:
     _constant = jax.jit(lambda: 0)
 
     def is_inside_jit() -> bool:
-        """Whether what is computed here becomes a part of a traced program."""
+        """Whether the caller runs inside a traced program."""
         return isinstance(_constant(), jax.core.Tracer)
 
 
 Equation = Any
-"""One line of a traced program, with `primitive`, `params`, `invars`, `outvars` and `effects`."""
+"""Equation of a traced program, with `primitive`, `params`, `invars`, `outvars` and `effects`."""
 Variable = Any
-"""An array in a traced program; its shape and type are its `aval`."""
+"""Variable of a traced program, with shape and type in its `aval`."""
 
 PLAIN_CALLS = frozenset("jit pjit closed_call core_call".split())
-"""Primitives that run the program that they hold, and do nothing else."""
+"""Primitives that only call a program."""
 
 CALLS = PLAIN_CALLS | frozenset("remat remat2 checkpoint custom_jvp_call custom_vjp_call".split())
-"""The plain calls, and those that also say how derivatives are taken."""
+"""Plain calls, and calls with derivative rules."""
 
 
 class UnknownError(Exception):
-    """A traced program has a form that this code does not know."""
+    """Unknown form of a traced program."""
 
 
 def kernel_options() -> dict[str, Any]:
-    """The options of `jax.jit` with which a single kernel is fastest on a CPU; none on other devices.
+    """Options of `jax.jit` for a single kernel on a CPU; empty on other devices.
 
-    Wider vectors where the CPU has them, the older code generator of XLA, and no sums by a library, which a single
-    kernel cannot call. Options that the installed compiler does not know are left out.
+    They select wider vectors if available, the older code generator of XLA, and no sums by a library, which a single
+    kernel cannot call. Options unknown to the installed compiler are left out.
     """
     return _known(
         xla_cpu_prefer_vector_width=512, xla_cpu_use_fusion_emitters=False, xla_cpu_experimental_ynn_fusion_type=""
@@ -59,7 +59,7 @@ def kernel_options() -> dict[str, Any]:
 
 
 def training_options() -> dict[str, Any]:
-    """The options with which training compiles faster on a CPU, and runs as fast; none on other devices."""
+    """Options for faster compilation of trainings on a CPU at equal speed; empty on other devices."""
     return _known(xla_cpu_use_fusion_emitters=False)
 
 
@@ -81,47 +81,47 @@ def _is_known(name: str, value: Any) -> bool:
 
 
 def set_notes(result: Any, **notes: str) -> Any:
-    """The result of a call that carries notes to XLA, or is the plain result where this version of JAX has none."""
+    """Result of a call with XLA attributes, or of a plain call without support in JAX."""
     return set_xla_metadata(result, **notes) if AVAILABLE else result
 
 
 def trace(function: Callable, *arguments: Any) -> tuple[Any, list, Any]:
-    """The program of a function, the values that it closes over, and the shapes of its result."""
+    """Program of a function, its closed-over values, and the shapes of its result."""
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     return *opened(closed), shape
 
 
 def opened(program: Any) -> tuple[Any, list]:
-    """A program, and the values that it closes over. Since JAX 0.12 they are one object."""
+    """Program and its closed-over values; one object since JAX 0.12."""
     if hasattr(program, "consts"):
         return getattr(program, "jaxpr", program), list(program.consts)
     return program, []
 
 
 def as_function(program: Any, consts: Sequence) -> Callable[..., list]:
-    """A program as a function of its inputs."""
+    """Function of a program."""
     return jaxpr_as_fun(ClosedJaxpr(program, list(consts)))
 
 
 def alone(equation: Equation, variables: Iterable[Variable], results: Iterable[Variable]) -> Callable[..., list]:
-    """An equation as a function of some of its variables, which returns some of its results."""
+    """Function from some variables of an equation to some of its results."""
     parts = dict(invars=[*variables], outvars=[*results], eqns=[equation], effects=equation.effects)
     return as_function(opened(_nothing())[0].replace(**parts), ())
 
 
 @functools.cache
 def _nothing() -> Any:
-    """A program without equations, as a template for others."""
+    """Empty program, as a template."""
     return jax.make_jaxpr(lambda: ())()
 
 
 def is_literal(variable: Variable) -> bool:
-    """Whether a variable stands for a number that is written in the program."""
+    """Whether a variable is a literal."""
     return isinstance(variable, Literal)
 
 
 def held(equation: Equation) -> Iterator[Any]:
-    """The programs that an equation holds, whatever its parameters are called."""
+    """Programs in the parameters of an equation."""
     for value in equation.params.values():
         for each in value if isinstance(value, tuple | list) else (value,):
             if hasattr(each, "eqns"):
@@ -129,7 +129,7 @@ def held(equation: Equation) -> Iterator[Any]:
 
 
 def called(equation: Equation) -> tuple[Any, list]:
-    """The program of an equation whose primitive is one of `CALLS`."""
+    """Program of an equation with a primitive of `CALLS`."""
     for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
         if name in equation.params:
             return opened(equation.params[name])
@@ -137,7 +137,7 @@ def called(equation: Equation) -> tuple[Any, list]:
 
 
 def scan_counts(equation: Equation) -> tuple[int, int]:
-    """How many inputs of a scan are the same in all passages, and how many are carried."""
+    """Numbers of constants and of carries of a scan."""
     params = equation.params
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
@@ -149,7 +149,7 @@ def scan_counts(equation: Equation) -> tuple[int, int]:
 
 
 def scan_of(equation: Equation, evaluate: Callable[..., list], inputs: Sequence) -> list:
-    """The results of a scan whose passages are evaluated by `evaluate(program, consts, *inputs)`."""
+    """Results of a scan with its body evaluated by `evaluate(program, consts, *inputs)`."""
     consts, carried = scan_counts(equation)
     program, own_consts = opened(equation.params["jaxpr"])
     same, first, stacks = inputs[:consts], inputs[consts : consts + carried], inputs[consts + carried :]
@@ -164,16 +164,16 @@ def scan_of(equation: Equation, evaluate: Callable[..., list], inputs: Sequence)
 
 
 def evaluated(equation: Equation, inputs: Sequence) -> list:
-    """The results of an equation."""
+    """Results of an equation."""
     variables = {v: x for v, x in zip(equation.invars, inputs, strict=True) if not is_literal(v)}
     return alone(equation, variables, equation.outvars)(*variables.values())
 
 
 def depends(function: Callable, *arguments: Any) -> Any:
-    """Which numbers of a function's result depend on its first argument: a pytree of booleans like the result.
+    """Pytree of booleans: dependence of each array of a function's result on its first argument.
 
-    It is read off the traced program, so it holds for all values of the arguments. Where the program is not transparent
-    (a loop, a derivative rule of its own) everything that goes in may change everything that comes out.
+    It is a property of the traced program, so it holds for all values of the arguments. In opaque equations (loops,
+    custom derivative rules) all outputs are assumed to depend on all inputs.
     """
     program, _, shape = trace(function, *arguments)
     first = len(jax.tree.leaves(arguments[0]))
@@ -182,7 +182,7 @@ def depends(function: Callable, *arguments: Any) -> Any:
 
 
 def _dependent(program: Any, given: Sequence[bool]) -> list[bool]:
-    """Which results of a program depend on the inputs that are given as true."""
+    """Dependence of the results of a program on the inputs marked true."""
     known = dict(zip(program.invars, given, strict=True))
 
     def depends(variable: Variable) -> bool:
@@ -204,11 +204,11 @@ def _dependent(program: Any, given: Sequence[bool]) -> list[bool]:
 
 
 def _sources(program: Any) -> list[int | None]:
-    """For every result of a program the index of the input that it is, or nothing."""
+    """Index of the forwarded input of every result of a program, or nothing."""
     inputs = {v: i for i, v in enumerate(program.invars)}
     return [None if is_literal(v) else inputs.get(v) for v in program.outvars]
 
 
 def _is_forwarded(*sources: int | None) -> bool:
-    """Whether a result is the same input in all branches."""
+    """Whether a result is the same forwarded input in all branches."""
     return sources[0] is not None and len(set(sources)) == 1

@@ -1,4 +1,4 @@
-"""Which programs can be a single kernel of XLA's CPU compiler, by the primitives that they are made of."""
+"""Eligibility of programs for a single kernel of XLA's CPU compiler, by their primitives."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import numpy as np
 from jaxdrones.accelerate import compiler
 
 LARGEST = 36
-"""Numbers of an array whose numbers become arrays of their own: as many as the coordinates of three drones' rotors.
-Arrays of four drones fill the vectors of a CPU as they are."""
+"""Largest size of an array to split into one array per entry: the rotor coordinates of three drones.
+Arrays of four drones fill the vectors of a CPU without a split."""
 
 _MAX_NUMBERS = 8_000
-"""Numbers that a program computes in its loops, up to which each becomes an array of its own: so many compile in a
-quarter of a minute."""
+"""Largest number of entries in the loops of a program to split: they compile in about 15 s."""
 
 ELEMENTWISE = frozenset(
     "abs add add_any and atan2 bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf exp exp2"
@@ -23,32 +22,32 @@ ELEMENTWISE = frozenset(
     " select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square stop_gradient sub tan"
     " tanh xor".split()
 )
-"""Primitives that compute each number from the numbers at its place."""
+"""Elementwise primitives."""
 
 SHAPES = frozenset(
     "broadcast_in_dim concatenate pad reshape rev slice split squeeze stack tile transpose unstack".split()
 )
-"""Primitives that put numbers in other places."""
+"""Rearranging primitives."""
 
 IDENTITIES = frozenset("copy copy_p optimization_barrier xla_metadata_value".split())
-"""Primitives whose results are their inputs."""
+"""Identity primitives."""
 
 REDUCTIONS = frozenset("reduce_sum reduce_prod reduce_max reduce_min reduce_and reduce_or".split())
 
 _BY_VMAP = frozenset("dynamic_slice dynamic_update_slice gather iota reduce_precision".split())
 _ALLOWED = compiler.CALLS | ELEMENTWISE | SHAPES | REDUCTIONS | _BY_VMAP | IDENTITIES | {"scan"}
-"""Primitives of which XLA's CPU compiler can make a single kernel, in the form that they get in `soa`."""
+"""Primitives that XLA's CPU compiler can fuse into a single kernel, in their form in `soa`."""
 
 
 class NoKernelError(Exception):
-    """XLA's CPU compiler can make no single kernel of a program."""
+    """Program that cannot be a single kernel of XLA's CPU compiler."""
 
 
 def fits_a_kernel(program: Any) -> bool:
-    """Whether a program can be a single kernel, and should be.
+    """Whether a program can and should be a single kernel.
 
-    It should if it has a loop, whose passages would otherwise be many kernels each. It can if every primitive in it is
-    known to become part of a kernel, whatever else JAX has or will have.
+    It should if it has a loop, with otherwise many kernels per iteration. It can if every primitive is on the list of
+    supported ones.
     """
     equations = list(_equations(program))
     loops = [eqn for eqn in equations if eqn.primitive.name == "scan" and eqn.params["length"] > 1]
@@ -62,13 +61,13 @@ def fits_a_kernel(program: Any) -> bool:
 
 
 def fits_number_by_number(program: Any) -> bool:
-    """Whether the numbers of a program's loops are few enough to be arrays of their own."""
+    """Whether the loops of a program have few enough entries to split."""
     sizes = list(_sizes_in_loops(program))
     return max(sizes, default=0) <= LARGEST and sum(sizes) <= _MAX_NUMBERS
 
 
 def _equations(program: Any) -> Iterable[compiler.Equation]:
-    """The equations of a program and of all programs that it holds."""
+    """Equations of a program and of all its subprograms."""
     for eqn in program.eqns:
         yield eqn
         for inner in compiler.held(eqn):
@@ -86,13 +85,13 @@ def _is_allowed(eqn: compiler.Equation) -> bool:
 
 
 def _is_plain(aval: Any) -> bool:
-    """Whether it is an array of real numbers or truth values, and not empty."""
+    """Whether it is a nonempty array of real numbers or booleans."""
     dtype = getattr(aval, "dtype", None)
     return isinstance(dtype, np.dtype) and dtype.kind in "biuf" and aval.size > 0
 
 
 def _sizes_in_loops(program: Any, inside: bool = False) -> Iterable[int]:
-    """The size of each array that loops compute or carry."""
+    """Sizes of the arrays computed or carried by loops."""
     for eqn in program.eqns:
         inner = list(compiler.held(eqn))
         for each in inner:

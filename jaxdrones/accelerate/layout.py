@@ -1,4 +1,4 @@
-"""Arrays of many worlds in two layouts, and what primitives compute where each number is an array of its own."""
+"""Two layouts of arrays over worlds, and primitives with one array per entry."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.fitting import ELEMENTWISE, REDUCTIONS
 
 _MAX_UNROLLED = 32
-"""Terms up to which a reduction is written out; of more it is a loop."""
+"""Largest number of terms of an unrolled reduction; a loop is used for more."""
 
 _OPERATIONS: dict[str, Callable] = {
     "reduce_sum": operator.add,
@@ -30,24 +30,24 @@ _OPERATIONS: dict[str, Callable] = {
 
 @dataclasses.dataclass(frozen=True)
 class Whole:
-    """An array as JAX has it: (..., worlds), or without that axis if it is the same in all worlds."""
+    """Array of JAX (..., worlds), or without that axis if equal in all worlds."""
 
     x: Array
     varies: bool
 
     def in_all_worlds(self, worlds: int) -> Array:
-        """The array with the axis over worlds, whether it varies or not."""
+        """Array with the axis over worlds, broadcast if necessary."""
         return self.x if self.varies else jnp.broadcast_to(self.x[..., None], (*self.x.shape, worlds))
 
 
 Apart = np.ndarray
-"""An array of objects, which are its numbers: (worlds,) each, or () if they are the same in all worlds."""
+"""Array of objects, its entries: (worlds,) each, or () if equal in all worlds."""
 
 Value = Whole | Apart
 
 
 def apart(value: Value) -> Apart:
-    """The value with its numbers apart."""
+    """Split a value into entries."""
     if not isinstance(value, Whole):
         return value
     shape = value.x.shape[:-1] if value.varies else value.x.shape
@@ -55,7 +55,7 @@ def apart(value: Value) -> Apart:
 
 
 def whole(value: Value) -> Whole:
-    """The value as one array."""
+    """Join a value into one array."""
     if isinstance(value, Whole):
         return value
     x = jnp.stack(_alike(value.flat))
@@ -63,7 +63,7 @@ def whole(value: Value) -> Whole:
 
 
 def of_numbers(numbers: Sequence, shape: tuple[int, ...]) -> Apart:
-    """An array of objects of a shape."""
+    """Array of objects of a shape."""
     array = np.empty(len(numbers), object)
     for i, x in enumerate(numbers):
         array[i] = x
@@ -71,7 +71,7 @@ def of_numbers(numbers: Sequence, shape: tuple[int, ...]) -> Apart:
 
 
 def number_by_number(eqn: compiler.Equation, inputs: list[Apart]) -> list[Apart]:
-    """The results of an equation that is elementwise, of shapes, or a reduction."""
+    """Results of an elementwise, rearranging or reducing equation."""
     p, x = eqn.params, inputs[0]
     match eqn.primitive.name:
         case name if name in ELEMENTWISE:
@@ -113,7 +113,7 @@ def number_by_number(eqn: compiler.Equation, inputs: list[Apart]) -> list[Apart]
 
 
 def reduced(eqn: compiler.Equation, x: Array) -> list[Array]:
-    """A reduction, written out or by a loop. XLA may make it a call of a library, of which there is no kernel."""
+    """Reduction, unrolled or by a loop: XLA may call a library for it, which a kernel cannot."""
     axes, operation = eqn.params["axes"], _OPERATIONS[eqn.primitive.name]
     rows = jnp.moveaxis(x, axes, range(len(axes)))
     rows = rows.reshape(-1, *rows.shape[len(axes) :])
@@ -143,7 +143,7 @@ def _padded(x: Apart, value: Array, eqn: compiler.Equation) -> Apart:
 
 
 def _alike(numbers: Iterable) -> list:
-    """The numbers, all of shape (worlds,) if one of them is."""
+    """Entries, all of shape (worlds,) if any is."""
     numbers = list(numbers)
     shape = max(map(jnp.shape, numbers), key=len)
     return [x if jnp.shape(x) == shape else jnp.broadcast_to(x, shape) for x in numbers]

@@ -1,4 +1,4 @@
-"""Arrays that a program uses in several orders. Each such use can double what XLA's CPU compiler makes of a program."""
+"""Storage of arrays used in several orders, each of which can double the code of XLA's CPU compiler."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxdrones.accelerate.compiler import Variable, is_literal
 from jaxdrones.accelerate.stored import stored
 
 _MAX_REORDERED = 8
-"""Reordered arrays up to which a program is left as it is."""
+"""Largest number of reordered arrays of an unchanged program."""
 
 _REORDERING = frozenset("dynamic_slice gather pad rev slice".split())
 
@@ -22,14 +22,14 @@ _REORDERING = frozenset("dynamic_slice gather pad rev slice".split())
 def store_reordered(
     program: Any, consts: Sequence[Array], *inputs: Array, rules: Mapping[str, Callable] | None = None
 ) -> list[Array]:
-    """Evaluate a program for one world, and store the arrays that it uses in another order too, where they are many.
+    """Evaluate a program for one world, and store its reordered arrays if they are many.
 
     Args:
         program: the traced program.
-        consts: the values that it closes over.
+        consts: its closed-over values.
         *inputs: its inputs.
-        rules: how to evaluate equations of some primitives, `(equation, *inputs) -> results`. With rules, derivatives
-            are no longer those of the program.
+        rules: evaluation of some primitives, `(equation, *inputs) -> results`. With rules, derivatives are no longer
+            those of the program.
     """
     reordered = _reordered(program)
     values = dict(zip(program.constvars, consts, strict=True)) | dict(zip(program.invars, inputs, strict=True))
@@ -58,14 +58,14 @@ def store_reordered(
 
 
 def has_reordered(program: Any) -> bool:
-    """Whether `store_reordered` stores anything of a program."""
+    """Whether `store_reordered` changes a program."""
     return bool(_reordered(program)) or any(
         has_reordered(inner) for eqn in program.eqns for inner in compiler.held(eqn)
     )
 
 
 def _reordered(program: Any) -> set[Variable]:
-    """The variables that are used in another order beside another use, if they are many."""
+    """Variables with a reordered use beside another use, if they are many."""
     read = [v for eqn in program.eqns for v in eqn.invars if not is_literal(v)]
     uses = collections.Counter(read)
     reordered = [eqn.invars[0] for eqn in program.eqns if eqn.primitive.name in _REORDERING]

@@ -1,4 +1,4 @@
-"""Storing what several expressions of a function share. XLA's CPU compiler would compute it anew in each of them."""
+"""Storage of common subexpressions, which XLA's CPU compiler would recompute in each expression."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from jaxdrones.accelerate.compiler import Equation, Variable, is_literal
 from jaxdrones.accelerate.stored import stored, stored_for_derivatives
 
 _MIN_SAVED_IN_KERNEL = 6
-"""Operations that storing a number must save within one kernel, where it costs a write and a few reads."""
+"""Smallest number of operations saved by storing a number within one kernel, at the cost of a write and a few reads."""
 
 _MIN_SAVED_BETWEEN_KERNELS = 40
-"""Operations that storing a number must save where it ends a kernel of XLA's and starts another."""
+"""Smallest number of operations saved by storing a number between two kernels."""
 
 _COSTS = {"div": 4, "sqrt": 4, "broadcast_in_dim": 0, "convert_element_type": 0}
-"""Operations that a primitive takes for one number, where it is not one."""
+"""Operations of a primitive per entry, if not one."""
 
 
 def materialize_shared(function: Callable) -> Callable:
-    """The same function, for a CPU: what its expressions share is stored, and what its arguments' derivatives are.
+    """Store the common subexpressions of a function and the derivatives of its arguments, on a CPU.
 
-    It works under `jit`, `vmap` and `grad` alike. On other devices, and with versions of JAX that lack what it needs,
-    the function is traced as it is.
+    It works under `jit`, `vmap` and `grad`. On other devices and unsupported versions of JAX, the function is
+    unchanged.
 
     Args:
-        function: of pytrees of arrays, and traceable. What it closes over is not stored.
+        function: traceable function of pytrees of arrays. Closed-over values are not stored.
     """
 
     def materialized(*arguments):
@@ -42,12 +42,12 @@ def materialize_shared(function: Callable) -> Callable:
 
 
 def recomputed(function: Callable) -> Callable:
-    """The same function, which a backward pass computes again: faster than storing more than its arguments."""
+    """Recompute a function in the backward pass, storing only its arguments."""
     return jax.checkpoint(materialize_shared(function))
 
 
 def store_shared(function: Callable) -> Callable:
-    """The same function, for the inside of a single kernel: what its expressions share, and is not cheap, is stored."""
+    """Store the costly common subexpressions of a function, for the inside of a single kernel."""
     return _store_shared(function, _MIN_SAVED_IN_KERNEL)
 
 
@@ -77,7 +77,7 @@ def _store_shared(function: Callable, min_saved: float) -> Callable:
 
 
 def _without_repetition(program: Any) -> tuple[dict[Variable, Variable], list[Equation]]:
-    """The equations that compute something new, and for every result of the others the variable that has its value."""
+    """Distinct equations, and the equivalent variable of every result of a duplicate equation."""
     same, known, equations = {}, {}, []
     for eqn in program.eqns:
         inputs = (_exactly(v) if is_literal(v) else same.get(v, v) for v in eqn.invars)
@@ -95,7 +95,7 @@ def _exactly(literal: Any) -> str:
 
 
 def _needed(program: Any, same: dict, equations: list[Equation]) -> tuple[dict[Variable, int], list[Equation]]:
-    """How often each variable is used on which the results depend, and the equations that compute them or act."""
+    """Live equations, and number of uses of each live variable."""
 
     def names(variables):
         return {same.get(v, v) for v in variables if not is_literal(v)}
@@ -110,18 +110,18 @@ def _needed(program: Any, same: dict, equations: list[Equation]) -> tuple[dict[V
 
 
 def _copies(eqn: Equation) -> int:
-    """How often an equation uses a number of its input: a broadcast once for each of its copies."""
+    """Number of uses of an input's entry in an equation: one per copy for a broadcast."""
     if eqn.primitive.name != "broadcast_in_dim":
         return 1
     return max(1, eqn.outvars[0].aval.size // max(1, eqn.invars[0].aval.size))
 
 
 _Used = tuple[Equation, list[Variable], list[Variable]]
-"""An equation, the variables that it reads, and those of its results that are needed."""
+"""Equation, its inputs, and its live results."""
 
 
 def _shared(equations: Sequence[_Used], uses: dict[Variable, int], min_saved: float) -> set[Variable]:
-    """Results that take `min_saved` operations more to compute again for every use than to store."""
+    """Results whose storage saves at least `min_saved` operations."""
     costs, chosen = {}, set()
     for eqn, inputs, results in equations:
         cost = _COSTS.get(eqn.primitive.name, 1) + sum(costs.get(v, 0) for v in set(inputs))

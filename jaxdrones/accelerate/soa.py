@@ -1,8 +1,8 @@
-"""Many worlds as a structure of arrays, in a form that XLA's CPU compiler can make a single kernel of.
+"""Structure of arrays over worlds, for a single kernel of XLA's CPU compiler.
 
-Of a world's velocity `jax.vmap` makes an array (worlds, 3). XLA's CPU compiler shuffles vectors wherever a component of
-it is used, and computes in each expression anew what several share. Here every number is an array (worlds,) of its own,
-so that to stack, split or transpose is only to name, and what is shared is stored once.
+`jax.vmap` batches a velocity to an array (worlds, 3). XLA's CPU compiler shuffles vectors for each use of a component,
+and recomputes common subexpressions. Here every entry is a separate array (worlds,), so stacking, splitting and
+transposing are free, and common subexpressions are stored once.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ _BY_NUMBERS = ELEMENTWISE | SHAPES | REDUCTIONS
 
 
 def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Array]) -> list[Array]:
-    """Evaluate a program that `fits_a_kernel` for many worlds, with the worlds last in inputs and results.
+    """Evaluate a program that `fits_a_kernel` for many worlds, with worlds as the last axis.
 
     Args:
         program: the traced program of one world.
-        consts: the values that it closes over.
+        consts: its closed-over values.
         leaves: its inputs, (..., worlds).
 
     Raises:
-        NoKernelError: it fits none, which shows only here.
+        NoKernelError: the program cannot be a single kernel.
     """
     if not fits_number_by_number(program):
         return jax.vmap(
@@ -57,7 +57,7 @@ def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Arra
 
 
 def _evaluate(program: Any, consts: Sequence[Value], inputs: Sequence[Value]) -> list[Value]:
-    """The results of a program."""
+    """Results of a program."""
     values = dict(zip(program.constvars, consts, strict=True))
     values |= dict(zip(program.invars, inputs, strict=True))
 
@@ -71,7 +71,7 @@ def _evaluate(program: Any, consts: Sequence[Value], inputs: Sequence[Value]) ->
 
 
 def _equation(eqn: compiler.Equation, inputs: list[Value]) -> list[Value]:
-    """The results of an equation."""
+    """Results of an equation."""
     name = eqn.primitive.name
     if name in IDENTITIES:
         return inputs
@@ -89,10 +89,10 @@ def _equation(eqn: compiler.Equation, inputs: list[Value]) -> list[Value]:
 
 
 def _vmapped(eqn: compiler.Equation, inputs: list[Whole]) -> list[Whole]:
-    """The results of any equation, by `jax.vmap`.
+    """Results of any equation, by `jax.vmap`.
 
     Raises:
-        NoKernelError: XLA's CPU compiler can make no kernel of it.
+        NoKernelError: an unsupported equation.
     """
     if eqn.primitive.name == "dynamic_update_slice" and any(x.varies for x in inputs[2:]):
         raise NoKernelError("a place that differs between worlds is a scatter")
@@ -104,7 +104,7 @@ def _vmapped(eqn: compiler.Equation, inputs: list[Whole]) -> list[Whole]:
 
 
 def _scan(eqn: compiler.Equation, inputs: list[Value]) -> list[Value]:
-    """The results of a scan that carries small arrays as their numbers, and larger ones whole."""
+    """Results of a scan that carries small arrays split, and larger ones whole."""
     first, carried = compiler.scan_counts(eqn)
     last = first + carried
     program, own_consts = compiler.opened(eqn.params["jaxpr"])
@@ -136,7 +136,7 @@ def _scan(eqn: compiler.Equation, inputs: list[Value]) -> list[Value]:
 
     carry, grown = None, jax.tree.map(jnp.asarray, to_carry(inputs[first:last]))
     while carry is None or jax.tree.map(jnp.shape, grown) != jax.tree.map(jnp.shape, carry):
-        carry = grown  # what is the same in all worlds at first need not stay so
+        carry = grown  # a carry that is equal in all worlds at first may vary later
         after, _ = jax.eval_shape(body, carry, [jax.eval_shape(lambda x: x[0], stack.x) for stack in stacks])
         grown = jax.tree.map(_grown, carry, after)
     options = {name: eqn.params[name] for name in ("length", "reverse", "unroll")}
@@ -146,5 +146,5 @@ def _scan(eqn: compiler.Equation, inputs: list[Value]) -> list[Value]:
 
 
 def _grown(x: Array, other: Array) -> Array:
-    """An array, given to each world if another one like it varies."""
+    """Broadcast an array over worlds if its counterpart varies."""
     return jnp.broadcast_to(x[..., None], other.shape) if x.ndim < other.ndim else x

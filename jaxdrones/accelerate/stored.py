@@ -1,4 +1,4 @@
-"""Numbers that XLA's CPU compiler is made to store."""
+"""Forced storage of intermediate results with XLA's CPU compiler."""
 
 from typing import Any
 
@@ -10,18 +10,17 @@ from jaxdrones.accelerate import compiler
 
 @jax.custom_jvp
 def stored(tree: Any) -> Any:
-    """The same numbers, which XLA's CPU compiler stores before they are used.
+    """Identity that forces XLA's CPU compiler to store its result.
 
-    The compiler would otherwise compute them anew in every expression that reads them, or read them there out of the
-    stack of a `scan`, which it does not vectorize. It fuses nothing across a call, so they go through a call that does
-    nothing.
+    The compiler would otherwise recompute it in every expression, or read it from the stack of a `scan`, which is not
+    vectorized. It does not fuse across calls, so this is an empty call.
     """
     return compiler.set_notes(_same(tree), inlineable="false") if jax.default_backend() == "cpu" else tree
 
 
 @jax.custom_jvp
 def stored_for_derivatives(tree: Any) -> Any:
-    """The same numbers, which are stored only where derivatives are taken."""
+    """Identity that forces storage only under differentiation."""
     return tree
 
 
@@ -31,9 +30,9 @@ _same = jax.jit(lambda tree: tree)
 @stored.defjvp
 @stored_for_derivatives.defjvp
 def _by_quotient(tree, tangent):
-    """Derivatives are stored by a division by one, which takes less than a call.
+    """Identity with derivatives stored by a division by one, which is cheaper than a call.
 
-    The compiler stores a quotient that is used several times, and sees too late that the divisor is one.
+    The compiler stores a quotient with several uses, before it simplifies the division.
     """
 
     def quotient(x):

@@ -1,4 +1,4 @@
-"""Images that are computed only in the worlds where one is due, also of many worlds at once and in gradients."""
+"""Conditional images: computed only in worlds where one is due, also under `vmap` and in gradients."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ Draw = Callable[..., Any]
 
 
 def where_due(draw: Draw, chunk: int) -> Draw:
-    """Build `f(due, before, *args) -> draw(*args) where due, else before`, which costs what is due.
+    """Build `f(due, before, *args)`, `draw(*args)` where due and `before` elsewhere, at the cost of the due worlds.
 
     Under `jax.vmap` a condition computes both of its branches in every world. This function gathers the worlds where
-    `due` holds and draws those alone, some at a time. Gradients are those of `jnp.where`, in reverse mode, at the cost
-    of drawing once more what was due; only gradients that are asked for are computed.
+    `due` holds and computes only those, in chunks. Gradients are those of `jnp.where`, in reverse mode, at the cost of
+    one recomputation; unused gradients are not computed.
 
     Args:
-        draw: a pure function of arrays whose result has the type of `before`.
-        chunk: number of worlds that are drawn at a time.
+        draw: pure function of arrays with a result of the type of `before`.
+        chunk: number of worlds per chunk.
     """
 
     def f(due: Array, before: Any, *args: Any) -> Any:
@@ -32,8 +32,8 @@ def where_due(draw: Draw, chunk: int) -> Draw:
         shown = [jnp.issubdtype(x.dtype, jnp.inexact) for x in kept]
 
         def images(real: list, other: list) -> tuple[list, list]:
-            """The images of real numbers, and those of integers."""
-            leaves = map(jnp.asarray, _merge(differentiable, real, other))  # constants arrive as numbers of Python
+            """Images of real numbers, and of integers."""
+            leaves = map(jnp.asarray, _merge(differentiable, real, other))  # constants arrive as Python numbers
             drawn = jax.tree.leaves(draw(*jax.tree.unflatten(structure, leaves)))
             return _split(shown, drawn)
 
@@ -111,11 +111,11 @@ def _of_due(draw: Callable[[Any], Any], chunk: int) -> Callable:
 
 
 def _split(mask: list[bool], leaves: list) -> tuple[list, list]:
-    """Leaves where the mask is true, and the others."""
+    """Split leaves by a mask."""
     return [x for x, m in zip(leaves, mask, strict=True) if m], [x for x, m in zip(leaves, mask, strict=True) if not m]
 
 
 def _merge(mask: list[bool], chosen: list, others: list) -> list:
-    """What was split, in the old order."""
+    """Inverse of `_split`."""
     first, second = iter(chosen), iter(others)
     return [next(first) if m else next(second) for m in mask]

@@ -1,4 +1,4 @@
-"""Costly functions whose result matters in few of many worlds at a time."""
+"""Conditional computation of costly functions needed in few worlds."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from jaxtyping import Array
 
 
 def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[..., Any]:
-    """`(needed, *args) -> function(*args)`, whose result matters only where `needed` () is true.
+    """Build `(needed, *args) -> function(*args)`, with zeros where `needed` () is false.
 
-    Of many worlds, by `jax.vmap`, only those are computed in which it matters, one of `one_in` at a time; the others
-    get zeros. Derivatives are those of the function where it is needed, else zero; they are computed in every world.
+    Under `jax.vmap` only worlds with `needed` are computed, in chunks of one in `one_in`. Derivatives are those of the
+    function where it is needed, else zero; they are computed in every world.
     """
 
     @jax.custom_batching.custom_vmap

@@ -1,4 +1,4 @@
-"""Many worlds at once, as fast as the device flies them."""
+"""`over_worlds`: fast simulation of many worlds."""
 
 from __future__ import annotations
 
@@ -27,29 +27,27 @@ R = TypeVar("R")
 def over_worlds(
     function: Callable[P, R], in_axes: int | Sequence[int] = 0, devices: Sequence[jax.Device] = ()
 ) -> Callable[P, R]:
-    """Turn a function of one world into one of many worlds: its arguments get an axis over worlds.
+    """Vectorize a function of one world over many worlds, like `jax.vmap`, and compile it.
 
-    It gives what `jax.vmap` gives, of every function that JAX can trace. Called with arrays, it compiles itself: the
-    first call with arguments of some shapes takes seconds, like that of `jax.jit`, and later calls reuse the program.
-    So make it once and keep it. What the function closes over is fixed at the first call. Called inside of `jax.jit`,
-    `jax.grad` or another transformation, it is traced like any other function and compiled with what is around it;
-    that is slower on a CPU, and so derivatives belong in the function, `over_worlds(jax.grad(miss))`.
+    It accepts every traceable function. The first call with arguments of some shapes compiles, like `jax.jit`, and
+    later calls reuse the program, so keep the returned function. Closed-over values are fixed at the first call. Inside
+    of `jax.jit`, `jax.grad` or another transformation it is traced like any other function, which is slower on a CPU:
+    take derivatives inside, `over_worlds(jax.grad(miss))`.
 
-    On a CPU it flies one chunk of the worlds after another, whose states stay in the cache. A function that has loops
-    and is made of arithmetic, as flights and their gradients are, is compiled as a single kernel, which keeps one core
-    busy. With sorting, matrix products, solvers, random numbers or branches it is compiled as usual, and so it is, with
-    a warning, where the single kernel does not compile.
+    On a CPU the worlds are computed in chunks that fit in the cache. A function of loops and arithmetic, such as a
+    flight or its gradient, is compiled to a single kernel on one core. With sorting, matrix products, solvers, random
+    numbers or branches it is compiled as usual; so it is, with a warning, if the single kernel does not compile.
 
     Args:
-        function: of one world; what is the same for all worlds it closes over.
-        in_axes: axis over worlds, of each argument or of all. Commands (steps, worlds, ...), that is 1, are read
+        function: function of one world; it may close over values common to all worlds.
+        in_axes: axis over worlds, of each argument or of all. Commands (steps, worlds, ...), with axis 1, are read
             fastest. Results have worlds first.
-        devices: each flies an equal share of the worlds. A CPU is one device, unless JAX is told before its first use:
-            `jax.config.update("jax_num_cpu_devices", 2)`.
+        devices: devices with an equal share of the worlds each. A CPU is one device by default; before the first use of
+            JAX, `jax.config.update("jax_num_cpu_devices", 2)` makes it two.
 
     Raises:
-        ValueError: when called, if `in_axes` is of another number of arguments, the arguments are of unequal numbers of
-            worlds, or the devices do not divide that number.
+        ValueError: at a call with a wrong number of `in_axes`, unequal numbers of worlds, or a number of worlds that is
+            not a multiple of the devices.
     """
     return in_chunks(function, None, in_axes, devices)
 
@@ -60,23 +58,23 @@ def in_chunks(
     in_axes: int | Sequence[int] = 0,
     devices: Sequence[jax.Device] = (),
 ) -> Callable[P, R]:
-    """`over_worlds` with chunks of another number of worlds."""
+    """`over_worlds` with chunks of a given number of worlds."""
     return cast(Callable[P, R], _ManyWorlds(function, chunk, in_axes, devices))
 
 
 class _ClosureIsTracedError(Exception):
-    """A function closes over an array that is being traced."""
+    """Closure over a traced array."""
 
 
 class _ManyWorlds:
-    """A function of many worlds, and the programs that were compiled of it."""
+    """Function of many worlds, and its compiled programs."""
 
     def __init__(
         self, function: Callable, chunk: int | None, in_axes: int | Sequence[int], devices: Sequence[jax.Device]
     ):
         self._function, self._chunk, self._in_axes, self._devices = function, chunk, in_axes, tuple(devices)
         self._several_kernels = jax.jit(functools.partial(self._evaluated, kernel=False))
-        self._without_kernel: set[Any] = set()  # shapes of arguments for which there is none
+        self._without_kernel: set[Any] = set()  # shapes of arguments without a single kernel
 
     def __call__(self, *arguments: Any) -> Any:
         can_be_kernel = self._can_be_kernel(arguments)
@@ -93,14 +91,14 @@ class _ManyWorlds:
         return self._evaluated(*arguments, kernel=False)
 
     def _one_kernel(self, *arguments: Any) -> Any:
-        """The results by a single kernel, or by several where there is none."""
+        """Results by a single kernel, or by several as a fallback."""
         try:
             return self._single_kernel(*arguments)
         except NoKernelError:
             self._goes_without_kernel(arguments)
         except jax.errors.JaxRuntimeError as error:
             if self._compiles(arguments):
-                raise  # it failed while it flew
+                raise  # failed at run time
             self._goes_without_kernel(arguments)
             name = getattr(self._function, "__name__", repr(self._function))
             warnings.warn(
@@ -134,11 +132,11 @@ class _ManyWorlds:
         self._without_kernel.add(_shapes(arguments))
 
     def _evaluated(self, *arguments: Any, kernel: bool, has_options: bool = False) -> Any:
-        """The results of many worlds.
+        """Results of many worlds.
 
         Raises:
-            NoKernelError: they should be those of a kernel, and there is none.
-            _ClosureIsTracedError: compiled with options, which JAX forbids within a trace.
+            NoKernelError: the program cannot be a single kernel.
+            _ClosureIsTracedError: a closure over traced arrays, which forbids compiler options.
         """
         axes = tuple(self._in_axes) if isinstance(self._in_axes, Sequence) else (self._in_axes,) * len(arguments)
         worlds = _number_of_worlds(arguments, axes)
@@ -167,7 +165,7 @@ class _ManyWorlds:
             raise NoKernelError(str(error)) from error
 
     def _shared(self, function: Callable, axes: tuple[int, ...]) -> Callable:
-        """The function with the worlds shared by the devices."""
+        """Function with the worlds sharded over the devices."""
         if len(self._devices) < 2:
             return function
         mesh = jax.make_mesh((len(self._devices),), ("worlds",), axis_types=(AxisType.Auto,), devices=self._devices)
@@ -177,7 +175,7 @@ class _ManyWorlds:
 
 
 def _number_of_worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
-    """The number of worlds, which all arguments must have."""
+    """Number of worlds, equal for all arguments."""
     for axis in axes:
         check_whole("an axis of in_axes", axis, minimum=0)
     if len(axes) != len(arguments):
@@ -193,7 +191,7 @@ def _number_of_worlds(arguments: tuple, axes: tuple[int, ...]) -> int:
 
 
 def _is_traced(tree: Any) -> bool:
-    """Whether some of the arrays are being traced, or all that is computed here is."""
+    """Whether any array is traced, or the caller runs inside a trace."""
     return compiler.is_inside_jit() or True in [isinstance(x, _TRACER) for x in jax.tree.leaves(tree)]
 
 

@@ -1,4 +1,4 @@
-"""Brax: an environment for its trainers, which need `wrap_for_training` and, from jax 0.10 on, `trainers`.
+"""Brax environments for its trainers, with `wrap_for_training` and, from jax 0.10 on, `trainers`.
 
 from jaxdrones.adapters import brax
 from brax.training.agents.ppo import train as ppo
@@ -32,12 +32,12 @@ try:
 except ImportError as error:
     raise ImportError(f"brax is not installed; {install('brax')}") from error
 
-_COLORED = 4  # axes of the images of a team that have colors
-_NEXT = np.uint32(2**32 - 1)  # what the key is folded with for the next episode: no episode has that many steps
+_COLORED = 4  # axes of color images of a team
+_NEXT = np.uint32(2**32 - 1)  # fold for the key of the next episode, above the number of steps of any episode
 
 
 def wrap(env: envs.Env, team_reward: str = "sum") -> BraxEnv:
-    """An environment for brax's trainers.
+    """Wrap an environment for brax's trainers.
 
     Args:
         env: environment.
@@ -52,12 +52,12 @@ def wrap(env: envs.Env, team_reward: str = "sum") -> BraxEnv:
 class BraxEnv(base.Env):
     """One world with one agent: actions and observations of the drones are concatenated.
 
-    `metrics` has the terms of the reward, as the reward counts them, and means over the drones of the task's metrics.
+    `metrics` has the weighted terms of the reward, and means over the drones of the task's metrics.
 
-    As in all of brax's environments, the time limit is the trainer's `episode_length`; take `env.steps`.
-    `info["time_out"]` is 1 where the task truncated the episode. With images, observations are dictionaries, as brax's
-    networks for vision take them: `state`, and `pixels/rgb`, `pixels/depth`, `pixels/segmentation` (h, w, channels),
-    where the images of all drones are channels of one image.
+    As in all of brax's environments, the time limit is the trainer's `episode_length`; give `env.steps`.
+    `info["time_out"]` is 1 where the task truncated the episode. With images, observations are dictionaries for brax's
+    vision networks: `state`, and `pixels/rgb`, `pixels/depth`, `pixels/segmentation` (h, w, channels), with the images
+    of all drones as channels.
     """
 
     def __init__(self, env: envs.Env, team_reward: str = "sum"):
@@ -80,7 +80,7 @@ class BraxEnv(base.Env):
 
     @property
     def backend(self) -> str:
-        """Name of the simulator, which is none of brax's."""
+        """Name of the simulator."""
         return "jaxdrones"
 
     def reset(self, rng: jax.Array) -> base.State:
@@ -119,7 +119,7 @@ class BraxEnv(base.Env):
 
 
 class _Training(base.Wrapper):
-    """Many worlds; where an episode ends, a new one begins from a newly drawn start."""
+    """Many worlds with automatic reset to a new random start."""
 
     def __init__(self, env: BraxEnv, episode_length: int):
         super().__init__(env)
@@ -136,7 +136,7 @@ class _Training(base.Wrapper):
         return jax.vmap(self._step)(state, action)
 
     def _step(self, state: base.State, action: jax.Array) -> base.State:
-        again = 1 - state.done  # 0 where this is the first step of an episode
+        again = 1 - state.done  # 0 in the first step of an episode
         info = state.info
         after = self.env.step(state, action)
         steps = again * info["steps"] + 1
@@ -167,19 +167,19 @@ class _Training(base.Wrapper):
 def wrap_for_training(
     env: BraxEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
 ) -> base.Wrapper:
-    """The trainers' `wrap_env_fn`: many worlds, each episode from a newly drawn start.
+    """`wrap_env_fn` of the trainers: many worlds, each episode from a new random start.
 
     Brax's own wrapper starts every episode of a world from the same cached state. `info["truncation"]` and
     `info["time_out"]` are 1 where an episode was truncated, by `episode_length` or by the task.
 
     Args:
-        env: environment that `wrap` returned.
+        env: environment of `wrap`.
         episode_length: control steps of an episode.
-        action_repeat: must be 1; make the environment with a lower `control_hz` to hold actions longer.
-        randomization_fn: must be `None`; make the environment with `randomize` to draw parameters in every episode.
+        action_repeat: must be 1; use a lower `control_hz` of the environment instead.
+        randomization_fn: must be `None`; use `randomize` of the environment instead.
 
     Raises:
-        ValueError: an argument that is not of that kind.
+        ValueError: an unsupported argument.
     """
     check_whole("episode_length", episode_length)
     if action_repeat != 1:
@@ -193,10 +193,10 @@ def wrap_for_training(
 
 @contextlib.contextmanager
 def trainers() -> Iterator[None]:
-    """A context in which brax 0.14.2's trainers run on jax 0.10 and later.
+    """Context for brax 0.14.2's trainers with jax 0.10 and later.
 
-    They call `jax.device_put_replicated`, which jax 0.10 removed (google/brax issue 671). The context adds it, and
-    removes it again at the end.
+    They call `jax.device_put_replicated`, which jax 0.10 removed (google/brax issue 671). The context adds it
+    temporarily.
     """
     missing = not hasattr(jax, "device_put_replicated")
     if missing:
@@ -209,7 +209,7 @@ def trainers() -> Iterator[None]:
 
 
 def _device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
-    """A copy of every array on every device, along a new leading axis, with the sharding of a `pmap` over "i"."""
+    """Copy every array to every device, along a new leading axis, with the sharding of a `pmap` over "i"."""
     sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
 
     def put(leaf):

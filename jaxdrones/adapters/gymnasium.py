@@ -1,6 +1,6 @@
-"""Gymnasium: importing this registers `jaxdrones/Hover-v0`, ... one id per task.
+"""Gymnasium environments; the import registers `jaxdrones/Hover-v0`, ..., one id per task.
 
-`gymnasium.make(id, **options)` gives one environment, `gymnasium.make_vec(id, num_envs, **options)` many of them in one
+`gymnasium.make(id, **options)` makes one environment, `gymnasium.make_vec(id, num_envs, **options)` many of them in one
 compiled step; the options are those of `jaxdrones.make`.
 """
 
@@ -32,8 +32,8 @@ NAMESPACE = "jaxdrones"
 class GymnasiumEnv(gymnasium.Env):
     """One world.
 
-    `info` has the terms of the reward of every drone, `reward_position`, ..., and likewise `metric_...`, of the drones,
-    and `termination_...` and `truncation_...`, of the team.
+    `info` has the terms of the reward (`reward_position`, ...) and the metrics (`metric_...`) of every drone, and the
+    conditions of the team (`termination_...`, `truncation_...`).
     """
 
     metadata = {"render_modes": pictures.MODES, "render_fps": 100}  # noqa: RUF012
@@ -51,14 +51,14 @@ class GymnasiumEnv(gymnasium.Env):
 
         Args:
             task: a name, a task, or an environment.
-            dict_spaces: observations and actions are dicts by drone, "0", "1", ..., as in gym-pybullet-drones (2021);
-                else a team has Box spaces (n, d) and (n, a), and a single drone (d,) and (a,).
+            dict_spaces: whether observations and actions are dicts by drone, "0", "1", ..., as in gym-pybullet-drones
+                (2021); else a team has Box spaces (n, d) and (n, a), and a single drone (d,) and (a,).
             team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
-            render_mode: `rgb_array` or nothing.
+            render_mode: `rgb_array` or `None`.
             **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: an argument that `jaxdrones.make` refuses.
+            ValueError: an invalid argument of `jaxdrones.make`.
         """
         pictures.check_mode(render_mode)
         self.env, self.render_mode = as_env(task, options), render_mode
@@ -68,7 +68,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._session = Session(self.env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; the same seed starts the same one."""
+        """Start an episode, reproducible by its seed."""
         super().reset(seed=seed)
         _refuse(options)
         obs = self._session.reset(int(self.np_random.integers(SEEDS)) if seed is None else seed)
@@ -79,7 +79,7 @@ class GymnasiumEnv(gymnasium.Env):
 
         Raises:
             ValueError: an action of wrong shape or with NaN.
-            gymnasium.error.ResetNeeded: no episode has begun, or the last one has ended.
+            gymnasium.error.ResetNeeded: before `reset`, or after the end of an episode.
         """
         if not self._session.running:
             raise gymnasium.error.ResetNeeded("step is called before reset or after the end of an episode; call reset")
@@ -90,10 +90,10 @@ class GymnasiumEnv(gymnasium.Env):
         return self._layout.arrange(obs), float(self._rewarding(reward)), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """A picture (height, width, 3) of the team from the side, if made with `render_mode="rgb_array"`.
+        """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`.
 
         Raises:
-            gymnasium.error.ResetNeeded: no episode has begun.
+            gymnasium.error.ResetNeeded: before `reset`.
         """
         if self.render_mode is None:
             gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
@@ -103,17 +103,17 @@ class GymnasiumEnv(gymnasium.Env):
         return self._session.photo()
 
     def close(self) -> None:
-        """End the connection to Bullet, if there is one."""
+        """Close the connection to Bullet, if any."""
         self._session.close()
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
-    """Many worlds in one compiled step; where an episode ends, the next one begins in the same step by default.
+    """Many worlds in one compiled step, by default with automatic reset in the same step.
 
-    `infos` has arrays of what the infos of one world have, and of `name` a mask `_name`, of which worlds it is valid.
-    World i, reset with `seed`, starts like a `GymnasiumEnv` that is reset with `seed + i`. If an episode ended and the
-    autoreset mode is `SAME_STEP`, `infos` has `final_obs`, of all worlds with its mask, and `final_info`, with the last
-    infos of the episode and `episode`: return `r` and length `l`.
+    `infos` has the infos of one world as arrays, each with a mask `_name` of valid worlds. World i of a reset with
+    `seed` starts like a `GymnasiumEnv` with `seed + i`. At the end of an episode with the autoreset mode `SAME_STEP`,
+    `infos` has `final_obs`, of all worlds with its mask, and `final_info`, with the last infos of the episode and
+    `episode`: return `r` and length `l`.
     """
 
     metadata = {"render_modes": pictures.MODES, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
@@ -138,18 +138,18 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             num_envs: number of worlds.
             dict_spaces: as for `GymnasiumEnv`.
             team_reward: as for `GymnasiumEnv`.
-            numpy: return new NumPy arrays; else JAX arrays, not copied and not waited for, with `final_obs` and
-                `final_info` in every step.
-            max_episode_steps: truncate episodes after so many steps, not after the task's duration.
-            autoreset_mode: when a world starts its next episode, a mode of gymnasium or its value: `SAME_STEP`, in the
-                step that ends one; `NEXT_STEP`, in the step after it, which ignores the action and rewards nothing;
-                `DISABLED`, when `reset(options={"reset_mask": ...})` says so.
-            render_mode: `rgb_array` or nothing.
+            numpy: whether to return new NumPy arrays; else JAX arrays, without copies and asynchronous, with
+                `final_obs` and `final_info` in every step.
+            max_episode_steps: time limit in steps, in place of the task's duration.
+            autoreset_mode: a mode of gymnasium or its value: `SAME_STEP`, reset in the step that ends an episode;
+                `NEXT_STEP`, in the step after it, with its action ignored and zero reward; `DISABLED`, only by
+                `reset(options={"reset_mask": ...})`.
+            render_mode: `rgb_array` or `None`.
             **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: an argument that `jaxdrones.make` refuses.
-            TypeError: an option that it does not have.
+            ValueError: an invalid argument of `jaxdrones.make`.
+            TypeError: an unknown option.
         """
         check_whole("num_envs", num_envs)
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
@@ -164,20 +164,20 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._worlds = Worlds(self.env, self._layout, self.autoreset_mode, team_reward)
-        self._over = np.zeros(num_envs, bool)  # worlds that have to be reset, in NumPy with autoreset disabled
+        self._over = np.zeros(num_envs, bool)  # worlds that need a reset, in NumPy with autoreset disabled
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode in every world, or in those of a mask; the same seed starts the same ones.
+        """Start an episode in every world, or in those of a mask, reproducible by seeds.
 
         Args:
-            seed: of the first world, which is counted up for the others; or one for every world.
-            options: nothing, or `reset_mask`: (num_envs,) bool, the worlds to reset.
+            seed: seed of the first world, incremented for the others; or one for every world.
+            options: `None`, or `reset_mask`: (num_envs,) bool, the worlds to reset.
 
         Raises:
-            ValueError: seeds or a mask that are not one for every world, or another option.
-            gymnasium.error.ResetNeeded: some worlds are to be reset before all of them were.
+            ValueError: a wrong number of seeds, a wrong mask, or an unknown option.
+            gymnasium.error.ResetNeeded: a mask before the first reset of all worlds.
         """
         mask = self._mask(options)
         seeds = self._seeds(seed)
@@ -189,9 +189,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         """One control step in every world.
 
         Raises:
-            ValueError: actions of wrong shape or with NaN (JAX arrays are not searched for NaN).
-            gymnasium.error.ResetNeeded: no episode has begun, or one has ended and autoreset is disabled (with
-                `numpy=False` such a world flies on).
+            ValueError: actions of wrong shape or with NaN (not checked in JAX arrays).
+            gymnasium.error.ResetNeeded: before `reset`, or after the end of an episode without autoreset (with
+                `numpy=False` the episode continues).
         """
         if not self._worlds.started:
             raise gymnasium.error.ResetNeeded("step is called before reset; call reset")
@@ -207,10 +207,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture (height, width, 3) of every world from the side, if made with `render_mode="rgb_array"`.
+        """Picture (height, width, 3) of every world from the side, with `render_mode="rgb_array"`.
 
         Raises:
-            gymnasium.error.ResetNeeded: no episode has begun.
+            gymnasium.error.ResetNeeded: before `reset`.
         """
         if self.render_mode is None:
             gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
@@ -220,11 +220,11 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return tuple(pictures.of_worlds(self.env, self._worlds.world))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the connection to Bullet, if there is one."""
+        """Close the connection to Bullet, if any."""
         self.env.close()
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
-        """A seed for every world."""
+        """Seed of every world."""
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=None if seed is None else int(seed))
             first = int(self.np_random.integers(SEEDS)) if seed is None else int(seed)
@@ -238,7 +238,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return np.array([seed % SEEDS for seed in seeds], np.uint32)
 
     def _mask(self, options: dict[str, Any] | None) -> np.ndarray | None:
-        """The worlds that options of `reset` choose; `None` for all."""
+        """Mask of worlds in the options of `reset`; `None` for all."""
         if not options or "reset_mask" not in options:
             _refuse(options)
             return None
@@ -258,7 +258,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return jax.tree.map(lambda x: np.array(x, np.float32 if x.dtype == np.float64 else None), tree)
 
     def _infos(self, info: dict[str, Any], ended: Any) -> dict[str, Any]:
-        """The infos with gymnasium's masks: `_name` says of which worlds `name` is valid."""
+        """Infos with gymnasium's masks `_name` of valid worlds."""
         last, infos = info["last"], _masked(info["last"], info["not_reset"])
         if "final_obs" in info and (not self._numpy or ended.any()):
             final = _masked(last | {"episode": _masked(info["episode"], ended)}, ended)
@@ -267,7 +267,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
 
 def ids() -> dict[str, str]:
-    """Id of every task, by its name."""
+    """Id of every task by name."""
     return {task: f"{NAMESPACE}/{string.capwords(task, '-').replace('-', '')}-v0" for task in envs.TASKS}
 
 

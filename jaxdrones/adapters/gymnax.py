@@ -1,4 +1,4 @@
-"""Gymnax-style environments, for PureJaxRL and other loops that train within one compiled program.
+"""Gymnax-style environments, for PureJaxRL and other compiled training loops.
 
 from jaxdrones.adapters import gymnax
 
@@ -7,7 +7,7 @@ params = env.default_params
 obs, state = env.reset(key, params)
 obs, state, reward, done, info = env.step(key, state, action, params)
 
-Neither gymnax nor another library is needed.
+Gymnax itself is not needed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from jaxdrones.pytree import PyTreeNode
 
 
 class EnvParams(PyTreeNode):
-    """What may differ between worlds; give the same to the reset and to the steps of a world."""
+    """Parameters that may differ between worlds; use the same for reset and steps of a world."""
 
     max_steps_in_episode: Any
     """Control steps after which an episode is truncated."""
@@ -50,14 +50,14 @@ def wrap(
     spaces: Spaces = jax_spaces,
     team_reward: str = "sum",
 ) -> GymnaxEnv:
-    """An environment with the interface of gymnax.
+    """Wrap an environment with the interface of gymnax.
 
     Args:
         env: environment.
         separate_truncation: whether `step` returns `terminated` and `truncated`, as in gymnax 1.0, in place of `done`.
-        discrete_actions: (k, n a) the actions of the whole team between which a discrete action chooses; actions are
-            continuous when left out.
-        spaces: module whose classes the spaces are of, for loops that ask for the class of a space, such as
+        discrete_actions: (k, n a) table of actions of the whole team for discrete actions; by default actions are
+            continuous.
+        spaces: module of the space classes, for loops that check the class of a space, such as
             `gymnax.environments.spaces`.
         team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
 
@@ -68,10 +68,10 @@ def wrap(
 
 
 class GymnaxEnv:
-    """One world with one agent; where an episode ends, the next one begins in the same step.
+    """One world with one agent and automatic reset in the same step.
 
     Observations and actions of the drones are concatenated. With images, observations are
-    dictionaries of `state` and of the images, which have a drone axis if there are several drones.
+    dictionaries of `state` and of the images, with a drone axis for several drones.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class GymnaxEnv:
 
     @property
     def default_params(self) -> EnvParams:
-        """The parameters that the environment was made with."""
+        """Default parameters of the environment."""
         return EnvParams(self.env.steps, self.env.params)
 
     @property
@@ -108,21 +108,21 @@ class GymnaxEnv:
         return self._action_space.n if self._table is not None else self._action_space.shape[0]
 
     def observation_space(self, params: EnvParams | None = None) -> Any:
-        """The observation space, which is the same for all parameters."""
+        """Observation space, independent of the parameters."""
         return self._observation_space
 
     def action_space(self, params: EnvParams | None = None) -> Any:
-        """The action space, which is the same for all parameters."""
+        """Action space, independent of the parameters."""
         return self._action_space
 
     @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[Any, Episode]:
-        """Start an episode: the observation and the state."""
+        """Start an episode; return observation and state."""
         obs, state = self._episodes(params).reset(key)
         return self._arranged(obs), state
 
     def reset_env(self, key: jax.Array, params: EnvParams | None = None) -> tuple[Any, Episode]:
-        """Start an episode, as `reset` does."""
+        """Start an episode, like `reset`."""
         return self.reset(key, params)
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -130,9 +130,9 @@ class GymnaxEnv:
         """One control step.
 
         Returns:
-            Observation, state, reward, done and info, where `info["discount"]` is 0 in a step that terminated the
-            episode, and else 1. With `separate_truncation` observation, state, reward, terminated, truncated and info,
-            which has `final_observation`: the observation before a possible reset.
+            Observation, state, reward, done and info, with `info["discount"]` 0 in a step that terminates the episode,
+            else 1. With `separate_truncation` observation, state, reward, terminated, truncated and info, with
+            `final_observation`, the observation before a possible reset.
         """
         action = self._gathered(action)
         outcome = (
@@ -150,7 +150,7 @@ class GymnaxEnv:
 
     @functools.partial(jax.jit, static_argnums=0)
     def step_env(self, key: jax.Array, state: Episode, action: jax.Array, params: EnvParams | None = None) -> tuple:
-        """One control step, after which no episode begins.
+        """One control step without reset.
 
         Returns:
             Observation, state, reward, done and info; with `separate_truncation` it is `terminated` in place of done,
@@ -179,7 +179,7 @@ class GymnaxEnv:
 
 
 def _step_and_reset(env: envs.Env, key: jax.Array, state: Episode, action: jax.Array) -> tuple:
-    """The step of `AutoReset`, with a reset in every step: worlds may differ in what the environment is made of."""
+    """Step of `AutoReset` with a reset in every step, as the parameters of worlds may differ."""
     episodes = envs.AutoReset(env)
     final_obs, after, reward, terminated, truncated, _ = episodes.step_without_reset(key, state, action)
     fresh = episodes.reset(jax.random.fold_in(key, RESET))

@@ -1,4 +1,4 @@
-"""Spaces whose samples are drawn by JAX, with the constructors of gymnax's and JaxMARL's spaces."""
+"""Spaces with samples by JAX, compatible with those of gymnax and JaxMARL."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Box:
         self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """An array that is uniform between the bounds."""
+        """Uniform sample between the bounds."""
         return jax.random.uniform(key, self.shape, minval=self.low, maxval=self.high).astype(self.dtype)
 
     def contains(self, x: Any) -> jax.Array:
@@ -37,7 +37,7 @@ class Discrete:
         self.n, self.shape, self.dtype = num_categories, (), dtype
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """One of the numbers, all equally likely."""
+        """Uniform sample."""
         return jax.random.randint(key, (), 0, self.n, self.dtype)
 
     def contains(self, x: Any) -> jax.Array:
@@ -57,12 +57,12 @@ class Dict:
         return {name: space.sample(k) for k, (name, space) in zip(keys, self.spaces.items(), strict=True)}
 
     def contains(self, x: Mapping[str, Any]) -> jax.Array:
-        """Whether every space contains what `x` has of its name."""
+        """Whether every space contains its entry of `x`."""
         return jnp.all(jnp.stack([space.contains(x[name]) for name, space in self.spaces.items()]))
 
 
 class Spaces(Protocol):
-    """A module with these classes: this one, `gymnax.environments.spaces` or `jaxmarl.environments.spaces`."""
+    """Module of space classes: this one, `gymnax.environments.spaces` or `jaxmarl.environments.spaces`."""
 
     Box: Any
     Discrete: Any
@@ -70,7 +70,7 @@ class Spaces(Protocol):
 
 
 def of_gymnasium(space: gymnasium.Space, spaces: Spaces) -> Any:
-    """A gymnasium space as one whose samples are drawn by JAX."""
+    """Convert a gymnasium space."""
     if isinstance(space, gymnasium.spaces.Dict):
         return spaces.Dict({name: of_gymnasium(entry, spaces) for name, entry in space.items()})
     assert isinstance(space, gymnasium.spaces.Box)
@@ -78,7 +78,7 @@ def of_gymnasium(space: gymnasium.Space, spaces: Spaces) -> Any:
 
 
 def action_table(discrete_actions: Any, size: int) -> Float[Array, "k a"]:
-    """The actions between which a discrete action chooses, one a row.
+    """Validated table of discrete actions, one a row.
 
     Raises:
         ValueError: not a table of finite numbers with rows of `size`.

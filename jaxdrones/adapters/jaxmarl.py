@@ -1,4 +1,4 @@
-"""JaxMARL-style environments: a team as dictionaries by agent, one agent per drone, for loops that JAX compiles.
+"""JaxMARL-style environments: dictionaries by agent, one agent per drone, for compiled training loops.
 
 from jaxdrones.adapters import jaxmarl
 
@@ -6,7 +6,7 @@ env = jaxmarl.wrap(jd.make("leader-follower"))
 obs, state = env.reset(key)
 obs, state, rewards, dones, infos = env.step(key, state, {agent: action for agent in env.agents})
 
-Neither JaxMARL nor another library is needed.
+JaxMARL itself is not needed.
 """
 
 from __future__ import annotations
@@ -34,15 +34,14 @@ WORLD_STATE = "world_state"
 def wrap(
     env: envs.Env, *, world_state: bool = False, discrete_actions: ArrayLike | None = None, spaces: Spaces = jax_spaces
 ) -> JaxMARLEnv:
-    """An environment with the interface of JaxMARL.
+    """Wrap an environment with the interface of JaxMARL.
 
     Args:
         env: environment.
         world_state: whether observations also have `world_state` (n, n d), a row for the centralized critic of every
             agent: its own observation, then those of the others, without images.
-        discrete_actions: (k, a) the actions of a drone between which a discrete action chooses; actions are continuous
-            when left out.
-        spaces: module whose classes the spaces are of, for loops that ask for the class of a space, such as
+        discrete_actions: (k, a) table of actions of a drone for discrete actions; by default actions are continuous.
+        spaces: module of the space classes, for loops that check the class of a space, such as
             `jaxmarl.environments.spaces`.
 
     Raises:
@@ -52,7 +51,7 @@ def wrap(
 
 
 class JaxMARLEnv:
-    """One world; an episode begins and ends for all agents at once, and the next one begins in the same step."""
+    """One world with automatic reset in the same step; episodes begin and end for all agents at once."""
 
     def __init__(self, env: envs.Env, world_state: bool, discrete_actions: ArrayLike | None, spaces: Spaces):
         self.env = env
@@ -72,11 +71,11 @@ class JaxMARLEnv:
         return self.env.task.name
 
     def observation_space(self, agent: str) -> Any:
-        """The observation space of an agent."""
+        """Observation space of an agent."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """The action space of an agent."""
+        """Action space of an agent."""
         return self.action_spaces[agent]
 
     def world_state_size(self) -> int:
@@ -85,7 +84,7 @@ class JaxMARLEnv:
 
     @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: jax.Array) -> tuple[dict[str, Any], Episode]:
-        """Start an episode: the observations and the state."""
+        """Start an episode; return observations and state."""
         obs, state = self._episodes.reset(key)
         return self._by_agent(obs), state
 
@@ -97,14 +96,13 @@ class JaxMARLEnv:
 
         Args:
             key: random key.
-            state: as `reset` or `step` returned it.
+            state: from `reset` or `step`.
             actions: one for every agent.
-            reset_state: state at which the next episode begins; a newly drawn one when left out.
+            reset_state: initial state of the next episode; by default a random one.
 
         Returns:
-            Observations and state, those of the next episode where one ended; rewards; dones, by agent and `__all__`;
-            and infos, whose arrays have one entry per agent: `rewards` and `metrics` by name, `terminated` and
-            `truncated`.
+            Observations and state, those of the next episode after an end; rewards; dones, by agent and `__all__`; and
+            infos with one entry per agent: `rewards` and `metrics` by name, `terminated` and `truncated`.
         """
         if reset_state is None:
             outcome = self._episodes.step(key, state, self._gathered(actions))
@@ -118,17 +116,17 @@ class JaxMARLEnv:
     def step_env(
         self, key: jax.Array, state: Episode, actions: Mapping[str, Array]
     ) -> tuple[dict[str, Any], Episode, dict[str, Array], dict[str, Array], dict[str, Any]]:
-        """One control step, after which no episode begins; returns what `step` does."""
+        """One control step without reset; returns are those of `step`."""
         outcome = self._episodes.step_without_reset(key, state, self._gathered(actions))
         return self._by_agent(outcome[0]), outcome[1], *self._outcome(*outcome[2:])
 
     @functools.partial(jax.jit, static_argnums=0)
     def get_obs(self, state: Episode) -> dict[str, Any]:
-        """The observations of a state, without noise."""
+        """Observations of a state, without noise."""
         return self._by_agent(observation(self.env.privileged_observation(state.world).obs, state.world))
 
     def get_avail_actions(self, state: Episode) -> dict[str, Array]:
-        """Ones for every discrete action, or every entry of an action, of every agent: all are available."""
+        """Ones for all discrete actions, or all entries of an action, of every agent."""
         n = self.env.action_size if self._table is None else len(self._table)
         return dict.fromkeys(self.agents, jnp.ones(n))
 

@@ -1,4 +1,4 @@
-"""PettingZoo: a team as a `ParallelEnv`, one agent per drone."""
+"""PettingZoo `ParallelEnv` of a team, one agent per drone."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ except ImportError as error:
 
 
 def parallel_env(task: str | Task | Env, **options: Any) -> ParallelEnv:
-    """A team whose agents are `drone_0`, `drone_1`, ...; it takes the options of `jaxdrones.make`."""
+    """Make a team with agents `drone_0`, `drone_1`, ..., with the options of `jaxdrones.make`."""
     return ParallelEnv(task, **options)
 
 
 class ParallelEnv(pettingzoo.ParallelEnv):
-    """One world; an episode begins and ends for all agents at once."""
+    """One world; episodes begin and end for all agents at once."""
 
     def __init__(self, task: str | Task | Env, *, render_mode: str | None = None, **options: Any):
         """Wrap an environment.
 
         Args:
             task: a name, a task, or an environment.
-            render_mode: `rgb_array` or nothing.
+            render_mode: `rgb_array` or `None`.
             **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: an argument that `jaxdrones.make` refuses.
+            ValueError: an invalid argument of `jaxdrones.make`.
         """
         pictures.check_mode(render_mode)
         self.env = as_env(task, options)
@@ -59,15 +59,15 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         self._seeds = np.random.default_rng()
 
     def observation_space(self, agent: str) -> gymnasium.Space:
-        """The observation space of an agent."""
+        """Observation space of an agent."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> gymnasium.Space:
-        """The action space of an agent."""
+        """Action space of an agent."""
         return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Start an episode; the same seed starts the same one, and the same ones after it. There are no options."""
+        """Start an episode; a seed makes it and the following ones reproducible. There are no options."""
         if seed is not None:
             self._seeds = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
@@ -78,7 +78,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         """One control step.
 
         Raises:
-            ValueError: an agent without an action, an action of wrong shape or with NaN, or there is no episode.
+            ValueError: a missing action, an action of wrong shape or with NaN, or no episode.
         """
         if not self._session.running:
             raise UserError("step is called before reset or after the end of an episode; call reset")
@@ -95,20 +95,20 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """The concatenated observations of all agents without pictures, for centralized critics.
+        """Concatenated observations of all agents without images, for centralized critics.
 
         Raises:
-            ValueError: no episode has begun.
+            ValueError: before `reset`.
         """
         if self._session.world is None:
             raise UserError("state is called before reset; call reset")
         return self._state.copy()
 
     def render(self) -> np.ndarray | None:
-        """A picture (height, width, 3) of the team from the side, if made with `render_mode="rgb_array"`.
+        """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`.
 
         Raises:
-            ValueError: no episode has begun.
+            ValueError: before `reset`.
         """
         if self.render_mode is None:
             gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
@@ -118,7 +118,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         return self._session.photo()
 
     def close(self) -> None:
-        """End the connection to Bullet, if there is one."""
+        """Close the connection to Bullet, if any."""
         self._session.close()
 
     def _observed(self, obs: Any) -> dict[str, Any]:

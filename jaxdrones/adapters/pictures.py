@@ -17,18 +17,18 @@ from jaxdrones.tasks.task import World
 
 MODES = ["rgb_array"]
 _CAMERA = Camera(resolution=(640, 480), field_of_view=60.0)
-_DIRECTION = np.array([-1.2, 0.9, 0.6])  # from the middle of the team to the camera; so that the sun is behind it
-_AT_A_TIME = 8  # pictures of worlds: what many take at once does not stay in a cache
+_DIRECTION = np.array([-1.2, 0.9, 0.6])  # from the middle of the team to the camera, with the sun behind it
+_AT_A_TIME = 8  # pictures of worlds at a time, to fit in a cache
 
 
 def check_mode(render_mode: str | None) -> None:
-    """Raise unless there are pictures of this mode."""
+    """Raise unless the render mode is supported."""
     if render_mode not in (None, *MODES):
         raise UserError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
 
 
 def of_world(env: Env, world: World) -> np.ndarray:
-    """A picture of a team, RGB (480, 640, 3) uint8: by the explicit renderer, or by Bullet on its backend."""
+    """Picture of a team, RGB (480, 640, 3) uint8, by the explicit renderer, or by Bullet on its backend."""
     if not isinstance(env.physics, HostStep):
         return np.array(_picture(world))
     eye, center = map(np.asarray, _side(world.drones.pos))
@@ -37,7 +37,7 @@ def of_world(env: Env, world: World) -> np.ndarray:
 
 
 def of_worlds(env: Env, worlds: World) -> np.ndarray:
-    """Pictures of worlds, which have a leading axis: (worlds, 480, 640, 3)."""
+    """Pictures of worlds with a leading axis: (worlds, 480, 640, 3)."""
     if not isinstance(env.physics, HostStep):
         return np.array(_pictures(worlds))
     count = len(worlds.drones.pos)
@@ -45,7 +45,7 @@ def of_worlds(env: Env, worlds: World) -> np.ndarray:
 
 
 def _side(pos: Float[Array, "n 3"]) -> tuple[Array, Array]:
-    """Where a camera sees the whole team, and the middle of the team, m, world."""
+    """Position of a camera that sees the whole team, and the middle of the team, m, world."""
     center = jnp.mean(pos, axis=0)
     reach = 1.0 + jnp.max(jnp.abs(pos - center[None]))
     return center + reach * jnp.asarray(_DIRECTION, pos.dtype), center

@@ -1,4 +1,4 @@
-"""RLlib: a team as a `MultiAgentEnv`, one agent per drone."""
+"""RLlib `MultiAgentEnv` of a team, one agent per drone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ except ImportError as error:
 
 
 class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
-    """One world whose agents are `drone_0`, `drone_1`, ...; an episode begins and ends for all of them at once."""
+    """One world with agents `drone_0`, `drone_1`, ...; episodes begin and end for all of them at once."""
 
     def __init__(self, task: str | Task | Env, **options: Any):
         """Wrap an environment.
@@ -29,7 +29,7 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
             **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: an argument that `jaxdrones.make` refuses.
+            ValueError: an invalid argument of `jaxdrones.make`.
         """
         super().__init__()
         self.env = as_env(task, options)
@@ -42,7 +42,7 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
         self._seeds = np.random.default_rng()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Start an episode; the same seed starts the same one, and the same ones after it. There are no options."""
+        """Start an episode; a seed makes it and the following ones reproducible. There are no options."""
         if seed is not None:
             self._seeds = np.random.default_rng(seed)
         obs = self._session.reset(int(self._seeds.integers(SEEDS)) if seed is None else seed)
@@ -52,7 +52,7 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
         """One control step.
 
         Raises:
-            ValueError: an agent without an action, an action of wrong shape or with NaN, or there is no episode.
+            ValueError: a missing action, an action of wrong shape or with NaN, or no episode.
         """
         if not self._session.running:
             raise UserError("step is called before reset or after the end of an episode; call reset")
@@ -67,5 +67,5 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
         )
 
     def close(self) -> None:
-        """End the connection to Bullet, if there is one."""
+        """Close the connection to Bullet, if any."""
         self._session.close()

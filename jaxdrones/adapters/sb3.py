@@ -1,4 +1,4 @@
-"""Stable-Baselines3: many worlds in one compiled step as its `VecEnv`."""
+"""Stable-Baselines3 `VecEnv` of many worlds in one compiled step."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ except ImportError as error:
 
 
 class VecEnv(vec_env.VecEnv):
-    """Many worlds; `infos[i]` is empty but in the last step of an episode.
+    """Many worlds with automatic reset.
 
-    There it has `terminal_observation`, `TimeLimit.truncated`, and `episode` (return `r`, length `l`) for SB3's log.
+    `infos[i]` is empty except for the last step of an episode, with `terminal_observation`, `TimeLimit.truncated`, and
+    `episode` (return `r`, length `l`) for SB3's log.
     """
 
     def __init__(
@@ -33,17 +34,17 @@ class VecEnv(vec_env.VecEnv):
         render_mode: str | None = None,
         **options: Any,
     ):
-        """Make the worlds.
+        """Create the worlds.
 
         Args:
             task: a name, a task, or an environment.
             num_envs: number of worlds.
             seed: seed of the first reset; SB3's algorithms set it too.
-            render_mode: `rgb_array` or nothing.
+            render_mode: `rgb_array` or `None`.
             **options: options of `jaxdrones.make`, and `team_reward`, `sum` or `mean` of the rewards of the drones.
 
         Raises:
-            ValueError: an argument that `jaxdrones.make` refuses.
+            ValueError: an invalid argument of `jaxdrones.make`.
         """
         self.envs = gymnasium.VectorEnv(task, num_envs, render_mode=render_mode, **options)
         self.render_mode = render_mode
@@ -65,7 +66,7 @@ class VecEnv(vec_env.VecEnv):
         return obs
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take actions for `step_wait`."""
+        """Set the actions of `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -83,19 +84,19 @@ class VecEnv(vec_env.VecEnv):
         return obs, reward, done, infos
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture (height, width, 3) of every world from the side."""
+        """Picture (height, width, 3) of every world from the side."""
         return self.envs.render() or [None] * self.num_envs
 
     def close(self) -> None:
-        """End the connection to Bullet, if there is one."""
+        """Close the connection to Bullet, if any."""
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The same attribute for every world asked for."""
+        """Common attribute for every requested world."""
         return [getattr(self.envs, attr_name) for _ in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Always raises: all worlds are one compiled step and cannot be set apart.
+        """Unsupported: all worlds are one compiled step.
 
         Raises:
             ValueError: always.
@@ -103,7 +104,7 @@ class VecEnv(vec_env.VecEnv):
         raise UserError(f"attribute {attr_name} cannot be set in a compiled environment; give it as an option")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Always raises: all worlds are one compiled step and have no methods of their own.
+        """Unsupported: all worlds are one compiled step.
 
         Raises:
             ValueError: always.

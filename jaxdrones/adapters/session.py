@@ -1,4 +1,4 @@
-"""One episode at a time on the host: NumPy in and out, one compiled call per control step."""
+"""Single episodes on the host, with NumPy arrays and one compiled call per control step."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.tasks.task import Task, World
 
-SEEDS = 2**32  # seeds are taken modulo this
+SEEDS = 2**32  # modulus of seeds
 _GROUPS = {"rewards": "reward", "metrics": "metric", "terminations": "termination", "truncations": "truncation"}
 
 
 class Session:
-    """A world that stays on the device, whose observations are returned as new NumPy arrays."""
+    """World on the device, with observations as new NumPy arrays."""
 
     def __init__(self, env: Env):
         self.env = env
         self.world: World | None = None
         self.running = False
-        """Whether an episode has begun and not ended."""
-        on_host = isinstance(env.physics, HostStep)  # the environment compiles what is around such a step by itself
+        """Whether an episode is in progress."""
+        on_host = isinstance(env.physics, HostStep)  # the environment itself compiles the code around such a step
         self._compiled: Callable[..., Any] = _partial if on_host else Env.compiled
 
     def reset(self, seed: int) -> Any:
-        """Start an episode; returns the observation."""
+        """Start an episode; return the observation."""
         self._key, self.world, obs = self._compiled(self.env, begin)(np.uint32(seed % SEEDS))
         self.running = True
         return _numpy(obs)
@@ -41,10 +41,10 @@ class Session:
         """One control step.
 
         Args:
-            action: (n, a), checked.
+            action: (n, a), validated.
 
         Returns:
-            Observation, reward (n,), terminated, truncated and info, as the environment gives them.
+            Observation, reward (n,), terminated, truncated and info of the environment.
         """
         self.world, outcome = self._compiled(self.env, _advance)(self._key, self.world, action)
         obs, reward, terminated, truncated, info = _numpy(outcome)
@@ -55,22 +55,22 @@ class Session:
         return obs, reward, terminated, truncated, info
 
     def photo(self) -> np.ndarray:
-        """A picture of the team from the side, RGB (height, width, 3) uint8."""
+        """Picture of the team from the side, RGB (height, width, 3) uint8."""
         assert self.world is not None
         return pictures.of_world(self.env, self.world)
 
     def close(self) -> None:
-        """End the connection to Bullet, if there is one; the session cannot go on."""
+        """Close the connection to Bullet, if any."""
         self.running = False
         self.env.close()
 
 
 def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
-    """The environment for a name, a task, or an environment.
+    """Environment from a name, a task, or an environment.
 
     Raises:
-        ValueError: an argument that `jaxdrones.make` refuses.
-        TypeError: an option that it does not have, or options beside an environment.
+        ValueError: an invalid argument of `jaxdrones.make`.
+        TypeError: an unknown option, or options beside an environment.
     """
     if not isinstance(task, Env):
         return make(task, **options)
@@ -83,11 +83,10 @@ def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
 
 
 def rewarding(team_reward: str) -> Callable[[Any], Any]:
-    """The function from the rewards (*batch, n) of the drones to that (*batch) of their team.
+    """Function from the rewards (*batch, n) of the drones to that (*batch) of their team.
 
     Args:
-        team_reward: `sum`, as in gym-pybullet-drones' `MultiHoverAviary`, or `mean`, which is of one scale for teams of
-            any size.
+        team_reward: `sum`, as in gym-pybullet-drones' `MultiHoverAviary`, or `mean`, independent of the team's size.
 
     Raises:
         ValueError: another name.
@@ -97,16 +96,16 @@ def rewarding(team_reward: str) -> Callable[[Any], Any]:
 
 
 def flat(info: dict[str, Any]) -> dict[str, Any]:
-    """The infos of an environment in one dictionary, as other libraries read them: `reward_position`, `metric_error`.
+    """Flatten the infos of an environment to one dictionary: `reward_position`, `metric_error`, ...
 
     Args:
-        info: infos of which `rewards`, `metrics`, `terminations` and `truncations` are taken.
+        info: infos; `rewards`, `metrics`, `terminations` and `truncations` are used.
     """
     return {f"{prefix}_{name}": x for group, prefix in _GROUPS.items() for name, x in info[group].items()}
 
 
 def begin(env: Env | AutoReset, seed: ArrayLike) -> tuple[jax.Array, Any, Any]:
-    """The key of an episode's steps, the world at its start, and the first observation."""
+    """Key of an episode's steps, initial world, and first observation."""
     key, start = jax.random.split(jax.random.PRNGKey(seed))
     obs, world = env.reset(start)
     return key, world, obs
@@ -122,5 +121,5 @@ def _partial(env: Env, function: Callable) -> Callable:
 
 
 def _numpy(tree: Any) -> Any:
-    """New NumPy arrays, real ones in single precision."""
+    """Copy to NumPy, real arrays in single precision."""
     return jax.tree.map(lambda x: np.array(x, np.float32 if x.dtype == np.float64 else None), tree)

@@ -1,4 +1,4 @@
-"""Gymnasium's spaces of an environment, and how the drones of a team are laid out in them."""
+"""Gymnasium spaces of an environment, and layouts of teams."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxdrones.errors import UserError
 
 
 def observation_of_drone(env: Env) -> spaces.Space:
-    """The observation space of one drone."""
+    """Observation space of one drone."""
     state = spaces.Box(-env.observation_bound, env.observation_bound, dtype=np.float32)
     images = {name: spaces.Box(x.low, x.high, x.shape, x.dtype) for name, x in env.image_spaces.items()}
     known: dict[str, spaces.Space] = {"state": state, **images}
@@ -24,12 +24,12 @@ def observation_of_drone(env: Env) -> spaces.Space:
 
 
 def action_of_drone(env: Env) -> spaces.Box:
-    """The action space of one drone."""
+    """Action space of one drone."""
     return spaces.Box(-1, 1, (env.action_size,), np.float32)
 
 
 def stacked(space: spaces.Space, n: int) -> spaces.Space:
-    """The space of n of them, with a leading axis."""
+    """Space of n copies, with a leading axis."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({name: stacked(entry, n) for name, entry in space.items()})
     assert isinstance(space, spaces.Box)
@@ -38,7 +38,7 @@ def stacked(space: spaces.Space, n: int) -> spaces.Space:
 
 
 class Layout:
-    """Layout of observations and actions: one drone without the drone axis; a team with it, or as a dict by drone."""
+    """Layout of observations and actions: a single drone without drone axis; a team with it, or as a dict by drone."""
 
     def __init__(self, env: Env, names: Sequence[str] | None):
         n = env.drones
@@ -55,16 +55,16 @@ class Layout:
             self.action = stacked(action_of_drone(env), n)
 
     def arrange(self, tree: Any, axis: int = 0) -> Any:
-        """Arrays with all drones along `axis`, in this layout."""
+        """Convert arrays with drones along `axis` to this layout."""
         if self.names:
             return {name: _pick(tree, i, axis) for i, name in enumerate(self.names)}
         return _pick(tree, 0, axis) if self.drones == 1 else tree
 
     def gather(self, action: Any, batch: tuple[int, ...] = ()) -> Any:
-        """The array (*batch, n, a) of an action in this layout.
+        """Convert an action in this layout to an array (*batch, n, a).
 
         Raises:
-            ValueError: a drone without an action, a wrong shape, or not a number (in a NumPy array).
+            ValueError: a missing action, a wrong shape, or NaN (in a NumPy array).
         """
         if not self.names:
             alone = self.drones == 1

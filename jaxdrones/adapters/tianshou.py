@@ -1,4 +1,4 @@
-"""Tianshou: many worlds in one compiled step as its vector environment, for `Collector`."""
+"""Tianshou vector environment of many worlds in one compiled step, for `Collector`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ except ImportError as error:
 
 
 class VectorEnv(BaseVectorEnv):
-    """Many worlds; `Collector` says which of them take a step and which begin an episode.
+    """Many worlds; `Collector` selects those to step and to reset.
 
     Observations and actions have the shapes of `jaxdrones.adapters.gymnasium.VectorEnv`. Infos are empty.
     """
@@ -39,7 +39,7 @@ class VectorEnv(BaseVectorEnv):
         team_reward: str = "sum",
         **options: Any,
     ):
-        """Make the worlds.
+        """Create the worlds.
 
         Args:
             task: a name, a task, or an environment.
@@ -49,7 +49,7 @@ class VectorEnv(BaseVectorEnv):
             **options: options of `jaxdrones.make`.
 
         Raises:
-            ValueError: an argument that `jaxdrones.make` refuses.
+            ValueError: an invalid argument of `jaxdrones.make`.
         """
         check_whole("num_envs", num_envs)
         self.env, self.env_num = as_env(task, options), num_envs
@@ -59,13 +59,13 @@ class VectorEnv(BaseVectorEnv):
         self.seed(seed)
 
     def get_env_attr(self, key: str, id: Any = None) -> list[Any]:
-        """An attribute of the environment, or one of its spaces, for every world asked for."""
+        """Attribute of the environment, or one of its spaces, for every requested world."""
         spaces = {"observation_space": self._layout.observation, "action_space": self._layout.action}
         value = spaces[key] if key in spaces else getattr(self.env, key)
         return [value] * int(self._mask(id).sum())
 
     def set_env_attr(self, key: str, value: Any, id: Any = None) -> None:
-        """Always raises: all worlds are one compiled step and cannot be set apart.
+        """Unsupported: all worlds are one compiled step.
 
         Raises:
             ValueError: always.
@@ -73,13 +73,13 @@ class VectorEnv(BaseVectorEnv):
         raise UserError(f"attribute {key} cannot be set in a compiled environment; give it as an option")
 
     def seed(self, seed: int | Sequence[int] | None = None) -> list[int]:
-        """Seed the worlds, of which each draws all its episodes from its own seed.
+        """Seed all episodes of every world.
 
         Args:
-            seed: of the first world, which is counted up for the others; or one for every world; or drawn.
+            seed: seed of the first world, incremented for the others; or one for every world; `None` for random seeds.
 
         Raises:
-            ValueError: not one seed for every world.
+            ValueError: a wrong number of seeds.
         """
         if seed is None:
             seed = int(np.random.default_rng().integers(SEEDS))
@@ -92,10 +92,10 @@ class VectorEnv(BaseVectorEnv):
     def reset(
         self, env_id: int | Sequence[int] | np.ndarray | None = None, *, seed: int | Sequence[int] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Start an episode in worlds `env_id`, or in all; returns their observations and infos.
+        """Start an episode in worlds `env_id`, or in all; return their observations and infos.
 
         Raises:
-            ValueError: some worlds are to begin before all have begun.
+            ValueError: a partial reset before that of all worlds.
         """
         if seed is not None:
             self.seed(seed)
@@ -110,7 +110,7 @@ class VectorEnv(BaseVectorEnv):
     def step(
         self, action: Any, id: int | Sequence[int] | np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """One control step of worlds `id`, or of all; the others stand still.
+        """One control step of worlds `id`, or of all; the others are unchanged.
 
         Args:
             action: one for each of these worlds.
@@ -120,7 +120,7 @@ class VectorEnv(BaseVectorEnv):
             Observations, rewards, terminated, truncated and infos of these worlds, in their order.
 
         Raises:
-            ValueError: no episode has begun, or actions of wrong shape or with NaN.
+            ValueError: before `reset`, or actions of wrong shape or with NaN.
         """
         if not self._worlds.started:
             raise UserError("step is called before reset; call reset")
@@ -136,17 +136,17 @@ class VectorEnv(BaseVectorEnv):
         return self._rows(obs, chosen), reward, terminated, truncated, _infos(chosen)
 
     def render(self, **kwargs: Any) -> list[np.ndarray]:
-        """A picture (height, width, 3) of every world from the side.
+        """Picture (height, width, 3) of every world from the side.
 
         Raises:
-            ValueError: no episode has begun.
+            ValueError: before `reset`.
         """
         if not self._worlds.started:
             raise UserError("render is called before reset; call reset")
         return list(pictures.of_worlds(self.env, self._worlds.world))
 
     def close(self) -> None:
-        """End the connection to Bullet, if there is one."""
+        """Close the connection to Bullet, if any."""
         self.is_closed = True
         self.env.close()
 
@@ -159,7 +159,7 @@ class VectorEnv(BaseVectorEnv):
         return mask
 
     def _rows(self, obs: Any, chosen: np.ndarray) -> np.ndarray:
-        """Observations of some worlds; with images an array of dictionaries, as tianshou batches them."""
+        """Observations of some worlds; with images an array of dictionaries, for tianshou's batches."""
         rows = jax.tree.map(lambda x: np.asarray(x)[chosen], obs)
         if not isinstance(rows, dict):
             return rows

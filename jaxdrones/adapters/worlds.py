@@ -1,4 +1,4 @@
-"""Many worlds in one compiled step, which start their next episodes by themselves or on request."""
+"""Many worlds in one compiled step, with automatic or manual reset."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxdrones.envs.functions import check_process
 
 
 class Worlds:
-    """Worlds that stay on the device; results are JAX arrays with a leading axis over worlds, in a layout."""
+    """Worlds on the device; results are JAX arrays with a leading axis over worlds, in a layout."""
 
     def __init__(self, env: Env, layout: Layout, mode: AutoresetMode, team_reward: str):
         self.env, self.layout, self.mode, self._rewarding = env, layout, mode, rewarding(team_reward)
@@ -30,11 +30,11 @@ class Worlds:
 
     @property
     def world(self) -> Any:
-        """The `World` of every environment, with a leading axis."""
+        """`World` of every environment, with a leading axis."""
         return self._worlds[1].world
 
     def reset(self, seeds: np.ndarray, mask: np.ndarray | None = None) -> Any:
-        """Start episodes, where a mask is true; returns the observations of all worlds."""
+        """Start episodes where a mask is true; return the observations of all worlds."""
         check_process()
         if mask is None:
             self._keys, self._worlds, self._obs = self._compiled_reset(seeds)
@@ -50,7 +50,7 @@ class Worlds:
     ) -> tuple[Any, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
         """One control step: observations, rewards of the teams, terminated, truncated and info.
 
-        Where a mask is false, a world stands still: it keeps its observation, and its other results are undefined.
+        Where a mask is false, the world is unchanged: it keeps its observation, and its other results are undefined.
         """
         check_process()
         if mask is None:
@@ -101,7 +101,7 @@ class Worlds:
         return (count, *after), (obs, *outcome)
 
     def _of_one(self, key: jax.Array, episode: Any, ended: jax.Array, action: jax.Array):
-        """One control step of one world, which begins an episode as the autoreset mode says."""
+        """One control step of one world, with the autoreset mode."""
         if self.mode is AutoresetMode.SAME_STEP:
             return self._episodes.step(key, episode, action)
         obs, episode, reward, terminated, truncated, info = self._episodes.step_without_reset(key, episode, action)

@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to by its debugging protocol through a pipe: it opens no port and needs no library."""
+"""Headless Chromium, controlled by its debugging protocol through a pipe, without a port or a library."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ os.execv(sys.argv[3], sys.argv[3:])"""  # Chromium reads commands from 3 and ans
 
 
 def find_browser() -> str | None:
-    """Path of a Chromium or Chrome; `None` where there is none."""
+    """Path of a Chromium or Chrome; `None` if not found."""
     return next(filter(None, map(shutil.which, _PROGRAMS)), None)
 
 
 class Tab:
-    """One page in the browser."""
+    """Page in the browser."""
 
     def __init__(self, write: int, read: int) -> None:
         self._write, self._read = write, read
@@ -41,10 +41,10 @@ class Tab:
         self._session: str | None = None
         self._url = ""
         self.problems: list[str] = []
-        """Errors and warnings of the console, exceptions, and requests that left the file, or the server."""
+        """Errors and warnings of the console, exceptions, and requests beyond the file or the server."""
 
     def open(self, page: Path | str, width: int = 1100, height: int = 720) -> None:
-        """Open a file, or the address of a server on this machine, and wait until the page says that it is ready."""
+        """Open a file, or the address of a local server, and wait until the page is ready."""
         self._url = page if isinstance(page, str) else page.absolute().as_uri()
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
@@ -56,7 +56,7 @@ class Tab:
         self.wait("document.documentElement?.dataset.ready === 'true'")
 
     def call(self, method: str, timeout: float = 120, **arguments: Any) -> dict[str, Any]:
-        """Call a method of the protocol; returns its result."""
+        """Call a method of the protocol; return its result."""
         self._count += 1
         message = {"id": self._count, "method": method, "params": arguments}
         if self._session is not None:
@@ -70,7 +70,7 @@ class Tab:
         return answer["result"]
 
     def run(self, script: str, **more: Any) -> Any:
-        """The value of an expression of JavaScript; a promise is awaited."""
+        """Value of a JavaScript expression; a promise is awaited."""
         answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True, **more)
         if "exceptionDetails" in answer:
             raise RuntimeError(answer["exceptionDetails"]["exception"].get("description", script))
@@ -91,7 +91,7 @@ class Tab:
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, modifiers=8 * shift, **text)
 
     def screenshot(self) -> bytes:
-        """What is on the screen, as PNG."""
+        """Screenshot as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", optimizeForSpeed=True)["data"])
 
     def _next(self, end: float) -> dict[str, Any]:
@@ -124,10 +124,10 @@ class Tab:
 
 @contextlib.contextmanager
 def open_tab() -> Iterator[Tab]:
-    """A page in a browser of its own, which draws in software and ends with the context.
+    """Context with a page in a new browser with software rendering.
 
     Raises:
-        ValueError: there is no browser; says what to install.
+        ValueError: no browser.
     """
     program = find_browser()
     if program is None:

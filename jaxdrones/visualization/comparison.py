@@ -1,4 +1,4 @@
-"""A figure of flights of the same example under different conditions: their paths, and their errors over time."""
+"""Comparison of flights of the same example: paths, and errors over time."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,20 +11,20 @@ from jaxdrones.visualization import paths, style
 from jaxdrones.visualization.palette import colors
 
 _COMMANDED: dict[str, Any] = style.TARGET | {"color": "#222222", "zorder": 4}
-_WIDEST, _NARROWEST = 3.6, 1.4  # lines: those that are drawn first are wider, and so are seen where others cover them
-_MOST_BANDED = 3  # flights whose range over the drones is shown
+_WIDEST, _NARROWEST = 3.6, 1.4  # lines: earlier ones are wider, to be visible below later ones
+_MOST_BANDED = 3  # flights with a band over the drones
 _SMALLEST = 0.01  # m or m/s: range of an axis
-_CELLS = 100  # along each side of a panel: what is commanded is drawn once in each, so that dashes stay dashes
+_CELLS = 100  # cells along each side of a panel: commands are drawn once in each, to keep dashes
 
 
 def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str) -> None:
-    """Draw flights of the same example: a color for each, all of its drones, and what is commanded dashed.
+    """Draw flights of the same example: a color for each flight, with commands dashed.
 
-    Beside the paths are the errors of each flight over time, mean and range over its drones. Two flights with the same
-    times also have the distance between them, largest over the drones.
+    Beside the paths are the errors of each flight over time, mean and range over its drones, and for two flights with
+    the same times the distance between them, largest over the drones.
 
     Args:
-        records: by name, what differs between them.
+        records: logs by name.
         path: path of the picture; its suffix chooses the format.
         title: title of the figure.
     """
@@ -51,7 +51,7 @@ def _widths(count: int) -> np.ndarray:
 
 
 def _draw_paths(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> None:
-    """The paths of all drones in the plane in which they are widest, at the same scale along both axes."""
+    """Draw the paths of all drones in their widest plane, at equal scales."""
     plane = list(paths.widest_plane(flights[0].pos))
     names = ["xyz"[k] for k in plane]
     for outline in paths.outlines(flights[0].scene, *np.eye(3)[plane]):
@@ -69,7 +69,7 @@ def _draw_paths(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> 
 
 
 def _once(lines: np.ndarray) -> list[np.ndarray]:
-    """Lines (K, n, 2) of n drones, each without the points where a line before it was near."""
+    """Lines (K, n, 2) of n drones, without points near an earlier line."""
     points = lines.reshape(-1, 2)
     if not np.isfinite(points).any():
         return []
@@ -87,7 +87,7 @@ def _once(lines: np.ndarray) -> list[np.ndarray]:
 
 
 def _draw_errors(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> None:
-    """Mean and range over the drones of the distance to the target position, or of the difference in velocity."""
+    """Draw mean and range over the drones of the distance to the target position, or of the difference in velocity."""
     ends = []
     for record, tint, width in zip(flights, tints, _widths(len(flights)), strict=True):
         difference, unit = record.difference()
@@ -103,7 +103,7 @@ def _draw_errors(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) ->
 
 
 def _draw_distance(axis: Any, first: FlightLog, second: FlightLog) -> None:
-    """The distance between the same drones of two flights, largest over the drones, on a logarithmic axis."""
+    """Draw the distance between equal drones of two flights, largest over the drones, on a logarithmic axis."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     with np.errstate(over="ignore", invalid="ignore"):
@@ -119,7 +119,7 @@ def _draw_distance(axis: Any, first: FlightLog, second: FlightLog) -> None:
 
 
 def _handles(records: Mapping[str, FlightLog], tints: tuple[str, ...]) -> list[Any]:
-    """The lines of the legend: flights, what is dashed, start and end, and the band."""
+    """Legend: flights, dashed lines, start and end, and the band."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -1,4 +1,4 @@
-"""Films by the cameras of JAX, with shadows of the drones, and with trails, targets, names and a clock drawn on top."""
+"""Films by the JAX renderer, with shadows, trails, targets, names and a clock."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from jaxdrones.visualization.overlay import Lens, Overlay
 from jaxdrones.visualization.palette import as_rgb, colors
 from jaxdrones.visualization.shots import FIELD_OF_VIEW, Shot, shoot
 
-_DARKNESS = 0.45  # share of light that a shadow takes away
+_DARKNESS = 0.45  # fraction of light lost in a shadow
 _SCALED = ("rotor_pos", "prop_radius", "collision_radius", "collision_height", "collision_offset")
-_ROUGH = 24.0  # levels of brightness between neighboring pixels from which on an edge is smoothed
+_ROUGH = 24.0  # levels of brightness between neighboring pixels of a smoothed edge
 
 
 def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
-    """The pictures (height, width, 3) uint8 of a film that JAX draws."""
+    """Frames (height, width, 3) uint8 of a film by the JAX renderer."""
     shot = shoot(record, fps, size[0] / size[1])
     camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW)
     params = _enlarged(record.params, shot.scale)
@@ -46,13 +46,13 @@ def _lens(shot: Shot, k: int, size: tuple[int, int]) -> Lens:
 
 
 def _enlarged(params: Params, scale: float) -> Params:
-    """Parameters of drones that look larger."""
+    """Parameters of enlarged drones."""
     names = {field.name for field in dataclasses.fields(params)}
     return params.replace(**{name: scale * jnp.asarray(getattr(params, name)) for name in _SCALED if name in names})
 
 
 def _draw(scene, params: Params, state: State, eye: Array, target: Array, tints: Array, camera: Camera):
-    """A picture (h, w, 3) uint8 with shadows and without jagged edges, and its depth (h, w), m."""
+    """Antialiased picture (h, w, 3) uint8 with shadows, and its depth (h, w), m."""
     images = view(scene, params, state, eye, target, camera, tints)
     picture = images.rgb[..., :3].astype(jnp.float32)
     if scene.ground:
@@ -61,7 +61,7 @@ def _draw(scene, params: Params, state: State, eye: Array, target: Array, tints:
 
 
 def _shadow(images: Images, params: Params, state: State, eye: Array, target: Array, camera: Camera) -> Array:
-    """(h, w) how much of each pixel is in the shadow that hubs and rotors, as discs, cast on the ground, 0 to 1."""
+    """(h, w) shadow of hubs and rotors, as discs, on the ground, 0 to 1."""
     height, width = images.depth.shape
     forward, left, up = Lens.axes_of(eye, target, jnp)
     u = camera.slopes[0] * (1 - (2 * jnp.arange(width)[None] + 1) / width)
@@ -87,7 +87,7 @@ def _shadow(images: Images, params: Params, state: State, eye: Array, target: Ar
 
 
 def _smooth(picture: Float[Array, "h w 3"]) -> UInt8[Array, "h w 3"]:
-    """A picture whose edges are averaged over their neighborhood."""
+    """Antialias a picture by averaging edges over their neighborhood."""
     padded = jnp.pad(picture, ((1, 1), (1, 1), (0, 0)), mode="edge")
     height, width = picture.shape[:2]
     around = [padded[i : i + height, j : j + width] for i, j in ((1, 1), (0, 1), (1, 0), (1, 2), (2, 1))]

@@ -1,4 +1,4 @@
-"""Films of recorded flights: by the page in a browser where there is one, else by the cameras of JAX."""
+"""Films of recorded flights, by the viewer's page in a browser or by the JAX renderer."""
 
 import contextlib
 from collections.abc import Callable, Generator, Iterator
@@ -19,10 +19,10 @@ SIZE = (1280, 720)
 
 
 def choose_renderer(renderer: str | None, path: Path) -> str:
-    """The renderer of a film, by default the page where there is a browser, else JAX.
+    """Renderer of a film, by default the page if there is a browser, else JAX.
 
     Raises:
-        ValueError: an unknown renderer, or something that it or the kind of film needs is not there.
+        ValueError: an unknown renderer, or a missing dependency.
     """
     video.check_video(path)
     if renderer is None:
@@ -44,24 +44,24 @@ def film(
     size: tuple[int, int] = SIZE,
     on_frame: Callable[[float], Any] = lambda share: None,
 ) -> int:
-    """Write a film of a flight, with drones in colors of their own, trails, targets and a clock.
+    """Write a film of a flight with colored drones, trails, targets and a clock.
 
-    Bullet draws all drones alike, neither trails nor targets, and no clock.
+    Bullet draws all drones alike, without trails, targets or clock.
 
     Args:
-        record: the flight.
+        record: log of the flight.
         path: path of the film, .mp4 or .gif.
-        title: what is written above.
-        renderer: one of `RENDERERS`; what `choose_renderer` chooses when left out.
+        title: title above.
+        renderer: one of `RENDERERS`; by default that of `choose_renderer`.
         fps: frames per simulated second.
         size: width and height, pixels; even numbers.
-        on_frame: function that is called with the share of the film that is done, after every frame.
+        on_frame: function of the completed fraction, called after every frame.
 
     Returns:
         The number of frames.
 
     Raises:
-        ValueError: something that is needed is not there, or no state of the flight is finite.
+        ValueError: a missing dependency, or no finite state in the flight.
         OSError: the film cannot be written.
     """
     frames = RENDERERS[choose_renderer(renderer, path)](record, title, fps, size)
@@ -95,4 +95,4 @@ def _by_bullet(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -
 
 
 RENDERERS = {"page": _by_page, "jax": _by_jax, "bullet": _by_bullet}
-"""What draws films: the viewer's page in Chromium, the cameras of JAX, or Bullet's TinyRenderer."""
+"""Renderers of films: the viewer's page in Chromium, the JAX renderer, or Bullet's TinyRenderer."""

@@ -1,4 +1,4 @@
-"""Figures of trainings, with what the seeds have in common. They need matplotlib (extra `cli`)."""
+"""Learning curves over seeds. They need matplotlib (extra `cli`)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ PANELS = {
 _MEDIAN, _BAND = COLORS[-1], "#b4bac1"
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 18, "color": "#f2b705", "markeredgecolor": "black", "zorder": 5}
 _GRID = 400
-_MOST_NAMED = 7  # runs that have lines and names of their own
+_MOST_NAMED = 7  # runs with their own lines and names
 
 
 def save_curves(
@@ -30,15 +30,15 @@ def save_curves(
 ) -> None:
     """Draw learning curves over the number of control steps.
 
-    Each run is a line. Several runs have their median besides, and a band from the lowest to the highest of them. The
-    success of a single run has its confidence interval. A star marks the evaluation of the policy that each run keeps.
+    Each run is a line. Several runs also have their median, and a band from lowest to highest. The success rate of a
+    single run has its confidence interval. A star marks the evaluation of the best policy of each run.
 
     Args:
-        histories: label -> rows of progress.csv, as `training.run.Run.history` returns them.
+        histories: label -> rows of progress.csv, from `training.run.Run.history`.
         path: path of the picture.
         title: title of the figure.
-        interval: function that returns the 95 % interval of a success rate; without it none is drawn.
-        kept: label -> update of the policy that is kept; there is no star where it is the untrained one.
+        interval: function for the 95 % interval of a success rate; by default none is drawn.
+        kept: label -> update of the best policy; an untrained one has no star.
     """
     from matplotlib.ticker import EngFormatter
 
@@ -79,13 +79,13 @@ def save_curves(
 
 
 def spread(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Median, lowest and highest of several curves where all of them have values.
+    """Median, lowest and highest of several curves over their common range.
 
     Args:
-        curves: (p, 2) points of each, number of steps and value; between its points a curve is a straight line.
+        curves: (p, 2) points of each, number of steps and value, with linear interpolation.
 
     Returns:
-        Numbers of steps, medians, lowest and highest values, each (s,); nothing of curves that do not overlap.
+        Numbers of steps, medians, lowest and highest values, each (s,); empty without overlap.
     """
     begin, end = max(points[0, 0] for points in curves), min(points[-1, 0] for points in curves)
     between = np.linspace(begin, max(begin, end), _GRID)  # where curves cross between their points
@@ -96,7 +96,7 @@ def spread(curves: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _points(rows: Sequence[Mapping[str, float]], name: str) -> np.ndarray:
-    """(p, 2) numbers of steps and values, where there are values."""
+    """(p, 2) numbers of steps and values, without missing values."""
     points = [(row["steps"], row[name]) for row in rows if name in row and np.isfinite(row[name])]
     return np.array(sorted(points)).reshape(-1, 2)
 
@@ -112,7 +112,7 @@ def _draw_runs(axis: Any, curves: Mapping[str, np.ndarray], names: Sequence[str]
 def _rows_of(
     histories: Mapping[str, Sequence[Mapping[str, float]]], kept: Mapping[str, int] | None, run: str
 ) -> list[Mapping[str, float]]:
-    """The row of the policy that a run keeps; none of the untrained one."""
+    """Row of the best policy of a run; none for an untrained one."""
     return [row for row in histories[run] if kept and "update" in row and row["update"] == kept.get(run)]
 
 
@@ -126,7 +126,7 @@ def _tints(runs: int) -> tuple[str, ...]:
 
 
 def _handles(names: Sequence[str], has_interval: bool, starred: bool) -> list[Any]:
-    """The lines of the legend."""
+    """Lines of the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

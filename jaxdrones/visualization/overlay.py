@@ -1,4 +1,4 @@
-"""What is drawn over the pictures of a film: trails, targets, names, title and clock. Needs Pillow (extra `video`)."""
+"""Overlays of a film: trails, targets, names, title and clock. Needs Pillow (extra `video`)."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from PIL import Image, ImageDraw, ImageFont
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization.palette import colors
 
-_MOST_NAMED = 8  # drones that have their names in the picture
-_CROWD, _SHORT = 24, 2.0  # drones from which on trails are short, and their length then, s
-_LEGS = 300  # most straight pieces of a trail
-_BEHIND = 1.02  # a point is hidden if it is this many times as deep as what the picture shows
+_MOST_NAMED = 8  # drones with names in the picture
+_CROWD, _SHORT = 24, 2.0  # drones above which trails are short, and their length then, s
+_LEGS = 300  # largest number of segments of a trail
+_BEHIND = 1.02  # a point is hidden beyond this many times the depth of its pixel
 _WHITE, _INK = (255, 255, 255, 200), (29, 37, 44, 255)
 
 
 class Lens(NamedTuple):
-    """Where a picture is taken from, and how wide it is."""
+    """Pose and field of view of a picture."""
 
     eye: np.ndarray
     """(3,) m, world."""
     target: np.ndarray
-    """(3,) what is in the middle, m, world."""
+    """(3,) center of the picture, m, world."""
     field_of_view: float
     """Vertical, degrees."""
     size: tuple[int, int]
@@ -31,7 +31,7 @@ class Lens(NamedTuple):
 
     @staticmethod
     def axes_of(eye: Any, target: Any, xp: Any = np) -> tuple[Any, Any, Any]:
-        """Directions (3,) that are forward, left and up in a picture, world."""
+        """Forward, left and up directions (3,) of a picture, world."""
         forward = (target - eye) / xp.linalg.norm(target - eye)
         left = xp.stack([-forward[1], forward[0], xp.zeros_like(forward[0])])
         left = left / xp.linalg.norm(left)
@@ -40,7 +40,7 @@ class Lens(NamedTuple):
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (..., 2), from the upper left corner, and depths (...,), m, of points (..., 3), m, world.
 
-        Points behind the camera have pixels that are NaN.
+        Pixels of points behind the camera are NaN.
         """
         width, height = self.size
         depth, left, up = (np.asarray(points - self.eye) @ axis for axis in self.axes_of(self.eye, self.target))
@@ -50,10 +50,10 @@ class Lens(NamedTuple):
 
 
 class Overlay:
-    """Draws over the pictures of one flight."""
+    """Overlay for the pictures of one flight."""
 
     def __init__(self, record: FlightLog, title: str, scale: float) -> None:
-        """Prepare for a record; drones are drawn `scale` times as large as they are."""
+        """Prepare for a record, with drones enlarged by `scale`."""
         self._record, self._title = record, title
         self._colors = [(*(int(color[i : i + 2], 16) for i in (1, 3, 5)), 255) for color in colors(len(record.labels))]
         self._radius = scale * float(np.max(np.linalg.norm(record.params.rotor_pos, axis=-1)))
@@ -61,12 +61,12 @@ class Overlay:
             self._title += f" (drones {scale:g} times as large as they are)"
 
     def draw(self, picture: np.ndarray, depth: np.ndarray, lens: Lens, row: int, time: float) -> np.ndarray:
-        """A picture (h, w, 3) uint8 with everything drawn over it.
+        """Draw the overlay on a picture (h, w, 3) uint8.
 
         Args:
             picture: (h, w, 3) uint8.
-            depth: (h, w) depth of what it shows, m.
-            lens: with which it was taken.
+            depth: (h, w) depth of the picture, m.
+            lens: of the picture.
             row: of the record.
             time: s, for the clock.
         """
@@ -83,7 +83,7 @@ class Overlay:
         return np.asarray(image)
 
     def _path(self, i: int, row: int) -> np.ndarray:
-        """(m, 3) positions of a drone up to a row, and the position there."""
+        """(m, 3) positions of a drone up to a row."""
         record, first = self._record, 0
         if len(self._colors) > _CROWD:
             first = int(np.searchsorted(record.t, record.t[row] - _SHORT))
@@ -98,7 +98,7 @@ class Overlay:
                 brush.line((2 * pixels[begin:end]).ravel().tolist(), fill=color, width=5, joint="curve")
 
     def _target(self, brush: Any, point: np.ndarray, color: tuple, depth: np.ndarray, lens: Lens) -> None:
-        """A hollow diamond of half the size of a drone."""
+        """Hollow diamond of half the size of a drone."""
         if np.isfinite(point).all() and _visible(point[None], depth, lens)[0]:
             (x, y), away = lens.project(point)
             r = max(7.0, 0.5 * self._radius * lens.size[1] / 2 / np.tan(np.deg2rad(lens.field_of_view) / 2) / away)
@@ -122,7 +122,7 @@ class Overlay:
 
 
 def _visible(points: np.ndarray, depth: np.ndarray, lens: Lens) -> np.ndarray:
-    """Which points (m, 3) are in the picture and not behind what it shows."""
+    """Mask of the visible points (m, 3)."""
     pixels, away = lens.project(points)
     width, height = lens.size
     with np.errstate(invalid="ignore"):
@@ -132,13 +132,13 @@ def _visible(points: np.ndarray, depth: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def _runs(flags: np.ndarray) -> np.ndarray:
-    """(r, 2) first and one past the last index of every run of true flags."""
+    """(r, 2) start and stop index of every run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     return edges.reshape(-1, 2)
 
 
 def _text(brush: Any, at: tuple[float, float], text: str, size: float, anchor: str) -> tuple[float, ...]:
-    """Write on a light ground; returns its box."""
+    """Write text on a light background; return its box."""
     box = brush.textbbox(at, text, font=_font(size), anchor=anchor)
     box = (box[0] - 5, box[1] - 3, box[2] + 5, box[3] + 3)
     brush.rounded_rectangle(box, 3, fill=_WHITE)

@@ -1,13 +1,13 @@
-"""Colors of drones and lines in figures, films and pages, for all kinds of sight, after Okabe and Ito (2008)."""
+"""Colors of drones and lines in figures, films and pages, safe for color blindness, after Okabe and Ito (2008)."""
 
 import numpy as np
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#222222")
 """Blue, vermilion, green, purple, orange, sky blue, wine, near black."""
-_SHADES = ((0.0, 0), (0.5, 255), (0.65, 0))  # share and level of the gray that is mixed in, for every eight drones
+_SHADES = ((0.0, 0), (0.5, 255), (0.65, 0))  # fraction and level of the added gray, for every eight drones
 
 DISTINCT = len(COLORS) * len(_SHADES)
-"""Number of drones that have colors of their own."""
+"""Number of distinct colors."""
 
 
 def colors(n: int) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Panels of a figure that show the paths of a flight: in three dimensions, and in the plane in which it is largest."""
+"""Panels with the paths of a flight: in three dimensions, and in the widest plane."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,11 +26,11 @@ START: dict[str, Any] = {
 _GOAL: dict[str, Any] = {"marker": "x", "markersize": 9, "markeredgewidth": 2.2, "linestyle": "none"}
 END: dict[str, Any] = {"marker": "o", "markersize": 7, "linestyle": "none"}
 ENDS = {"start": START, "end": END}
-"""How the first and the last point of a path are drawn."""
+"""Style of the first and the last point of a path."""
 
 
 def widest_plane(pos: np.ndarray) -> tuple[int, int]:
-    """The two axes along which positions (K, n, 3) extend most, in the order x, y, z; x and z of a vertical line."""
+    """Two axes of largest extent of positions (K, n, 3), in the order x, y, z; x and z for a vertical line."""
     extent = [np.ptp(style.limits(pos[..., axis])) for axis in range(3)]
     first, second = np.argsort([-extent[0], -extent[1], -extent[2]], kind="stable")[:2]
     if extent[second] < 0.1 * extent[first]:
@@ -39,7 +39,7 @@ def widest_plane(pos: np.ndarray) -> tuple[int, int]:
 
 
 def draw_plane(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
-    """Draw the paths in the widest plane, at the same scale along both axes, and obstacles as their outlines."""
+    """Draw the paths in the widest plane, at equal scales, with outlines of obstacles."""
     plane = list(widest_plane(record.pos))
     names = ["xyz"[k] for k in plane]
     axis.set_title(plane_title(names))
@@ -58,12 +58,12 @@ def draw_plane(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
 
 
 def plane_title(names: Sequence[str]) -> str:
-    """The title of a panel in the plane of two axes, `x`, `y` or `z`."""
+    """Title of a panel in the plane of two axes, `x`, `y` or `z`."""
     return "path from above" if "z" not in names else "path from the side"
 
 
 def set_equal(axis: Any, x: np.ndarray, y: np.ndarray) -> None:
-    """Let a panel hold ranges (c, 2) along both of its axes, at the same scale, without becoming a strip."""
+    """Set ranges (c, 2) of a panel at equal scales, with a limited aspect ratio."""
     left, right, low, high = x[:, 0].min(), x[:, 1].max(), y[:, 0].min(), y[:, 1].max()
     wide, tall = max(right - left, (high - low) / 1.5), max(high - low, (right - left) / 1.5)
     middle, height = (left + right) / 2, (low + high) / 2
@@ -72,7 +72,7 @@ def set_equal(axis: Any, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def draw_space(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
-    """Draw the paths in three dimensions, with their shadows on the floor of the panel."""
+    """Draw the paths in three dimensions, with projections on the floor of the panel."""
     spaces = ranges(record, [0, 1, 2])
     floor = spaces[2][0]
     for i, color in enumerate(colors):
@@ -95,7 +95,7 @@ def draw_space(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
 
 
 def legend_handles(record: FlightLog) -> list[Any]:
-    """Lines for a legend that explain what all drones of a figure have in common."""
+    """Legend entries common to all drones of a figure."""
     from matplotlib.lines import Line2D
 
     looks = dict(ENDS)
@@ -107,9 +107,9 @@ def legend_handles(record: FlightLog) -> list[Any]:
 
 
 def outlines(scene: Scene, right: np.ndarray, up: np.ndarray) -> list[np.ndarray]:
-    """Outlines (c, 2) of the obstacles of a scene, seen along the cross product of two directions (3,).
+    """Outlines (c, 2) of the obstacles of a scene, projected along the cross product of two directions (3,).
 
-    Scenes with more than 400 obstacles have none, and so have URDF files.
+    They are empty for scenes with more than 400 obstacles and for URDF files.
     """
     solids = [solid.bounding_box() if isinstance(solid, Mesh) else solid for solid in scene.numbered.values()]
     if len(solids) > _MOST_OBSTACLES:
@@ -132,12 +132,12 @@ def outlines(scene: Scene, right: np.ndarray, up: np.ndarray) -> list[np.ndarray
 
 
 def ranges(record: FlightLog, axes: Sequence[int]) -> list[tuple[float, float]]:
-    """Ranges of panels that show paths and what is commanded along some axes, 0 to 2."""
+    """Ranges of panels for paths and commands along some axes, 0 to 2."""
     both = np.concatenate([record.pos, record.target_pos], axis=1)
     return [style.limits(both[..., axis], _SMALLEST) for axis in axes]
 
 
 def _inside(path: np.ndarray, spaces: Sequence[tuple[float, float]]) -> np.ndarray:
-    """A path (K, 3) without its points outside of the ranges, which axes in three dimensions do not cut off."""
+    """Clip a path (K, 3) to the ranges, as three-dimensional axes do not clip."""
     low, high = np.transpose(spaces)
     return np.where(((path >= low) & (path <= high)).all(axis=1, keepdims=True), path, np.nan)

@@ -38,10 +38,10 @@ _WIDTH, _PATHS, _ROW = 13.0, 5.4, 1.6  # in
 
 
 def check_matplotlib() -> None:
-    """Raise `ValueError` if no figure can be drawn.
+    """Raise `ValueError` without matplotlib.
 
     Raises:
-        ValueError: matplotlib is not installed; says how to get it.
+        ValueError: matplotlib is not installed.
     """
     try:
         import matplotlib  # noqa: F401
@@ -52,13 +52,13 @@ def check_matplotlib() -> None:
 
 
 def save_flight(record: FlightLog, path: Path, title: str, panels: Sequence[str] = ()) -> None:
-    """Draw a flight: its paths, and signals over time; one color per drone, what is commanded dashed.
+    """Draw paths and signals of a flight over time, with one color per drone and commands dashed.
 
     Args:
-        record: the flight.
+        record: log of the flight.
         path: path of the picture; its suffix chooses the format.
         title: title of the figure.
-        panels: names of `PANELS`, or `error`; all `PANELS` when empty.
+        panels: names of `PANELS`, or `error`; empty for all `PANELS`.
     """
     panels = panels or list(PANELS)
     columns = 1 if len(panels) < 4 else 2
@@ -83,7 +83,7 @@ def save_flight(record: FlightLog, path: Path, title: str, panels: Sequence[str]
 
 
 def _draw_signal(axis: Any, record: FlightLog, name: str, tints: Sequence[str]) -> None:
-    """Draw one panel over time, and say what of it lies outside of the axes."""
+    """Draw one panel over time, with a note on values outside of the axes."""
     array, column, label = (PANELS | ERROR)[name]
     signal = np.asarray(getattr(record, array), float)[..., column]
     targets = {"pos": record.target_pos, "vel": record.target_vel}
@@ -104,13 +104,13 @@ def _draw_signal(axis: Any, record: FlightLog, name: str, tints: Sequence[str]) 
 
 
 def _range(values: np.ndarray) -> str:
-    """From the smallest to the largest value, as text."""
+    """Range of values as text."""
     ends = [f"{x:,.0f}" if 1e3 <= abs(x) < 1e6 else f"{x:.2g}" for x in (values.min(), values.max())]
     return " to ".join(dict.fromkeys(ends))
 
 
 def _handles(record: FlightLog, tints: Sequence[str]) -> list[Any]:
-    """The lines of the legend: drones, what is dashed, start and end."""
+    """Legend: drones, dashed lines, start and end."""
     from matplotlib.lines import Line2D
 
     named = [Line2D([], [], color=tint, label=drone) for tint, drone in zip(tints, record.labels, strict=True)]

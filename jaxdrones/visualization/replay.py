@@ -1,4 +1,4 @@
-"""Films and on-board pictures of recorded flights of either backend, drawn by Bullet (extra `bullet`)."""
+"""Films and on-board pictures of recorded flights, rendered by Bullet (extra `bullet`)."""
 
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -15,7 +15,7 @@ FPS = 24  # frames per simulated second; the camera rate of gym-pybullet-drones 
 
 
 def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
-    """The pictures (height, width, 3) uint8 of a film that Bullet draws, without its title."""
+    """Frames (height, width, 3) uint8 of a film by Bullet, without title."""
     shot = shoot(record, fps, size[0] / size[1])
     camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW, near=0.02)
     with bullet.make_step(scene=record.scene) as step:
@@ -24,7 +24,7 @@ def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Ge
 
 
 def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequence:
-    """Write the pictures of every drone's camera as `drone 0/00000.png` and so on; returns them."""
+    """Write the images of every drone's camera as `drone 0/00000.png` etc.; return them."""
     from matplotlib.image import imsave
 
     t, pictures = [], []
@@ -40,7 +40,7 @@ def save_cameras(record: FlightLog, folder: Path, fps: int = FPS) -> ImageSequen
 
 
 def _states(record: FlightLog, fps: int) -> Iterator[State]:
-    """The recorded state nearest to every frame's time, out of those that can be shown; at least one."""
+    """Recorded finite state nearest to every frame's time; at least one."""
     return (_state(record, row) for row in rows_of_frames(record, fps))
 
 

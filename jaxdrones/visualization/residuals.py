@@ -1,4 +1,4 @@
-"""Figures of recorded flights: open-loop errors by horizon, and recorded beside simulated paths."""
+"""Figures of identification: open-loop errors by horizon, and recorded and simulated paths."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Where the camera of a film is: as close as the whole team allows, and where obstacles do not hide it."""
+"""Camera of a film: close to the whole team, with an unobstructed view."""
 
 from __future__ import annotations
 
@@ -16,48 +16,48 @@ from jaxdrones.sensing import Mesh, Scene, Urdf, from_urdf, ray
 
 FIELD_OF_VIEW = 45.0  # degrees, vertical
 _FAR = 1e6  # m; states beyond are not shown
-_FILLED = 0.85  # share of the picture, along each side, that the team may fill
-_LARGE = 0.06  # height of a drone over that of the picture from which on a camera that stands still is close enough
-_WINDOW = 1.2  # s around each time of which a moving camera shows all positions, so that it moves calmly
+_FILLED = 0.85  # largest fraction of the picture, along each side, for the team
+_LARGE = 0.06  # smallest height of a drone over that of the picture for a static camera
+_WINDOW = 1.2  # s around each time with all positions in view, for a smooth camera motion
 _SCALES = (1.0, 3.0, 10.0)  # of the size of drones
-_SMALL = 0.03  # height of a drone over that of the picture below which it is drawn larger
+_SMALL = 0.03  # height of a drone over that of the picture below which it is enlarged
 _ELEVATIONS = (0.46, 0.9)  # rad, of the camera above the team
-_AZIMUTHS = np.deg2rad([229, 139, 319, 49, 184, 274, 94, 4])  # of the camera, the preferred ones first
-_LOOKS, _LOOKED_AT = 24, 8  # times and drones for which sight lines are counted
-_POINTS = 3000  # of a flight, most that are kept in view
+_AZIMUTHS = np.deg2rad([229, 139, 319, 49, 184, 274, 94, 4])  # of the camera, in order of preference
+_LOOKS, _LOOKED_AT = 24, 8  # times and drones of the sight lines
+_POINTS = 3000  # largest number of points of a flight to keep in view
 _CORNERS = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)  # of a box of size 1
-_BLOCKING = 0.2  # share of the sight lines from which on an obstacle is left out
+_BLOCKING = 0.2  # fraction of obstructed sight lines above which an obstacle is left out
 
 
 class Shot(NamedTuple):
-    """The camera of a film of F frames, and what it films."""
+    """Camera and scene of a film of F frames."""
 
     rows: np.ndarray
     """(F,) row of the record in every frame."""
     eyes: np.ndarray
     """(F, 3) position of the camera, m, world."""
     targets: np.ndarray
-    """(F, 3) what is in the middle of the picture, m, world."""
+    """(F, 3) center of the picture, m, world."""
     scene: Scene
-    """Boxes, spheres, cylinders and capsules, without those that would hide the team."""
+    """Boxes, spheres, cylinders and capsules, without those that hide the team."""
     scale: float
-    """How many times as large as they are drones are drawn; above 1 where they would be too small to be seen."""
+    """Enlargement of drones, above 1 if they are too small otherwise."""
 
 
 def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
-    """Choose the camera of a film that has a frame for every 1/fps of simulated time, at least one.
+    """Choose the camera of a film with a frame for every 1/fps of simulated time, at least one.
 
-    The camera stands still if it can show the whole flight with drones that are large enough. Otherwise it follows the
-    box around the team. It looks from the direction in which obstacles hide the team least; an obstacle that still
-    hides it in a fifth of the sight lines, such as a ceiling, is left out.
+    The camera is static if the whole flight fits with large enough drones. Otherwise it follows the bounding box of the
+    team. Its direction is that with the fewest obstructed sight lines; an obstacle that still obstructs a fifth of
+    them, such as a ceiling, is left out.
 
     Args:
-        record: the flight.
+        record: log of the flight.
         fps: frames per second.
         aspect: width of the picture over its height.
 
     Raises:
-        ValueError: no state of the flight is finite.
+        ValueError: no finite state in the flight.
     """
     finite, rows = _finite_rows(record), rows_of_frames(record, fps)
     reach = float(np.max(np.linalg.norm(record.params.rotor_pos, axis=-1).max(-1) + record.params.prop_radius))
@@ -86,10 +86,10 @@ def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
 
 
 def rows_of_frames(record: FlightLog, fps: int) -> np.ndarray:
-    """The row (F,) nearest to the time of every frame, at least one, in which the pose of every drone is a number.
+    """Row (F,) with finite poses nearest to the time of every frame, at least one.
 
     Raises:
-        ValueError: no state of the flight is finite.
+        ValueError: no finite state in the flight.
     """
     finite = _finite_rows(record)
     if not len(finite):
@@ -99,13 +99,13 @@ def rows_of_frames(record: FlightLog, fps: int) -> np.ndarray:
 
 
 def _finite_rows(record: FlightLog) -> np.ndarray:
-    """Rows in which the pose of every drone is a number that can be shown."""
+    """Rows with finite poses of every drone."""
     poses = np.concatenate([record.pos, record.quat], axis=-1)
     return np.flatnonzero((np.abs(poses) < _FAR).all(axis=(1, 2)))
 
 
 def only_shapes(scene: Scene) -> Scene:
-    """A scene of boxes, spheres, cylinders and capsules: a mesh is its bounding box, a URDF what collides in it."""
+    """Convert a scene to basic shapes: a mesh to its bounding box, a URDF to its collision elements."""
     solids: list = []
     for solid in scene.numbered.values():
         if isinstance(solid, Urdf):
@@ -120,7 +120,7 @@ def _slope() -> float:
 
 
 def _directions() -> list[np.ndarray]:
-    """Unit vectors from the team to the camera, the preferred ones first."""
+    """Unit vectors from the team to the camera, in order of preference."""
     return [
         np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
         for up in _ELEVATIONS
@@ -129,7 +129,7 @@ def _directions() -> list[np.ndarray]:
 
 
 def _calm(low: np.ndarray, high: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes that hold those given and change slowly: means of boxes that hold all within `half` frames."""
+    """Smoothed bounding boxes: means of boxes that contain all within `half` frames."""
 
     def windows(x: np.ndarray) -> np.ndarray:
         padded = np.pad(x, ((half, half), (0, 0)), mode="edge")
@@ -139,7 +139,7 @@ def _calm(low: np.ndarray, high: np.ndarray, half: int) -> tuple[np.ndarray, np.
 
 
 def _distance(points: np.ndarray, reach: float, direction: np.ndarray, aspect: float) -> np.ndarray:
-    """Distances (F,) at which a camera in a direction shows points (F, m, 3), and `reach` m around them, m."""
+    """Distances (F,) of a camera in a direction with points (F, m, 3), and `reach` m around them, in view, m."""
     right = np.cross([0, 0, 1.0], direction)
     right /= np.linalg.norm(right)
     up = np.cross(direction, right)
@@ -149,7 +149,7 @@ def _distance(points: np.ndarray, reach: float, direction: np.ndarray, aspect: f
 
 
 def _hidden(scene: Scene, eyes: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(k, d, F n) which of k obstacles are between the camera (d, F, 3), in d directions, and the drones (F, n, 3)."""
+    """(k, d, F n) mask of k obstacles between the camera (d, F, 3), in d directions, and the drones (F, n, 3)."""
     ends = jnp.asarray(np.broadcast_to(seen, (len(eyes), *seen.shape)).reshape(-1, 3))
     begins = jnp.asarray(np.repeat(eyes[:, :, None], seen.shape[1], axis=2).reshape(-1, 3))
 

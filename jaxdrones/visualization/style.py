@@ -1,4 +1,4 @@
-"""What all figures have in common: fonts that are readable at half size, lines, and limits of axes."""
+"""Common style of figures: fonts, lines, and limits of axes."""
 
 import contextlib
 import os
@@ -13,9 +13,9 @@ from jaxdrones.writing import replaced
 
 DPI = 110
 TARGET: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.3, "alpha": 0.75}
-"""How a target is drawn, in the color of its drone."""
-_KEPT = 0.95  # share of the samples of each line that is shown
-_FLATTENED = 3.0  # times that the whole range is larger than that of the kept samples from which on it is not shown
+"""Style of a target, in the color of its drone."""
+_KEPT = 0.95  # fraction of the samples of each line in view
+_FLATTENED = 3.0  # largest ratio of the whole range to that of these samples
 _LOOK: dict[str, Any] = {
     "font.size": 14,
     "axes.titlesize": 15,
@@ -36,7 +36,7 @@ _LOOK: dict[str, Any] = {
 
 @contextlib.contextmanager
 def figure(width: float, height: float) -> Iterator[Any]:
-    """A context with an empty figure of a size in inches; everything drawn in it has the common look."""
+    """Context with an empty figure of a size in inches and the common style."""
     import matplotlib
     from cycler import cycler
     from matplotlib.figure import Figure  # importing it takes half a second
@@ -47,7 +47,7 @@ def figure(width: float, height: float) -> Iterator[Any]:
 
 
 def save(figure: Any, path: str | os.PathLike) -> None:
-    """Write a figure as a file, whose suffix chooses the format.
+    """Write a figure to a file; the suffix selects the format.
 
     Raises:
         OSError: the file cannot be written.
@@ -57,14 +57,14 @@ def save(figure: Any, path: str | os.PathLike) -> None:
 
 
 def limits(lines: np.ndarray, smallest: float = 0.0) -> tuple[float, float]:
-    """Limits of an axis, which a short spike does not flatten.
+    """Limits of an axis, robust to short spikes.
 
-    They hold everything, unless that is more than three times the range of the middle 95 % of each line. Then they
-    hold those samples and half as much to both sides.
+    They contain all samples, unless that is more than three times the range of the middle 95 % of each line. Then they
+    contain those samples and half as much to both sides.
 
     Args:
-        lines: (K, n) one column per line; what is not finite is not counted.
-        smallest: smallest range, so that noise is not magnified.
+        lines: (K, n) one column per line; values that are not finite are ignored.
+        smallest: smallest range, against magnified noise.
     """
     lines = np.where(np.isfinite(lines), lines, np.nan)
     lines = lines[:, ~np.isnan(lines).all(axis=0)]

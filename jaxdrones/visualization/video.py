@@ -1,4 +1,4 @@
-"""Writes frames as MP4 (extra `video`) or GIF."""
+"""Write films as MP4 (extra `video`) or GIF."""
 
 import warnings
 from collections.abc import Iterable
@@ -14,10 +14,10 @@ SUFFIXES = (".mp4", ".gif")
 
 
 def check_video(path: Path) -> None:
-    """Raise `ValueError` if no film can be written to `path`.
+    """Raise `ValueError` for an unknown suffix or a missing package.
 
     Raises:
-        ValueError: an unknown suffix, or a package that is not installed; says which extra to install.
+        ValueError: an unknown suffix, or a package that is not installed.
     """
     if path.suffix not in SUFFIXES:
         raise UserError(f"{path}: films end in {' or '.join(SUFFIXES)}")
@@ -31,7 +31,7 @@ def check_video(path: Path) -> None:
 
 
 def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
-    """Write RGB frames (height, width, 3) uint8, at least one, as a film; returns their number.
+    """Write RGB frames (height, width, 3) uint8, at least one, as a film; return their number.
 
     Raises:
         OSError: the file cannot be written.
@@ -62,7 +62,7 @@ def _write_mp4(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
         if imageio_ffmpeg.count_frames_and_secs(new)[0] != count:
             raise OSError("frames are missing")
         new.replace(path)
-    except (OSError, RuntimeError) as error:  # RuntimeError: of a file that is no film
+    except (OSError, RuntimeError) as error:  # RuntimeError: invalid film
         raise OSError(
             f"{path} cannot be written, ffmpeg broke off; is the disk full, or the folder read-only?"
         ) from error

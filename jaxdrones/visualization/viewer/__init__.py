@@ -1,4 +1,4 @@
-"""The viewer: flights as one page of HTML with everything in it, for notebooks, for files, and while they fly."""
+"""Viewer: self-contained HTML pages of flights, for notebooks, files and live views."""
 
 from jaxdrones.visualization.viewer.live import Live
 from jaxdrones.visualization.viewer.page import Page

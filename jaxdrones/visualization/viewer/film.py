@@ -1,4 +1,4 @@
-"""Films from the page, taken by a headless Chromium."""
+"""Films of the page, by a headless Chromium."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ CAMERAS = ("orbit", "follow", "board")
 
 
 def film(page: Page, path: Path, fps: int = 24, size: tuple[int, int] = (1280, 720), camera: str = "orbit") -> int:
-    """Write a film of what a page shows; one frame per 1/fps of simulated time. It takes some tenths of a second each.
+    """Write a film of a page, one frame per 1/fps of simulated time, in a few tenths of a second each.
 
     Args:
-        page: what `show` returned.
+        page: result of `show`.
         path: path of the film, .mp4 or .gif.
         fps: frames per second.
         size: width and height, pixels; even numbers.
-        camera: `orbit` shows all of the flight, `follow` the first drone, `board` what it sees.
+        camera: `orbit` shows the whole flight, `follow` the first drone, `board` its own view.
 
     Returns:
         The number of frames.
 
     Raises:
-        ValueError: an unknown suffix, a package that is not installed, or no browser; says what to install.
+        ValueError: an unknown suffix, a package that is not installed, or no browser.
         OSError: the film cannot be written.
     """
     video.check_video(path)
@@ -41,7 +41,7 @@ def film(page: Page, path: Path, fps: int = 24, size: tuple[int, int] = (1280, 7
 
 
 def frames(page: Page, fps: int, size: tuple[int, int], camera: str | Shot) -> Generator[np.ndarray]:
-    """The pictures (height, width, 3) uint8 of a film of a page, by one of its cameras or by a camera of its own."""
+    """Frames (height, width, 3) uint8 of a film of a page, by one of its cameras or by a given one."""
     from PIL import Image  # of the extra `video`
 
     with open_tab() as tab, tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Flights in the browser while they are flown: a server for this machine alone, which streams them to the page."""
+"""Live view of flights in the browser, streamed by a local server."""
 
 from __future__ import annotations
 
@@ -18,27 +18,26 @@ from jaxdrones.visualization.viewer.payload import encode, encode_rows
 from jaxdrones.visualization.viewer.server import Server
 from jaxdrones.visualization.viewer.show import LAYOUTS, check_size, looks, records_of
 
-_RELOADING = 2.0  # s, for which a viewer that left is awaited
-_ALIVE = 0.5  # s between signs of life, by which it is noticed that a viewer left
-_FLUSHING = 5.0  # s, for which viewers may take what is left at the end
-_ROWS = ("t", *STATE, *OPTIONAL)  # arrays of a log that grow
+_RELOADING = 2.0  # s, wait for a viewer that left
+_ALIVE = 0.5  # s between keep-alive messages, to detect closed viewers
+_FLUSHING = 5.0  # s, time for viewers to receive the rest at the end
+_ROWS = ("t", *STATE, *OPTIONAL)  # growing arrays of a log
 
 
 class Live:
-    """A server that shows flights while they are flown, to any number of viewers; a context, which ends them.
+    """Context with a server that shows flights live to any number of viewers.
 
-    Only programs on this machine reach it, and only those that know `url`, which holds a secret. A viewer that comes
-    late sees the flight from its start.
+    It is reachable only from this machine, by the secret in `url`. A late viewer sees the flight from its start.
 
     Args:
-        port: port of the server; 0 takes a free one.
-        title: title of the page; the conditions of the flight when left out.
-        wait: how long `add` waits for the first viewer, s.
-        say: function that is given a line to print when something happens.
+        port: port of the server; 0 for a free one.
+        title: title of the page; by default the conditions of the flight.
+        wait: longest wait of `add` for the first viewer, s.
+        say: function to print a line.
 
     Raises:
-        ValueError: the port is taken, or there is no such port.
-        ImportError: the viewer's page is not built; says how to get it.
+        ValueError: an invalid port, or one in use.
+        ImportError: the viewer's page is not built.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class Live:
         self.url = self._server.url
         self._title, self._wait, self._say = title, wait, say
         self._changed = threading.Condition()
-        self._parts: list[FlightLog] = []  # of the flight that is shown
+        self._parts: list[FlightLog] = []  # of the current flight
         self._flight = 0  # its number; 0 before the first
         self._header: dict[str, Any] = {}
         self._viewers = 0
@@ -69,19 +68,18 @@ class Live:
 
     @property
     def viewers(self) -> int:
-        """How many pages are open now."""
+        """Number of open pages."""
         return self._viewers
 
     def add(self, part: Any, end: float) -> None:
-        """Show the next part of a flight, and return when as much real time has passed since its first.
+        """Show the next part of a flight in real time.
 
-        The first part is held until there is a viewer, for `wait` seconds at most. Without a viewer, or when all have
-        left, nothing is waited for any more.
+        The first part waits for a viewer, for `wait` seconds at most. Without viewers there is no wait.
 
         Args:
-            part: anything with one world that `show` takes; a part that begins before the last one ended is of a new
+            part: an argument of `show` with one world; a part that begins before the last one ended starts a new
                 flight.
-            end: time at which the flight ends at the latest, s.
+            end: latest end of the flight, s.
         """
         (record,) = records_of(part, {})
         if not self._parts or record.t[0] <= self._parts[-1].t[-1]:
@@ -97,13 +95,13 @@ class Live:
         self._pace(self._start + float(record.t[-1]))
 
     def show(self, flight: Any, title: str, curve: Sequence[tuple[float, float]] = (), label: str = "success") -> None:
-        """Show a whole flight, again and again until the next one comes; this waits for nobody.
+        """Show a whole flight in a loop until the next one, without waiting.
 
         Args:
-            flight: anything with one world that `show` takes.
-            title: title of the page from now on.
-            curve: points of a learning curve: numbers of updates, and what was evaluated after them.
-            label: name of what was evaluated; `success` is a share, 0 to 1.
+            flight: an argument of `show` with one world.
+            title: new title of the page.
+            curve: points of a learning curve: numbers of updates, and evaluated values.
+            label: name of the value; `success` is a fraction, 0 to 1.
         """
         (record,) = records_of(flight, {})
         self._title = title
@@ -112,7 +110,7 @@ class Live:
         self._begin(record, live | {"curve": {"label": label, "points": points}})
 
     def close(self) -> None:
-        """Let the viewers take what is left, and end. Their pages stay, and play what they have."""
+        """Send the rest to the viewers, and end. Their pages stay open."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -145,7 +143,7 @@ class Live:
             self._say("no viewer came; the flight goes on without one")
 
     def _pace(self, due: float) -> None:
-        """Wait until a time, unless there is nobody to wait for."""
+        """Wait until a time, unless there is no viewer."""
         with self._changed:
             while self._paced and (left := due - time.monotonic()) > 0:
                 if self._viewers:
@@ -156,22 +154,22 @@ class Live:
 
     @property
     def _news(self) -> tuple[int, int]:
-        """Number of the flight that is shown, and of the parts that there are of it."""
+        """Number of the current flight, and of its parts."""
         return self._flight, len(self._parts)
 
     def _await_news(self, had: tuple[int, int]) -> None:
-        """Wait until there is something that a viewer who has this does not have, but not for long."""
+        """Wait for news for a viewer, with a timeout."""
         self._changed.wait_for(lambda: self._closed or self._news != had, _ALIVE)
 
     def _stream(self, send: Callable[[str, str], None]) -> None:
-        """Tell one viewer everything, by a function that sends an event and its data; returns at the end.
+        """Stream events to one viewer by a function of event and data, until the end.
 
         The events are `begin` (a payload), `rows` (further rows) and `end`.
         """
         with self._changed:
             self._viewers += 1
             self._changed.notify_all()
-        had = (0, 0)  # number of the flight that the viewer has, and of its parts
+        had = (0, 0)  # number of the viewer's flight, and of its parts
         try:
             while True:
                 with self._changed:
@@ -196,6 +194,6 @@ class Live:
 
 
 def _joined(parts: Sequence[FlightLog]) -> FlightLog:
-    """Successive parts of a flight as one."""
+    """Concatenate successive parts of a flight."""
     rows: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ROWS}
     return dataclasses.replace(parts[0], **rows | {"images": {}})

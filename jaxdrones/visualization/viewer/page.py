@@ -1,4 +1,4 @@
-"""The page as a file, and in a notebook."""
+"""Viewer page as a file, and in a notebook."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _TEMPLATE = Path(__file__).with_name("page.html")
 
 @dataclasses.dataclass(frozen=True)
 class Page:
-    """One page of HTML that plays flights; it needs nothing from the network. Notebooks show it as it is."""
+    """Self-contained HTML page that plays flights, displayed by notebooks."""
 
     title: str
     payload: str
-    """As `payload.encode` made it."""
+    """Result of `payload.encode`."""
     height: int = 600
     """Height in a notebook, pixels."""
 
     @property
     def html(self) -> str:
-        """The page as text."""
+        """HTML text of the page."""
         return _template().replace("@TITLE@", html.escape(self.title)).replace("@PAYLOAD@", self.payload)
 
     def save(self, path: str | os.PathLike) -> Path:
-        """Write the page as a file, which any browser opens, and its folder if there is none; returns its path.
+        """Write the page to a file, creating its folder; return its path.
 
         Raises:
             OSError: the file cannot be written.

@@ -1,8 +1,8 @@
-"""What a page holds of flights: a JSON header and arrays of numbers, compressed, in base64.
+"""Payload of a page: a JSON header and arrays of numbers, compressed, in base64.
 
 The bytes before compression are the length of the header (uint32), the header, and the arrays, all little-endian. In
-the header an array is `{"dtype", "offset", "shape", "low", "step"}`. Numbers that 65,536 steps tell apart well enough
-are int16: they count steps from `low`, and are stored as differences along the first axis, modulo 2^16.
+the header an array is `{"dtype", "offset", "shape", "low", "step"}`. Numbers within a resolution of 65,536 steps are
+int16: they count steps from `low`, and are stored as differences along the first axis, modulo 2^16.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from jaxdrones.visualization.palette import COLORS, as_rgb
 from jaxdrones.visualization.shots import only_shapes
 
 _LARGEST_ERROR = {"pos": 5e-5, "targets": 5e-5}  # m, of rounding to int16
-_FARTHEST = 10.0  # m: depth of a black pixel, unless all is nearer
+_FARTHEST = 10.0  # m: depth of a black pixel, if any is as far
 _LEVELS = 65535  # steps of an int16 beside the first
-_CONSTANTS = ("rotor_pos", "prop_radius", "rotor_spin", "kf", "mass", "inertia", "gravity")  # that the page needs
+_CONSTANTS = ("rotor_pos", "prop_radius", "rotor_spin", "kf", "mass", "inertia", "gravity")  # of the page
 
 
 class _Arrays:
-    """Arrays one after the other, and where each is."""
+    """Concatenated arrays and their offsets."""
 
     def __init__(self) -> None:
         self.data: list[bytes] = []
         self.size = 0
 
     def add(self, array: np.ndarray, largest_error: float = math.inf) -> dict[str, Any]:
-        """Append an array (K, ...); returns its entry in the header."""
+        """Append an array (K, ...); return its entry in the header."""
         columns = array.shape[-1] if array.ndim > 1 else 1
         rows = np.asarray(array, float).reshape(-1, columns)
         finite = bool(np.isfinite(rows).all())
@@ -52,7 +52,7 @@ class _Arrays:
             return {"dtype": "f4"} | self._append(np.asarray(array, "<f4"))
 
     def add_bytes(self, array: np.ndarray) -> dict[str, Any]:
-        """Append an array of uint8; returns its entry in the header."""
+        """Append an array of uint8; return its entry in the header."""
         return {"dtype": "u1"} | self._append(array)
 
     def _append(self, array: np.ndarray) -> dict[str, Any]:
@@ -65,13 +65,13 @@ class _Arrays:
 
 
 def encode(records: Sequence[FlightLog], names: Sequence[str], title: str, **looks: Any) -> str:
-    """The payload of a page.
+    """Encode the payload of a page.
 
     Args:
-        records: the flights, one world each.
+        records: logs of the flights, one world each.
         names: of the worlds.
         title: of the page.
-        looks: further entries of the header, as the page reads them.
+        looks: further entries of the header.
     """
     arrays = _Arrays()
     vehicles: list[dict[str, Any]] = []
@@ -90,13 +90,13 @@ def encode(records: Sequence[FlightLog], names: Sequence[str], title: str, **loo
 
 
 def encode_rows(record: FlightLog) -> str:
-    """Further rows of the only world of a page, in the same form: a header that is `{"rows": arrays by name}`."""
+    """Encode further rows of the only world of a page, with the header `{"rows": arrays by name}`."""
     arrays = _Arrays()
     return _packed({"rows": _rows(arrays, record)}, arrays)
 
 
 def _rows(arrays: _Arrays, record: FlightLog) -> dict[str, Any]:
-    """What a page plays of a flight, by name; targets that are nowhere known are `None`."""
+    """Arrays of a flight for the page by name; unknown targets are `None`."""
     rows: dict[str, Any] = {"t": arrays.add(record.t)}
     for name in ("pos", "quat", "vel", "omega", "rpm"):
         rows[name] = arrays.add(getattr(record, name), _LARGEST_ERROR.get(name, math.inf))
@@ -115,7 +115,7 @@ def _packed(header: dict[str, Any], arrays: _Arrays) -> str:
 
 
 def decode(payload: str) -> dict[str, Any]:
-    """The header of a payload with arrays in place of their entries, as the page reads it."""
+    """Decode a payload to its header with arrays in place of their entries."""
     data = zlib.decompress(base64.b64decode(payload))
     start = 4 + int.from_bytes(data[:4], "little")
     return _resolved(json.loads(data[4:start]), data[start:])
@@ -137,7 +137,7 @@ def _resolved(value: Any, data: bytes) -> Any:
 
 
 def _pixels(kind: str, frames: np.ndarray) -> np.ndarray:
-    """Images as uint8 (F, n, height, width, channels): depth as shades of grey, near is bright; 1, 3 or 4 channels."""
+    """Images as uint8 (F, n, height, width, channels): depth in shades of gray, near is bright; 1, 3 or 4 channels."""
     if kind == "depth":
         seen = frames[np.isfinite(frames)]
         farthest = max(1e-6, min(_FARTHEST, float(seen.max()))) if seen.size else 1.0
@@ -156,6 +156,6 @@ def _index(known: list[dict[str, Any]], entry: dict[str, Any]) -> int:
 
 
 def _vehicles(params: Params) -> list[dict[str, Any]]:
-    """What the page needs to know of each drone of a team."""
+    """Geometry of each drone of a team for the page."""
     constants = {name: np.asarray(getattr(params, name), float).tolist() for name in _CONSTANTS}
     return [{name: values[i] for name, values in constants.items()} for i in range(len(constants["mass"]))]

@@ -1,4 +1,4 @@
-"""The server of the live page: for this machine alone, and for those who know its address."""
+"""Local server of the live page, with a secret address."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from typing import Any
 from jaxdrones.visualization.viewer.page import Page
 
 HOST = "127.0.0.1"
-"""The only address that is served: that by which a machine reaches itself."""
+"""Address of the server: the loopback interface."""
 STREAM = "events"
 """End of the path of the stream of server-sent events."""
 CONNECTIONS = 32
-"""Connections at a time; beyond them the one that has been silent for longest is closed."""
-_LOCAL_NAMES = ("127.0.0.1", "localhost")  # that a browser may ask for; others may be names of a foreign site
-_OWN_SITE = ("none", "same-origin")  # what a browser says of a request that no page of another site makes
-_SILENT = 5.0  # s, within which a connection has to ask for something
-_STUCK = 30.0  # s, within which it has to take what it is sent
+"""Largest number of connections; above it the longest idle one is closed."""
+_LOCAL_NAMES = ("127.0.0.1", "localhost")  # allowed in requests; others may be names of a foreign site
+_OWN_SITE = ("none", "same-origin")  # header values of requests from the same site
+_SILENT = 5.0  # s, timeout of a request
+_STUCK = 30.0  # s, timeout of sending
 
 
 class Server(http.server.ThreadingHTTPServer):
-    """A thread for each connection, of which there are few; none keeps the program from ending."""
+    """Server with a daemon thread for each connection."""
 
     request_queue_size = 4 * CONNECTIONS
 
     def __init__(self, port: int, title: str, stream: Callable[[Callable[[str, str], None]], None]) -> None:
-        """Take a port; nothing is answered before `serve_forever`.
+        """Bind a port; `serve_forever` answers requests.
 
         Args:
-            port: port of this machine; 0 takes a free one.
-            title: title of the page until there is a flight.
-            stream: function that tells one viewer everything, by the function `(event, data)` that it is given.
+            port: port; 0 for a free one.
+            title: title of the page before the first flight.
+            stream: function that streams to one viewer by its argument, a function `(event, data)`.
 
         Raises:
-            OSError: the port is taken.
+            OSError: the port is in use.
         """
         self.path = f"/{secrets.token_urlsafe(16)}/"
         self.page = Page(title, f"live:{self.path}{STREAM}").html.encode()
@@ -49,10 +49,10 @@ class Server(http.server.ThreadingHTTPServer):
         self.url = f"http://{HOST}:{self.server_port}{self.path}"
         self._lock = threading.Lock()
         self._connected: set[socket.socket] = set()
-        self._silent: dict[socket.socket, float] = {}  # those that have not asked for anything yet, and since when
+        self._silent: dict[socket.socket, float] = {}  # connections without a request yet, and their start
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a connection in a thread; close one that is silent, if there are too many."""
+        """Handle a connection in a thread; close an idle one if there are too many."""
         with self._lock:
             if len(self._connected) >= CONNECTIONS and self._silent:
                 self._end(next(iter(self._silent)))
@@ -70,27 +70,27 @@ class Server(http.server.ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def heard(self, request: socket.socket) -> None:
-        """Note that a connection has asked for something."""
+        """Mark a connection as active."""
         with self._lock:
             self._silent.pop(request, None)
 
     def service_actions(self) -> None:
-        """Close connections that have been silent for too long."""
+        """Close idle connections."""
         with self._lock:
             for request, since in list(self._silent.items()):
                 if time.monotonic() - since > _SILENT:
                     self._end(request)
 
     def _end(self, request: socket.socket) -> None:
-        """Have the thread of a connection that is silent end."""
+        """End the thread of an idle connection."""
         del self._silent[request]
         self._connected.discard(request)
-        with contextlib.suppress(OSError):  # the other end was faster
+        with contextlib.suppress(OSError):  # already closed by the peer
             request.shutdown(socket.SHUT_RDWR)
 
 
 class Handler(http.server.BaseHTTPRequestHandler):
-    """Answers a viewer's requests: the page, and its stream."""
+    """Handler of a viewer's requests for the page and its stream."""
 
     server: Server
     server_version = "jaxdrones"
@@ -98,7 +98,7 @@ class Handler(http.server.BaseHTTPRequestHandler):
     timeout = _SILENT
 
     def do_GET(self) -> None:
-        """Send the page or its stream to those who know their address."""
+        """Send the page or its stream for a request with the secret."""
         self.server.heard(self.request)
         self.request.settimeout(_STUCK)
         path = self.server.path
@@ -116,11 +116,11 @@ class Handler(http.server.BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
+        """Disable logging."""
 
     def _is_own(self) -> bool:
-        """Whether a request names this machine, and comes from no page of another site."""
-        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")  # another port, where ssh forwards it
+        """Whether a request is addressed to this machine and not from another site."""
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")  # another port, if forwarded by ssh
         embedded = self.path.endswith(STREAM) and self.headers.get("Sec-Fetch-Site", "none") not in _OWN_SITE
         return host.partition(":")[0] in _LOCAL_NAMES and origin in (None, f"http://{host}") and not embedded
 

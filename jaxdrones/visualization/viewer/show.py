@@ -1,4 +1,4 @@
-"""Showing what flew: trajectories, records, logs, episodes; one or many worlds."""
+"""`show`: viewer pages of trajectories, logs and episodes of one or many worlds."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.payload import encode
 
 LAYOUTS = {"ghosts": "ghosts", "side by side": "grid", "hidden": "alone"}
-"""How other worlds than the chosen one are shown at first -> what the page calls it."""
+"""Initial layouts of other worlds -> names in the page."""
 CHANNELS = {"rgb": True, "depth": False, "segmentation": False}
-"""Kinds of images -> whether a pixel is several numbers."""
-_MOST = 2_000_000  # states of drones in a page, which are 60 MB
+"""Kinds of images -> whether a pixel has channels."""
+_MOST = 2_000_000  # states of drones in a page, 60 MB
 
 
 def show(
@@ -45,25 +45,25 @@ def show(
     title: str | None = None,
     height: int = 600,
 ) -> Page:
-    """A page that plays flights in three dimensions, as an object that notebooks show and that `save` writes to a file.
+    """Make a page that plays flights in 3D, for display in notebooks or `save`.
 
     Args:
-        flight: what to show. The trajectory that `rollout` returns, a `State` of arrays (K, n, ...), or (W, K, n, ...)
-            for W worlds; a `FlightLog`; the episode of a policy that `fly_episode` returns; the path of a log.npz or of
-            the folder it is in; or several of these, a list or a dictionary by name, each of them a world.
+        flight: a trajectory of `rollout`, a `State` of arrays (K, n, ...), or (W, K, n, ...) for W worlds; a
+            `FlightLog`; an episode of `fly_episode`; the path of a log.npz or of its folder; or a list or dictionary of
+            these, each of them a world.
         params: of the team, with a leading drone axis. Logs and episodes have their own.
         dt: time between the rows of a trajectory, s. Logs and episodes have their own.
-        scene: obstacles and ground; the flight's own, or a bare ground, when left out.
-        targets: positions (n, 3), (K, n, 3) or (W, K, n, 3), m, world, of a trajectory; none when left out.
-        labels: names of the drones of a trajectory; `drone 0`, ... when left out.
-        images: what the drones' cameras saw at every row of a trajectory of one world, by kind: `rgb`
+        scene: obstacles and ground; by default the flight's, or a bare ground.
+        targets: positions (n, 3), (K, n, 3) or (W, K, n, 3), m, world, of a trajectory; by default none.
+        labels: names of the drones of a trajectory; by default `drone 0`, ...
+        images: camera images at every row of a trajectory of one world, by kind: `rgb`
             (K, n, height, width, 3 or 4) uint8, `depth` (K, n, height, width) m, or `segmentation`.
-        others: how the worlds beside the chosen one are shown at first: `ghosts`, `side by side` or `hidden`.
-        title: title of the page; the conditions of the flight when left out.
+        others: initial layout of the other worlds: `ghosts`, `side by side` or `hidden`.
+        title: title of the page; by default the conditions of the flight.
         height: height in a notebook, pixels.
 
     Raises:
-        ValueError: something that is no flight, shapes that do not fit together, or so much that no browser plays it.
+        ValueError: an unsupported flight, inconsistent shapes, or too much data for a browser.
     """
     check_choice("layout of other worlds", others, LAYOUTS)
     check_positive("height", height, "pixels")
@@ -81,14 +81,14 @@ def show(
 
 
 def looks(records: Sequence[FlightLog]) -> dict[str, Any]:
-    """Colors of drones, and the signals that are plotted at first, as the page reads them."""
+    """Colors of drones, and initially plotted signals, for the page."""
     has_targets = any(np.isfinite(record.target_pos).any() for record in records)
     signals = ["distance from target" if has_targets else "position z", "rotor speeds"]  # names in plots.js
     return {"palette": colors(DISTINCT), "signals": signals}
 
 
 def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, FlightLog]:
-    """The worlds of one or several flights, by name."""
+    """Worlds of one or several flights, by name."""
     if isinstance(flight, Mapping):
         named = {str(name): records_of(part, of_trajectory) for name, part in flight.items()}
     elif isinstance(flight, list | tuple) and not isinstance(flight, State):
@@ -107,11 +107,11 @@ def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, FlightLog]:
 
 @functools.singledispatch
 def records_of(flight: Any, of_trajectory: dict[str, Any]) -> list[FlightLog]:
-    """The worlds of a flight. Other modules register kinds of flights here, `@records_of.register`.
+    """Logs of the worlds of a flight. Other modules register kinds of flights, `@records_of.register`.
 
     Args:
-        flight: what was given to `show`.
-        of_trajectory: arguments of `show` that only a bare trajectory needs; `None` where they were left out.
+        flight: argument of `show`.
+        of_trajectory: arguments of `show` for a bare trajectory only, or `None`.
     """
     raise UserError(
         f"{short_repr(flight)} cannot be shown; give a trajectory of jaxdrones.rollout, a record, an episode, or the "
@@ -120,7 +120,7 @@ def records_of(flight: Any, of_trajectory: dict[str, Any]) -> list[FlightLog]:
 
 
 def refuse(of_trajectory: dict[str, Any]) -> None:
-    """Raise if an argument is given that the flight knows itself."""
+    """Raise for an argument that the flight has itself."""
     for name, value in of_trajectory.items():
         if value is not None:
             raise UserError(f"{name} is given beside a flight that has its own; leave it out")
@@ -162,7 +162,7 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[FlightLog]:
         return [_record(flight, params, of_trajectory)]
 
     def world(tree: Any, w: int, axes: int) -> Any:
-        """One world of a tree whose first array has so many axes if it has an axis of worlds."""
+        """One world of a tree; its first array has this number of axes with an axis of worlds."""
         leaves = jax.tree.leaves(tree)
         return jax.tree.map(lambda x: np.asarray(x)[w], tree) if leaves and np.ndim(leaves[0]) == axes else tree
 
@@ -174,7 +174,7 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[FlightLog]:
 
 
 def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> FlightLog:
-    """One world of arrays (K, n, ...)."""
+    """Log of one world of arrays (K, n, ...)."""
     steps, n = flight.pos.shape[:2]
     if np.shape(params.mass) != (n,):
         raise UserError(
@@ -205,7 +205,7 @@ def _record(flight: State, params: Params, of_trajectory: dict[str, Any]) -> Fli
 
 
 def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str, ImageSequence]:
-    """Images at every row, checked."""
+    """Validated images at every row."""
     for name, frames in images.items():
         check_choice("kind of images", name, CHANNELS)
         shape = np.shape(frames)
@@ -216,7 +216,7 @@ def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str,
 
 
 def check_size(*positions: ArrayLike) -> None:
-    """Raise if arrays of positions (..., 3) are more than a page plays."""
+    """Raise if arrays of positions (..., 3) are too large for a page."""
     samples = sum(math.prod(np.shape(pos)[:-1]) for pos in positions)
     if samples > _MOST:
         raise UserError(

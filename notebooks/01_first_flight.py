@@ -28,8 +28,8 @@ from jaxdrones.visualization.palette import COLORS
 plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True, "grid.linewidth": 0.3}
 
 # %% [markdown]
-# What changes during a flight is the `State`, what does not change is `Params`, and what is chosen is an argument of
-# `make_step`: here drag, ground effect and downwash, with two physics steps of 1/240 s per control step.
+# `State` changes during a flight, `Params` are constant, and the physics are arguments of `make_step`: here drag,
+# ground effect and downwash, with two physics steps of 1/240 s per control step.
 
 # %%
 HZ = 120  # control steps per second
@@ -39,7 +39,7 @@ circle = curves.circle(radius=0.3, period=10.0)
 start = jd.State.at_rest(circle.positions(4))
 
 # %% [markdown]
-# A controller is about one drone. `jax.vmap` makes it one of a team, and `rollout` calls it `length` times.
+# A controller is a function of one drone. `jax.vmap` maps it over a team, and `rollout` calls it `length` times.
 
 # %%
 pilot = functools.partial(pid.control, pid.gains("cf2x"), dt=1 / HZ)
@@ -59,8 +59,7 @@ final, trajectory = fly(params, start)
 print("positions:", trajectory.pos.shape, "= control steps, drones, (x, y, z)")
 
 # %% [markdown]
-# Every drone follows a target on the circle. The PID knows the target's position but not its velocity, so it lags
-# behind.
+# Every drone follows a target on the circle. The PID uses the target's position but not its velocity, so it lags.
 
 # %%
 t = np.arange(1, 12 * HZ + 1) / HZ
@@ -83,15 +82,15 @@ right.set(xlabel="t (s)", ylabel="distance from the target (cm)", ylim=(0, None)
 assert error[4 * HZ :].mean() < 0.12  # the PID lags some 10 cm behind, as in gym-pybullet-drones
 
 # %% [markdown]
-# `jd.show` plays the flight: drag to turn the view, press `?` for the keys. (Where this notebook is only displayed, as
-# on GitHub, there is a picture instead.)
+# `jd.show` plays the flight: drag to rotate the view, press `?` for the keys. (A static display of the notebook, as on
+# GitHub, shows a picture instead.)
 
 # %%
 jd.show(trajectory, params, dt=1 / HZ, targets=targets, title="Four Crazyflies on a circle")
 
 # %% [markdown]
 # ## The same flight in wind
-# Wind is a field of `Params`, which the drag sees. `jax.vmap` flies one world for each wind; nothing else changes.
+# Wind is a field of `Params` and acts through the drag. `jax.vmap` simulates one world for each wind.
 
 # %%
 speeds = jnp.array([0.0, 2.0, 4.0])  # m/s along x

@@ -1,6 +1,6 @@
 # %% [markdown]
 # # Thousands of drones
-# A step is about one world. Many worlds, masses or vehicles are `jax.vmap` of that. First two thousand worlds with one
+# A step advances one world; `jax.vmap` maps it over many worlds, masses or vehicles. First two thousand worlds with one
 # drone each, then one world with a thousand drones.
 
 # %%
@@ -39,7 +39,7 @@ nominal = jd.load_params("cf2x")
 
 
 def control(params, memory, state, k):
-    """The controller does not know what the drone carries: it is given the nominal parameters."""
+    """Control with the nominal parameters: the payload is unknown to the controller."""
     target = Setpoint.at(jnp.array([[0.3, 0.0, 1.0]]))
     return jax.vmap(pilot)(jd.repeat(nominal, 1), memory, state, target)
 
@@ -58,7 +58,7 @@ masses = jnp.linspace(0.020, 0.040, WORLDS)  # kg
 
 # %%
 def timed(function):
-    """The result of a second call, and its seconds."""
+    """Result and duration of a second call, s."""
     jax.block_until_ready(function(masses))
     began = time.perf_counter()
     result = jax.block_until_ready(function(masses))
@@ -84,8 +84,8 @@ assert jnp.abs(pos[jnp.argmin(jnp.abs(masses - nominal.mass)), -1, 2] - 1.0) < 0
 
 # %% [markdown]
 # ## A thousand drones in one world
-# Two sheets of 500 drones, one 0.6 m above the other, hold their places in a wave. Each drone flies in the downwash of
-# those above it. With a `NeighborGrid` only pairs within 1.5 m of each other are evaluated, instead of all 999,000.
+# Two sheets of 500 drones, one 0.6 m above the other, track a wave. Each drone flies in the downwash of those above
+# it. With a `NeighborGrid` only pairs within 1.5 m of each other are evaluated, instead of all 999,000.
 
 # %%
 SECONDS = 2
@@ -97,7 +97,7 @@ params = jd.repeat(nominal, DRONES)
 
 
 def places(t):
-    """Where the drones should be at time t (s): (1000, 3) m, world."""
+    """Target positions at time t (s): (1000, 3) m, world."""
     wave = 0.5 * jnp.sin(2 * jnp.pi * (across[:, 0] / 12 + across[:, 1] / 20 - t / 8))
     return jnp.column_stack([across, 2.0 + above + wave])
 
@@ -111,7 +111,7 @@ def swarm_control(params, memory, state, k):
 
 
 def fly_swarm(**options):
-    """Distance of every drone from its place at the end (m), and every tenth state."""
+    """Final distance of every drone from its target (m), and every tenth state."""
     step = jd.make_step(effects=(jd.drag,), dt=1 / 240, substeps=2, **options)
     start = jd.State.at_rest(places(0.0))
     memory = for_team(geometric.init(), DRONES)

@@ -61,7 +61,7 @@ t = jnp.arange(1, 4 * HZ + 1) / HZ
 
 
 def curve(t):
-    """Where the target is at time t (s): once around in 4 s, up and down on the way; m, world."""
+    """Target position at time t (s), m, world: a closed curve of 4 s with varying height."""
     angle = 2 * jnp.pi * t / 4
     return jnp.stack([0.4 * jnp.sin(angle), 0.4 * jnp.cos(angle), 1 + 0.2 * jnp.sin(2 * angle)])
 
@@ -107,22 +107,21 @@ print(f"distance from the target, rms: {100 * costs[0] ** 0.5:.1f} cm before, {1
 assert costs[-1] < 0.5 * costs[0]
 
 # %% [markdown]
-# The lag shrinks, and the path becomes less round: the cost asks for the right place at the right time, not for a round
+# The lag shrinks, and the path becomes less round: the cost is on positions at given times, not on the shape of the
 # path. The gains are tuned for this flight alone, in a simulation without noise and delay. For a real drone, put these
 # into the simulation first.
 
 # %% [markdown]
 # ## Identifying a mass
-# A drone with an unknown payload climbs by a metre, and its heights are recorded with 1 cm of noise. The controller
-# assumes the nominal mass. Which mass makes the simulation agree best? Newton's method for least squares (Gauss-Newton)
-# needs the derivative of the whole flight in the mass, which `jax.jacfwd` gives. The curvature tells the standard
-# error.
+# A drone with an unknown payload climbs by a meter, and its heights are recorded with 1 cm of noise. The controller
+# assumes the nominal mass. The mass is estimated by nonlinear least squares (Gauss-Newton), with the derivative of the
+# whole flight with respect to the mass by `jax.jacfwd`. The curvature gives the standard error.
 
 
 # %%
 @jax.jit
 def climb(mass):
-    """Heights (length,) of a drone of a mass that the controller does not know."""
+    """Heights (length,) of a drone with a mass unknown to the controller."""
     pilot = functools.partial(pid.control, pid.gains("cf2x"), dt=1 / HZ)
 
     def control(params, memory, state, k):
@@ -165,9 +164,9 @@ assert abs(mass - TRUE_MASS) < 4 * standard_error
 
 # %% [markdown]
 # ## A trajectory through gates
-# The variables are the control points of a curve (a cubic B-spline) that a controller is told to follow. The cost is
-# about the *flown* path: it should pass the middle of every gate at a given time and straight through, and the curve
-# should be smooth. So the optimization also makes up for the lag of the controller.
+# The variables are the control points of a cubic B-spline, the reference of a controller. The cost is on the *flown*
+# path: it should pass the middle of every gate at a given time and straight through, and the curve should be smooth.
+# The optimization thus also compensates for the lag of the controller.
 
 # %%
 times = jnp.array([1.4, 2.6, 4.2, 5.4])  # s, at which the gates are to be passed
@@ -179,7 +178,7 @@ through = jnp.stack([jnp.cos(gates[:, 3]), jnp.sin(gates[:, 3]), 0 * gates[:, 3]
 
 
 def spline(points, t):
-    """The B-spline of control points (POINTS, 3) at time t (s)."""
+    """B-spline with control points (POINTS, 3) at time t (s)."""
     k = jnp.clip(jnp.floor(t / KNOT).astype(int), 0, POINTS - 4)
     u = t / KNOT - k
     weights = jnp.stack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, -3 * u**3 + 3 * u**2 + 3 * u + 1, u**3]) / 6
@@ -188,7 +187,7 @@ def spline(points, t):
 
 @jax.jit
 def fly_through(points):
-    """The trajectory of a drone that is told to follow a spline."""
+    """Trajectory of a drone with a spline as its reference."""
     pilot = functools.partial(rates.control, rates.gains(), dt=1 / HZ)
     told = jax.vmap(functools.partial(curves.setpoint_on, functools.partial(spline, points)))(jnp.arange(LENGTH) / HZ)
 

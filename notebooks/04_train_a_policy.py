@@ -1,6 +1,6 @@
 # %% [markdown]
 # # Train a policy
-# The task: hover with all four rotors, from any motion within a metre of the goal. Two learners are compared:
+# The task: hover with all four rotors, from any motion within a meter of the goal. Two learners are compared:
 # backpropagation through time (BPTT), which follows the gradient of the rewards through the physics, and batched PPO,
 # which needs no gradient of the physics.
 
@@ -29,7 +29,7 @@ from jaxdrones.visualization.palette import COLORS
 plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True, "grid.linewidth": 0.3}
 
 # %% [markdown]
-# The environment explains itself. `print(jd.explain(env))` says more: each number of the observation, ends, physics.
+# `print(jd.explain(env))` describes the environment in full: observation, action, rewards, terminations, physics.
 
 # %%
 env = jd.make("hover")
@@ -38,8 +38,8 @@ print("\n\n".join(part for part in parts if part.startswith(("hover", "Action", 
 
 # %% [markdown]
 # ## Two trainings
-# `presets.preset` has settings that were found to work; PPO's are cut to fewer and shorter updates here. A training is
-# one compiled program, in which all worlds fly at once.
+# `presets.preset` has tuned settings; PPO's are cut to fewer and shorter updates here. A training is one compiled
+# program for all worlds.
 
 # %%
 env, config = presets.preset("hover", "bptt")
@@ -68,8 +68,7 @@ axis.legend()
 
 # %% [markdown]
 # ## How good are they?
-# Success is to be within 5 cm and 0.1 m/s of the goal for the last two of five seconds, over 1,000 starts that no
-# training has seen.
+# Success is to be within 5 cm and 0.1 m/s of the goal for the last two of five seconds, over 1,000 new starts.
 
 # %%
 for name, result in results.items():

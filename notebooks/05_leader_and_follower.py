@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Leader and follower
-# The multi-agent example of gym-pybullet-drones (2021), equation 13 of the paper: the leader is to hover at z = 0.5 m,
-# the follower to be as high as the leader. Each has a policy of its own, of its own twelve numbers. While they learn,
-# a critic sees all: both drones' observations and the other's action, 25 numbers. It is not needed to fly.
+# The multi-agent example of gym-pybullet-drones (2021), equation 13 of the paper: the leader hovers at z = 0.5 m, and
+# the follower matches its height. Each has its own policy of its own twelve observations. The centralized critic, for
+# training only, has 25 inputs: both drones' observations and the other's action.
 
 # %%
 # Installs the package where it is missing, as on Colab.
@@ -50,7 +50,7 @@ axis.set(xlabel="control steps flown (million)", ylabel="reward per step, in tra
 
 # %% [markdown]
 # ## The flight
-# The task starts every episode from the same place, so one episode says it all.
+# The task has a fixed start, so all episodes are the same.
 
 # %%
 report = evaluate(env, result.policy, jax.random.key(1), episodes=1)

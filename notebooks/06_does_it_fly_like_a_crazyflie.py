@@ -38,7 +38,7 @@ from jaxdrones.visualization.palette import COLORS
 plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True, "grid.linewidth": 0.3}
 
 # %% [markdown]
-# ## What was recorded
+# ## The recordings
 # The log has Vicon's position, attitude and velocity, the gyroscope, the PWM of the motors, the voltage of the battery
 # and the set-points, at 100 Hz. The firmware's PID flew the drone; rotor speeds were not measured.
 
@@ -62,7 +62,7 @@ print(f"{kept.name}: {len(kept.t)} rows, {kept.t[-1] - kept.t[0]:.0f} s, at most
 # %% [markdown]
 # ## Vehicles from papers
 # *Open loop*: from every state of the log, the model gets the recorded PWM and voltage of the next half second. The
-# table has its mean errors. *Hold* is a model that stays in the state where it starts. `cf2x` has the parameters of
+# table has its mean errors. *Hold* is a model with a constant state. `cf2x` has the parameters of
 # Panerati et al. 2021, `cf21` those of a later identification of the same vehicle with these propellers (crazyflow).
 
 # %%
@@ -80,8 +80,8 @@ print(open_loop_table({name: errors_as_dict(e) for name, e in open_loop(kept).it
 
 # %% [markdown]
 # After half a second the errors of both are larger than those of *hold*. There is no controller in open loop: errors
-# of a percent in the four thrusts make a drone of 30 g turn at some rad/s within that time. For the real drone it is
-# not known which fraction of the firmware's thrust curve its motors give, nor how much they differ from each other.
+# of a percent in the four thrusts make a drone of 30 g rotate at several rad/s within that time. The actual thrust of
+# the real drone's motors, relative to the firmware's curve and to each other, is unknown.
 
 # %% [markdown]
 # ## Identify it from a flight
@@ -116,8 +116,8 @@ assert (errors["pieces"][-1, [0, 1, 3]] < errors["hold"][-1, [0, 1, 3]]).all()
 
 # %% [markdown]
 # ## The whole flight again
-# *Closed loop*: the firmware's PID gets the logged set-points and the logged voltage, and nothing else of the flight.
-# Now a controller corrects the errors of the model, so the flight identifies other parameters. Thrust over mass comes
+# *Closed loop*: the inputs of the firmware's PID are the logged set-points and the logged voltage alone. Now a
+# controller corrects the errors of the model, so the flight identifies other parameters. Thrust over mass comes
 # from the balance of vertical forces. Drag, flapping, rotor lag and the scale of the tilt in the drone's state estimate
 # come from the path itself, with the derivative of the whole flight.
 
@@ -146,7 +146,7 @@ right.set(xlabel="t (s)", ylabel="distance from the flight (cm)", ylim=(0, None)
 assert twins["path"].as_dict()["xy_rms_m"] < twins["cf2x"].as_dict()["xy_rms_m"]
 
 # %% [markdown]
-# ## What limits the agreement
+# ## Limits of the agreement
 # - **No vehicle is best at both.** The vehicle that was fitted to half a second without a controller has an inertia
 #   more than ten times too large, and a damping that goes with it: thrust errors of a percent turn a light model away,
 #   and a slow model has the smallest errors. With the PID it oscillates and climbs away. The vehicle that was fitted to

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Fly by depth
-# A drone flies through a forest that it has not seen before, by a depth image of 16 x 12 pixels and its own motion. It
-# does not know its position. The forest is drawn anew in every episode, inside the compiled program.
+# A drone flies through a random forest, with a depth image of 16 x 12 pixels and its own motion as observations,
+# without its position. Every episode has a new forest, inside the compiled program.
 #
-# This notebook trains for about a minute, on a shorter and sparser forest than the task's own. That is enough to learn
-# that trees are to be avoided, not enough to be good at it; the last section says what a full training reaches.
+# This notebook trains for about a minute, on a shorter and sparser forest than the default. That is enough to learn to
+# avoid trees, not enough for a high success rate; the last section has the result of a full training.
 
 # %%
 # Installs the package where it is missing, as on Colab.
@@ -33,7 +33,7 @@ from jaxdrones.visualization.palette import COLORS
 plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True, "grid.linewidth": 0.3}
 
 # %% [markdown]
-# ## What the drone sees
+# ## Depth images
 
 # %%
 FOREST = dict(length=10.0, density=0.2, speed=2.0, duration=7.0)  # m, trees per m^2, m/s, s
@@ -43,7 +43,7 @@ print({name: x.shape for name, x in obs.items()})
 
 
 def draw_depth(axis, depth):
-    """Draw a depth image; returns what a color bar needs."""
+    """Draw a depth image; return the artist for the color bar."""
     axis.grid(False)
     axis.set(xticks=[], yticks=[])
     return axis.imshow(depth, cmap="viridis_r", vmin=0, vmax=10)
@@ -72,9 +72,9 @@ axis.plot(steps / 1e6, reward)
 axis.set(xlabel="control steps flown (million)", ylabel="reward per step, in training", title="BPTT, one seed")
 
 # %% [markdown]
-# ## What it reaches
-# An episode is a success when the drone comes within 1 m of its goal and touches nothing. To see whether the policy
-# uses its eyes, it flies the same forests blindfolded too: all pixels then say that there is nothing within sight.
+# ## Results
+# An episode is a success if the drone comes within 1 m of its goal without contact. To test whether the policy uses its
+# images, it also flies the same forests with empty images.
 
 
 # %%
@@ -90,7 +90,7 @@ for name, policy in ("with eyes", result.policy), ("blindfolded", blindfolded):
     print(f"{name}: success {reports[name].success:.0%} (95 % interval {low:.0%} to {high:.0%}) in 100 new forests")
 
 # %%
-# A new forest with a tree in the straight way, from above, and what the drone with eyes saw.
+# A new forest with a tree on the straight path, from above, and the images of the drone.
 flights = {
     "with eyes": fly_episode(env, result.policy, jax.random.key(3)),
     "blindfolded": fly_episode(env, blindfolded, jax.random.key(3)),
@@ -122,5 +122,5 @@ jd.show(flights)
 # %% [markdown]
 # ## A full training
 # `jaxdrones train forest` trains on the task's own forest (20 m, 3 m/s) through the pixels, for about a quarter of an
-# hour on one core. In 1,000 forests that it had not seen, each of three such policies arrived in 97.7 % (`jaxdrones
-# eval runs/forest --episodes 1000`).
+# hour on one core. In 1,000 new forests, each of three such policies succeeded in 97.7 % (`jaxdrones eval runs/forest
+# --episodes 1000`).

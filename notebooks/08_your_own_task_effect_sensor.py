@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Your own task, effect and sensor
-# What the package does not know is a few lines of yours. Here an **effect**, a column of rising air; a **sensor**, a
-# barometer with noise and a lag; and a **task**, to fly to and fro through the column at a constant height that only
-# the barometer tells. Then a policy learns the task.
+# Extensions are a few lines: an **effect**, a column of rising air; a **sensor**, a barometer with noise and a lag; and
+# a **task**, to fly to and fro through the column at a constant height, measured only by the barometer. Then a policy
+# learns the task.
 
 # %%
 # Installs the package where it is missing, as on Colab.
@@ -38,7 +38,7 @@ RADIUS = 0.3  # m
 
 
 def thermal(params, state):
-    """A column of rising air at the origin."""
+    """Column of rising air at the origin."""
     distance_squared = state.pos[0] ** 2 + state.pos[1] ** 2
     lift = 0.4 * params.weight * jnp.exp(-distance_squared / (2 * RADIUS**2))
     return jd.Wrench.of_force(jd.rotation.rotate_inverse(state.quat, jd.vector.along_z(lift)))
@@ -53,8 +53,8 @@ for x in 0.0, 0.3, 1.0:
 
 # %% [markdown]
 # ## A sensor
-# A sensor measures one drone. It may keep a memory, here the pressure inside its housing, expressed as a height, which
-# follows the one outside with a lag. `entries` say what its numbers are, for `jd.explain`.
+# A sensor measures one drone. It may have a memory, here the pressure inside its housing, expressed as a height, which
+# follows the outside pressure with a lag. `entries` describe the reading for `jd.explain`.
 
 # %%
 NOISE, LAG, DT = 0.03, 0.1, 0.01  # m (standard deviation), s, s between measurements
@@ -74,8 +74,8 @@ barometer = jd.Sensor("barometer", measure, init, bound=10.0, entries=(Quantity(
 
 # %% [markdown]
 # ## A task
-# A task is a function that returns a `Task`: start, target, rewards, ends. Its arguments become options of `jd.make`.
-# `jd.envs.check_env(env)` tests whether an environment of yours keeps what every environment promises.
+# A task is a function that returns a `Task`: start, target, rewards, terminations. Its arguments become options of
+# `jd.make`. `jd.envs.check_env(env)` is the contract test of environments.
 
 
 # %%
@@ -131,7 +131,7 @@ for entry in jd.explain(env).observation[:3]:
 
 # %% [markdown]
 # ## Training
-# The gradient goes through the effect, the sensor and the task of yours, too.
+# The gradient includes your effect, sensor and task.
 
 # %%
 config = bptt.Config(updates=120, worlds=64)
@@ -162,4 +162,4 @@ axis.legend()
 jd.show(log)
 
 # %% [markdown]
-# In a file of their own, task and effects are trained at the shell too: `jaxdrones train my_task.py:patrol`.
+# Tasks and effects in a file also work at the shell: `jaxdrones train my_task.py:patrol`.

@@ -56,7 +56,7 @@ def _measured(name: str, results: str) -> str:
     own = [row for row in rows.splitlines(keepends=True) if re.match(rf"\| `{name}`[ ,]", row)]
     if not own:
         return "Not measured."
-    return f"On 2 shared CPU cores; [Train a policy](../training.md#results) has the conditions.\n\n{head}{''.join(own)}"
+    return f"On 2 shared CPU cores; see [Train a policy](../training.md#results).\n\n{head}{''.join(own)}"
 
 
 def _entries(entries: Sequence[Entry]) -> str:

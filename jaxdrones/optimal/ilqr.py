@@ -13,18 +13,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_callable, check_shape, check_whole
 from jaxdrones.control import Setpoint
-from jaxdrones.control.single import check_single
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.box_qp import box_qp, solve_free
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, check_period, hover, reference, replaced_unless
+from jaxdrones.optimal.problem import (
+    Reference,
+    Weights,
+    check_plan,
+    hover,
+    reference,
+    replaced_unless,
+)
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.status import Status, check_on_failure, is_finite, raise_unless_ok, status_of
+from jaxdrones.status import Status, is_finite, raise_unless_ok, status_of
 
 _STEP_SIZES = tuple(0.5**k for k in range(8))  # of the line search
 _MIN_REGULARIZATION, _MAX_REGULARIZATION = 1e-6, 1e6
@@ -82,9 +87,6 @@ def settings(step: Any, weights: Weights | None = None, horizon: int = 25, itera
         horizon: planned control steps. The terminal cost is that of the regulator of `lqr`.
         iterations: per call of `control`, starting from the previous plan.
     """
-    check_callable("step", step, "jaxdrones.make_step(...)")
-    check_whole("horizon", horizon, 2)
-    check_whole("iterations", iterations)
     return Settings(default_weights() if weights is None else weights, step, horizon, iterations)
 
 
@@ -125,10 +127,7 @@ def control(
         ValueError: arrays of a team (use `jax.vmap`), a wrong number of setpoints, or a `dt` other than the period of
             the step.
     """
-    check_single(params, state)
-    check_period(settings.step, dt)
-    check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
-    check_on_failure(on_failure, params, memory, state, setpoints)
+    check_plan(settings, params, memory, state, setpoints, dt, on_failure)
     valid = is_finite((state, setpoints))
     state, setpoints = replaced_unless(valid, params, state, setpoints)
     target = reference(params, setpoints, state.aux, dt)

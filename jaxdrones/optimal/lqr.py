@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_callable
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.dynamics.rotors import limited
@@ -49,7 +48,6 @@ def settings(step: Any, weights: Weights | None = None) -> Settings:
         step: of a team, over one control period: that of the simulation, or a simpler one.
         weights: of the errors; by default `problem.weights()`.
     """
-    check_callable("step", step, "jaxdrones.make_step(...)")
     return Settings(default_weights() if weights is None else weights, step)
 
 

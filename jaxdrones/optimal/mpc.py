@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdrones.checks import check_choice, check_number, check_positive, check_shape, check_whole
+from jaxdrones.checks import check_choice, check_shape
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.optimal.coordinates import tracking_error
@@ -58,11 +58,8 @@ class Mpc:
             solver: a name of `SOLVERS`.
 
         Raises:
-            ValueError: a model of a team, a number out of range, or an unknown solver.
+            ValueError: a model of a team, or an unknown solver.
         """
-        check_positive("dt", dt, "s")
-        check_whole("horizon", horizon, 2)
-        check_number("terminal", terminal, at_least=0)
         check_choice("solver", solver, SOLVERS)
         check_shape("model.params.mass", model.params.mass, (), "the controller is of one drone; make one for each")
         self.model, self.horizon = model, horizon

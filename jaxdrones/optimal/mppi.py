@@ -15,18 +15,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_callable, check_positive, check_shape, check_whole
 from jaxdrones.control import Setpoint
 from jaxdrones.control.allocation import mixer
-from jaxdrones.control.single import check_single
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, check_period, hover, reference, replaced_unless
+from jaxdrones.optimal.problem import (
+    Reference,
+    Weights,
+    check_plan,
+    hover,
+    reference,
+    replaced_unless,
+)
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.status import Status, check_on_failure, is_finite, raise_unless_ok, status_of
+from jaxdrones.status import Status, is_finite, raise_unless_ok, status_of
 
 
 class Settings(PyTreeNode):
@@ -80,11 +85,6 @@ def settings(
         temperature: in standard deviations of the samples' costs; a lower value favors the best sample.
         hold: control steps between samples of the noise: noise at every step hardly moves a drone.
     """
-    check_callable("step", step, "jaxdrones.make_step(...)")
-    check_whole("horizon", horizon, 2)
-    check_whole("samples", samples, 2)
-    check_whole("hold", hold)
-    check_positive("temperature", temperature, "standard deviations")
     noise = jnp.array([0.05, 0.02, 0.02, 0.02])
     return Settings(
         default_weights() if weights is None else weights,
@@ -139,10 +139,7 @@ def control(
         ValueError: arrays of a team (use `jax.vmap`), a wrong number of setpoints, or a `dt` other than the period of
             the step.
     """
-    check_single(params, state)
-    check_period(settings.step, dt)
-    check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
-    check_on_failure(on_failure, params, memory, state, setpoints)
+    check_plan(settings, params, memory, state, setpoints, dt, on_failure)
     valid = is_finite((state, setpoints))
     state, setpoints = replaced_unless(valid, params, state, setpoints)
     next_key, noise_key = jax.random.split(memory.key)

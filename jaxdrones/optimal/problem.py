@@ -10,14 +10,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_positive, check_shape
+from jaxdrones.checks import check_shape
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
+from jaxdrones.control.single import check_single
 from jaxdrones.errors import UserError
 from jaxdrones.optimal.coordinates import command_unit, tracking_error
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
+from jaxdrones.status import check_on_failure
 from jaxdrones.vector import along_z, cross, dot, safe_sqrt
 
 
@@ -77,7 +79,6 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
         aux: states of models of the reference.
         dt: time between setpoints, s.
     """
-    check_shape("setpoints.pos", setpoints.pos, ("H + 1", 3), "the setpoints of one drone over the horizon")
     quat, thrust = jax.vmap(lambda acc, yaw: _upright(params, acc, yaw))(setpoints.acc, setpoints.yaw)
     omega = _with_last(jax.vmap(_turn)(quat[:-1], quat[1:]) / dt)
     omega_rate = _with_last(jnp.diff(omega[:-1], axis=0) / dt, 2)
@@ -125,9 +126,18 @@ def replaced_unless(
     return jax.tree.map(lambda x, safe: jnp.where(valid, x, safe), (state, setpoints), (rest, zero))
 
 
+def check_plan(
+    settings: Any, params: Params, memory: Any, state: State, setpoints: Setpoint, dt: float, on_failure: str
+) -> None:
+    """Raise `ValueError` on the arrays of a team, a wrong number of setpoints, another period or `on_failure`."""
+    check_single(params, state)
+    check_period(settings.step, dt)
+    check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
+    check_on_failure(on_failure, params, memory, state, setpoints)
+
+
 def check_period(step: Any, dt: float) -> None:
-    """Raise `ValueError` unless the time between calls is positive, and equal to the step's period if known."""
-    check_positive("dt", dt, "s")
+    """Raise `ValueError` unless the time between calls is the step's period, if that is known."""
     period = getattr(step, "period", None)
     if period is not None and not math.isclose(period, dt, rel_tol=1e-6):
         raise UserError(f"dt is {dt} s and the step takes {period:g} s; give a step of one control period")

@@ -88,7 +88,6 @@ def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500,
     check_params(params)
     check_shape("params.mass", params.mass, (), "tune takes the parameters of a single drone")
     check_whole("control_hz", control_hz, 100)
-    check_whole("iterations", iterations)
     gains, error = _descend(module, control_hz, iterations, params, start(module, params))
     if not jnp.isfinite(error):
         raise UserError(f"{_name(module)} cannot fly this vehicle with any gains that were tried; use 'geometric'")

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxdrones.checks import check_choice, check_shape, short_repr
+from jaxdrones.checks import check_choice, short_repr
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.rotors import instant_rotors
 from jaxdrones.engine.explicit import make_derivative
@@ -62,7 +62,6 @@ class CasadiModel:
     def state(self, vector: ArrayLike) -> State:
         """State of a vector (nx,)."""
         numbers = np.asarray(vector, float).ravel()
-        check_shape("vector", numbers, (len(self.names),), "the numbers of a state")
         leaves, structure = jax.tree.flatten(self.start)
         parts = np.split(numbers, np.cumsum([leaf.size for leaf in leaves])[:-1])
         shaped = [jnp.asarray(part.reshape(leaf.shape), float) for part, leaf in zip(parts, leaves, strict=True)]

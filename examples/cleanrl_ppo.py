@@ -22,12 +22,12 @@ from jaxdrones.learning import evaluate
 
 
 def to_torch(x: jax.Array) -> torch.Tensor:
-    """The same memory as a tensor."""
+    """Convert to a tensor that shares memory."""
     return torch.from_dlpack(x)
 
 
 def to_jax(x: torch.Tensor) -> jax.Array:
-    """The same memory as a JAX array."""
+    """Convert to a JAX array that shares memory."""
     return jnp.from_dlpack(x.contiguous())
 
 
@@ -45,7 +45,7 @@ def network(inputs: int, outputs: int, output_scale: float) -> nn.Sequential:
 
 
 class Agent(nn.Module):
-    """A Gaussian policy and a value function of normalized observations."""
+    """Gaussian policy and value function of normalized observations."""
 
     def __init__(self, observation_size: int, action_size: int, init_std: float):
         super().__init__()
@@ -67,11 +67,11 @@ class Agent(nn.Module):
         return (obs - self.mean) / (self.var + 1e-6).sqrt()
 
     def value(self, obs: torch.Tensor) -> torch.Tensor:
-        """The value of observations (*batch, d)."""
+        """Value of observations (*batch, d)."""
         return self.critic(self.normalized(obs))[..., 0]
 
     def distribution(self, obs: torch.Tensor) -> torch.distributions.Normal:
-        """The distribution of actions."""
+        """Distribution of actions."""
         return torch.distributions.Normal(self.actor(self.normalized(obs)), self.log_std.exp())
 
 
@@ -93,8 +93,8 @@ def train(
     init_std: float = 0.4,
     final_std: float = 0.02,
 ) -> tuple[Agent, list[float]]:
-    """Train an agent; returns it and the mean return of the episodes that ended in each update."""
-    torch.set_num_threads(1)  # with networks of this size more threads only wait for each other
+    """Train an agent; return it and the mean return of the finished episodes of each update."""
+    torch.set_num_threads(1)  # more threads are slower with networks of this size
     torch.manual_seed(seed)
     envs = gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=num_envs, numpy=False)
     (d,), (a,) = envs.single_observation_space.shape, envs.single_action_space.shape
@@ -122,7 +122,7 @@ def train(
                 if done.any():
                     last = step[4]
                     episode_returns.append(to_torch(last["final_info"]["episode"]["r"])[done])
-                    # A truncated episode could go on: its last state has a value.
+                    # The last state of a truncated episode has a value.
                     cut = truncated & ~terminated
                     rewards[t, cut] += gamma * agent.value(to_torch(last["final_obs"])[cut])
             advantages = torch.zeros_like(rewards)
@@ -150,7 +150,7 @@ def train(
                 optimizer.step()
 
         with torch.no_grad():
-            # The learning rate follows the divergence of the new policy from the old one.
+            # The learning rate adapts to the divergence of the new policy from the old one.
             log_ratio = agent.distribution(flat[0]).log_prob(flat[1]).sum(-1) - flat[2]
             kl = (log_ratio.exp() - 1 - log_ratio).mean().item()
             left = 1 - update / updates
@@ -176,7 +176,7 @@ def train(
 
 
 def jax_policy(agent: Agent):
-    """The mean action of an agent as a function of JAX arrays, for the evaluation in one compiled program."""
+    """Mean action of an agent as a function of JAX arrays, for a compiled evaluation."""
     layers = [(to_jax(x.weight.detach()), to_jax(x.bias.detach())) for x in agent.actor if isinstance(x, nn.Linear)]
     mean, std = to_jax(agent.mean), to_jax((agent.var + 1e-6).sqrt())
 

@@ -1,7 +1,7 @@
-"""The leader and the follower of Panerati et al. 2021 by RLlib's PPO, each drone with a centralized critic.
+"""Leader and follower of Panerati et al. 2021 by RLlib's PPO with centralized critics.
 
-`make rllib` trains three seeds. The best policy of each is saved as one of `jaxdrones train`, which `jaxdrones eval`
-and `jaxdrones fly --policy` read without ray; the learning curves are in curve.png.
+`make rllib` trains three seeds. The best policy of each is saved in the format of `jaxdrones train`, for `jaxdrones
+eval` and `jaxdrones fly --policy` without ray; the learning curves are in curve.png.
 """
 
 import argparse
@@ -47,11 +47,11 @@ PPO = dict(num_epochs=5, gamma=GAMMA, lambda_=1.0, clip_param=0.2, grad_clip=0.5
 PPO |= dict(vf_loss_coeff=0.5 * (1 - GAMMA) ** 2, vf_clip_param=math.inf, use_kl_loss=False)
 RATES = (2e-3, 1e-5)  # learning rate: first, last
 STDS = (0.05, 0.2, 0.5)  # standard deviation of actions: last, lowest before it is annealed, first
-ANNEALED, RESTARTED = 0.4, 0.05  # fractions of the updates that anneal, and of the worlds that start anew in each
+ANNEALED, RESTARTED = 0.4, 0.05  # fractions of annealing updates, and of restarted worlds in each
 
 
 class CentralizedCritic(TorchRLModule, ValueFunctionAPI):
-    """A policy of a drone's own observation, which comes first, and a critic of all observations and other actions."""
+    """Policy of a drone's own observation, the first entries, and critic of all observations and other actions."""
 
     def setup(self):
         actions, self.own_size = self.action_space.shape[0], self.model_config["own_size"]
@@ -68,7 +68,7 @@ class CentralizedCritic(TorchRLModule, ValueFunctionAPI):
 
 
 def mlp(sizes):
-    """Linear layers with tanh between them; the first outputs are nearly zero, so that the drones hover."""
+    """Linear layers with tanh between them; initial outputs are near zero, for hover."""
     layers = [layer for pair in itertools.pairwise(sizes) for layer in (torch.nn.Linear(*pair), torch.nn.Tanh())]
     for parameter in layers[-2].parameters():
         parameter.data *= 0.01
@@ -76,7 +76,7 @@ def mlp(sizes):
 
 
 class AnnealingLearner(PPOTorchLearner):
-    """PPO whose exploration falls in the last updates."""
+    """PPO with annealed exploration in the last updates."""
 
     def after_gradient_based_update(self, *, timesteps):
         super().after_gradient_based_update(timesteps=timesteps)
@@ -87,7 +87,7 @@ class AnnealingLearner(PPOTorchLearner):
 
 
 class TeamRunner(MultiAgentEnvRunner):
-    """An EnvRunner in which many worlds, the policies and the exploration are one compiled program."""
+    """EnvRunner with many worlds, policies and exploration in one compiled program."""
 
     def make_env(self):
         self.team, self.horizon = RECIPE.env(), self.config.rollout_fragment_length
@@ -101,13 +101,13 @@ class TeamRunner(MultiAgentEnvRunner):
         return {name: (SPACE, space) for name, space in self.env.action_spaces.items()}
 
     def policy(self):
-        """The policies of all drones in JAX, without exploration."""
+        """Policies of all drones in JAX, without exploration."""
         layers = zip(*(self.module[name].policy[::2] for name in self.env.agents), strict=True)
         weights = [(stacked(x.weight for x in drones), stacked(x.bias for x in drones)) for drones in layers]
         return mlp_policy(weights, obs_stats=self.statistics, per_agent=True)
 
     def sample(self, **_):
-        """The control steps of an update; each part of an episode is an episode of RLlib."""
+        """Control steps of an update; each part of an episode is an episode of RLlib."""
         self.key, key = jax.random.split(self.key)
         log_std = stacked(self.module[name].log_std for name in self.env.agents)
         self.worlds, raw, steps = simulate(self.team, self.horizon, key, self.policy(), log_std, self.worlds)
@@ -122,7 +122,7 @@ class TeamRunner(MultiAgentEnvRunner):
         ]
 
     def episode(self, steps, world, begin, end):
-        """The control steps of one world from `begin` to before `end`."""
+        """Control steps of one world from `begin` to before `end`."""
         episode = MultiAgentEpisode()
         ends = {name: bool(steps[name][end - 1, world]) for name in ("terminated", "truncated")}
         episode.env_t, episode.is_terminated, episode.is_truncated = end - begin, *ends.values()
@@ -140,13 +140,13 @@ class TeamRunner(MultiAgentEnvRunner):
 
 
 def stacked(tensors):
-    """Tensors of the drones as one array."""
+    """Stack tensors of the drones to one array."""
     return jnp.stack([jnp.array(x.detach().numpy()) for x in tensors])
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def simulate(env, horizon, key, policy, log_std, worlds):
-    """The worlds after some control steps, all observations, and (t, w, n, ...) what RLlib learns from."""
+    """Worlds after some control steps, all observations, and (t, w, n, ...) training data."""
     restart_key, key, final_key = jax.random.split(key, 3)
     worlds, act = collect.restart(restart_key, env, worlds, RESTARTED), jax.tree_util.Partial(explore, policy, log_std)
     worlds, x = collect.collect(key, env, act, worlds, horizon)
@@ -178,7 +178,7 @@ def build(env, seed, updates, worlds, horizon):
 
 
 def train(seed, updates, worlds, horizon, folder):
-    """Train a seed: its rows of progress, and the best policy with its return and its update."""
+    """Train a seed; return its rows of progress, and the best policy with its return and update."""
     env, start, rows, best = RECIPE.env(), time.perf_counter(), [], (-math.inf, None, 0)
     algorithm = build(env, seed, updates, worlds, horizon)
     for update in range(1, updates + 1):

@@ -1,7 +1,7 @@
-"""The one-dimensional hover of Panerati et al. 2021 by PPO of Stable-Baselines3, with the paper's network.
+"""One-dimensional hover of Panerati et al. 2021 by PPO of Stable-Baselines3, with the paper's network.
 
-`make sb3` trains a policy, saves it as `jaxdrones train` saves its own, and flies it with `jaxdrones fly --policy`,
-which needs neither Stable-Baselines3 nor torch. The learning curve is in curve.png.
+`make sb3` trains a policy, saves it in the format of `jaxdrones train`, and flies it with `jaxdrones fly --policy`,
+without Stable-Baselines3 and torch. The learning curve is in curve.png.
 """
 
 import argparse
@@ -29,7 +29,7 @@ EVALUATIONS = 20
 
 
 class TanhPolicy(ActorCriticPolicy):
-    """An actor whose mean passes through tanh, as that of the policies of jaxdrones."""
+    """Actor with a tanh mean, as in the policies of jaxdrones."""
 
     def _build(self, lr_schedule):
         super()._build(lr_schedule)
@@ -37,14 +37,14 @@ class TanhPolicy(ActorCriticPolicy):
 
 
 def policy_of(model: PPO):
-    """The actor of a model in JAX, without exploration."""
+    """Actor of a model in JAX, without exploration."""
     layers = [*model.policy.mlp_extractor.policy_net, *model.policy.action_net]
     weights = [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in layers if hasattr(x, "weight")]
     return mlp_policy(weights, activation="relu")
 
 
 class Evaluation(BaseCallback):
-    """Evaluates the actor between two updates, and keeps the one with the highest return."""
+    """Evaluate the actor between updates, and keep the one with the highest return."""
 
     def __init__(self, seed: int, steps: int, folder: Path):
         super().__init__()

@@ -25,7 +25,7 @@ def network(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Policy(GaussianMixin, Model):
-    """Gaussian policy whose standard deviation does not depend on the observation."""
+    """Gaussian policy with a constant standard deviation."""
 
     def __init__(self, observation_space, action_space, device):
         Model.__init__(self, observation_space=observation_space, action_space=action_space, device=device)
@@ -52,7 +52,7 @@ class Value(DeterministicMixin, Model):
 
 
 def train(steps: int = 2_000_000, num_envs: int = 128, rollouts: int = 64, seed: int = 1) -> list[float]:
-    """Train; returns the mean return of the episodes that ended in each tenth of the training."""
+    """Train; return the mean return of the finished episodes of each tenth of the training."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     starts = dict(reach=0.5, speed=0.3, omega=0.3, tilt=15.0)
@@ -90,7 +90,7 @@ def train(steps: int = 2_000_000, num_envs: int = 128, rollouts: int = 64, seed:
 
 
 class Returns(gymnasium.vector.VectorWrapper):
-    """Keeps the return of every episode."""
+    """Record the return of every episode."""
 
     def __init__(self, env: gymnasium.vector.VectorEnv):
         super().__init__(env)

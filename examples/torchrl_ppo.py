@@ -1,7 +1,7 @@
 """TorchRL's PPO on many worlds in one compiled step: hover from starts near the goal.
 
 `DroneEnv` is a TorchRL environment with a batch of worlds. Tensors and JAX arrays share their memory (DLPack), and the
-observation after the last step of an episode is the true one, so that TorchRL bootstraps where an episode is truncated.
+last observation of an episode is returned before the reset, for bootstrapping of truncated episodes.
 
     pip install jaxdrones torch torchrl
     python examples/torchrl_ppo.py
@@ -85,7 +85,7 @@ def network(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def train(steps: int = 2_000_000, num_envs: int = 128, horizon: int = 64, seed: int = 1) -> list[float]:
-    """Train; returns the mean return of the episodes that ended in each tenth of the training."""
+    """Train; return the mean return of the finished episodes of each tenth of the training."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     task = jd.make("hover", action="thrust_and_rates", reach=0.5, speed=0.3, omega=0.3, tilt=15.0)

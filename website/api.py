@@ -1,4 +1,4 @@
-"""A page for each room of the package: what its modules say of their public names."""
+"""API pages, one per subpackage, from docstrings."""
 
 from pathlib import Path
 

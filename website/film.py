@@ -24,13 +24,13 @@ DRONES, PERIOD, RATE, FPS, SIZE = 5, 6.0, 100, 15, (640, 360)
 
 
 def place(drone, t):
-    """Where a drone should be, m: on a figure-eight of 4 by 2.4 m, lower in the middle."""
+    """Target position, m, on a figure-eight of 4 by 2.4 m, lower in the middle."""
     angle = 2 * jnp.pi * (t / PERIOD - drone / DRONES)
     return jnp.stack([2.0 * jnp.sin(angle), 1.2 * jnp.sin(2 * angle), 1.0 - 0.25 * jnp.cos(2 * angle)])
 
 
 def fly() -> tuple[jd.Params, jd.State]:
-    """The vehicles, and the second of two rounds."""
+    """Vehicles, and the second of two laps."""
     drones = jnp.arange(DRONES)
     params = jd.repeat(jd.load_params("hb"), DRONES)
     step = jd.make_step(effects=(jd.drag,), pairs=(jd.downwash,), dt=1 / (4 * RATE), substeps=4)
@@ -51,7 +51,7 @@ def fly() -> tuple[jd.Params, jd.State]:
 
 
 def scene() -> Scene:
-    """Two gates on the way, and trees beside it."""
+    """Two gates on the path, and trees beside it."""
     trees = [(-1.4, 1.9), (0.1, 1.5), (2.2, 1.7), (2.7, 0.0), (0.3, -1.5), (-2.5, 0.1)]
     return Scene.of(
         gate(pos=(1.41, 1.2, 1.0), opening=0.7, frame=0.12),

@@ -1,4 +1,4 @@
-"""What MkDocs asks of this project: pages that are made and not written, links out of docs/, code beside formulas.
+"""MkDocs hooks: generated pages, links out of docs/, code beside formulas.
 
 `<!-- code: dynamics/aero.py drag -->` on a page becomes the source of that function.
 """
@@ -34,7 +34,7 @@ _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
 
 
 def on_config(config):
-    """Make the pages, and put them into the navigation."""
+    """Generate pages, and add them to the navigation."""
     _made.update(tasks.pages(ROOT) | api.pages(ROOT))
     sections = {title: content for entry in config.nav for title, content in entry.items()}
     sections["Tasks"] += [path for path in _made if path.startswith("tasks/")]
@@ -43,7 +43,7 @@ def on_config(config):
 
 
 def on_files(files, config):
-    """Add what is not in docs/."""
+    """Add files from outside docs/."""
     for path, text in _made.items():
         files.append(File.generated(config, path, content=text))
     for path, source in _SOURCE.items():
@@ -54,7 +54,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Functions in place of their names; links to files of the repository: to their page, or else their name alone."""
+    """Insert the source of functions; resolve links to files of the repository."""
     source = _SOURCE.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
     def moved(match):
@@ -84,13 +84,13 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def _task_link(match):
-    """The first cell of a row, with a link where it names a task."""
+    """First cell of a row, with a link for a task."""
     path = f"tasks/{match[1]}.md"
     return f"| [`{match[1]}`](../docs/{path}) |" if path in _made else match[0]
 
 
 def _source_of(match):
-    """The source of a function of the package, as a block."""
+    """Source of a function of the package, as a block."""
     path, name = match.groups()
     text = (ROOT / "jaxdrones" / path).read_text()
     found = [node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef) and node.name == name]
@@ -101,7 +101,7 @@ def _source_of(match):
 
 
 def on_page_content(html, page, config, files):
-    """Formulas as MathML, which browsers draw by themselves."""
+    """Convert formulas to MathML."""
 
     def drawn(match):
         display = "block" if match[1] == "div" else "inline"
@@ -111,7 +111,7 @@ def on_page_content(html, page, config, files):
 
 
 def on_post_page(output, page, config):
-    """A page that would load something from elsewhere is an error: the site is read without a network."""
+    """Raise for pages with external resources: the site works offline."""
     for address in _ADDRESS.findall(output):
         _log.warning("%s loads %s", page.file.src_uri, address)
     return output

@@ -26,7 +26,7 @@ _SIZE = (640, 360)  # pixels
 
 
 def main() -> None:
-    """Write the pictures of the tasks that are named, or of all."""
+    """Write the pictures of the named tasks, by default of all."""
     folder = Path(__file__).parent.parent / "docs" / "images" / "tasks"
     folder.mkdir(parents=True, exist_ok=True)
     for name in sys.argv[1:] or TASKS:
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def _picture(name: str) -> np.ndarray:
-    """The start of an episode: of obstacles from a place that shows them, else the first frame of a film."""
+    """Start of an episode: with obstacles from a suitable viewpoint, else the first frame of a film."""
     with jd.make(name) as env:
         world = jax.jit(env.reset)(jax.random.key(0))[1]
         target = np.asarray(env.task.target_now(world).pos)

@@ -1,4 +1,4 @@
-"""A page for each task, from what `jd.explain` says of it and from the table of results in docs/training.md."""
+"""Task pages, from `jd.explain` and the table of results in docs/training.md."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -51,7 +51,7 @@ def _training(name: str) -> str:
 
 
 def _measured(name: str, results: str) -> str:
-    """The rows of the table of results that are about a task."""
+    """Rows of a task in the table of results."""
     head, rows = re.search(r"^(\| task, learner .*\n\|[-|: ]+\n)((?:\|.*\n)+)", results, re.M).groups()
     own = [row for row in rows.splitlines(keepends=True) if re.match(rf"\| `{name}`[ ,]", row)]
     if not own:

@@ -240,6 +240,19 @@ def test_drawn_vehicles_are_inside_the_published_envelope_and_fill_half_of_it(dr
     assert np.log(values.max() / values.min()) > 0.5 * np.log(high / low)
 
 
+def test_the_aspect_is_the_rotors_y_over_x(monkeypatch):
+    monkeypatch.setitem(vehicles.LAWS, "aspect", vehicles.Law(1.1, 0.01, 1.09, 1.11))
+    x, y, _ = np.abs(vehicles.draw(KEYS[0], CF2X).rotor_pos[0])
+    assert 1.089 < y / x < 1.111
+
+
+def test_as_many_light_as_heavy_vehicles_are_drawn(drawn):
+    """The logarithm of the mass is uniform: each fifth of its range has a fifth of the vehicles."""
+    counts, _ = np.histogram(np.log(drawn.mass), 5, np.log([0.02, 3.0]))
+    share = counts / len(drawn.mass)
+    assert np.abs(share - 0.2).max() < 4 * np.sqrt(0.2 * 0.8 / len(drawn.mass))
+
+
 def test_a_thousand_drawn_vehicles_hover(drawn):
     """With lagging rotors, the reaction of their inertia and drag, from 0.3 m away and tilted by 20 degrees."""
     distance, speed = hover_errors(drawn, jax.random.key(1), seconds=10)

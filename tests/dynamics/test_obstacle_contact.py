@@ -9,6 +9,7 @@ import pytest
 from helpers import assert_close, assert_finite
 
 import jaxdrones as jd
+from jaxdrones.dynamics.contact import stop_at
 from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere, gate
 
 VEHICLES = {name: jd.load_params(name) for name in ("cf2x", "hb", "racer")}
@@ -222,6 +223,16 @@ def test_looking_only_at_what_is_within_reach_changes_nothing():
     assert np.all(found.distance[~near] >= 0.02)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(nearest), strict=True):
         np.testing.assert_allclose(a[near], b[near], atol=1e-12)
+
+
+@pytest.mark.parametrize(("toward", "kept"), [(-2.0, 0.0), (3.0, 3.0)])
+def test_a_plane_takes_the_velocity_toward_it_and_no_other(toward, kept):
+    normal, along = jnp.array([0.6, 0.0, 0.8]), jnp.array([0.8, 0.0, -0.6])
+    state = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.zeros((1, 3)))).replace(vel=toward * normal + 5 * along)
+    stopped = stop_at(state, jnp.stack([normal, jnp.zeros(3)]), jnp.array([0.01, 0.0]))
+    np.testing.assert_allclose(stopped.vel, kept * normal + 5 * along, atol=1e-12)
+    np.testing.assert_allclose(stopped.pos, 0.01 * normal, atol=1e-12)
+    np.testing.assert_array_equal(stop_at(state, normal[None], jnp.array([-0.01])).vel, state.vel)
 
 
 SPHERE = Sphere(pos=(0.5, 0.01, 1.0), radius=0.3)

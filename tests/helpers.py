@@ -23,6 +23,10 @@ STATE = [field.name for field in dataclasses.fields(State) if field.name != "aux
 CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name != "aux"]
 """Names of the arrays of parameters."""
 
+UNOPTIMIZED = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+jit_unoptimized = partial(jax.jit, compiler_options=UNOPTIMIZED)
+"""`jax.jit` in a third of the time, for large programs that run a few times and whose law is not about compilation."""
+
 make_step = lru_cache(jaxdrones.make_step)  # one compilation for all tests of a module that ask for the same step
 
 

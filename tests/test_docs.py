@@ -37,7 +37,7 @@ def test_every_file_that_a_page_names_is_there():
     "name",
     mostly_slow(
         (str(page.relative_to(ROOT)) for page in PAGES if blocks(page, "python") and page.name not in IN_TEST_README),
-        quick=["docs/from-gym-pybullet-drones.md"],
+        quick=[],
     ),
 )
 def test_the_python_of_a_page_runs_from_top_to_bottom(name):

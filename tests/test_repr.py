@@ -1,5 +1,7 @@
 """What is printed of the large objects is one line that says what they are."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -9,46 +11,57 @@ from jaxdrones.envs import AutoReset, make
 from jaxdrones.learning import Result
 from jaxdrones.learning.networks import Policy
 
-HOVER = make("hover", drones=2, vehicle="hb")
-POLICY = Policy.init(jax.random.key(0), HOVER, (32, 16))
-
 
 def two_gusts(params, state):
     return jd.Wrench.of_force(2 * params.external_force)
 
 
-LINES = {
-    "environment": (HOVER, "<Env hover: 2 x hb, dt 0.01 s, 500 steps, 4 actions and 22 observations a drone, explicit"),
-    "own vehicle": (make("hover", vehicle=jd.load_params("hb")), "<Env hover: 1 x drones of own parameters, dt 0.01"),
-    "autoreset": (AutoReset(HOVER), "<AutoReset of <Env hover: 2 x hb, "),
-    "policy": (POLICY, "<Policy 22 -> 32 -> 16 -> 4, tanh, 1,332 parameters, statistics of 0 observations>"),
+@functools.cache
+def hover():
+    return make("hover", drones=2, vehicle="hb")
+
+
+@functools.cache
+def policy():
+    return Policy.init(jax.random.key(0), hover(), (32, 16))
+
+
+LINES = {  # what makes an object, and what is printed of it
+    "environment": (hover, "<Env hover: 2 x hb, dt 0.01 s, 500 steps, 4 actions and 22 observations a drone, explicit"),
+    "own vehicle": (
+        lambda: make("hover", vehicle=jd.load_params("hb")),
+        "<Env hover: 1 x drones of own parameters, dt 0.01",
+    ),
+    "autoreset": (lambda: AutoReset(hover()), "<AutoReset of <Env hover: 2 x hb, "),
+    "policy": (policy, "<Policy 22 -> 32 -> 16 -> 4, tanh, 1,332 parameters, statistics of 0 observations>"),
     "policies": (
-        Policy.init(jax.random.key(0), HOVER, (8,), True),
+        lambda: Policy.init(jax.random.key(0), hover(), (8,), True),
         "440 parameters, one network per drone, statistics",
     ),
-    "result": (Result(POLICY, None, {"reward": jnp.zeros(3)}), "<Result: <Policy 22 -> 32 -> 16 -> 4, "),
+    "result": (lambda: Result(policy(), None, {"reward": jnp.zeros(3)}), "<Result: <Policy 22 -> 32 -> 16 -> 4, "),
     "step": (
-        jd.make_step((jd.drag, two_gusts), (jd.downwash,), jd.lagging_rotors, jd.rk4, dt=0.002, substeps=5),
+        lambda: jd.make_step((jd.drag, two_gusts), (jd.downwash,), jd.lagging_rotors, jd.rk4, dt=0.002, substeps=5),
         "<step: rk4 at 100 Hz x 5, lagging_rotors, effects: drag, two_gusts, pairs: downwash>",
     ),
     "plain step": (
-        jd.make_step(),
+        jd.make_step,
         "<step: semi_implicit_euler at 240 Hz x 1, instant_rotors, effects: none, pairs: none>",
     ),
 }
 
 
-@pytest.mark.parametrize(("thing", "line"), LINES.values(), ids=LINES)
-def test_one_line_says_what_it_is(thing, line):
+@pytest.mark.parametrize(("make_thing", "line"), LINES.values(), ids=LINES)
+def test_one_line_says_what_it_is(make_thing, line):
+    thing = make_thing()
     assert line in repr(thing) == str(thing)
     assert "\n" not in repr(thing) and len(repr(thing)) < 200
 
 
 def test_a_policy_can_be_printed_while_it_is_traced_mapped_and_rebuilt():
     lines = []
-    jax.jit(jax.vmap(lambda policy: lines.append(repr(policy))))(jax.tree.map(lambda x: jnp.stack([x, x]), POLICY))
-    lines.append(repr(jax.tree.map(lambda x: None, POLICY)))
-    lines.append(repr(jax.eval_shape(lambda: POLICY)))
+    jax.jit(jax.vmap(lambda policy: lines.append(repr(policy))))(jax.tree.map(lambda x: jnp.stack([x, x]), policy()))
+    lines.append(repr(jax.tree.map(lambda x: None, policy())))
+    lines.append(repr(jax.eval_shape(policy)))
     assert all("32 -> 16 -> 4, tanh" in line and "statistics" not in line for line in lines)
 
 

@@ -61,7 +61,7 @@ def test_truncation_may_be_separate_as_in_gymnax_1(env_of):
 @pytest.mark.parametrize("separate_truncation", mostly_slow([False, True], [False]))
 def test_a_step_without_reset_stays_in_the_episode(separate_truncation, env_of):
     env = gymnax.wrap(env_of("hover", drones=2, duration=0.02), separate_truncation=separate_truncation)
-    _, state = env.reset_env(KEY)
+    _, state = jax.jit(env.reset_env)(KEY)
     for _ in range(2):
         *_, flag, info = env.step(KEY, state, jnp.zeros(8))
         obs, state, _, ended, last = env.step_env(KEY, state, jnp.zeros(8))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import always, at, control_team, fly, hovering, one, team_of
-from helpers import VEHICLES, assert_close, assert_finite, flying
+from helpers import VEHICLES, assert_close, assert_finite, flying, jit_unoptimized
 from jax.flatten_util import ravel_pytree
 
 from jaxdrones import rotation
@@ -216,7 +216,7 @@ def call(control, gains, team, memory, state, target):
     return control_team(control, gains, team, memory, state, target, dt=DT)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jit_unoptimized, static_argnums=0)
 def differentiate(control, inputs, memory):
     """Gradients of a weighted sum of rotor speeds in gains, team, state and target; and the speeds."""
 
@@ -246,7 +246,7 @@ def in_flight(loop, size=1.0):
     wild, calm = flying(team, tilt=0.1 * size), hovering(team)
     state = wild.replace(vel=size * wild.vel, omega=size * wild.omega, pos=calm.pos + size * (wild.pos - calm.pos))
     offset = [jnp.array(size * x) for x in rng.normal(size=(4, N, 3))]
-    rpy = jax.vmap(rotation.to_rpy)(state.quat)
+    rpy = jax.jit(jax.vmap(rotation.to_rpy))(state.quat)
     if loop in VELOCITY:
         target = jnp.array(size * rng.normal(size=(N, 4)))
     else:
@@ -261,6 +261,7 @@ def in_flight(loop, size=1.0):
     return team, memory, state, target
 
 
+@jax.jit
 def turn_world(yaw, state, target, memory):
     turn = rotation.exp(jnp.array([0, 0, yaw]))
     rotate = jax.vmap(partial(rotation.rotate, turn))

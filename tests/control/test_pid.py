@@ -50,7 +50,7 @@ def test_recorded_sequences_agree_in_speeds_and_memory(name):
     np.testing.assert_allclose(memory.rpy, case.arrays["last_rpy"], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("hz", [120, 240])
+@pytest.mark.parametrize("hz", [pytest.param(120, marks=pytest.mark.slow), 240])
 def test_a_place_30_cm_off_is_reached_and_the_rest_leaves_with_the_integral(hz):
     """Within 3 cm after one second; then the position integral unwinds with P / I = 8 s."""
     error = reaches(pid, ("cf2x", "cf2p"), (0.3, -0.3, 1.3), seconds=12, hz=hz)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_finite, mostly_slow
+from helpers import assert_finite, jit_unoptimized, mostly_slow
 
 import jaxdrones
 from jaxdrones import State, drone_contact, ground_contact, rotation, vector
@@ -43,7 +43,7 @@ alone = jax.tree.map(lambda x: x[:, 0], random_states(500, below=0.06))
 couples = random_states(200, 2)
 
 
-@partial(jax.jit, static_argnames=("length", "dt"))
+@partial(jit_unoptimized, static_argnames=("length", "dt"))
 def fall(start, params=CRAZYFLIE, length=480, dt=STEP):
     """The trajectory of worlds of equal drones with the rotors standing still."""
     n = start.pos.shape[1]
@@ -68,12 +68,12 @@ def kinetic(params, states):
     return 0.5 * params.mass * jnp.sum(states.vel**2, -1) + 0.5 * states.omega**2 @ params.inertia
 
 
-@jax.jit
+@jit_unoptimized
 def ground_wrench(states=alone, params=CRAZYFLIE):
     return jax.vmap(ground_contact, (None, 0))(params, states)
 
 
-on_ground = jax.jit(ground_contact)
+on_ground = jit_unoptimized(ground_contact)
 
 
 def in_world(states, wrench):
@@ -94,7 +94,7 @@ def test_the_ground_pushes_and_rubs_within_the_cone_of_friction(vehicle):
 def test_there_is_no_contact_in_the_air():
     high = alone.replace(pos=alone.pos.at[:, 2].set(0.0601 + 1e-6))  # the radius and more
     assert all(np.all(x == 0) for x in jax.tree.leaves(ground_wrench(high)))
-    apart = jax.jit(drone_contact)(CRAZYFLIE, level_one(0.0), CRAZYFLIE, level_one(0.13))
+    apart = jit_unoptimized(drone_contact)(CRAZYFLIE, level_one(0.0), CRAZYFLIE, level_one(0.13))
     assert all(np.all(x == 0) for x in jax.tree.leaves(apart))
 
 
@@ -189,7 +189,9 @@ def test_thrust_lifts_a_drone_off_the_ground_as_if_it_were_not_there():
     params = jaxdrones.repeat(CRAZYFLIE, 1)
     rpm = params.hover_rpm[:, None] * jnp.sqrt(1.05) * jnp.ones((1, 4))
     state = level(foot(CRAZYFLIE) - 1.5e-3)
-    end = jax.jit(lambda s: jax.lax.scan(lambda s, _: (make_step()(params, s, rpm), None), s, length=240)[0])(state)
+    end = jit_unoptimized(lambda s: jax.lax.scan(lambda s, _: (make_step()(params, s, rpm), None), s, length=240)[0])(
+        state
+    )
     risen = end.pos[0, 2] - foot(CRAZYFLIE)
     assert risen > 0.05 * 9.81 / 2
     assert end.vel[0, 2] ** 2 / 2 < 9.81 * (0.05 * risen + 1.5e-3)
@@ -213,7 +215,7 @@ def some(states, n):
     return [jax.tree.map(lambda x: x[i], states) for i in range(n)]  # noqa: B023
 
 
-@partial(jax.jit, static_argnames=("vehicle", "other"))
+@partial(jit_unoptimized, static_argnames=("vehicle", "other"))
 def both_ways(couples, vehicle, other):
     """Forces and torques about the world's origin, on the first and on the second."""
     params, others = VEHICLES[vehicle], VEHICLES[other]
@@ -277,7 +279,7 @@ def test_drones_that_crash_stop_each_other_and_gain_nothing(vehicle, speed, towa
         assert past.sum() <= 1
 
 
-@partial(jax.jit, static_argnames="cells")
+@partial(jit_unoptimized, static_argnames="cells")
 def part(params, start, cells=None):
     """A fifth of a second of a team without weight and with its rotors at rest."""
     team = jaxdrones.repeat(params.replace(gravity=jnp.zeros_like(params.gravity)), len(start.pos))
@@ -331,7 +333,7 @@ def test_gradients_of_drones_in_the_same_place_are_finite():
         return sum(jnp.sum(x) for x in jax.tree.leaves(physics.wrench(params, state, Scene())))
 
     team, start = jaxdrones.repeat(CRAZYFLIE, 2), in_one_place(2)
-    assert_finite(jax.jit(jax.grad(sums, (0, 1)))(start, team))
+    assert_finite(jit_unoptimized(jax.grad(sums, (0, 1)))(start, team))
 
 
 @pytest.mark.slow
@@ -365,7 +367,7 @@ def test_values_and_gradients_are_finite_wherever_a_drone_is(dtype):
         both = ground_contact(params, state) + drone_contact(params, state, params, other)
         return jnp.sum(both.force) + jnp.sum(both.torque)
 
-    slopes = jax.jit(jax.vmap(jax.value_and_grad(push, (0, 1, 2)), (0, None, None)))
+    slopes = jit_unoptimized(jax.vmap(jax.value_and_grad(push, (0, 1, 2)), (0, None, None)))
     for speed in 0.0, -3.0:
         for aside in 0.0, 0.12, 1e3:
             vel = jnp.full(3, speed, dtype)
@@ -379,8 +381,8 @@ def landing(start, share, steps=288):
     return jax.lax.scan(lambda s, _: (make_step()(params, s, rpm), None), start, length=steps)[0].pos[0, 0]
 
 
-landings = jax.jit(jax.vmap(landing))
-landing_gradients = jax.jit(jax.vmap(jax.grad(landing, argnums=1)))
+landings = jit_unoptimized(jax.vmap(landing))
+landing_gradients = jit_unoptimized(jax.vmap(jax.grad(landing, argnums=1)))
 
 
 def thrown(n, seed=0):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, assert_finite
+from helpers import assert_close, assert_finite, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.dynamics.contact import stop_at
@@ -37,7 +37,7 @@ def random_states(n, seed=0):
     )
 
 
-@partial(jax.jit, static_argnames="length")
+@partial(jit_unoptimized, static_argnames="length")
 def fly(params, starts, scene, rpm, length):
     """The trajectories of single drones in worlds of one scene."""
     team = jd.repeat(params, 1)
@@ -52,7 +52,7 @@ def fly(params, starts, scene, rpm, length):
     return jax.tree.map(lambda x: x[:, :, 0], jax.vmap(trajectory)(starts))
 
 
-@jax.jit
+@jit_unoptimized
 def wrenches(scene, states):
     return jax.vmap(jd.obstacle_contact, (None, 0, None))(CRAZYFLIE, states, scene)
 
@@ -105,7 +105,7 @@ def flights_at(kind, vehicle, n, seed=0):
     scenes = jax.vmap(lambda t: solid(kind, t))(thickness)
     team = jd.repeat(params, 1)
 
-    @jax.jit
+    @jit_unoptimized
     @jax.vmap
     def flown(start, scene):
         def advance(state, _):
@@ -171,7 +171,7 @@ def test_a_box_is_as_good_as_the_ground():
     states = random_states(200)
     states = states.replace(pos=states.pos * jnp.array([[1, 1, 0.15]]))
     low = Scene.of(Box(pos=(0, 0, -50), size=(300, 300, 100)), ground=False)
-    of_ground = jax.jit(jax.vmap(jd.ground_contact, (None, 0)))(CRAZYFLIE, states)
+    of_ground = jit_unoptimized(jax.vmap(jd.ground_contact, (None, 0)))(CRAZYFLIE, states)
     assert np.mean(np.any(of_ground.force != 0, axis=1)) > 0.5
     assert_close(wrenches(low, states), of_ground, 1e-12)
     raised, up = Scene.of(Box(pos=(0, 0, -48), size=(300, 300, 100)), ground=False), jnp.array([[0, 0, 2]])
@@ -216,8 +216,8 @@ def test_looking_only_at_what_is_within_reach_changes_nothing():
     )
     centers = jnp.array(rng.uniform(-1, 1, (100, 1, 3)))
     points = centers + jnp.array(0.05 * rng.normal(size=(100, 8, 3)))
-    found = jax.jit(jax.vmap(lambda points: heap.touched(points, 0.02)))(points)
-    nearest = jax.jit(jax.vmap(jax.vmap(heap.nearest)))(points)
+    found = jit_unoptimized(jax.vmap(lambda points: heap.touched(points, 0.02)))(points)
+    nearest = jit_unoptimized(jax.vmap(jax.vmap(heap.nearest)))(points)
     near = np.asarray(nearest.distance) < 0.02
     assert 0.1 < near.mean() < 0.9
     assert np.all(found.distance[~near] >= 0.02)
@@ -245,7 +245,6 @@ def test_the_gradient_through_a_collision_is_that_of_central_differences(solid, 
     """Of the place after a hit, in the start; at 0.3 m/s compliant contact alone stops the drone at the sphere."""
     team, rpm = jd.repeat(CRAZYFLIE, 1), jnp.zeros((1, 4))
 
-    @jax.jit
     def end(x, to):
         scene = Scene.of(solid.replace(pos=solid.pos.at[0].add(to)), ground=False)
         start = jd.State.at_rest(jnp.stack([x, 0.0, 1.0])[None]).replace(vel=jnp.array([[speed, 0.1, 0.5]]))
@@ -253,7 +252,8 @@ def test_the_gradient_through_a_collision_is_that_of_central_differences(solid, 
         return jax.lax.scan(lambda s, _: (step(team, s, rpm, scene), None), start, length=length)[0].pos[0].sum()
 
     x, h = 0.1013, 1e-7
-    slope, slope_to = jax.jit(jax.grad(end, (0, 1)))(x, 0.0)
+    slope, slope_to = jit_unoptimized(jax.grad(end, (0, 1)))(x, 0.0)
+    end = jit_unoptimized(end)
     np.testing.assert_allclose(slope, (end(x + h, 0.0) - end(x - h, 0.0)) / (2 * h), rtol=1e-5, atol=1e-6)
     if solid is SPHERE:  # no swept stop, which takes an obstacle for resting
         np.testing.assert_allclose(slope_to, (end(x, h) - end(x, -h)) / (2 * h), rtol=1e-5)
@@ -271,7 +271,7 @@ def test_gradients_are_finite_wherever_a_drone_is():
     def push(scene, state):
         return sum(jnp.sum(x) for x in jax.tree.leaves(jd.obstacle_contact(params, state, scene)))
 
-    assert_finite(jax.jit(jax.vmap(jax.grad(push, (0, 1)), (None, 0)))(scene, states))
+    assert_finite(jit_unoptimized(jax.vmap(jax.grad(push, (0, 1)), (None, 0)))(scene, states))
 
 
 @pytest.mark.slow
@@ -291,9 +291,9 @@ def test_a_fast_drone_stops_where_the_wall_is_whatever_its_speed_and_goes_with_t
         return jd.rollout(partial(step, scene=WALL), hold, weightless, start, None, length=16)[0]
 
     y, speed = jnp.zeros(()), jnp.full((), 20.0)
-    final = jax.jit(end)(y, speed)
+    final = jit_unoptimized(end)(y, speed)
     assert abs(final.pos[0, 0] - (1 - CRAZYFLIE.collision_radius)) < 0.02 and abs(final.vel[0, 0]) < 0.7
     assert final.pos[0, 1] > 0.1
-    slopes = jax.jit(jax.jacfwd(lambda y, speed: end(y, speed).pos[0, :2], argnums=(0, 1)))(y, speed)
+    slopes = jit_unoptimized(jax.jacfwd(lambda y, speed: end(y, speed).pos[0, :2], argnums=(0, 1)))(y, speed)
     assert_finite(slopes)
     assert abs(slopes[0][1] - 1) < 1e-6 and abs(slopes[0][0]) < 1e-6

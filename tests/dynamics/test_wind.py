@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, assert_finite, flying, make_step
+from helpers import assert_close, assert_finite, flying, jit_unoptimized, make_step
 
 import jaxdrones as jd
 from jaxdrones.dynamics.flapping import flapping_moment, rate_damping
@@ -19,45 +19,37 @@ EFFECTS = {"drag": jd.drag, "quadratic drag": jd.quadratic_drag, "inflow": jd.in
 each_effect = pytest.mark.parametrize("name", EFFECTS)
 
 
-def lift(vel, state=HOVER, params=CF2X):
-    return jd.inflow_thrust(params, state.replace(vel=jnp.array(vel, float))).force[2] / params.weight
+@jax.jit
+def lift(vel):
+    """The change of thrust of a hovering Crazyflie, over its weight, at each of some velocities."""
+    states = jax.vmap(lambda vel: HOVER.replace(vel=vel))(vel)
+    return jax.vmap(jd.inflow_thrust, (None, 0))(CF2X, states).force[:, 2] / CF2X.weight
 
 
 def test_drag_of_the_body_takes_power_and_grows_with_the_square_of_the_speed():
-    wrench = jax.vmap(jd.quadratic_drag, (None, 0))(CF2X, STATES)
-    force = jax.vmap(jd.rotation.rotate)(STATES.quat, wrench.force)
+    drag = jax.jit(jax.vmap(jd.quadratic_drag, (None, 0)))
+    wrench, twice = drag(CF2X, STATES), drag(CF2X, STATES.replace(vel=2 * STATES.vel))
+    force = jax.jit(jax.vmap(jd.rotation.rotate))(STATES.quat, wrench.force)
     assert np.all(np.sum(force * STATES.vel, axis=1) < 0)
-    twice = jax.vmap(jd.quadratic_drag, (None, 0))(CF2X, STATES.replace(vel=2 * STATES.vel))
     np.testing.assert_allclose(twice.force, 4 * wrench.force, rtol=1e-12)
     ahead = jd.quadratic_drag(CF2X, HOVER.replace(vel=jnp.array([3.0, 0, 0]))).force
     np.testing.assert_allclose(ahead, [-1.225 / 2 * 2e-3 * 9, 0, 0], rtol=1e-12)
 
 
 @each_effect
-def test_only_the_motion_relative_to_the_air_counts(name):
+def test_only_the_motion_relative_to_the_air_counts_and_a_uniform_field_is_the_wind_of_the_parameters(name):
     wind = jnp.array([1.0, -2, 0.5])
-    still = jax.vmap(EFFECTS[name], (None, 0))(CF2X, STATES)
-    blown = jax.vmap(EFFECTS[name], (None, 0))(CF2X.replace(wind=wind), STATES.replace(vel=STATES.vel + wind[None]))
-    assert_close(blown, still, 1e-12)
-
-
-@each_effect
-def test_a_uniform_field_is_the_wind_of_the_parameters(name):
-    wind = jnp.array([1.0, -2, 0.5])
-    effect = jd.in_wind(lambda pos: wind / 2, EFFECTS[name])
-    half = CF2X.replace(wind=wind / 2)
-    assert_close(
-        jax.vmap(effect, (None, 0))(half, STATES),
-        jax.vmap(EFFECTS[name], (None, 0))(CF2X.replace(wind=wind), STATES),
-        1e-12,
-    )
+    effect = jax.jit(jax.vmap(EFFECTS[name], (None, 0)))
+    blown = effect(CF2X.replace(wind=wind), STATES.replace(vel=STATES.vel + wind[None]))
+    assert_close(blown, effect(CF2X, STATES), 1e-12)
+    in_half = jax.jit(jax.vmap(jd.in_wind(lambda pos: wind / 2, EFFECTS[name]), (None, 0)))
+    assert_close(in_half(CF2X.replace(wind=wind / 2), STATES), effect(CF2X.replace(wind=wind), STATES), 1e-12)
 
 
 @each_effect
 def test_gradients_at_rest_in_still_air_are_finite(name):
-    for rpm in 0.0, 14e3:
-        state = HOVER.replace(rpm=jnp.full(4, rpm))
-        assert_finite(jax.jacrev(EFFECTS[name], argnums=(0, 1))(CF2X, state))
+    at_rest = jax.vmap(lambda rpm: HOVER.replace(rpm=jnp.full(4, rpm)))(jnp.array([0.0, 14e3]))
+    assert_finite(jit_unoptimized(jax.vmap(jax.jacrev(EFFECTS[name], argnums=(0, 1)), (None, 0)))(CF2X, at_rest))
 
 
 def test_the_mean_wind_is_logarithmic():
@@ -66,7 +58,7 @@ def test_the_mean_wind_is_logarithmic():
     np.testing.assert_allclose(field(jnp.array([7.0, 8.0, 40 * 0.3048])), [0, 5 * 1.141662, 0], rtol=1e-5, atol=1e-12)
     for height in 0.0, -1.0, 0.0457:
         np.testing.assert_allclose(field(jnp.array([0.0, 0, height])), 0, atol=1e-12)
-    assert_finite(jax.jacrev(field)(jnp.array([0.0, 0, -1])))
+    assert_finite(jax.jit(jax.jacrev(field))(jnp.array([0.0, 0, -1])))
 
 
 @pytest.mark.slow
@@ -84,13 +76,13 @@ def test_a_field_may_change_with_time():
 
 def test_a_slow_climb_loses_the_share_of_thrust_that_the_vehicle_says():
     climb = 0.01
-    np.testing.assert_allclose(lift([0, 0, climb]), -CF2X.inflow_loss * climb, rtol=2e-3)
-    np.testing.assert_allclose(lift([0, 0, -climb]), CF2X.inflow_loss * climb, rtol=2e-3)
-    assert abs(lift([0, 0, 0])) < 1e-6
+    up, down, still = lift(jnp.array([[0, 0, climb], [0, 0, -climb], [0, 0, 0]]))
+    np.testing.assert_allclose([-up, down], CF2X.inflow_loss * climb, rtol=2e-3)
+    assert abs(still) < 1e-6
 
 
 def test_forward_flight_lifts_and_its_gain_is_bounded():
-    gains = [float(lift([speed, 0, 0])) for speed in (1, 3, 10, 40)]
+    gains = lift(jnp.array([[1.0, 0, 0], [3, 0, 0], [10, 0, 0], [40, 0, 0]]))
     assert 0 < gains[0] < 0.02 and np.all(np.diff(gains) > 0)
     induced = np.sqrt(CF2X.weight / 4 / (2 * CF2X.air_density * np.pi * CF2X.prop_radius**2))
     assert gains[-1] < 2 * CF2X.inflow_loss * induced
@@ -98,14 +90,14 @@ def test_forward_flight_lifts_and_its_gain_is_bounded():
 
 def test_the_flow_through_a_rotor_is_that_of_glauert_and_of_momentum_theory():
     climb, edgewise = jnp.meshgrid(jnp.array([-1.0, 0, 2, 8]), jnp.array([0.0, 1, 3, 10]))
-    flow = jax.vmap(flow_through, (0, 0, None))(climb.ravel(), edgewise.ravel() ** 2, 4.0)
+    flow = jax.jit(jax.vmap(flow_through, (0, 0, None)))(climb.ravel(), edgewise.ravel() ** 2, 4.0)
     np.testing.assert_allclose((flow - climb.ravel()) * np.sqrt(edgewise.ravel() ** 2 + flow**2), 16, rtol=1e-6)
     np.testing.assert_allclose(flow[:4], climb[0] / 2 + np.sqrt(climb[0] ** 2 / 4 + 16), rtol=1e-6)
 
 
 def test_a_rotor_that_moves_down_faster_than_its_neighbors_lifts_more_so_rolling_is_damped():
     rolling = HOVER.replace(omega=jnp.array([2.0, 0, 0]))
-    assert jd.inflow_thrust(CF2X, rolling).torque[0] < 0
+    assert jax.jit(jd.inflow_thrust)(CF2X, rolling).torque[0] < 0
 
 
 @pytest.mark.float32
@@ -145,7 +137,7 @@ def test_rotors_never_pull_down_and_a_descent_at_most_doubles_their_thrust():
         return jd.inflow_thrust(params, HOVER.replace(vel=vel, rpm=rpm)).force[2]
 
     on_grid = jax.vmap(jax.value_and_grad(change, argnums=(0, 1, 2, 3)), (0, 0, 0, None))
-    changes, slopes = jax.jit(jax.vmap(on_grid, (None, None, None, 0)))(climb, edgewise, speed, team)
+    changes, slopes = jit_unoptimized(jax.vmap(on_grid, (None, None, None, 0)))(climb, edgewise, speed, team)
     full = 4 * team.kf[:, None] * (speed[None] * team.max_rpm[:, None]) ** 2
     assert np.all(full + changes >= 0) and np.all(changes <= full)
     assert_finite(slopes)
@@ -182,7 +174,7 @@ def test_what_the_air_does_is_proportional_to_its_density_and_nothing_in_a_vacuu
         power = jax.vmap(battery_power)(params, state) - 0.5
         return jnp.concatenate([rate.vel + gravity * jnp.array([[0.0, 0, 1]]), rate.omega, power[:, None]], axis=1)
 
-    both = jax.jit(jax.vmap(lambda *x: (felt(*x), jax.jacrev(felt, (0, 1, 2))(*x)), (0, 0, None)))
+    both = jit_unoptimized(jax.vmap(lambda *x: (felt(*x), jax.jacrev(felt, (0, 1, 2))(*x)), (0, 0, None)))
     (vacuum, half, full, weightless), slopes = both(
         jnp.array([0, 0.6125, 1.225, 1.225]), jnp.array([9.8, 9.8, 9.8, 0]), state
     )

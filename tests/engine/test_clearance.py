@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, make_step
+from helpers import assert_close, jit_unoptimized, make_step
 
 import jaxdrones as jd
 from jaxdrones.dynamics.contact import contact_radius
@@ -44,10 +44,11 @@ def flown(effect, integrator, state, scene=SCENE, substeps=12):
 @pytest.mark.slow
 def test_worlds_that_are_near_and_worlds_that_are_not_fly_as_if_all_were_computed(integrator):
     """Where few and where most are near; at up to 20 m/s, with 1 m between two control steps."""
-    alone = jax.jit(partial(flown, jd.obstacle_contact, integrator))  # a world alone is always computed
+    fly = partial(flown, jd.obstacle_contact, integrator)
+    alone, together = jit_unoptimized(fly), jit_unoptimized(jax.vmap(fly))  # a world alone is always computed
     for near in 50, 6:
         states = starts(64, near, 20.0)
-        found = jax.jit(jax.vmap(alone))(states)
+        found = together(states)
         each = [alone(jax.tree.map(lambda x, i=i: x[i], states)) for i in range(64)]
         assert_close(found, jax.tree.map(lambda *x: jnp.stack(x), *each), 1e-9)
         pushed = np.any(np.asarray(found.vel != states.vel)[..., :2], axis=(1, 2))  # the rotors stand still
@@ -68,7 +69,7 @@ def test_what_stays_in_its_free_ball_has_no_contact():
         return free.hold(one, moved)[0], jnp.any(wrench.force != 0), free.radius[0]
 
     towards = jnp.array(np.random.default_rng(1).normal(size=(400, 1, 3)) * 0.2)
-    inside, touched, radius = jax.jit(jax.vmap(of_world))(states, towards)
+    inside, touched, radius = jit_unoptimized(jax.vmap(of_world))(states, towards)
     assert 50 < jnp.sum(inside) < 350 and jnp.sum(touched) > 10
     assert not np.any(inside & touched)
     size = contact_radius(jd.load_params("cf2x"))
@@ -86,7 +87,7 @@ def test_the_ball_that_holds_a_drone_is_the_smallest_one():
         state = state.replace(quat=jd.rotation.from_rpy(jnp.array([1.0, 0, 0]) * roll))
         return jnp.max(jnp.abs(jd.ground_contact(params, state).force))
 
-    @jax.jit
+    @jit_unoptimized
     @partial(jax.vmap, in_axes=(0, None))
     def largest(params, share):
         return jnp.max(force(params, share * contact_radius(params), jnp.linspace(-np.pi, np.pi, 721)))
@@ -119,8 +120,8 @@ def test_derivatives_of_many_worlds_are_those_of_each(derivative):
     """In the velocities and in the places of the obstacles."""
     states, shift = starts(8, 4, 3.0), jnp.zeros((1, 3))
     fall = partial(height, jd.obstacle_contact)
-    found = jax.jit(derivative(fall))(states.vel, shift, states)
-    alone = jax.jit(jax.grad(fall, (0, 1)))
+    found = jit_unoptimized(derivative(fall))(states.vel, shift, states)
+    alone = jit_unoptimized(jax.grad(fall, (0, 1)))
     each = [alone(states.vel[i], shift, jax.tree.map(lambda x, i=i: x[i], states)) for i in range(8)]
     by_vel, by_shift = (jnp.stack(x) for x in zip(*each, strict=True))
     expected = by_vel, (jnp.sum(by_shift, axis=0) if derivative is of_all else by_shift)

@@ -16,6 +16,7 @@ from helpers import (
     fly,
     flying,
     make_step,
+    mostly_slow,
     name_of,
     tape,
 )
@@ -145,6 +146,7 @@ def test_compiled_equals_not_compiled():
     assert_close(step(team, start, command), plain, ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_vmap_over_worlds_equals_a_loop():
     team = jaxdrones.repeat(cf2x, 2)
     worlds = [flying(team, seed) for seed in range(4)]
@@ -199,7 +201,7 @@ def test_a_lower_drone_leaves_the_upper_one_alone():
     np.testing.assert_allclose(end.pos[-1, 1], start.pos[1], atol=ROUND_OFF)
 
 
-@pytest.mark.parametrize("pair", [downwash, downwash_2021], ids=name_of)
+@pytest.mark.parametrize("pair", mostly_slow([downwash, downwash_2021], [downwash]), ids=name_of)
 def test_a_drone_is_not_its_own_neighbour(pair):
     team = jaxdrones.repeat(cf2x, 1)
     start, command = flying(team), tape(team, 1)[0]
@@ -294,7 +296,7 @@ def test_one_step_in_float32_agrees_with_float64(step):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("integrator", [semi_implicit_euler, rk4], ids=name_of)
+@pytest.mark.parametrize("integrator", mostly_slow([semi_implicit_euler, rk4], [semi_implicit_euler]), ids=name_of)
 def test_ten_thousand_steps_keep_the_quaternion_at_unit_length_in_float32(integrator):
     """In hover with a slow spin, so that every step rounds; a drift of one rounding per step would be 6e-4."""
     team = jaxdrones.repeat(jaxdrones.load_params("cf2x"), 1)

@@ -1,12 +1,13 @@
 """Derivatives of whole flights against central differences, and finite ones where formulas tend to break."""
 
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import INTEGRATORS, assert_close, assert_finite, fly, mostly_slow, name_of, tape
+from helpers import jit_unoptimized as jit
 
 import jaxdrones
 from jaxdrones import (
@@ -33,9 +34,6 @@ FELT = {  # what the flights must feel of `Params`; the rest of it describes lim
     "default": BODY | {"ground_effect_coeff", "downwash_coeff", "inflow_loss", "air_density", "prop_radius"},
     "lagging": BODY | {"rotor_rise_time", "rotor_fall_time"},
 }
-
-# Derivatives of many steps take long to optimise and are run a few times here.
-jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def flight():

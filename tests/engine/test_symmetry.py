@@ -90,7 +90,9 @@ def test_without_gravity_and_ground_there_is_no_up():
     assert_same_motion(flown, expected.replace(pos=expected.pos + shift[None, None]), ROUND_OFF)
 
 
-@pytest.mark.parametrize(("effects", "pairs"), [SMOOTH, PAPER], ids=["smooth", "paper"])
+@pytest.mark.parametrize(
+    ("effects", "pairs"), [SMOOTH, pytest.param(*PAPER, marks=pytest.mark.slow)], ids=["smooth", "paper"]
+)
 def test_a_mirrored_team_flies_the_mirrored_flight(effects, pairs):
     """A vehicle in the mirror has its rotors on the other side, turning the other way."""
     step = make_step(effects, pairs)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, mostly_slow
+from helpers import assert_close, jit_unoptimized, mostly_slow
 
 import jaxdrones as jd
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS, ContractError, check_env, make
@@ -57,7 +57,7 @@ def test_the_check_sees_a_broken_contract():
 def test_starts_are_valid(task):
     """No drone below the ground or in another one."""
     env = make_env(task)
-    worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(KEY, 256))[1]
+    worlds = jit_unoptimized(jax.vmap(env.reset))(jax.random.split(KEY, 256))[1]
     pos, radius = np.asarray(worlds.drones.pos), float(env.params.collision_radius[0])
     assert np.all(pos[..., 2] >= standing_height(env.params)[0] - 1e-9)
     for i in range(env.drones):
@@ -204,7 +204,7 @@ def check_gradient(env, world, steps=10, eps=1e-6):
 
         return jnp.sum(jax.lax.scan(advance, world, actions)[1])
 
-    slope = jnp.sum(jax.jit(jax.grad(returned))(actions) * direction)
+    slope = jnp.sum(jit_unoptimized(jax.grad(returned))(actions) * direction)
     difference = (returned(actions + eps * direction) - returned(actions - eps * direction)) / (2 * eps)
     np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-7)
     assert np.isfinite(slope)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close
+from helpers import assert_close, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.envs import episode, make
@@ -88,7 +88,7 @@ def test_every_episode_draws_a_delay_of_its_own_and_flies_with_it():
     env = make("hover", drones=2, delay=(0.0, 0.01))
     assert env.privileged_size == 1
 
-    @jax.jit
+    @jit_unoptimized
     @jax.vmap
     def first_speeds(key):
         _, world = env.reset(key)

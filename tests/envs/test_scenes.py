@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.envs import TASKS, AutoReset, check_env, make
@@ -62,8 +63,8 @@ def test_a_drawn_scene_is_another_one_in_every_episode_and_the_same_within():
     env = make("hover", scene=random_ball, effects=(repelled,), sensors=(RANGE,), duration=0.02, observation=("range",))
     auto = AutoReset(env)
     keys = jax.random.split(KEY, 3)
-    obs, episodes = jax.jit(jax.vmap(auto.reset))(keys)
-    step, first = jax.jit(jax.vmap(auto.step)), episodes.world
+    obs, episodes = jit_unoptimized(jax.vmap(auto.reset))(keys)
+    step, first = jit_unoptimized(jax.vmap(auto.step)), episodes.world
     for _ in range(2):
         obs, episodes, *_, info = step(keys, episodes, jnp.zeros((3, 1, 4)))
     balls = [world.scene.spheres.pos[:, 0] for world in (first, info["final_world"], episodes.world)]
@@ -82,7 +83,7 @@ def test_a_start_may_depend_on_the_scene():
         return state.replace(pos=scene.spheres.pos + jnp.array([[0.0, 0.0, 1.0]])), variables
 
     env = make(dataclasses.replace(plain, start=start), scene=random_ball, effects=(repelled,))
-    _, worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(KEY, 3))
+    _, worlds = jit_unoptimized(jax.vmap(env.reset))(jax.random.split(KEY, 3))
     np.testing.assert_allclose(worlds.drones.pos - worlds.scene.spheres.pos, np.tile([0, 0, 1], (3, 1, 1)), atol=1e-12)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from extensions import battery, flapping
 from extensions.payload import Payload
-from helpers import assert_close, assert_finite, mostly_slow
+from helpers import assert_close, assert_finite, jit_unoptimized, mostly_slow
 
 import jaxdrones as jd
 
@@ -75,7 +75,7 @@ def test_a_model_is_mapped_and_flies_in_one_kernel_as_alone(name, integrator):
 
     vels = jnp.stack([start.vel, 2 * start.vel, -start.vel])
     alone = jax.tree.map(lambda *x: jnp.stack(x), *map(fly, vels))
-    assert_close(jax.jit(jax.vmap(fly))(vels), alone, 1e-9)
+    assert_close(jit_unoptimized(jax.vmap(fly))(vels), alone, 1e-9)
     assert_close(jd.over_worlds(fly)(vels), alone, 1e-9)
 
 
@@ -90,11 +90,11 @@ def test_gradients_through_a_model_are_those_of_differences(name, integrator):
         end = flown(step, start.replace(vel=scale * start.vel), 20, share=1.02)[0]
         return sum(jnp.sum(x) for x in jax.tree.leaves((end.aux, end.pos)))
 
-    value = jax.jit(sum_of_aux)
+    value = jit_unoptimized(sum_of_aux)
     h = 1e-4
     measured = (value(1 + h) - value(1 - h)) / (2 * h)
     assert abs(measured) > 1e-9
-    np.testing.assert_allclose(jax.jit(jax.grad(sum_of_aux))(1.0), measured, rtol=1e-5)
+    np.testing.assert_allclose(jit_unoptimized(jax.grad(sum_of_aux))(1.0), measured, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from extensions.imu import Imu, specific_force
 from extensions.range_finder import RangeFinder
-from helpers import assert_close, assert_finite, flying
+from helpers import assert_close, assert_finite, flying, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.engine import bullet
@@ -63,7 +63,7 @@ def flight(steps):
     """States of a tumbling team, one row per step of `DT`, and their time derivatives."""
     start = flying(TEAM)
 
-    @jax.jit
+    @jit_unoptimized
     def fly(start):
         trajectory = jd.rollout(RK4, lambda p, m, s, k: (m, COMMAND), TEAM, start, None, steps)[1]
         return trajectory, jax.vmap(lambda state: RK4.rate(TEAM, state, COMMAND))(trajectory)
@@ -112,7 +112,7 @@ def test_the_variance_of_a_bias_grows_linearly_and_that_of_white_noise_does_not(
     rate = jax.tree.map(jnp.zeros_like, state)
     sensors = (Imu(dt=dt, acc_noise=0.5, gyro_noise=0.02, acc_walk=0.3, gyro_walk=0.01).sensor,)
 
-    @jax.jit
+    @jit_unoptimized
     def run(key):
         def measure(memories, key):
             memories, readings = measure_sensors(sensors, key, params, state, rate, Scene(), memories)
@@ -170,7 +170,7 @@ def range_in(key, pos):
 def test_ranges_in_drawn_scenes_are_mapped_and_fly_in_one_kernel():
     keys = jax.random.split(KEY, 20)
     pos = jnp.stack([jnp.linspace(-1.5, 1.5, 20), jnp.zeros(20), jnp.full(20, 2.0)], axis=-1)
-    found, height = jax.jit(jax.vmap(range_in))(keys, pos)
+    found, height = jit_unoptimized(jax.vmap(range_in))(keys, pos)
     np.testing.assert_allclose(found, np.where(np.abs(pos[:, 0]) < 1, 2 - height, 2), rtol=1e-12)
     assert_close(jd.over_worlds(range_in)(keys, pos), (found, height), 1e-12)
 
@@ -182,7 +182,7 @@ def test_a_range_is_differentiable_in_the_flight_and_in_the_scene():
     def total(state, scene):
         return jnp.sum(measured(FINDER, TEAM, state, scene=scene))
 
-    of_state, of_scene = jax.jit(jax.grad(total, argnums=(0, 1)))(state, TABLE)
+    of_state, of_scene = jit_unoptimized(jax.grad(total, argnums=(0, 1)))(state, TABLE)
     np.testing.assert_allclose(of_state.pos, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(of_scene.boxes.pos, [[0, 0, -1]], atol=1e-12)
     np.testing.assert_allclose(of_scene.boxes.size, [[0, 0, -0.5]], atol=1e-12)
@@ -233,7 +233,7 @@ def test_an_effect_of_a_drawn_scene_and_a_sensor_agree_where_a_drone_comes_to_re
     top = world.scene.boxes.size[:, 0, 2]
     assert len(set(top.tolist())) == 3
 
-    @jax.jit
+    @jit_unoptimized
     @jax.vmap
     def fall(world):
         still = world.replace(params=world.params.replace(kf=0.0 * world.params.kf, km=0.0 * world.params.km))

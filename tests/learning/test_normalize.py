@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -6,9 +7,15 @@ from jaxdrones.learning.normalize import RunningStatistics
 
 def test_statistics_in_pieces_are_those_of_everything():
     x = np.random.default_rng(0).normal(3.0, 2.0, size=(90, 4))
-    running = RunningStatistics.empty(4)
-    for piece in (x[:10], x[10:11], x[11:60], x[60:]):
-        running = running.update(jnp.asarray(piece))
+
+    @jax.jit
+    def in_pieces(x):
+        running = RunningStatistics.empty(4)
+        for piece in (x[:10], x[10:11], x[11:60], x[60:]):
+            running = running.update(piece)
+        return running
+
+    running = in_pieces(x)
     np.testing.assert_allclose(running.mean, x.mean(0), rtol=1e-12)
     np.testing.assert_allclose(running.var, x.var(0), rtol=1e-12)
     assert running.count == 90
@@ -36,8 +43,9 @@ def test_vectors_that_do_not_count_change_nothing():
     rng = np.random.default_rng(0)
     x, counts = jnp.asarray(rng.normal(3.0, 2.0, size=(20, 5, 4))), rng.random((20, 5)) < 0.4
     expected = RunningStatistics.empty(4).update(x[counts])
-    masked = RunningStatistics.empty(4).update(jnp.where(counts[..., None], x, 1e6), where=jnp.asarray(counts))
-    none = masked.update(x + 1e6, where=jnp.zeros((20, 5), bool))
+    update = jax.jit(RunningStatistics.update)
+    masked = update(RunningStatistics.empty(4), jnp.where(counts[..., None], x, 1e6), where=counts)
+    none = update(masked, x + 1e6, where=jnp.zeros((20, 5), bool))
     for one in masked, none:
         for name in ("mean", "var", "count"):
             np.testing.assert_allclose(getattr(one, name), getattr(expected, name), rtol=1e-12)

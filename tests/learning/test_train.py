@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from double_integrator import SMALL, Cue, DoubleIntegrator
 from flax import nnx
+from helpers import jit_unoptimized, mostly_slow, name_of
 
-from jaxdrones.learning import bptt, checkpoint, loggers
+from jaxdrones.learning import bptt, checkpoint, loggers, ppo
 from jaxdrones.learning.networks import MLP, Policy
 
 KEY = jax.random.key(0)
 SIZES = (2, 8, 1)
+EACH_LEARNER = pytest.mark.parametrize("learner", mostly_slow(SMALL, [ppo]), ids=name_of)
 
 
 class NnxNetwork(nnx.Module):
@@ -49,22 +51,20 @@ class Remember(nn.Module):
         return {"sum": total}, nn.Dense(1)(total)
 
 
-OWN = {"linen": lambda kernels: MLP(SIZES[1:2], SIZES[2]), "nnx": NnxNetwork, "equinox": equinox_network}
+OWN = {"nnx": NnxNetwork, "equinox": equinox_network}
 
 
 @pytest.mark.parametrize("library", OWN)
 def test_the_gradient_of_a_network_is_the_same_in_every_library(library):
-    """The gradient of a flight of the double integrator, of the same weights."""
+    """The gradient of a flight of the double integrator, of the same weights; that of flax linen is the reference."""
     params = MLP(SIZES[1:2], SIZES[2]).init(KEY, jnp.zeros(2))
     kernels = [(layer["kernel"], layer["bias"]) for layer in params["params"].values()]
     network = OWN[library](kernels)
     env, config = DoubleIntegrator(), dataclasses.replace(SMALL[bptt], max_grad_norm=1e-3, learning_rate=1e-3)
     state = bptt.init(KEY, env, config, network)
-    if library == "linen":
-        state = state.replace(policy=state.policy.replace(params=params))
     reference = state.replace(policy=state.policy.replace(params=params, network=MLP(SIZES[1:2], SIZES[2])))
     reference = reference.replace(opt_state=bptt.init(KEY, env, config, None).opt_state)
-    update = jax.jit(lambda state: bptt.update(env, config, state))
+    update = jit_unoptimized(lambda state: bptt.update(env, config, state))
     (mine, metrics), (theirs, expected) = update(state), update(reference)
     # Parameters of flax are float32, and the sums are in another order.
     np.testing.assert_allclose(metrics["gradient_norm"], expected["gradient_norm"], rtol=1e-6)
@@ -73,7 +73,7 @@ def test_the_gradient_of_a_network_is_the_same_in_every_library(library):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("learner", SMALL)
+@EACH_LEARNER
 def test_an_own_recurrent_network_learns_and_is_saved(learner, tmp_path):
     env, network = Cue(), Remember()
     result = learner.train(KEY, env, SMALL[learner], network=network)
@@ -114,11 +114,17 @@ def test_a_network_that_does_not_fit_is_refused(network, error):
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("learner", SMALL)
+@EACH_LEARNER
 def test_a_training_continued_from_a_state_is_one_long_training_and_the_callback_sees_every_update(learner):
     env, config = DoubleIntegrator(), dataclasses.replace(SMALL[learner], updates=5)
-    seen = []
-    half = learner.train(KEY, env, config, callback=lambda update, metrics, state: seen.append(metrics) or update == 2)
+    seen, observed = [], []
+
+    def callback(update, metrics, state):
+        seen.append(metrics)
+        observed.append(state.policy.obs_stats.count)
+        return update == 2
+
+    half = learner.train(KEY, env, config, callback=callback)
     rest = learner.train(KEY, env, config, state=half.train_state)
     whole = learner.train(KEY, env, config)
     assert len(seen) == 2 and int(half.train_state.step) == 2 and int(rest.train_state.step) == 5
@@ -127,6 +133,8 @@ def test_a_training_continued_from_a_state_is_one_long_training_and_the_callback
         np.testing.assert_array_equal([row[name] for row in seen], half.history[name])
     for x, y in zip(jax.tree.leaves(rest.policy), jax.tree.leaves(whole.policy), strict=True):
         np.testing.assert_array_equal(x, y)
+    if learner is ppo:  # which observes all steps of its worlds
+        assert observed[0] == config.worlds * config.horizon
     with pytest.raises(ValueError, match=r"state has made 5 updates; .* config.updates is 5"):
         learner.train(KEY, env, config, state=whole.train_state)
     with pytest.raises(ValueError, match="callback is not supported inside"):

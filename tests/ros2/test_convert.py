@@ -39,7 +39,7 @@ def test_whoever_hears_the_odometry_has_the_motors_speeds_of_that_time():
 
 
 def test_twists_are_in_body_axes_and_poses_in_the_world():
-    simulation, now = measured(1)
+    simulation, now = measured(2)
     sent = convert.state_messages(now, 0, 1_500_000_000)
     assert sent["pose"].header == msg.Header(msg.Time(1, 500_000_000), "world")
     assert sent["odom"].child_frame_id == sent["twist"].header.frame_id == "drone_0/base_link"
@@ -49,8 +49,8 @@ def test_twists_are_in_body_axes_and_poses_in_the_world():
 
 
 def test_the_imu_reads_gravity_at_rest_in_the_air_and_nothing_in_free_fall():
-    simulation = make_simulation(1)
-    hover = jnp.broadcast_to(simulation.params.hover_rpm[:, None], (1, 4))
+    simulation = make_simulation(2)
+    hover = jnp.broadcast_to(simulation.params.hover_rpm[:, None], (2, 4))
     for rpm, reading in ((hover, 9.8), (0 * hover, 0.0)):
         simulation._rpm = rpm
         imu = convert.state_messages(simulation.measure(), 0, 0)["imu"]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones import rotation
 from jaxdrones.sensing import BEAMS, Scene, builders, forest, gate, room, track
@@ -12,7 +13,7 @@ KEYS = jax.random.split(jax.random.key(0), 4096)
 ENDS = jnp.array([[0.0, 0.0, 1.5], [20.0, 0.0, 1.5]])
 
 
-@jax.jit
+@jit_unoptimized
 @jax.vmap
 def mixed_forests(key):
     """A forest of everything, and the distances of its obstacles alone from the two points that are kept free."""
@@ -44,7 +45,7 @@ def test_trees_are_as_many_as_the_density_says_but_for_those_left_out():
 def test_trunks_stand_with_their_foot_in_the_strip_and_tilt_to_all_sides_as_far_as_they_may():
     corners = np.array([[0, -3, 0], [20, 3, 5.0]])
 
-    @jax.jit
+    @jit_unoptimized
     def drawn(key):
         trunks = builders._trunks(key, 500, jnp.array(corners), (0.1, 0.3), tilt=20.0)
         return trunks.pos, jax.vmap(rotation.z_axis)(trunks.quat), trunks.radius
@@ -63,7 +64,7 @@ def test_a_room_is_closed_and_its_pillars_keep_away_from_places():
     places = jnp.array([[1.0, 1.0, 1.0], [-1.0, 0.5, 1.0]])
     outside = jnp.array([(3.1, 0, 1.5), (-3.1, 0, 1.5), (0, 2.1, 1.5), (0, -2.1, 1.5), (0, 0, 3.1), (3.1, 2.1, 1.5)])
 
-    @jax.jit
+    @jit_unoptimized
     def distances(key):
         scene = room((6.0, 4.0, 3.0), key=key, pillars=20, keep_free=places, clearance=0.7)
         return scene.cylinders.active, jax.vmap(scene.distance)(places), jax.vmap(scene.distance)(outside)
@@ -72,7 +73,7 @@ def test_a_room_is_closed_and_its_pillars_keep_away_from_places():
     assert 0 < jnp.sum(active) < 20 and jnp.all(clear >= 0.7) and jnp.all(beyond < 0)
 
 
-distances = jax.jit(jax.vmap(Scene.distance, (None, 0)))
+distances = jit_unoptimized(jax.vmap(Scene.distance, (None, 0)))
 
 
 def test_a_room_is_as_large_as_it_says_and_its_walls_are_as_thick():

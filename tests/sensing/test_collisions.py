@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State, rotation
@@ -37,7 +38,7 @@ def random_teams(worlds, n, high=(0.7, 0.7, 0.7)):
         yield State(pos=np.abs(pos), quat=quats(n), vel=np.zeros((n, 3)), omega=np.zeros((n, 3)), rpm=np.zeros((n, 4)))
 
 
-flags = jax.jit(collisions)
+flags = jit_unoptimized(collisions)
 
 
 def team(*pos, rpy=(0.0, 0.0, 0.0), vehicle=None):
@@ -113,7 +114,7 @@ def test_flags_of_many_worlds_are_those_of_each():
     params = jaxdrones.repeat(CRAZYFLIE, 3)
     worlds = list(random_teams(30, 3, high=(0.1, 0.1, 0.2)))
     together = jax.tree.map(lambda *x: np.stack(x), *worlds)
-    at_once = jax.jit(jax.vmap(partial(collisions, scene=SCENE), (None, 0)))(params, together)
+    at_once = jit_unoptimized(jax.vmap(partial(collisions, scene=SCENE), (None, 0)))(params, together)
     each = [flags(params, world, SCENE) for world in worlds]
     for name in "ground", "drones", "scene":
         found = getattr(at_once, name)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_finite
+from helpers import assert_finite, jit_unoptimized
 from scipy.stats import chi2
 from sensing.estimates import along, errors, few, flights, normalized
 
@@ -113,7 +113,7 @@ def test_a_controller_flies_on_the_estimate():
         return (state, rate, memory), (state.pos, seen.pos)
 
     begun = start, jax.tree.map(jnp.zeros_like, start), sensor.init(KEY, params)
-    pos, seen = jax.jit(lambda c: jax.lax.scan(control, c, jax.random.split(KEY, 300))[1])(begun)
+    pos, seen = jit_unoptimized(lambda c: jax.lax.scan(control, c, jax.random.split(KEY, 300))[1])(begun)
     np.testing.assert_allclose(pos[100:], np.broadcast_to(here, (200, 3)), atol=0.01)
     assert 0 < np.abs(pos - seen).max() < 0.05
 
@@ -147,7 +147,7 @@ def test_prediction_has_the_jacobian_of_its_own_motion_in_every_block():
     start, dt = tilted(), 1e-3
     gyro, acc, gravity = jnp.array([3.0, -2, 1]), jnp.array([4.0, 5, 9]), jnp.array(9.8)
 
-    @jax.jit
+    @jit_unoptimized
     def both(start):
         end = kalman.move(start, gyro, acc, gravity, dt)
         exact = jax.jacfwd(lambda e: difference(end, kalman.move(shifted(start, e), gyro, acc, gravity, dt)))
@@ -177,7 +177,7 @@ def test_a_measurement_leaves_the_covariance_of_bayes_about_the_corrected_attitu
     residual *= 0.2 / np.linalg.norm((gain @ residual)[kalman.ANGLE])
     error = jnp.array(gain @ residual)
 
-    @jax.jit
+    @jit_unoptimized
     def both(estimate):
         after = kalman.update(estimate, jnp.array(residual), jnp.array(jacobian), jnp.array(noise))
         mean = shifted(estimate, error)
@@ -213,7 +213,7 @@ def test_an_exact_measurement_of_any_kind_is_fulfilled_after_it():
     """Position and height move the position; the others, of a drone whose position is known, turn the attitude."""
     error = jnp.array([0.01, -0.02, 0.03, 0, 0, 0, 0.02, 0.03, -0.01, *[0.0] * 6])
 
-    @jax.jit
+    @jit_unoptimized
     def corrected(estimate):
         known = estimate.replace(cov=jnp.diag(jnp.full(15, 1e-16).at[kalman.ANGLE].set(0.01)))
         turned = jnp.zeros(15).at[kalman.ANGLE].set(error[kalman.ANGLE])
@@ -242,7 +242,7 @@ def test_environments_carry_all_of_them_and_policies_see_them():
     assert env.observation_size == 3 + 17 + 1
     obs, world = env.reset(KEY)
 
-    @jax.jit
+    @jit_unoptimized
     def fly(world):
         return jax.lax.scan(
             lambda w, k: (env.step(k, w, jnp.zeros((1, 4)))[1], None), world, jax.random.split(KEY, 50)

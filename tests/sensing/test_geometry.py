@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, assert_finite
+from helpers import assert_close, assert_finite, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.engine import bullet
@@ -21,9 +21,9 @@ POLE = Cylinder(pos=(0, 0, 2), radius=0.5, height=2.0)
 PILL = Capsule(pos=(0, 0, 2), radius=0.5, height=2.0)
 SOLIDS = [BRICK, BALL, POLE, PILL]
 
-distances = jax.jit(jax.vmap(Scene.distance, (None, 0)))
-distances_and_slopes = jax.jit(jax.vmap(jax.value_and_grad(Scene.distance, argnums=1), (None, 0)))
-rays = jax.jit(jax.vmap(ray, (None, 0, 0)))
+distances = jit_unoptimized(jax.vmap(Scene.distance, (None, 0)))
+distances_and_slopes = jit_unoptimized(jax.vmap(jax.value_and_grad(Scene.distance, argnums=1), (None, 0)))
+rays = jit_unoptimized(jax.vmap(ray, (None, 0, 0)))
 
 
 def units(*shape):
@@ -94,7 +94,7 @@ def test_the_nearest_point_of_the_surface_is_a_distance_down_the_gradient(solid)
     np.testing.assert_allclose(distances(scene, points - found[:, None] * slopes), 0, atol=1e-9)
 
 
-surfaces = jax.jit(jax.vmap(Scene.nearest, (None, 0)))
+surfaces = jit_unoptimized(jax.vmap(Scene.nearest, (None, 0)))
 
 
 def test_what_a_camera_takes_for_the_normal_is_outward_where_a_point_is_on_the_surface():
@@ -106,7 +106,7 @@ def test_what_a_camera_takes_for_the_normal_is_outward_where_a_point_is_on_the_s
         normal = jnp.stack(solid.normals(list(point - solid.distance(point) * outward)))
         return outward @ normal / jnp.linalg.norm(normal)
 
-    found = jax.jit(jax.vmap(lambda points: [cosine(*pair) for pair in zip(SOLIDS, points, strict=True)]))
+    found = jit_unoptimized(jax.vmap(lambda points: [cosine(*pair) for pair in zip(SOLIDS, points, strict=True)]))
     np.testing.assert_allclose(found(RNG.uniform(-1, 1, (100, 4, 3)) * reach), 1, rtol=1e-9)
 
 
@@ -126,12 +126,12 @@ def test_normals_have_unit_length_and_finite_gradients_also_at_centers_and_on_fa
     places = np.array([(0, 0, 2), (1, 0, 2), (1, 2, 2), (1, 2, 2.5), (0.5, 0, 2), (0, 0, 3), (0.5, 0, 3), (0, 0, 3.5)])
     scenes = [Scene.of(solid, ground=False) for solid in SOLIDS]
 
-    @jax.jit
+    @jit_unoptimized
     @jax.vmap
     def normals(point):
         return [scene.nearest(point).normal for scene in scenes]
 
-    @jax.jit
+    @jit_unoptimized
     @partial(jax.vmap, in_axes=(None, 0))
     @partial(jax.grad, argnums=(0, 1))
     def slopes(scenes, point):
@@ -224,7 +224,7 @@ def test_gradients_are_central_differences(name, kind):
     else:
         of_scene, arguments = total_ray, (POINTS[:50], DIRECTIONS[:50])
         assert np.isfinite(rays(at(), POINTS, DIRECTIONS))[:50].sum() > 3
-    slope, *others = jax.jit(jax.grad(of_scene, argnums=tuple(range(1 + len(arguments)))))(at(), *arguments)
+    slope, *others = jit_unoptimized(jax.grad(of_scene, argnums=tuple(range(1 + len(arguments)))))(at(), *arguments)
     for field in set(vars(solids)) - {"color", "active"}:
         numbers = central_differences(lambda x, f=field: of_scene(at(**{f: x}), *arguments), getattr(solids, field))
         np.testing.assert_allclose(getattr(getattr(slope, kind), field), numbers, rtol=1e-5, atol=1e-6, err_msg=field)
@@ -243,9 +243,9 @@ def test_gradients_are_finite_everywhere():
     places = jnp.array(
         [(0, 0, 2), (0, 0, 3), (0.5, 0, 3), (1, 2, 2.5), (1, 0, 2), (0, 0, 0), (5, 5, 5), (1, -9, 2)], float
     )
-    assert_finite(jax.jit(jax.vmap(jax.grad(Scene.distance, argnums=(0, 1)), (None, 0)))(scene, places))
+    assert_finite(jit_unoptimized(jax.vmap(jax.grad(Scene.distance, argnums=(0, 1)), (None, 0)))(scene, places))
     directions = jnp.array([UP, DOWN, (1, 0, 0), (0, -1, 0), (0.6, 0.8, 0)], float)
-    of_rays = jax.jit(jax.vmap(jax.vmap(jax.grad(ray, argnums=(0, 1, 2)), (None, None, 0)), (None, 0, None)))
+    of_rays = jit_unoptimized(jax.vmap(jax.vmap(jax.grad(ray, argnums=(0, 1, 2)), (None, None, 0)), (None, 0, None)))
     assert_finite(of_rays(scene, places, directions))
     missing = of_rays(scene, places + 9.0, jnp.abs(directions.at[1].set(0.6)))
     assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(missing))

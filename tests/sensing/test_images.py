@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import marching
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 import jaxdrones
 from jaxdrones import Camera, Scene, State, render, rotation
@@ -151,8 +152,8 @@ def test_the_gradient_of_depth_is_that_of_the_visible_surface():
     inside = np.stack([interior(image) for image in labels])
     direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), (moving, scene))
     weights = jnp.asarray(rng.normal(size=labels.shape))
-    tangent_of = jax.jit(lambda direction: jax.jvp(depth, (moving, scene), direction)[1])
-    gradient = jax.jit(jax.grad(lambda *x: jnp.sum(weights * depth(*x)), (0, 1)))(moving, scene)
+    tangent_of = jit_unoptimized(lambda direction: jax.jvp(depth, (moving, scene), direction)[1])
+    gradient = jit_unoptimized(jax.grad(lambda *x: jnp.sum(weights * depth(*x)), (0, 1)))(moving, scene)
     for part in range(2):  # the drones, then the obstacles
         along = tuple(x if i == part else jax.tree.map(jnp.zeros_like, x) for i, x in enumerate(direction))
         tangent = tangent_of(along)
@@ -177,7 +178,7 @@ def test_gradients_are_finite_along_faces_and_axes_in_single_precision():
     params, state, scene = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (params, state, scene))
     camera = Camera(resolution=(17, 13))  # the middle pixel looks along an axis of the box
 
-    @jax.jit
+    @jit_unoptimized
     @functools.partial(jax.value_and_grad, argnums=(0, 1))
     def nearness(state, scene):
         return jnp.sum(1 / render(scene, params, state, camera).depth)
@@ -224,7 +225,7 @@ def ball_from_a_tilted_camera():
     view = view_of(camera, *jax.tree.map(lambda x: x[0], team(([0, 0, 1.0], [0.2, -0.1, 0.3]))))
     solids, active = Scene.of(BALL).shapes(float), [jnp.ones(1, bool)]
 
-    @jax.jit
+    @jit_unoptimized
     def look(eye, axes):
         def and_itself(eye, axes):
             found = depth(view.replace(eye=eye, axes=axes), solids, active)

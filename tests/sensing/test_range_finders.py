@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_finite
+from helpers import assert_finite, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.sensing import (
@@ -130,7 +130,7 @@ def test_noise_has_its_deviation_and_dropouts_read_the_limit():
 
 @pytest.mark.slow
 def test_the_gradient_of_a_range_is_that_of_the_way_to_the_wall():
-    @jax.jit
+    @jit_unoptimized
     @jax.grad
     def slope(state):
         return jnp.sum(reading(time_of_flight(), state, WALL)) + jnp.sum(reading(optical_flow(), state, WALL))
@@ -157,7 +157,7 @@ def test_a_measurement_is_due_in_the_first_step_that_is_late_enough(rate, expect
 @pytest.mark.slow
 def test_in_an_environment_a_sensor_measures_at_its_rate():
     env = jd.make("hover", sensors=(downward_range(rate=25.0),), observation=("downward_range",), speed=1.0)
-    step = jax.jit(env.step)
+    step = jit_unoptimized(env.step)
     key = jax.random.key(0)
     obs, world = env.reset(key)
     seen = [float(obs[0, 0])]

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import Keys
+from helpers import Keys, jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones.sensing import (
@@ -80,7 +80,7 @@ def test_equal_keys_give_equal_readings_and_a_further_sensor_changes_none():
 def test_memories_are_carried_through_a_scan():
     sensors = (altimeter(), odometer())
 
-    @jax.jit
+    @jit_unoptimized
     def run(key):
         start = init_sensors(sensors, key, PARAMS)
         return jax.lax.scan(lambda memories, key: measure(sensors, key, memories), start, jax.random.split(key, 5))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones import rotation
 from jaxdrones.sensing import Box, Capsule, Cylinder, Scene, Sphere
@@ -48,7 +49,7 @@ def test_a_disc_meets_what_is_on_its_way_and_nothing_else(solid):
     kinds = scene.shapes(jnp.float64)
     start, end, axis = random_ways(100)
 
-    @jax.jit
+    @jit_unoptimized
     @jax.vmap
     def found(start, end, axis):
         discs = (Disc(center, axis, jnp.asarray(RING), jnp.asarray(ROUNDING)) for center in (start, end))

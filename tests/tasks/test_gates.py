@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones.envs import make
 from jaxdrones.sensing import Scene, track
@@ -16,7 +17,7 @@ RADIUS = float(ENV.params.collision_radius[0])
 THROUGH, LEFT = np.array([0.1, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
 
-advance = jax.jit(lambda world: ENV.task.advance(ENV.task, world))
+advance = jit_unoptimized(lambda world: ENV.task.advance(ENV.task, world))
 start_of_race = functools.cache(lambda: ENV.reset(jax.random.key(0))[1])
 
 
@@ -79,7 +80,7 @@ def test_progress_is_the_distance_gained_on_the_next_gate():
 @pytest.mark.slow
 def test_who_starts_anywhere_starts_at_the_start_one_time_in_five_and_else_before_a_gate():
     env = make("gates", random_start=True, level=2)
-    worlds = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2000))[1]
+    worlds = jit_unoptimized(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 2000))[1]
     z, index = worlds.drones.pos[:, 0, 2], worlds.variables["index"][:, 0]
     grounded = z < 0.1
     assert abs(jnp.mean(grounded) - 0.2) < 0.04  # 4 standard deviations
@@ -97,7 +98,7 @@ def test_poles_are_seen_from_the_drone_as_far_as_sight_goes():
 def test_levels_move_gates_and_poles_within_their_ranges_and_keep_random_gates_apart():
     def drawn(level):
         env = make("gates", level=level)
-        return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 200))[1].variables
+        return jit_unoptimized(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 200))[1].variables
 
     for level in (0, 1):
         np.testing.assert_allclose(drawn(level)["gates"], np.broadcast_to(GATES, (200, 4, 4)), atol=1e-12)

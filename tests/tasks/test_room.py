@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 
 from jaxdrones.envs import make
 
 ENV = make("room", drones=3)
 TASK = ENV.task
-first_world = functools.cache(lambda: jax.jit(ENV.reset)(jax.random.key(0))[1])
-advance = jax.jit(lambda world: TASK.advance(TASK, world))
+first_world = functools.cache(lambda: jit_unoptimized(ENV.reset)(jax.random.key(0))[1])
+advance = jit_unoptimized(lambda world: TASK.advance(TASK, world))
 
 
 def moved_to(*pos):
@@ -20,7 +21,7 @@ def moved_to(*pos):
     return advance(world.replace(drones=world.drones.replace(pos=jnp.asarray(pos))))
 
 
-@jax.jit
+@jit_unoptimized
 @jax.vmap
 def starts(key):
     """Places on the ring, goals, and the smallest distance (m) of both from the obstacles of a room."""
@@ -55,7 +56,7 @@ def test_the_nearest_surface_is_a_vector_to_the_wall():
     world = first_world()
     beside = jnp.array([2.9, -2.0, 1.5])
     world = world.replace(drones=world.drones.replace(pos=world.drones.pos.at[0].set(beside)))
-    term = jax.jit(lambda world: TASK.observations["nearest_surface"].observe(TASK, world))(world)
+    term = jit_unoptimized(lambda world: TASK.observations["nearest_surface"].observe(TASK, world))(world)
     np.testing.assert_allclose(term[0], [0.1, 0, 0], atol=1e-6)
 
 

@@ -8,7 +8,7 @@ from jaxdrones.flights.fly import fly
 from jaxdrones.visualization import style
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def record():
     return fly("circle", drones=2, duration=0.5)
 

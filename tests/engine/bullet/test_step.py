@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_close, assert_finite, assert_same_motion, flying, tape
+from helpers import assert_close, assert_finite, assert_same_motion, flying, mostly_slow, tape
 
 import jaxdrones
 from jaxdrones import State
@@ -14,6 +14,8 @@ from jaxdrones.engine import bullet
 from jaxdrones.sensing import Box, Scene
 
 pytestmark = pytest.mark.needs("pybullet")
+
+ROTORS = [jaxdrones.instant_rotors, jaxdrones.lagging_rotors]
 
 EVERYTHING = dict(effects=(jaxdrones.drag, jaxdrones.ground_effect), pairs=(jaxdrones.downwash,))
 LEVEL = [0.0, 0.0, 0.0, 1.0]
@@ -36,7 +38,7 @@ def apart(state: State) -> State:
     return state.replace(pos=state.pos + jnp.stack([2.0 * jnp.arange(n), jnp.zeros(n), 3.0 + jnp.arange(n)], axis=-1))
 
 
-@pytest.mark.parametrize("rotors", [jaxdrones.instant_rotors, jaxdrones.lagging_rotors])
+@pytest.mark.parametrize("rotors", mostly_slow(ROTORS, [jaxdrones.lagging_rotors]))
 def test_free_flight_equals_the_explicit_backend(team, rotors):
     """Also what the inertia of the rotors does."""
     team = team.replace(rotor_inertia=2e-3 * team.inertia[:, 2])
@@ -49,7 +51,7 @@ def test_free_flight_equals_the_explicit_backend(team, rotors):
     assert_same_motion(theirs, ours, 1e-9)  # both integrate the same equations in float64 (measured: 1e-14)
 
 
-@pytest.mark.parametrize("rotors", [jaxdrones.instant_rotors, jaxdrones.lagging_rotors])
+@pytest.mark.parametrize("rotors", mostly_slow(ROTORS, [jaxdrones.lagging_rotors]))
 def test_motors_are_limited_as_on_the_explicit_backend(team, rotors):
     """Commands of twice the highest speed and of -1,000 RPM, and a start out of range, fly as the nearest limits."""
     top = np.broadcast_to(np.asarray(team.max_rpm)[:, None], (4, 4))

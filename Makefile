@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fly train rllib sb3 test test-slow test-libraries test-rllib lint docs notebooks viewer
+.PHONY: fly train rllib sb3 tables test test-slow test-libraries test-rllib lint docs notebooks viewer
 
 fly: .venv/installed  ## four Crazyflies on the paper's circle
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
@@ -20,6 +20,9 @@ rllib: .venv-rllib/installed  ## the paper's leader and follower by RLlib, three
 sb3: .venv-libraries/installed  ## the paper's one-dimensional hover by Stable-Baselines3, and a flight of the policy
 	.venv-libraries/bin/python examples/sb3_hover.py --output runs/hover-2021-sb3
 	.venv-libraries/bin/jaxdrones fly --policy runs/hover-2021-sb3
+
+tables: .venv/installed  ## the measured tables of the pages, again; on idle cores
+	$(BIN)/python -m benchmarks.tables
 
 test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"

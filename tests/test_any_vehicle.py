@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_finite, jit_unoptimized
+from helpers import assert_finite
 from lagging_flight import hover_errors
 
 import jaxdrones as jd
@@ -140,7 +140,7 @@ RAPTOR = {"thrust_to_weight": (1.5, 5.0), "rise_time": (0.03, 0.10), "fall_time"
 
 CF2X = jd.load_params("cf2x")
 KEYS = jax.random.split(jax.random.key(20), 1000)
-draw_many = jit_unoptimized(jax.vmap(lambda key: vehicles.draw(key, CF2X)))
+draw_many = jax.jit(jax.vmap(lambda key: vehicles.draw(key, CF2X)))
 
 
 @pytest.fixture(scope="module")
@@ -297,10 +297,10 @@ def test_drawn_vehicles_have_the_precision_of_the_parameters():
 @pytest.mark.slow
 def test_an_action_of_zero_hovers_whatever_vehicle_is_drawn():
     env = jd.make("hover", randomize=(AnyVehicle(),), tilt=0.0, speed=0.0, omega=0.0)
-    _, world = jit_unoptimized(jax.vmap(env.reset))(KEYS[:20])
+    _, world = jax.jit(jax.vmap(env.reset))(KEYS[:20])
     assert np.ptp(np.asarray(world.params.mass)) > 1
     zero = jnp.zeros((20, 1, 4))
-    flown = jit_unoptimized(jax.vmap(env.step))(KEYS[:20], world, zero)[1]
+    flown = jax.jit(jax.vmap(env.step))(KEYS[:20], world, zero)[1]
     np.testing.assert_allclose(flown.drones.vel, world.drones.vel, atol=1e-12)
 
 

@@ -132,7 +132,7 @@ def test_an_eye_inside_a_solid_sees_that_solid_as_near_as_it_can():
 
 
 def test_what_is_no_camera_is_refused():
-    with bullet.make_step() as step, pytest.raises(ValueError, match=r"camera is 3; give for example jaxdrones\.Camera"):
+    with bullet.make_step() as step, pytest.raises(ValueError, match=r"camera is 3; give .*jaxdrones\.Camera"):
         step.camera(CRAZYFLIE, at([0, 0, 1.0]), 3)
 
 

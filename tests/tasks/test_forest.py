@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit_unoptimized
 
 from jaxdrones.envs import make
 from jaxdrones.sensing import Cylinder, Scene, collisions
@@ -22,7 +21,7 @@ def moved_to(pos):
     return advance(world.replace(drones=world.drones.replace(pos=jnp.asarray([pos]))))
 
 
-@jit_unoptimized
+@jax.jit
 @jax.vmap
 def starts(key):
     """Gaps (m) of start and goal from the obstacles of a forest."""
@@ -58,9 +57,9 @@ def test_what_is_touched_is_what_collisions_tell_in_one_world_and_in_many():
         found = collisions(world.params, world.drones, world.scene)
         return found.ground | found.scene
 
-    expected = jit_unoptimized(jax.vmap(by_geometry))(worlds)
+    expected = jax.jit(jax.vmap(by_geometry))(worlds)
     assert 3 < jnp.sum(expected) < 100
-    np.testing.assert_array_equal(jit_unoptimized(jax.vmap(lambda world: advance(world)["touched"]))(worlds), expected)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(lambda world: advance(world)["touched"]))(worlds), expected)
 
 
 @pytest.mark.slow
@@ -82,11 +81,11 @@ def test_the_clearance_term_grows_with_the_closing_speed_and_is_free_far_away():
         drones = world.drones.replace(pos=jnp.array([[x, 0, 1.5]]), vel=jnp.array([[speed, 0, 0]]))
         return clearance(TASK, world.replace(drones=drones, scene=scene))[0]
 
-    costs = jit_unoptimized(jax.vmap(cost))
+    costs = jax.jit(jax.vmap(cost))
     near = costs(jnp.full(3, 9.4), jnp.array([-3.0, 0.0, 3.0]))
     assert near[0] == near[1] < near[2]
     assert costs(jnp.array([5.0]), jnp.array([3.0]))[0] < 1e-6  # the ground is 1.5 m below
-    assert jit_unoptimized(jax.grad(cost))(9.4, 3.0) > 0
+    assert jax.jit(jax.grad(cost))(9.4, 3.0) > 0
 
 
 @pytest.mark.slow

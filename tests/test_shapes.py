@@ -6,7 +6,6 @@ import pytest
 
 import jaxdrones as jd
 from jaxdrones import rotation
-from jaxdrones.control import allocation
 
 
 def test_a_function_that_takes_another_shape_than_it_says_is_found():
@@ -15,5 +14,6 @@ def test_a_function_that_takes_another_shape_than_it_says_is_found():
 
 
 def test_an_error_of_the_function_itself_comes_first():
+    state = jd.State.at_rest(jnp.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"use jax\.vmap for a team"):
-        allocation.rpm_from_wrench(jd.load_params("cf2x"), jnp.ones(2), jnp.ones((2, 3)))
+        geometric.control(geometric.gains(), jd.load_params("cf2x"), None, state, Setpoint.at(jnp.zeros(3)), dt=0.01)

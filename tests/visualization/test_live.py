@@ -1,6 +1,7 @@
 """What a viewer hears of a running flight is what is flown; viewers come, go and stay away."""
 
 import dataclasses
+import signal
 import socket
 import threading
 import time
@@ -246,6 +247,15 @@ class Dropped:
         raise KeyboardInterrupt
 
 
+@pytest.fixture
+def interruptible():
+    """Ctrl-C raises, also in a process that was started in the background, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_a_wait_for_a_viewer_also_where_python_drops_it(record, tmp_path, monkeypatch, capsys):
     start = time.monotonic()
     with pytest.raises(KeyboardInterrupt), lasting_interrupts(), Live(say=lambda line: Dropped() and None) as live:

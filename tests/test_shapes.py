@@ -1,11 +1,13 @@
 """The shapes in annotations are checked while the tests run."""
 
+import jax
 import jax.numpy as jnp
 import jaxtyping
 import pytest
 
 import jaxdrones as jd
 from jaxdrones import rotation
+from jaxdrones.control import pid, velocity
 
 
 def test_a_function_that_takes_another_shape_than_it_says_is_found():
@@ -14,6 +16,6 @@ def test_a_function_that_takes_another_shape_than_it_says_is_found():
 
 
 def test_an_error_of_the_function_itself_comes_first():
-    state = jd.State.at_rest(jnp.zeros((2, 3)))
+    state = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.zeros((1, 3))))
     with pytest.raises(ValueError, match=r"use jax\.vmap for a team"):
-        geometric.control(geometric.gains(), jd.load_params("cf2x"), None, state, Setpoint.at(jnp.zeros(3)), dt=0.01)
+        velocity.control(pid.gains(), jd.load_params("cf2x"), pid.init(), state, jnp.zeros((2, 4)), dt=0.01)

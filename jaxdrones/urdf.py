@@ -163,7 +163,7 @@ def _check_flies(file: str, v: dict[str, np.ndarray], thrust2weight: float) -> N
         demand(
             _ANGULAR_ACCELERATION[0] <= acceleration <= _ANGULAR_ACCELERATION[1],
             f"its rotors accelerate it in {axis} by up to {acceleration:.3g} rad/s^2",
-            f"expected {_ANGULAR_ACCELERATION[0]:g} to {_ANGULAR_ACCELERATION[1]:g}; look at inertia, kf, km and mass",
+            f"expected {_ANGULAR_ACCELERATION[0]:g} to {_ANGULAR_ACCELERATION[1]:g}; check inertia, kf, km and mass",
         )
     tumbling = weight * np.hypot(np.mean(y) / inertia[0], np.mean(x) / inertia[1])
     demand(
@@ -211,7 +211,7 @@ class _Urdf:
         self._check_zero(origin, "xyz", slice(3), "put the origin of base_link at the centre of mass")
         self._check_zero(origin, "rpy", slice(3), "turn the body axes into principal axes")
         self._check_zero(collision, "xyz", slice(2), "centre the cylinder on body z")
-        self._check_zero(collision, "rpy", slice(2), "the cylinder stands along body z; give no roll and pitch")
+        self._check_zero(collision, "rpy", slice(2), "the cylinder must be along body z; give no roll and pitch")
         for product in ("ixy", "ixz", "iyz"):
             path = f"{_BASE}/inertial/inertia"
             if self.number(path, product, "product of inertia, kg m^2", default="0") != 0:

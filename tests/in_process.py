@@ -42,7 +42,7 @@ class InProcess:
 
     def call(self, name, timeout):
         if name not in self.wire.services:
-            raise TimeoutError(f"nobody offers the service {name!r}")
+            raise TimeoutError(f"no server of the service {name!r}")
         return self.wire.services[name]()
 
     def connect(self, topic, timeout):

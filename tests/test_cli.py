@@ -111,7 +111,7 @@ def test_no_flight_computes_what_is_not_a_number(tmp_path):
         (["fly", "circle", "--effects", "drag,drag_world_axes"], "'drag_world_axes' is given beside 'drag'"),
         (["fly", "circle", "--effects", "downwash_2021,downwash"], "'downwash' is given beside 'downwash_2021'"),
         (["fly", "circle", "--effects", "drag,"], "unknown effect ''"),
-        (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is asked for with 'racer'"),
+        (["fly", "circle", "--pwm", "--vehicle", "racer"], "PWM is requested for 'racer'"),
         pytest.param(
             ["fly", "circle", "--video", "folder.mp4"],
             "--video folder.mp4 cannot be written: Is a directory",
@@ -139,7 +139,7 @@ def test_no_flight_computes_what_is_not_a_number(tmp_path):
         (["fly", "circle", "--vehicle", "missing.urdf"], "missing.urdf: cannot be read"),
         (["fly", "circle", "--backend", "gazebo"], "unknown backend 'gazebo'"),
         (["fly", "circle", "--backend", "bullet", "--integrator", "rk4"], "bullet backend integrates by itself"),
-        (["fly", "circle", "--obstacles"], "take the bullet backend"),
+        (["fly", "circle", "--obstacles"], "use the bullet backend"),
         (["fly", "circle", "--gui"], "only the bullet backend has one"),
         (["fly", "circle", "--video", "film.avi"], "films end in .mp4 or .gif"),
         (["compare", "circle", "--backends", "explicit"], "give two"),

@@ -53,7 +53,7 @@ def test_a_run_on_any_vehicle_says_so_and_is_evaluated_and_flown_on_any_vehicle(
     assert printed.startswith("hover by bptt, realistic, any vehicle, duration 0.2: policy of update ")
     flown = json.loads(said(capsys, "fly", "--policy", str(folder), "--no-figure", "--json"))
     assert flown["realistic"] == "any" and flown["vehicle"] == "any vehicle"
-    assert "PWM is asked for with 'any vehicle'" in refused(capsys, "fly", "--policy", str(folder), "--pwm")
+    assert "PWM is requested for 'any vehicle'" in refused(capsys, "fly", "--policy", str(folder), "--pwm")
 
     again = ["train", "hover", *output, "--resume"]
     assert "was started with realistic any, not True; leave realistic out" in refused(capsys, *again, "--realistic")

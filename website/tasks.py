@@ -9,7 +9,7 @@ from jaxdrones.envs import TASKS
 from jaxdrones.envs.explanation import Entry, Part, number
 from jaxdrones.training.presets import default_algorithm, settings_known
 
-_NUMBERS = "Where -1, 0 and 1 stand for something else than the number in its unit, the last columns say for what."
+_NUMBERS = "Entries are in their unit, unless the last columns have the values at -1, 0 and 1."
 _ONE_DRONE = "Of each drone, in each control step."
 
 
@@ -22,24 +22,24 @@ def pages(root: Path) -> dict[str, str]:
 
 def _page(name: str, pictured: bool, results: str) -> str:
     with jd.make(name) as env:
-        told = jd.explain(env)
-    team = [(key, text) for key, text in told.task.items() if key not in ("name", "summary") and text]
-    observation, action = (_count(x) for x in (told.observation, told.action))
+        table = jd.explain(env)
+    team = [(key, text) for key, text in table.task.items() if key not in ("name", "summary") and text]
+    observation, action = (_count(x) for x in (table.observation, table.action))
     sections = [
         f"# {name}",
-        told.task["summary"].capitalize() + ".",
+        table.task["summary"].capitalize() + ".",
         *([f"![The start of an episode](../images/tasks/{name}.png)"] if pictured else []),
         _table(["", ""], team),
         f"```sh\njaxdrones explain {name}\n{_training(name)}\n```",
         f"## What was measured\n\n{_measured(name, results)}",
-        f"## Observation: {observation}\n\n{_ONE_DRONE} {_NUMBERS}\n\n{_entries(told.observation)}",
-        *([f"## Images\n\n{_table(['image', ''], told.images.items())}"] if told.images else []),
-        f"## Action: {action}\n\n{_ONE_DRONE}\n\n{_entries(told.action)}",
-        f"## Reward\n\nThe sum of weight times term. {_ONE_DRONE}\n\n{_parts(told.rewards)}",
-        "## Ends\n\nTerminations end an episode for good where one holds for one drone; truncations cut an episode "
-        f"that could go on.\n\n{_parts(told.terminations, 'termination')}\n\n{_parts(told.truncations, 'truncation')}",
-        f"## Metrics\n\nThey are not rewarded.\n\n{_parts(told.metrics, 'metric')}",
-        f"## Physics\n\n{_table(['', ''], told.physics.items())}",
+        f"## Observation: {observation}\n\n{_ONE_DRONE} {_NUMBERS}\n\n{_entries(table.observation)}",
+        *([f"## Images\n\n{_table(['image', ''], table.images.items())}"] if table.images else []),
+        f"## Action: {action}\n\n{_ONE_DRONE}\n\n{_entries(table.action)}",
+        f"## Reward\n\nThe sum of weight times term. {_ONE_DRONE}\n\n{_parts(table.rewards)}",
+        "## Ends\n\nAn episode terminates if one condition holds for one drone; truncations cut an episode short."
+        f"\n\n{_parts(table.terminations, 'termination')}\n\n{_parts(table.truncations, 'truncation')}",
+        f"## Metrics\n\nReported, without reward.\n\n{_parts(table.metrics, 'metric')}",
+        f"## Physics\n\n{_table(['', ''], table.physics.items())}",
     ]
     return "\n\n".join(sections) + "\n"
 

@@ -44,7 +44,7 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
     try:
         import shtab
     except ImportError:
-        raise UserError(f"shtab is not installed, which writes the script; {install('cli')}") from None
+        raise UserError(f"shtab is not installed; {install('cli')}") from None
     names = known_names()
     for action in _actions(root):
         if action.dest == "shell":

@@ -14,7 +14,7 @@ proportional to a mass, so one set of coefficients serves every vehicle.
 
 A velocity that is damped at a rate above 1/dt overshoots in explicit integration, and at a rate above 2/dt it gains
 energy. For every vehicle, heave, tilt and slip are each damped at no more than 408 1/s, 1.7 over `LARGEST_STEP`;
-`make_step` refuses longer steps. Coupled, the highest rate of a level drone is 275 1/s where it rests (hb: 334), and
+`make_step` rejects longer steps. Coupled, the highest rate of a level drone is 275 1/s where it rests (hb: 334), and
 490 1/s at a depth of 2 cm (hb: 610, above 2/dt). That rate is friction's at rest, which falls as soon as the drone
 slips, so that the overshoot is a slip of the order of 1 cm/s. The price of such soft contact is depth: a drone that
 lands on the ground at 1 m/s sinks in 8 mm, at 5 m/s 3 cm.

@@ -178,7 +178,7 @@ class ExplicitStep(Step):
             return derivative(params, physics.at_speed(params, state, command), command, scene)
 
         self._step, self._rate = jax.jit(step, inline=True), jax.jit(rate, inline=True)
-        self._params: Params | None = None  # what was looked at last, and the attitude that was flown to
+        self._params: Params | None = None  # inputs that were validated last, and the resulting attitude
         self._quat: jax.Array | None = None
 
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
@@ -210,7 +210,7 @@ class ExplicitStep(Step):
             raise UserError(f"scene is {scene!r}; give a jaxdrones.sensing.Scene")
         if scene.has_obstacles and not self.physics.takes_scene:
             raise UserError(
-                "the scene has obstacles and no effect takes it, so drones would fly through them; give "
+                "the scene has obstacles, but no effect uses it, so drones would fly through them; give "
                 "jaxdrones.obstacle_contact or another effect (params, state, scene) -> Wrench, leave the obstacles "
-                "out, or take the bullet backend"
+                "out, or use the bullet backend"
             )

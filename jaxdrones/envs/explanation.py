@@ -23,8 +23,8 @@ from jaxdrones.tasks.task import ObservationTerm
 _STANDARD_METRICS = {"error": "Distance from the target, m.", "speed": "Speed, m/s."}
 _UNKNOWN = "?"  # the unit of a number that a term does not describe
 _NUMBERS = (
-    "A number is in its unit; where -1, 0 and 1 stand for something else, the last columns say for what.\n"
-    "Numbers beyond the range are clipped."
+    "Entries are in their unit, unless the last columns have the values at -1, 0 and 1.\n"
+    "Values beyond the range are clipped."
 )
 
 
@@ -88,9 +88,9 @@ class Explanation:
             *([f"Images of each drone\n{_pairs(self.images)}"] if self.images else []),
             f"Action: {_count(self.action)} of each drone\n{_entries(self.action)}",
             f"Reward of each drone in each control step: the sum of weight times term\n{_parts(self.rewards)}",
-            f"Terminations: the episode ends for good where one holds for one drone\n{_parts(self.terminations)}",
-            f"Truncations: the episode is cut, though it could go on\n{_parts(self.truncations)}",
-            f"Metrics of each drone, which are not rewarded\n{_parts(self.metrics)}",
+            f"Terminations: the episode ends if one holds for one drone\n{_parts(self.terminations)}",
+            f"Truncations: the episode is cut short\n{_parts(self.truncations)}",
+            f"Metrics of each drone\n{_parts(self.metrics)}",
             f"Physics\n{_pairs(self.physics)}",
             f"Vehicle\n{_pairs(self.vehicle)}",
         ]

@@ -281,7 +281,5 @@ def _vision(
     if images:
         return make_vision(step, images, camera or task.camera or Camera(), dt, scene)
     if camera is not None:
-        raise UserError(
-            "camera is given, but vision asks for no image; give for example vision=('depth',), or leave it out"
-        )
+        raise UserError("camera is given without vision; give for example vision=('depth',), or leave it out")
     return None

@@ -23,8 +23,8 @@ from jaxdrones.state import State
 from jaxdrones.tasks.task import World
 
 IMAGES = ("rgb", "depth", "segmentation")
-_PIXELS = 16384  # that are computed at a time: so many stay in a cache
-_PIXELS_OF_STARTS = 2048  # the same at starts of episodes, of which there are few in a step
+_PIXELS = 16384  # computed at a time, to fit in a cache
+_PIXELS_OF_STARTS = 2048  # the same for starts of episodes, which are few in a step
 
 
 class ImageSpace(NamedTuple):

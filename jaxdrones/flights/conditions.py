@@ -101,7 +101,7 @@ class Conditions:
         if self.flight == "velocity" and self.controller != "pid":
             raise UserError(f"controller is {self.controller!r}; the velocity flight is flown by 'pid'")
         if self.flight == "velocity" and self.feedforward:
-            raise UserError("feedforward is asked for; the velocity flight commands velocities, leave it out")
+            raise UserError("feedforward is given; the velocity flight commands velocities, leave it out")
         if self.steps == 0:
             raise UserError(
                 f"duration is {self.duration} s, less than half a control period; give {self.dt:.4g} s or more"
@@ -117,7 +117,7 @@ class Conditions:
         if self.backend == "bullet" and self.integrator != "semi_implicit_euler":
             raise UserError(f"integrator is {self.integrator!r}; the bullet backend integrates by itself, leave it out")
         if self.obstacles and self.backend != "bullet":
-            raise UserError("obstacles are asked for; the explicit backend flies through them, take the bullet backend")
+            raise UserError("obstacles are given; the explicit backend ignores them, use the bullet backend")
 
     @property
     def dt(self) -> float:

@@ -145,7 +145,7 @@ def check_pwm(vehicle: str) -> None:
     """Raise `UserError` unless a vehicle has the motors of the Crazyflie, with known PWM."""
     if vehicle not in VEHICLES:
         raise UserError(
-            f"PWM is asked for with {vehicle!r}; it is known for {' and '.join(VEHICLES)} only, leave it out"
+            f"PWM is requested for {vehicle!r}; it is known for {' and '.join(VEHICLES)} only, leave it out"
         )
 
 

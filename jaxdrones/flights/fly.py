@@ -105,7 +105,7 @@ def _flown(
     )
     if conditions.backend == "explicit":
         if gui:
-            raise UserError("a window is asked for; only the bullet backend has one")
+            raise UserError("a window is requested; only the bullet backend has one")
         step = make_step(**common, integrator=INTEGRATORS[conditions.integrator])
         yield from legs(step, control, params, start, memory, conditions.steps, length)
         return

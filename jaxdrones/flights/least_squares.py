@@ -103,7 +103,7 @@ def normal_equations(
         vehicle: the vehicle at x = 0.
         names: names of the n parameters.
         x: (n,) coordinates of the parameters.
-        scale: (horizons, 4) by which residuals are divided.
+        scale: (horizons, 4) scales of the residuals.
         windows: windows of the flight.
         mask: (windows,) 1 for a window, 0 for padding.
         motors: see `predict`.

@@ -103,7 +103,7 @@ def load_tree(path: str | os.PathLike, like: Any) -> Any:
         arrays = flax.serialization.from_state_dict(zeros, _restore(path, sidecar))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(
-            f"{path} does not hold a tree of the structure asked for ({one_line(error)}); {ADVICE}"
+            f"{path} does not hold a tree of the requested structure ({one_line(error)}); {ADVICE}"
         ) from error
     _check_shapes(path, sidecar, arrays)
 

@@ -20,7 +20,7 @@ from jaxdrones.errors import UserError
 FORMAT = 4
 """Version of the format; files of other versions are rejected."""
 
-ADVICE = "take another checkpoint, or train anew"
+ADVICE = "use another checkpoint, or train again"
 
 
 def save_bytes(file: Path, content: bytes, **about: Any) -> None:
@@ -85,7 +85,7 @@ def read_sidecar(path: str | os.PathLike) -> dict[str, Any]:
         raise UserError(f"{file} is damaged: {one_line(error)}; {ADVICE}") from None
     if sidecar.get("format") != FORMAT:
         raise UserError(
-            f"{file} has format {repr(sidecar.get('format'))[:20]}, this version reads {FORMAT}; train anew"
+            f"{file} has format {repr(sidecar.get('format'))[:20]}, this version reads {FORMAT}; train again"
         )
     if expected != found:
         raise UserError(f"{file} is damaged, or was edited after it was saved: its checksum differs; {ADVICE}")

@@ -26,7 +26,7 @@ MAX_CALL = 64
 PATIENCE = 10
 """Number of consecutive updates with gradients that are not finite at which a training counts as diverged."""
 
-_RATE_FACTOR = 1.2  # by which the learning rate is raised or lowered
+_RATE_FACTOR = 1.2  # factor of an adaptation of the learning rate
 
 
 class Diverged(RuntimeError):

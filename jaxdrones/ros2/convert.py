@@ -129,7 +129,7 @@ def to_state(odometry: Sequence[msg.Odometry], rotors: Sequence[msg.Float64Multi
     """State of a team from the messages of its drones; the inverse of `state_messages`."""
     quat = np.array([numbers(m.pose.pose.orientation) for m in odometry])
     vel = np.array([numbers(m.twist.twist.linear) for m in odometry])
-    arrays: dict[str, Any] = {  # of NumPy: float64, as messages are, whatever the precision of JAX
+    arrays: dict[str, Any] = {  # NumPy's float64, as in messages, independent of JAX
         "pos": np.array([numbers(m.pose.pose.position) for m in odometry]),
         "quat": quat,
         "vel": to_world(quat, vel),

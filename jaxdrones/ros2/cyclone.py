@@ -71,7 +71,7 @@ class CycloneTransport:
         try:
             self._participant = DomainParticipant(number)
         except DDSException as error:
-            raise UserError(f"domain {number} of ROS 2 cannot be joined: {error}; look at CYCLONEDDS_URI") from error
+            raise UserError(f"domain {number} of ROS 2 cannot be joined: {error}; check CYCLONEDDS_URI") from error
         self._wake = WaitSet(self._participant)
         self._readers: list[tuple[DataReader, type, Callable[[Any], None]]] = []
         self._services: list[tuple[DataReader, DataWriter, Answer]] = []
@@ -132,7 +132,7 @@ class CycloneTransport:
                 there = time.monotonic() < end
                 self.spin(0.01)
             if not there:
-                raise TimeoutError(f"nobody offers the service {name!r} within {timeout:g} s; is the node there?")
+                raise TimeoutError(f"no server of the service {name!r} within {timeout:g} s; is the node there?")
             self._clients[name] = writer, replies
         writer, replies = self._clients[name]
         self._seq += 1

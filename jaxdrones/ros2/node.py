@@ -135,7 +135,7 @@ class Node:
             command = convert.to_command(name, message)
         except convert.Refused as error:
             self.flown.refused += 1
-            self._object(f"a message on /{topic.name} is refused: {error}", (topic.name, error.kind))
+            self._object(f"a message on /{topic.name} is rejected: {error}", (topic.name, error.kind))
             return
         self.flown.received += 1
         self._flight.commands[i] = command
@@ -156,7 +156,7 @@ class Node:
         if self._stepper.lose(self._clock()):
             self.flown.lost += 1
             silent = f"the step service was not called for {self._stepper.limit:g} s"
-            self._give_up(silent, "the flight goes on by the clock")
+            self._give_up(silent, "the flight continues by the clock")
             self._due = self._clock()
             for i in range(self._flight.drones):
                 self._flight.commands[i] = hover(self._flight.commands[i], self._flight.state, i)
@@ -194,14 +194,14 @@ class Node:
 
     def _give_up(self, what: str, then: str) -> None:
         if self._failsafe.action == "stop":
-            raise PeerLost(f"{what}; the flight stops, as its failsafe 'stop' asks for")
+            raise PeerLost(f"{what}; the flight stops by its failsafe 'stop'")
         self._warn(f"{what}; {then}")
 
     def _object(self, text: str, kind: Hashable) -> None:
         """Warn once for each kind of problem with a peer, or stop."""
         if kind not in self._said:
             self._said.add(kind)
-            self._give_up(text, "the flight goes on without it")
+            self._give_up(text, "the flight continues without it")
 
     def _step(self) -> None:
         self._flight.advance()

@@ -48,7 +48,7 @@ class Peer:
         if topic.name not in self._publishers:
             publish = self._transport.publisher(topic)
             if not self._transport.connect(topic, timeout):
-                raise TimeoutError(f"nobody listens to /{topic.name} within {timeout:g} s; is the node there?")
+                raise TimeoutError(f"no subscriber of /{topic.name} within {timeout:g} s; is the node there?")
             self._publishers[topic.name] = publish
         self._publishers[topic.name](message)
 
@@ -71,7 +71,7 @@ class Peer:
             raise TimeoutError(f"commands did not arrive within {timeout:g} s; is the node still there?")
         done, text = self._transport.call(topics.STEP_SERVICE, timeout)
         if not done:
-            raise RuntimeError(f"the step was refused: {text}")
+            raise RuntimeError(f"the step was rejected: {text}")
         seconds, _, fraction = text.partition(".")
         return self.state(timeout, since=int(seconds) * 1_000_000_000 + int(fraction))
 

@@ -78,7 +78,7 @@ class RclpyTransport:
             self._clients[name] = self._node.create_client(_trigger(), f"/{name}")
         client = self._clients[name]
         if not client.wait_for_service(timeout_sec=timeout):
-            raise TimeoutError(f"nobody offers the service {name!r} within {timeout:g} s; is the node there?")
+            raise TimeoutError(f"no server of the service {name!r} within {timeout:g} s; is the node there?")
         future = client.call_async(_trigger().Request())
         self._executor.spin_until_future_complete(future, timeout_sec=timeout)
         if not future.done():

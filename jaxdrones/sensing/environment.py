@@ -19,7 +19,7 @@ _PASCAL = 1 / 12.013  # m; height at sea level over which the pressure of the IS
 
 BMP388 = Noise(density=0.03 * _PASCAL, turn_on=8 * _PASCAL)
 """Barometer of the Crazyflie 2.1, as height in m: Bosch BST-BMP388-DS001 gives a relative accuracy of +-8 Pa, taken for
-the standard deviation of the bias, and a noise of 0.03 Pa at its slowest setting, here taken for a density per
+the standard deviation of the bias, and a noise of 0.03 Pa at its slowest setting, used here as a density per
 sqrt(Hz)."""
 LIS3MDL = Noise(density=0.08, turn_on=3.0, limit=1200.0)
 """Magnetometer at 12 gauss, in uT: STMicroelectronics DocID024204 gives a noise of 3.2 (x, y) and 4.1 mgauss (z) in a

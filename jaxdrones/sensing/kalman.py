@@ -133,7 +133,7 @@ def update(
     kept = jnp.eye(15, dtype=gain.dtype) - gain @ jacobian
     error = gain @ residual
     after = kept @ estimate.cov @ kept.T + gain @ cov @ gain.T
-    # The rotation by which the attitude is corrected turns the body axes in which its error is given.
+    # The correction of the attitude rotates the body axes of its error.
     reset = jnp.eye(15, dtype=gain.dtype).at[ANGLE, ANGLE].add(-_skew(error[ANGLE] / 2))
     after = reset @ after @ reset.T
     return Estimate(

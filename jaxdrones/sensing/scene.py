@@ -80,7 +80,7 @@ class Scene(PyTreeNode, kw_only=True):
         arrays: dict[str, Any] = {}
         for name, kind in KINDS.items():
             rows = [_rows(obstacle) for obstacle in obstacles if isinstance(obstacle, kind)]
-            if sum(len(row.pos) for row in rows):  # an array without entries stands for nothing
+            if sum(len(row.pos) for row in rows):  # an empty array is ignored
                 arrays[name] = _joined(rows)
         meshes = tuple(obstacle for obstacle in obstacles if isinstance(obstacle, Mesh))
         urdfs = tuple(obstacle for obstacle in obstacles if isinstance(obstacle, Urdf))
@@ -158,7 +158,7 @@ class Scene(PyTreeNode, kw_only=True):
         """
         check_scene(self)
         if not self.has_obstacles:
-            raise UserError("the scene has no obstacles that could be touched; look at scene.has_obstacles before")
+            raise UserError("the scene has no obstacles that could be touched; check scene.has_obstacles first")
         return touched_of(merged(self.shapes(points.dtype)), points, within)
 
     def contains(self, point: ArrayLike) -> Bool[Array, ""]:
@@ -212,8 +212,8 @@ def check_scene(scene: Any, files: bool = False) -> None:
         builder = "mesh.bounding_box()" if isinstance(file, Mesh) else "jaxdrones.sensing.from_urdf(path)"
         known = ", ".join(kind.__name__ for kind in KINDS.values())
         raise UserError(
-            f"the scene has a {type(file).__name__}, which only Bullet reads; give {known}, for example "
-            f"{builder} in its place, or ask the Bullet backend, for example step.contacts(params, state)"
+            f"the scene has a {type(file).__name__}, supported by Bullet only; give {known}, for example "
+            f"{builder} in its place, or use the Bullet backend, for example step.contacts(params, state)"
         )
 
 

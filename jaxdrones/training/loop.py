@@ -88,7 +88,7 @@ def _load(trainer: Trainer, run: Run) -> Any:
     """Training state of a run with checked files."""
     state = run.load_state(trainer.shapes)
     if not _is_finite(state):
-        raise UserError(f"{run.folder / 'state'} holds numbers that are not finite; train anew with --overwrite")
+        raise UserError(f"{run.folder / 'state'} holds numbers that are not finite; train again with --overwrite")
     run.policy("best", trainer.env)
     return state
 

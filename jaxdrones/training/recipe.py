@@ -97,7 +97,7 @@ class Recipe:
             settings_type = learner(entries["algorithm"]).Config
             return cls(**entries | {"config": settings_type(**config)})
         except (AttributeError, KeyError, TypeError) as error:
-            raise UserError(f"the recipe is not one of this version ({error!r}); train anew") from error
+            raise UserError(f"the recipe is not one of this version ({error!r}); train again") from error
 
 
 def split_changes(

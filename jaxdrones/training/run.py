@@ -110,7 +110,7 @@ class Run:
             if found.get("run_id") != own:
                 raise UserError(
                     f"{self.folder / name}.json and {other}.json are of two trainings; restore the files of one, or "
-                    "train anew with --overwrite"
+                    "train again with --overwrite"
                 )
 
     def recipe(self, name: str = "best") -> Recipe:
@@ -147,7 +147,7 @@ class Run:
         if sizes != expected:
             raise UserError(
                 f"{self.folder / name} was trained on another version of {env.task.name}: its observations and "
-                f"actions have {sizes} numbers, those of the environment {expected}; train anew"
+                f"actions have {sizes} numbers, those of the environment {expected}; train again"
             )
 
     @property

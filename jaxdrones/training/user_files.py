@@ -91,7 +91,7 @@ def check_unchanged(folder: Path, kept: Mapping[str, str], found: Mapping[str, s
         if kept.get(name, text) != text:
             raise UserError(
                 f"{name} has changed since {folder} was started; undo the change to --resume (best.json there has the "
-                "old text), or train anew with --overwrite or in another --output"
+                "old text), or train again with --overwrite or in another --output"
             )
 
 
@@ -103,5 +103,5 @@ def _read(file: Path, kept: Mapping[str, str] | None) -> Files:
 
 def _text(name: str, files: Mapping[str, str]) -> str:
     if name not in files:
-        raise UserError(f"the recipe lacks the text of {name}; train anew")
+        raise UserError(f"the recipe lacks the text of {name}; train again")
     return files[name]

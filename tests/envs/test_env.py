@@ -220,7 +220,7 @@ MISTAKES = [
     (dict(task="hover", control_hz=0), "control_hz is 0; give a positive number"),
     (dict(task="hover", substeps=2.5), "substeps is 2.5; give a whole number"),
     (dict(task="hover", vision=("rgb",), camera=3), r"camera is 3; give for example jaxdrones\.Camera"),
-    (dict(task="hover", camera=jd.Camera()), r"camera is given, but vision asks for no image; give .*vision="),
+    (dict(task="hover", camera=jd.Camera()), r"camera is given without vision; give .*vision="),
     (
         dict(task="hover", vision=("rgb",), camera=jd.Camera(rate=200.0)),
         r"rate of the camera is 200 images/s; give at most the control rate, 100",

@@ -126,7 +126,7 @@ def test_progress_goes_from_nothing_to_all():
         (dict(flight="velocity", controller="geometric"), "velocity flight is flown by 'pid'"),
         (
             dict(flight="velocity", feedforward=True),
-            "feedforward is asked for; the velocity flight commands velocities",
+            "feedforward is given; the velocity flight commands velocities",
         ),
         (dict(flight="circle", feedforward=1), "feedforward is 1; give True or False"),
         (dict(flight="velocity", vehicle="hb"), "no PID gains for 'hb'"),

@@ -86,7 +86,7 @@ def test_a_state_that_is_not_finite_for_a_moment_is_named():
 def test_pwm_is_of_a_crazyflie():
     record = dataclasses.replace(hovering(), conditions=Conditions("circle", vehicle="racer"))
     assert "pwm" in arrays_of(hovering(), pwm=True)
-    with pytest.raises(ValueError, match="PWM is asked for with 'racer'; it is known for cf2x and cf2p only"):
+    with pytest.raises(ValueError, match="PWM is requested for 'racer'; it is known for cf2x and cf2p only"):
         arrays_of(record, pwm=True)
 
 

@@ -42,7 +42,7 @@ def test_a_landing_is_reported_as_json(wire, capsys):
     short = ["--lockstep", "--wait", "0.01", "--height", "0.03", "--speed", "20"]
     assert main(["ros2", "--failsafe", "land", *short, "--json"]) == 0
     said = capsys.readouterr()
-    assert json.loads(said.out)["landed"] is True and "the flight goes on by the clock" in said.err
+    assert json.loads(said.out)["landed"] is True and "the flight continues by the clock" in said.err
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_without_calls_of_the_step_service_the_failsafe_acts(action):
         return
     flown = node.run(10.0 if action == "land" else 0.5)
     assert flown.landed == (action == "land") and flown.lost == 1
-    assert warnings == ["the step service was not called for 0.5 s; the flight goes on by the clock"]
+    assert warnings == ["the step service was not called for 0.5 s; the flight continues by the clock"]
 
 
 @pytest.mark.parametrize("action", ["hover", "stop"])
@@ -160,7 +160,7 @@ def test_a_wrong_type_is_said_and_the_flight_goes_on_or_stops(action):
         with pytest.raises(PeerLost, match="its type is geometry_msgs/msg/Twist; the flight stops"):
             node.run(0.1)
     else:
-        assert node.run(0.1).steps == 10 and len(warnings) == 1 and "goes on without it" in warnings[0]
+        assert node.run(0.1).steps == 10 and len(warnings) == 1 and "continues without it" in warnings[0]
 
 
 def test_refused_messages_of_a_kind_are_said_once_whatever_their_numbers():
@@ -185,7 +185,7 @@ def test_refused_messages_of_a_kind_are_said_once_whatever_their_numbers():
     ]
     flown = node.run(0.3)
     assert flown.refused == 20 * len(kinds) and flown.received == 0 and len(warnings) == len(kinds)
-    assert "a message on /drone_0/cmd_motors is refused: its data has 5 numbers; give 4 rotor speeds" in warnings[0]
+    assert "a message on /drone_0/cmd_motors is rejected: its data has 5 numbers; give 4 rotor speeds" in warnings[0]
     assert peer.state().pos[0, 2] == pytest.approx(1.0, abs=0.05)
 
 

@@ -57,7 +57,7 @@ def test_the_wrong_type_of_a_peer_is_named_once(ros):
 
 
 def test_a_service_that_is_not_there_is_an_error(ros):
-    with pytest.raises(TimeoutError, match="nobody offers the service 'step'"):
+    with pytest.raises(TimeoutError, match="no server of the service 'step'"):
         open_transport("rclpy").call("step", 0.1)
 
 

@@ -320,7 +320,7 @@ def test_what_has_no_geometry_is_refused(tmp_path):
     file.write_text("")
     scene = Scene.of(Urdf(pos=(0, 0, 0), path=file))
     for call in (lambda s: Scene.distance(s, UP), lambda s: ray(s, UP, DOWN)):
-        with pytest.raises(ValueError, match="the scene has a Urdf, which only Bullet reads; give Box, Sphere"):
+        with pytest.raises(ValueError, match="the scene has a Urdf, supported by Bullet only; give Box, Sphere"):
             call(scene)
         with pytest.raises(ValueError, match=r"scene\.spheres\.pos has shape \(2, 1, 3\); .*jax\.vmap"):
             call(jax.tree.map(lambda x: jnp.stack([x, x]), Scene.of(BALL)))

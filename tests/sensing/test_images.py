@@ -269,7 +269,7 @@ def test_what_is_turned_towards_the_sun_is_bright_by_lamberts_law_and_the_rest_i
     ("arguments", "error"),
     [
         ({"camera": "front"}, r"camera is 'front'; give for example jaxdrones.Camera"),
-        ({"scene": Scene.of(Mesh(path=__file__, pos=(0, 0, 0)))}, "the scene has a Mesh, which only Bullet reads"),
+        ({"scene": Scene.of(Mesh(path=__file__, pos=(0, 0, 0)))}, "the scene has a Mesh, supported by Bullet only"),
         ({"scene": None}, "scene is None; give a jaxdrones.sensing.Scene"),
     ],
 )

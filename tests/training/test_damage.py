@@ -204,7 +204,7 @@ def test_a_number_that_is_edited_in_the_sidecar_is_noticed(runs, tmp_path):
     edited = copy.deepcopy(about)
     edited["recipe"]["config"]["worlds"] = 255
     file.write_text(json.dumps(edited))
-    with pytest.raises(ValueError, match=r"best\.json is damaged, or was edited after it was saved.*train anew"):
+    with pytest.raises(ValueError, match=r"best\.json is damaged, or was edited after it was saved.*train again"):
         Run(tmp_path / "run").recipe()
 
 
@@ -212,7 +212,7 @@ def test_a_checkpoint_of_an_earlier_format_says_train_anew(runs, tmp_path):
     shutil.copytree(runs[0], tmp_path / "run")
     file = tmp_path / "run" / "best.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"format": 1}))
-    with pytest.raises(ValueError, match="has format 1, this version reads 4; train anew"):
+    with pytest.raises(ValueError, match="has format 1, this version reads 4; train again"):
         checkpoint.load(tmp_path / "run" / "best")
 
 
@@ -223,7 +223,7 @@ def test_numbers_that_are_not_finite_are_neither_saved_nor_loaded(policy, tmp_pa
     assert list(tmp_path.iterdir()) == []
     network = {"hidden_sizes": (4,), "output_size": 4, "output_scale": 0.01, "activation": "tanh"}
     checkpoint.save_tree(tmp_path / "policy", broken, policy={"network": network, "per_agent": False})
-    with pytest.raises(ValueError, match=r"obs_stats\.var holds numbers that are not finite; take another"):
+    with pytest.raises(ValueError, match=r"obs_stats\.var holds numbers that are not finite; use another"):
         checkpoint.load(tmp_path / "policy")
 
 

@@ -119,7 +119,7 @@ def test_without_a_viewer_the_flight_waits_for_a_while_and_goes_on(record):
     lines = []
     with Live(wait=0.1, say=lines.append) as live:
         play(live, record)
-    assert lines == ["waiting for a viewer, 0.1 s at most", "no viewer came; the flight goes on without one"]
+    assert lines == ["waiting for a viewer, 0.1 s at most", "no viewer came; the flight continues without one"]
 
 
 def test_when_the_viewer_leaves_the_flight_goes_on_without_waiting(record, monkeypatch):
@@ -133,7 +133,7 @@ def test_when_the_viewer_leaves_the_flight_goes_on_without_waiting(record, monke
         viewer.join(20)
         pilot.join(20)
         assert not pilot.is_alive() and live.viewers == 0
-    assert lines[-1] == "the viewer has left; the flight goes on without one"
+    assert lines[-1] == "the viewer has left; the flight continues without one"
 
 
 def test_a_page_that_is_loaded_again_sees_the_rest_in_real_time(record):

@@ -18,7 +18,7 @@ from jaxdrones.state import State
 
 _BODY_MASK = (1 << 24) - 1  # the bits of Bullet's segmentation that name the body; those above name the link
 # TinyRenderer does not return when a vertex lies behind the plane of the eye by less than 1e-8 m, but not by 0. A pose
-# with 1e-17 in place of 0 leads there, so poses are rounded to a micrometre and a microradian.
+# with 1e-17 in place of 0 leads there, so poses are rounded to a micrometer and a microradian.
 _DIGITS = 6
 _AWAY = [0.0, 0.0, -1e4]  # m; parking place of a drone while its own camera renders
 _AHEAD = 1000.0  # m; how far in front of the eye the camera's target is

@@ -173,7 +173,7 @@ class Client:
         else:
             # Contact manifolds are cleared at every step. Without their memory a cylinder on a plane sinks in and
             # spins up, and one that is hit on its side is hit at an edge and tumbles. Balls as high as the cylinder
-            # touch in points of their own, half-way up; the disc fills the rim between them.
+            # touch in separate points, half-way up; the disc fills the rim between them.
             ball = min(height, radius) / 2
             ring = [(radius - ball) * np.exp(2j * np.pi * k / _BALLS) for k in range(_BALLS)]
             shapes, radii = [p.GEOM_CYLINDER] + [p.GEOM_SPHERE] * _BALLS, [radius] + [ball] * _BALLS

@@ -41,7 +41,7 @@ class BulletStep(HostStep):
         client.set_scene(scene)
         self._loads = arrays.make_loads(physics, dt)
         self._at_speed = jax.jit(arrays.make_start(physics))
-        # What the last call with values was checked for and what was made of it, kept as long as it stays the same:
+        # Cache of the last concrete call, valid for identical arguments:
         self._params: Params | None = None
         self._shapes: list[tuple[int, ...]] = []
         self._layout: Layout

@@ -140,7 +140,7 @@ class Live:
                 self._say(f"waiting for a viewer, {self._wait:g} s at most")
             self._paced = self._changed.wait_for(lambda: self._viewers > 0, self._wait)
         if not self._paced:
-            self._say("no viewer came; the flight goes on without one")
+            self._say("no viewer came; the flight continues without one")
 
     def _pace(self, due: float) -> None:
         """Wait until a time, unless there is no viewer."""
@@ -150,7 +150,7 @@ class Live:
                     self._changed.wait(min(left, _ALIVE))
                 elif not self._changed.wait_for(lambda: self._viewers > 0, _RELOADING):
                     self._paced = False
-                    self._say("the viewer has left; the flight goes on without one")
+                    self._say("the viewer has left; the flight continues without one")
 
     @property
     def _news(self) -> tuple[int, int]:

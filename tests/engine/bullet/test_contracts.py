@@ -96,7 +96,7 @@ def test_an_effect_sees_the_scene_of_either_backend():
 
 def test_obstacles_that_nothing_honors_are_refused_by_the_explicit_backend():
     scene = Scene.of(Box(pos=(0.0, 0.0, 1.5), size=(0.1, 0.1, 0.1)))
-    with pytest.raises(ValueError, match=r"scene has obstacles and no effect takes it.*take the bullet backend"):
+    with pytest.raises(ValueError, match=r"scene has obstacles, but no effect uses it.*use the bullet backend"):
         jd.make_step(scene=scene)
-    with pytest.raises(ValueError, match="scene has obstacles and no effect takes it"):
+    with pytest.raises(ValueError, match="scene has obstacles, but no effect uses it"):
         jd.make_step()(TEAM, HIGH, HOVER, scene)

@@ -31,6 +31,15 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
+def largest(v: Float[Array, "4"]) -> Float[Array, ""]:
+    """The largest of four numbers.
+
+    The derivative of `jnp.max` compares each number with the maximum: NaN where a compiler rounds the two differently.
+    """
+    a, b, c, d = components(v)
+    return jnp.maximum(jnp.maximum(a, b), jnp.maximum(c, d))
+
+
 def along_z(x: Float[Array, ""]) -> Float[Array, "3"]:
     """Vector (0, 0, x)."""
     return jnp.stack([jnp.zeros_like(x), jnp.zeros_like(x), x])

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.params import Params
-from jaxdrones.vector import safe_sqrt
+from jaxdrones.vector import largest, safe_sqrt
 
 _MIN_SHARE = 0.01  # smallest significant share of a rotor in thrust or yaw; usually each rotor has 0.25
 _ACTIVE_SETS = np.array([[i >> k & 1 for k in range(4)] for i in range(16)], bool)  # rotors whose speed is not zero
@@ -58,8 +58,8 @@ def _within_authority(
     """
     turning = inverse[:, 1:3] @ target[1:3]
     exact = inverse @ target
-    spread = jnp.max(turning) - jnp.min(turning)
-    spread = jnp.minimum(spread, jnp.maximum(jnp.max(exact), 0) - jnp.minimum(jnp.min(exact), 0))
+    spread = largest(turning) + largest(-turning)
+    spread = jnp.minimum(spread, jnp.maximum(largest(exact), 0) + jnp.maximum(largest(-exact), 0))
     share = 1 / jnp.maximum(spread / jnp.maximum(limit, 1), 1)
     target = jnp.stack([target[0], share * target[1], share * target[2], target[3]])
     squares, sign = inverse @ target, jnp.sign(target[3])
@@ -76,7 +76,7 @@ def _excess(
     """Step back along a direction until no rotor accelerated by it exceeds the limit, RPM^2."""
     raises = direction > _MIN_SHARE
     beyond = jnp.maximum(squares - limit, 0) / jnp.where(raises, direction, 1)
-    return jnp.max(jnp.where(raises, beyond, 0))
+    return largest(jnp.where(raises, beyond, 0))
 
 
 def _inverses(matrix: Float[Array, "4 4"]) -> Float[Array, "16 4 4"]:

@@ -16,7 +16,7 @@ from jaxdrones.control.allocation import mixer
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.thrust_curves import THRUST_CURVES, voltage_for
-from jaxdrones.vector import safe_sqrt
+from jaxdrones.vector import largest, safe_sqrt
 
 FULL = 65535.0
 """The largest command, and the duty cycle of a motor that is always on."""
@@ -92,7 +92,7 @@ def mix(
 
 def within_range(commands: Float[Array, "4"]) -> Float[Array, "4"]:
     """Commands limited to 0 .. 65535; if one is too high, all are lowered, so thrust is reduced before torque."""
-    return jnp.maximum(commands - jnp.maximum(jnp.max(commands) - FULL, 0), 0)
+    return jnp.maximum(commands - jnp.maximum(largest(commands) - FULL, 0), 0)
 
 
 def duty_cycles(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import hovering, make_step, one, team_of
-from helpers import VEHICLES, assert_finite
+from helpers import VEHICLES, assert_finite, jit_unoptimized
 
 import jaxdrones
 from jaxdrones import State, rotation
@@ -193,3 +193,16 @@ def test_other_set_points_and_propellers_are_refused():
         firmware_pid.pwm(firmware_pid.gains(), firmware_pid.init(), LEVEL, np.zeros(3))
     with pytest.raises(ValueError, match=r"unknown propellers '2.2'.*known: 2.1, 2.1\+"):
         firmware_pid.gains(propellers="2.2")
+
+
+def test_gradients_of_limited_commands_are_finite_however_a_compiler_rounds():
+    """The largest command is chosen without comparing a command with a second rounding of it."""
+    rng = np.random.default_rng(5)
+    params, gains = jaxdrones.load_params("cf2x"), firmware_pid.gains()
+    thrust, torque = jnp.array(rng.uniform(3e4, 6.5e4, 500)), jnp.array(rng.uniform(-3e4, 3e4, (500, 3)))
+
+    def total(thrust, torque):
+        return jnp.sum(firmware_motors.rotor_speeds(gains.motor, params, 1.1 * thrust + 3.3, 0.7 * torque))
+
+    for compiled in jax.jit, jit_unoptimized:
+        assert_finite(compiled(jax.vmap(jax.grad(total, (0, 1))))(thrust, torque))

@@ -34,7 +34,7 @@ def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
 def largest(v: Float[Array, "4"]) -> Float[Array, ""]:
     """The largest of four numbers.
 
-    The derivative of `jnp.max` compares each number with the maximum: NaN where a compiler rounds the two differently.
+    The derivative of `jnp.max` compares each number with the maximum: NaN where both are rounded differently.
     """
     a, b, c, d = components(v)
     return jnp.maximum(jnp.maximum(a, b), jnp.maximum(c, d))

@@ -173,7 +173,7 @@ def test_a_missing_file_says_what_to_give(tmp_path):
         (
             '<collision>\n      <origin xyz="0 0 0"/>',
             '<collision><origin rpy="1 0 0"/>',
-            r"rpy is .*; the cylinder stands",
+            r"rpy is .*; the cylinder must be",
         ),
         ('robot name="cf2x"', 'sdf name="cf2x"', r"is not well-formed XML"),
         ("kf=", "&lots;kf=", r"is not well-formed XML"),

@@ -108,7 +108,7 @@ def test_a_state_is_a_vector_with_names_and_back():
     state = jax.tree.map(lambda x: x[0], state)
     again = model.state(model.vector(state))
     assert jax.tree.all(jax.tree.map(np.array_equal, again, state))
-    with pytest.raises(ValueError, match="the state has the shapes"):
+    with pytest.raises(ValueError, match="the state has shapes"):
         model.vector(jd.State.at_rest(jnp.zeros((2, 3))))
     assert model.function.name_in() == ["x", "u"] and model.function.name_out() == ["xdot"]
 

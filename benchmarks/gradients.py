@@ -62,15 +62,14 @@ def norms(env, config, policy, worlds: int, horizons) -> tuple[jax.Array, jax.Ar
         """Mean rewards of one world, up to each horizon."""
         flown = policy.replace(params=params)
         start_key, fly_key = jax.random.split(key)
-        world = collect.restart(start_key, env, collect.empty_worlds(env, 1))
+        world = collect.restart(start_key, collect.empty_worlds(env, 1), collect.draw_starts(start_key, env, 1))
         _, trajectory = collect.collect(
             fly_key,
-            with_gradient(env, config.gradient, config.surrogate),
+            with_gradient(env, config),
             collect.deterministic(flown),
             world,
             max(horizons),
-            reset=False,
-            between_steps=gradient_between_steps(config.gradient, config.gradient_decay),
+            between_steps=gradient_between_steps(config),
         )
         sums = jnp.cumsum(jnp.mean(discounted_rewards(trajectory, 1.0), axis=(1, 2)))
         return jnp.stack([sums[h - 1] / h for h in horizons])

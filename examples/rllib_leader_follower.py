@@ -147,10 +147,13 @@ def stacked(tensors):
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def simulate(env, horizon, key, policy, log_std, worlds):
     """Worlds after some control steps, all observations, and (t, w, n, ...) training data."""
-    restart_key, key, final_key = jax.random.split(key, 3)
-    worlds, act = collect.restart(restart_key, env, worlds, RESTARTED), jax.tree_util.Partial(explore, policy, log_std)
-    worlds, x = collect.collect(key, env, act, worlds, horizon)
-    final_actions = jax.vmap(act, (0, None, 0))(jax.random.split(final_key, x.done.shape), None, x.final_obs)[1]
+    start_key, restart_key, key, noise_key = jax.random.split(key, 4)
+    act = jax.tree_util.Partial(explore, policy, log_std)
+    starts = collect.draw_starts(start_key, env, len(worlds.done))
+    worlds = collect.restart(restart_key, worlds, starts, RESTARTED)
+    noise = jax.random.normal(noise_key, (2 * horizon, len(worlds.done), env.drones, env.action_size))
+    worlds, x = collect.collect(key, env, act, worlds, horizon, noise=noise[:horizon], starts=starts)
+    final_actions = act(noise[horizon:], None, x.final_obs)[1]
     obs, final_obs = map(policy.obs_stats.normalize, (x.obs, x.final_obs))
     mean = policy(x.obs)
     steps = {"obs": centralized_input(obs, x.action), "final": centralized_input(final_obs, final_actions)}

@@ -15,6 +15,7 @@ from jaxdrones.checks import check_keywords
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect, result
 from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
+from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.returns import discounted_rewards
 from jaxdrones.learning.settings import TracedCount, check_config
 
@@ -38,17 +39,16 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> resul
 
 def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.TrainState, dict[str, Array]]:
     """Simulate a trajectory of all worlds and take one gradient step on its rewards."""
-    key, restart_key, collect_key = jax.random.split(state.key, 3)
+    key, start_key, restart_key, collect_key = jax.random.split(state.key, 4)
     progress = collect.progress_of(env, config, state.step)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)
+    starts = collect.draw_starts(start_key, env, config.worlds, progress)
+    worlds = collect.restart(restart_key, state.worlds, starts, config.restart_fraction)
     env = with_gradient(env, config)
     between_steps = gradient_between_steps(config)
 
     def loss(params):
         act = collect.deterministic(state.policy.replace(params=params))
-        after, trajectory = collect.collect(
-            collect_key, env, act, worlds, config.horizon, reset=False, between_steps=between_steps
-        )
+        after, trajectory = collect.collect(collect_key, env, act, worlds, config.horizon, between_steps=between_steps)
         return -jnp.mean(discounted_rewards(trajectory, config.gamma)), (after, trajectory)
 
     (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
@@ -59,7 +59,7 @@ def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.T
     )
     norm = optax.tree.norm(gradient)
     metrics = {"gradient_norm": norm, "nonfinite_gradients": result.count_nonfinite(norm)}
-    worlds, measured = collect.measure(env, config, state.step, worlds, trajectory)
+    worlds, measured = measure(env, config, state.step, worlds, trajectory)
     return result.TrainState(state.step + 1, key, policy, opt_state, worlds), metrics | measured
 
 

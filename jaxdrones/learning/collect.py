@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jaxdrones.checks import takes
 from jaxdrones.envs import AutoReset, Env
@@ -17,20 +17,24 @@ from jaxdrones.envs.env import Obs
 from jaxdrones.envs.observations import PrivilegedObservation
 from jaxdrones.learning import sharding
 from jaxdrones.learning.layers import expand
-from jaxdrones.learning.networks import Policy, set_zero
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics, state_vector
 from jaxdrones.learning.settings import Scalar
 from jaxdrones.pytree import PyTreeNode
 
-Act = Callable[[jax.Array, Any, Obs], tuple[Any, Array, Any]]
-"""(keys (w,), hidden state, observations (w, n, d)) -> hidden state, actions (w, n, a), and extras such as log
+Act = Callable[[Any, Any, Obs], tuple[Any, Array, Any]]
+"""(noise, hidden state, observations (w, n, d)) -> hidden state, actions (w, n, a), and extras such as log
 probabilities."""
+
+Starts = tuple[Obs, Episode]
+"""First observations (w, n, d) and episodes of w worlds, without the constant fields of the world."""
 
 
 class Worlds(PyTreeNode):
     """Batch of w worlds, each in the middle of an episode."""
 
     episodes: Episode
+    """Without the fields of the world that are constant over episodes, which are those of the environment."""
     obs: Obs
     """(w, n, d) current observations; here and below, with cameras, a dictionary of such an array and of images."""
     done: Array
@@ -71,7 +75,7 @@ class Trajectory(PyTreeNode):
     final_privileged: PrivilegedObservation | None
     """(t, w, n, ...) privileged observations after the step, before a new episode starts."""
     was_done: Array
-    """(t, w) whether the episode had ended before the step, which is then invalid. Always false with `reset`."""
+    """(t, w) whether the episode had ended before the step, which is then invalid. Always false with `starts`."""
     hidden_state: Any = None
     """(t, w, n, ...) hidden state of the policy after the observations before the step; `None` without one."""
 
@@ -83,30 +87,37 @@ class Trajectory(PyTreeNode):
 
 def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
     """Worlds before their first episode; `restart` starts one in each."""
-    obs, episodes = jax.eval_shape(jax.vmap(AutoReset(env).reset), jax.random.split(jax.random.key(0), count))
-    episodes, obs = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), (episodes, obs))
+    shapes = jax.eval_shape(lambda: draw_starts(jax.random.key(0), env, count))
+    obs, episodes = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     hidden_state = None if policy is None else policy.initial_hidden_state((count, env.drones))
     none = jnp.zeros(count, episodes.episode_return.dtype)
     return Worlds(episodes, obs, jnp.ones(count, bool), none, none, hidden_state)
 
 
-def restart(key: jax.Array, env: Env, worlds: Worlds, fraction: Scalar = 0.0, progress: Array | None = None) -> Worlds:
-    """Start a new episode in every world with a finished episode, and in the others with a given probability.
+def draw_starts(key: jax.Array, env: Env, count: int, progress: Array | None = None) -> Starts:
+    """Draw the starts of episodes.
 
     Args:
         key: random key.
         env: environment.
-        worlds: worlds.
-        fraction: probability of a new episode in the other worlds, which decorrelates the times of their episodes.
+        count: number of worlds.
         progress: progress of training, see `progress_of`.
     """
-    start_key, choice_key = jax.random.split(key)
-    count = len(worlds.done)
-    chosen = worlds.done | jax.random.bernoulli(choice_key, fraction, (count,))
-    obs, episodes = jax.vmap(AutoReset(env, progress).reset)(jax.random.split(start_key, count))
-    hidden_state = jax.tree.map(jnp.zeros_like, worlds.hidden_state)
-    fresh = worlds.replace(episodes=episodes, obs=obs, done=jnp.zeros_like(chosen), hidden_state=hidden_state)
-    return _select(chosen, fresh, worlds)
+    obs, episodes = jax.vmap(AutoReset(env, progress).reset)(jax.random.split(key, count))
+    return obs, _without_constants(env, episodes)
+
+
+def restart(key: jax.Array, worlds: Worlds, starts: Starts, fraction: Scalar = 0.0) -> Worlds:
+    """Start a new episode in every world with a finished episode, and in the others with a given probability.
+
+    Args:
+        key: random key.
+        worlds: worlds.
+        starts: starts of the new episodes.
+        fraction: probability of a new episode in the other worlds, which decorrelates the times of their episodes.
+    """
+    chosen = worlds.done | jax.random.bernoulli(key, fraction, worlds.done.shape)
+    return _select(chosen, _started(worlds, starts), worlds)
 
 
 def collect(
@@ -115,10 +126,11 @@ def collect(
     act: Act,
     worlds: Worlds,
     length: int,
-    reset: bool = True,
+    *,
+    noise: Any = None,
+    starts: Starts | None = None,
     between_steps: Callable[[Worlds], Worlds] = lambda worlds: worlds,
     privileged: bool = False,
-    progress: Array | None = None,
 ) -> tuple[Worlds, Trajectory]:
     """Simulate all worlds for `length` control steps; with `jax.set_mesh` each device simulates its share.
 
@@ -129,22 +141,31 @@ def collect(
             arguments of a `jax.tree_util.Partial`.
         worlds: worlds at the start of the trajectory.
         length: control steps.
-        reset: whether a new episode starts in the step that ends one. Otherwise the drones are frozen, and all later
-            steps are marked by `was_done`, until `restart` starts a new episode.
+        noise: (length, w, ...) first argument of `act` in every step.
+        starts: starts of the episodes that follow on those that end, in every step of another world than in the last,
+            so that hard starts do not repeat themselves. By default the drones are frozen after the end of an episode,
+            and all later steps are marked by `was_done`, until `restart` starts a new episode.
         between_steps: function of the worlds between steps, to change their gradient.
         privileged: whether to record privileged observations.
-        progress: progress of training, see `progress_of`.
     """
-    privileged_of = jax.vmap(env.privileged_observation) if privileged else lambda worlds: None
+
+    def one_step(key: jax.Array, episode: Episode, action: Array) -> tuple:
+        obs, episode, *outcome = AutoReset(env).step_without_reset(key, _with_constants(env, episode), action)
+        return obs, _without_constants(env, episode), *outcome
+
+    def privileged_of(episodes: Episode) -> PrivilegedObservation | None:
+        if not privileged:
+            return None
+        return jax.vmap(lambda episode: env.privileged_observation(_with_constants(env, episode).world))(episodes)
 
     def control_step(
-        act: Act, index: Array, progress: Array | None, worlds: Worlds, key: jax.Array
+        act: Act, index: Array, starts: Starts | None, worlds: Worlds, inputs: tuple
     ) -> tuple[Worlds, Trajectory]:
-        step = jax.vmap((AutoReset(env, progress) if reset else _NoReset(env)).step)
-        act_keys, step_keys = (jax.vmap(jax.random.fold_in, (None, 0))(key, index) for key in jax.random.split(key))
+        t, key, noise = inputs
         worlds = between_steps(worlds)
-        hidden_state, action, extras = act(act_keys, worlds.hidden_state, worlds.obs)
-        obs, episodes, reward, terminated, truncated, info = step(step_keys, worlds.episodes, action)
+        hidden_state, action, extras = act(noise, worlds.hidden_state, worlds.obs)
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
+        obs, episodes, reward, terminated, truncated, info = jax.vmap(one_step)(keys, worlds.episodes, action)
         recorded = Trajectory(
             obs=worlds.obs,
             action=action,
@@ -152,34 +173,53 @@ def collect(
             reward=reward,
             terminated=terminated,
             truncated=truncated & ~terminated,
-            final_obs=info["final_obs"],
+            final_obs=obs,
             episode_return=info["episode"]["return"],
             length=info["episode"]["length"],
             error=info["metrics"]["error"],
-            privileged=privileged_of(worlds.episodes.world),
-            final_privileged=privileged_of(info["final_world"]),
+            privileged=privileged_of(worlds.episodes),
+            final_privileged=privileged_of(episodes),
             was_done=worlds.done,
             hidden_state=hidden_state,
         )
         ended = terminated | truncated
-        if reset:
-            hidden_state = set_zero(ended, hidden_state)
-            return worlds.replace(episodes=episodes, obs=obs, hidden_state=hidden_state), recorded
-        after = worlds.replace(episodes=episodes, obs=obs, done=worlds.done | ended, hidden_state=hidden_state)
+        after = worlds.replace(episodes=episodes, obs=obs, hidden_state=hidden_state)
+        if starts is not None:
+            first = (index[0] + t + 1) % count
+            following = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, len(keys)), starts)
+            return _select(ended, _started(after, following), after), recorded
+        after = after.replace(done=worlds.done | ended)
         return _select(worlds.done, worlds, after), recorded  # otherwise a lost drone would fly on to infinity
 
     def control_steps(
-        act: Act, keys: jax.Array, progress: Array | None, index: Array, worlds: Worlds
+        act: Act, keys: jax.Array, index: Array, starts: Starts | None, noise: Any, worlds: Worlds
     ) -> tuple[Worlds, Trajectory]:
-        return jax.lax.scan(functools.partial(control_step, act, index, progress), worlds, keys)
+        starts = jax.tree.map(lambda x: jnp.concatenate([x, x]), starts)
+        inputs = jnp.arange(length), keys, noise
+        return jax.lax.scan(functools.partial(control_step, act, index, starts), worlds, inputs)
 
+    count = len(worlds.done)
+    replicated, by_worlds, by_steps = sharding.REPLICATED, sharding.WORLDS, sharding.STEPS
     control_steps = sharding.map_worlds(
-        control_steps,
-        (sharding.REPLICATED, sharding.REPLICATED, sharding.REPLICATED, sharding.WORLDS, sharding.WORLDS),
-        (sharding.WORLDS, sharding.STEPS),
+        control_steps, (replicated, replicated, by_worlds, replicated, by_steps, by_worlds), (by_worlds, by_steps)
     )
     act = act if isinstance(act, jax.tree_util.Partial) else jax.tree_util.Partial(act)
-    return control_steps(act, jax.random.split(key, length), progress, jnp.arange(len(worlds.done)), worlds)
+    return control_steps(act, jax.random.split(key, length), jnp.arange(count), starts, noise, worlds)
+
+
+def _started(worlds: Worlds, starts: Starts) -> Worlds:
+    """Worlds at the starts of new episodes."""
+    obs, episodes = starts
+    hidden_state = jax.tree.map(jnp.zeros_like, worlds.hidden_state)
+    return worlds.replace(episodes=episodes, obs=obs, done=jnp.zeros_like(worlds.done), hidden_state=hidden_state)
+
+
+def _without_constants(env: Env, episode: Episode) -> Episode:
+    return episode.replace(world=episode.world.replace(**dict.fromkeys(env.constant_fields)))
+
+
+def _with_constants(env: Env, episode: Episode) -> Episode:
+    return episode.replace(world=episode.world.replace(**{name: getattr(env, name) for name in env.constant_fields}))
 
 
 def progress_of(env: Env, config: Any, step: Array) -> Array | None:
@@ -196,82 +236,11 @@ def progress_of(env: Env, config: Any, step: Array) -> Array | None:
 
 def deterministic(policy: Policy) -> Act:
     """Actions of the policy without exploration noise, and no extras."""
-    return jax.tree_util.Partial(lambda policy, keys, hidden_state, obs: (*policy.act(hidden_state, obs), None), policy)
 
+    def act(policy: Policy, noise: Any, hidden_state: Any, obs: Obs) -> tuple[Any, Array, Any]:
+        return *policy.act(hidden_state, obs), None
 
-class _NoReset(AutoReset):
-    """Episodes without automatic reset."""
-
-    def step(self, key: jax.Array, episode: Episode, action: Array):
-        obs, world, reward, terminated, truncated, info = self.env.step(key, episode.world, action)
-        episode = Episode(world, episode.episode_return + reward, episode.length + 1)
-        final = {"final_obs": obs, "final_world": world}
-        info = info | final | {"episode": {"return": episode.episode_return, "length": episode.length}}
-        return obs, episode, reward, terminated, truncated, info
-
-
-def measure(
-    env: Env, config: Any, step: Array, worlds: Worlds, trajectory: Trajectory
-) -> tuple[Worlds, dict[str, Array]]:
-    """Update the returns of the worlds after a trajectory, and compute the metrics of an update.
-
-    The metrics are the mean reward and the mean error (m) of the valid steps, the fraction of them that terminated an
-    episode, and the mean return. The latter is NaN before a whole episode can have ended, as only failed episodes have
-    ended by then: in the first `env.steps` steps of a training, and always if every trajectory is shorter and starts
-    new episodes in all worlds.
-
-    Args:
-        env: environment.
-        config: settings of a learner; `horizon` and `restart_fraction` are used.
-        step: () updates made before this one.
-        worlds: worlds after the trajectory.
-        trajectory: trajectory.
-    """
-    counts = ~trajectory.was_done
-    worlds = with_returns(worlds, trajectory, config.restart_fraction)
-    episodes_fit = config.horizon >= env.steps
-    could_end = (config.restart_fraction < 1) & ((step + 1) * config.horizon >= env.steps) | episodes_fit
-    return worlds, {
-        "reward": jnp.mean(trajectory.reward, where=counts[..., None]),
-        "error": jnp.mean(trajectory.error, where=counts[..., None]),
-        "termination_rate": jnp.mean(trajectory.terminated.astype(trajectory.reward.dtype), where=counts),
-        "return": jnp.where(could_end, mean_return(worlds), jnp.nan),
-    }
-
-
-def with_returns(worlds: Worlds, trajectory: Trajectory, restart_fraction: Scalar) -> Worlds:
-    """Worlds with the return and the weight of the last finished episode in each.
-
-    An episode of k updates survives `restart` with the probability (1 - restart_fraction)^k. The inverse is the weight
-    that corrects for missing long episodes (Horvitz and Thompson 1952).
-
-    Args:
-        worlds: worlds after the trajectory.
-        trajectory: trajectory.
-        restart_fraction: probability of being cut before an update.
-    """
-    ended = trajectory.done & ~trajectory.was_done
-    t = jnp.arange(len(ended))[:, None]
-    last = jnp.max(jnp.where(ended, t, -1), axis=0)
-    chosen = t == last[None]  # an index would make devices exchange worlds
-    length = jnp.sum(jnp.where(chosen, trajectory.length, 0), axis=0)
-    passed = -((last + 1 - length) // len(ended))  # updates since its first step
-    weight = (1 - jnp.asarray(restart_fraction, trajectory.reward.dtype)) ** -passed
-    returns = jnp.mean(jnp.sum(jnp.where(chosen[..., None], trajectory.episode_return, 0), axis=0), axis=-1)
-    return worlds.replace(
-        last_return=jnp.where(last >= 0, returns, worlds.last_return),
-        last_weight=jnp.where(last >= 0, weight, worlds.last_weight),
-    )
-
-
-def mean_return(worlds: Worlds) -> Float[Array, ""]:
-    """Mean return of the last finished episode over worlds and drones; NaN before the first.
-
-    Every world counts once. A mean over all finished episodes would be biased towards short ones.
-    """
-    weight = jnp.sum(worlds.last_weight)
-    mean = jnp.sum(worlds.last_weight * worlds.last_return) / jnp.where(weight > 0, weight, 1)
-    return jnp.where(weight > 0, mean, jnp.nan)
+    return jax.tree_util.Partial(act, policy)
 
 
 def update_obs_stats(

@@ -8,9 +8,11 @@ from typing import Any
 import jax
 
 from jaxdrones.accelerate.compiler import training_options
+from jaxdrones.learning.gradients import GradientConfig
+from jaxdrones.learning.settings import Config
 
 
-def jit(function: Callable, **arguments: Any) -> Any:
+def jit(function: Callable, config: Config | None = None, **arguments: Any) -> Any:
     """`jax.jit` with compiler options for training.
 
     The result can be called or lowered, but not inside another traced function, where JAX rejects compiler options.
@@ -18,9 +20,11 @@ def jit(function: Callable, **arguments: Any) -> Any:
 
     Args:
         function: function to compile.
+        config: settings of the learner whose updates the function makes.
         **arguments: further arguments of `jax.jit`.
     """
-    return jax.jit(function, compiler_options=training_options(), **arguments)
+    options = training_options(differentiated=config is None or isinstance(config, GradientConfig))
+    return jax.jit(function, compiler_options=options, **arguments)
 
 
 def is_tracing() -> bool:

@@ -6,7 +6,6 @@ input, so it learns from single control steps in any order.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -19,7 +18,6 @@ from jaxdrones.envs.observations import PrivilegedObservation
 from jaxdrones.learning.layers import make_network
 from jaxdrones.learning.networks import Policy, apply, example_observation, init_params
 from jaxdrones.learning.normalize import map_state_vector, state_vector
-from jaxdrones.learning.settings import Scalar
 
 
 def init_critic(key: jax.Array, env: Env, policy: Policy, config: Any) -> Any:
@@ -40,12 +38,16 @@ def init_critic(key: jax.Array, env: Env, policy: Policy, config: Any) -> Any:
     return init_params(key, network, example, n if config.per_agent else None)
 
 
-def discounted_value(
-    params: Any, critic_obs: Obs, hidden_sizes: Sequence[int], gamma: Scalar, per_agent: bool = False
-) -> Float[Array, "*batch n"]:
-    """Discounted sum of future rewards; the network's output is that sum times one minus `gamma`."""
-    network = make_network(critic_obs, hidden_sizes, 1, 0.01)
-    return apply(network, params, critic_obs, per_agent)[1][..., 0] / (1 - gamma)
+def discounted_value(config: Any, params: Any, critic_obs: Obs) -> Float[Array, "*batch n"]:
+    """Discounted sum of future rewards; the network's output is that sum times one minus `gamma`.
+
+    Args:
+        config: settings of shac or ppo.
+        params: parameters of the critic.
+        critic_obs: observations of the critic, normalized.
+    """
+    network = make_network(critic_obs, config.critic_hidden_sizes, 1, 0.01)
+    return apply(network, params, critic_obs, config.per_agent)[1][..., 0] / (1 - config.gamma)
 
 
 def critic_observation(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,13 +14,13 @@ from jaxdrones.learning.networks import Policy
 HALF_LOG_2_PI = math.log(2 * math.pi) / 2
 
 
-def explore(policy: Policy, log_std: Array, keys: jax.Array, hidden_state: Any, obs: Obs) -> tuple[Any, Array, Array]:
-    """Sample actions around those of a policy in many worlds, for `collect.collect`.
+def explore(policy: Policy, log_std: Array, noise: Array, hidden_state: Any, obs: Obs) -> tuple[Any, Array, Array]:
+    """Actions around those of a policy in many worlds, for `collect.collect`.
 
     Args:
         policy: policy.
         log_std: (a,) or (n, a), logarithm of the standard deviation of actions.
-        keys: (w,) random key of each world.
+        noise: (w, n, a) standard normal noise.
         hidden_state: (w, n, ...) hidden state of the policy before the observations; `None` without one.
         obs: (w, n, d) observations, or a dictionary with images.
 
@@ -29,13 +28,13 @@ def explore(policy: Policy, log_std: Array, keys: jax.Array, hidden_state: Any, 
         The hidden state after the observations, the actions (w, n, a), and their log probability density (w, n).
     """
     hidden_state, mean = policy.act(hidden_state, obs)
-    action = jax.vmap(sample, (0, 0, None))(keys, mean, log_std)
+    action = sample(noise, mean, log_std)
     return hidden_state, action, log_prob(action, mean, log_std)
 
 
-def sample(key: jax.Array, mean: Float[Array, "*batch n a"], log_std: Array) -> Float[Array, "*batch n a"]:
-    """Sample normally distributed actions."""
-    return mean + jnp.broadcast_to(jnp.exp(log_std), mean.shape) * jax.random.normal(key, mean.shape, mean.dtype)
+def sample(noise: Float[Array, "*batch n a"], mean: Float[Array, "*batch n a"], log_std: Array) -> Array:
+    """Normally distributed actions (*batch, n, a) for standard normal noise."""
+    return mean + jnp.broadcast_to(jnp.exp(log_std), mean.shape) * noise
 
 
 def log_prob(action: Float[Array, "*batch n a"], mean: Array, log_std: Array) -> Float[Array, "*batch n"]:

@@ -29,9 +29,10 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "*batch d"]) -> Array:
         """Outputs (*batch, output_size)."""
+        batch, x = x.shape[:-1], x.reshape(-1, x.shape[-1])  # matrices are faster than arrays of more axes
         for size in self.hidden_sizes:
             x = ACTIVATIONS[self.activation](nn.Dense(size, kernel_init=_kernel_init(1.0))(x))
-        return nn.Dense(self.output_size, kernel_init=_kernel_init(self.output_scale))(x)
+        return nn.Dense(self.output_size, kernel_init=_kernel_init(self.output_scale))(x).reshape(*batch, -1)
 
 
 class CNN(nn.Module):

@@ -211,16 +211,16 @@ class Policy(PyTreeNode):
         hidden_state, output = apply(self.network, self.params, x, self.per_agent, hidden_state)
         return hidden_state, jnp.tanh(output)
 
-    def replay(self, hidden_state: Any, obs: Obs, starts: Array | None) -> Float[Array, "t *batch n a"]:
-        """Actions of a sequence of observations.
+    def replay(self, hidden_state: Any, obs: Obs, starts: Array | None) -> Float[Array, "*batch a"]:
+        """Actions of a sequence of normalized observations.
 
         Args:
             hidden_state: (*batch, n, ...) hidden state before the first observation.
-            obs: (t, *batch, n, d) observations, or a dictionary.
+            obs: (t, *batch, n, d) normalized observations, or a dictionary; without a hidden state and `per_agent` with
+                any leading axes.
             starts: (t, *batch) whether an episode starts with the observation; `None` without a hidden state.
         """
-        x = map_state_vector(self.obs_stats.normalize, obs)
-        return jnp.tanh(apply(self.network, self.params, x, self.per_agent, hidden_state, starts)[1])
+        return jnp.tanh(apply(self.network, self.params, obs, self.per_agent, hidden_state, starts)[1])
 
     def __call__(self, obs: Obs) -> Float[Array, "*batch n a"]:
         """Actions of a policy without a hidden state.

@@ -17,6 +17,7 @@ from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect, result
 from jaxdrones.learning.critic import critic_observation, discounted_value, init_critic
 from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
+from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
 from jaxdrones.learning.settings import (
@@ -86,9 +87,10 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
 
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Simulate a trajectory of all worlds, take one gradient step of the policy, then fit the critic."""
-    key, restart_key, collect_key, critic_key = jax.random.split(state.key, 4)
+    key, start_key, restart_key, collect_key, critic_key = jax.random.split(state.key, 5)
     progress = collect.progress_of(env, config, state.step)
-    worlds = collect.restart(restart_key, env, state.worlds, config.restart_fraction, progress)
+    starts = collect.draw_starts(start_key, env, config.worlds, progress)
+    worlds = collect.restart(restart_key, state.worlds, starts, config.restart_fraction)
     env = with_gradient(env, config)
     between_steps = gradient_between_steps(config)
     weight = jnp.minimum(state.step / (config.terminal_value_warmup * config.updates), 1)
@@ -101,13 +103,12 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
             collect.deterministic(policy),
             worlds,
             config.horizon,
-            reset=False,
             between_steps=between_steps,
             privileged=config.privileged_critic,
         )
         bootstrap = trajectory.truncated.at[-1].set(~trajectory.terminated[-1]) & ~trajectory.was_done
         final_obs = _final_observation(policy, _at(bootstrap, trajectory))
-        terminal_value = weight * config.gamma * _value(config, state.target_critic, final_obs)
+        terminal_value = weight * config.gamma * discounted_value(config, state.target_critic, final_obs)
         reward = trajectory.reward + jnp.where(bootstrap[..., None], terminal_value[None], 0)
         returns = jnp.sum(discounted_rewards(trajectory.replace(reward=reward), config.gamma), axis=0)
         return -jnp.mean(returns) / config.horizon, (after, trajectory)
@@ -126,7 +127,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         "critic_loss": critic_metrics["loss"],
         "nonfinite_gradients": result.count_nonfinite(norm) + critic_metrics["nonfinite_gradients"],
     }
-    worlds, measured = collect.measure(env, config, state.step, worlds, trajectory)
+    worlds, measured = measure(env, config, state.step, worlds, trajectory)
     state = TrainState(state.step + 1, key, policy, opt_state, worlds, critic, target_critic, critic_opt_state)
     return state, metrics | measured
 
@@ -165,15 +166,15 @@ def _final_observation(policy: Policy, trajectory: collect.Trajectory) -> Obs:
 def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: collect.Trajectory):
     """Parameters, optimizer state and metrics of the critic after gradient steps on the TD(lambda) returns."""
     obs = critic_observation(state.policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged)
-    now = _value(config, state.target_critic, obs)
-    later = _value(config, state.target_critic, _final_observation(state.policy, trajectory))
+    now = discounted_value(config, state.target_critic, obs)
+    later = discounted_value(config, state.target_critic, _final_observation(state.policy, trajectory))
     target = now + trajectory_advantages(trajectory, now, later, config.gamma, config.gae_lambda)
     mask = jnp.broadcast_to(~trajectory.was_done[..., None], now.shape)
     data = jax.lax.stop_gradient((obs, target, mask.astype(target.dtype)))
     length = min(_CRITIC_BATCH, config.horizon)
 
     def loss(params, obs, target, mask):
-        error = (1 - config.gamma) * (_value(config, params, obs) - target)
+        error = (1 - config.gamma) * (discounted_value(config, params, obs) - target)
         return jnp.mean(mask * error**2)
 
     def step(carry, key):
@@ -187,10 +188,6 @@ def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: c
     carry = (state.critic, state.critic_opt_state)
     (critic, opt_state), (costs, norms) = jax.lax.scan(step, carry, jax.random.split(key, config.critic_steps))
     return critic, opt_state, {"loss": jnp.mean(costs), "nonfinite_gradients": result.count_nonfinite(norms)}
-
-
-def _value(config: Config, critic: Any, critic_obs: Obs) -> Array:
-    return discounted_value(critic, critic_obs, config.critic_hidden_sizes, config.gamma, config.per_agent)
 
 
 def _policy_optimizer(config: Config) -> optax.GradientTransformation:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jaxdrones.errors import UserError
@@ -83,6 +84,14 @@ def map_worlds(function: Callable, in_specs: Any, out_specs: Any) -> Callable:
     if jax.sharding.get_abstract_mesh().shape.get(_AXIS, 1) == 1:
         return function
     return jax.shard_map(function, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+
+
+def mean_over_devices(tree: Any) -> Any:
+    """Mean of the arrays of all devices, in one exchange; for functions of `map_worlds`."""
+    if jax.sharding.get_abstract_mesh().shape.get(_AXIS, 1) == 1:
+        return tree
+    flat, unflatten = ravel_pytree(tree)
+    return unflatten(jax.lax.pmean(flat, _AXIS))
 
 
 def gather(mesh: Mesh, tree: Any) -> Any:

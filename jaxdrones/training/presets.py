@@ -49,6 +49,9 @@ _ONE_D_PPO = {
 }
 """The tasks of (2021) are slow: all rotor speeds are within 5 % of hover, so actions take seconds to have an effect."""
 
+_SLOW_PPO = {"epochs": 4, "learning_rate": 2e-3, "max_learning_rate": 5e-3}
+"""Smaller steps, for tasks with rare or random rewards."""
+
 _FOREST = dict(
     worlds=128,
     horizon=75,
@@ -64,15 +67,13 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("hover", "bptt"): dict(gradient="decay", gradient_decay=0.99, learning_rate=1.5e-2, restart_fraction=0.3),
     ("tracking", "bptt"): dict(updates=400, learning_rate=1e-2),
     ("recovery", "bptt"): dict(updates=250),
-    ("gates", "ppo"): dict(
-        updates=2500, gae_lambda=0.95, final_std=0.05, hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64)
-    ),
+    ("gates", "ppo"): _SLOW_PPO
+    | dict(updates=2500, gae_lambda=0.95, final_std=0.05, hidden_sizes=(64, 64), critic_hidden_sizes=(64, 64)),
     # Through the pixels an update costs twice as much, and success is the same.
     ("forest", "bptt"): _FOREST | dict(updates=900, image_gradient=False),
     ("forest", "shac"): _FOREST | dict(updates=600, horizon=50, critic_hidden_sizes=(128, 64)),
-    ("forest", "ppo"): dict(
-        updates=600, worlds=256, horizon=64, hidden_sizes=(128, 64), critic_hidden_sizes=(128, 64), gae_lambda=0.95
-    ),
+    ("forest", "ppo"): _SLOW_PPO
+    | dict(updates=600, worlds=256, horizon=64, hidden_sizes=(128, 64), critic_hidden_sizes=(128, 64), gae_lambda=0.95),
     ("room", "bptt"): dict(updates=300, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
     ("follow", "bptt"): dict(updates=200, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
     ("hover-2021", "bptt"): _ONE_D,

@@ -52,7 +52,8 @@ class Trainer:
         count = jnp.zeros((), jnp.int32)
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
         init = compilation.jit(self._init, in_shardings=same, out_shardings=state)
-        updates = compilation.jit(self._updates, in_shardings=(state, same, same), out_shardings=(state, same))
+        shardings = {"in_shardings": (state, same, same), "out_shardings": (state, same)}
+        updates = compilation.jit(self._updates, self.recipe.config, **shardings)
         with jax.set_mesh(self.mesh):
             self._start = init.lower(jax.random.key(0)).compile()
             self._advance = updates.lower(self.shapes, count, count).compile()

@@ -45,19 +45,19 @@ def flights():
     """Final mean reward and its gradient in the policy's parameters, for each option."""
     env = envs.make("hover")
     state = bptt.init(jax.random.key(0), env, CONFIG)
-    worlds = collect.restart(jax.random.key(1), env, state.worlds)
+    starts = collect.draw_starts(jax.random.key(1), env, CONFIG.worlds)
+    worlds = collect.restart(jax.random.key(1), state.worlds, starts)
 
     def flown(params, **options):
         config = bptt.Config(**vars(CONFIG) | options)
         policy = state.policy.replace(params=params)
         _, trajectory = collect.collect(
             jax.random.key(2),
-            with_gradient(env, config.gradient, config.surrogate),
+            with_gradient(env, config),
             lambda key, memory, obs: (memory, policy(obs), None),
             worlds,
             config.horizon,
-            reset=False,
-            between_steps=gradient_between_steps(config.gradient, config.gradient_decay),
+            between_steps=gradient_between_steps(config),
         )
         return jnp.mean(trajectory.reward[-1])
 

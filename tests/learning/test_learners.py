@@ -12,6 +12,7 @@ from helpers import jit_unoptimized
 from jaxdrones import envs
 from jaxdrones.envs.randomize import scaled
 from jaxdrones.learning import bptt, collect, ppo, shac
+from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import MLP, Policy
 from jaxdrones.learning.normalize import RunningStatistics
 from jaxdrones.learning.returns import discounted_rewards
@@ -106,10 +107,12 @@ def test_the_mean_return_is_that_of_all_episodes_however_long_and_none_before_on
     config = ppo.Config(horizon=horizon, restart_fraction=fraction)
 
     def update(worlds, step):
-        start_key, key = jax.random.split(jax.random.fold_in(jax.random.key(0), step))
-        worlds = collect.restart(start_key, env, worlds, fraction)
-        worlds, flown = collect.collect(key, env, lambda k, m, obs: (m, 0 * obs, None), worlds, horizon, reset)
-        worlds, metrics = collect.measure(env, config, step, worlds, flown)
+        start_key, restart_key, key = jax.random.split(jax.random.fold_in(jax.random.key(0), step), 3)
+        starts = collect.draw_starts(start_key, env, 1000)
+        worlds = collect.restart(restart_key, worlds, starts, fraction)
+        act = lambda noise, memory, obs: (memory, 0 * obs, None)  # noqa: E731
+        worlds, flown = collect.collect(key, env, act, worlds, horizon, starts=starts if reset else None)
+        worlds, metrics = measure(env, config, step, worlds, flown)
         return worlds, metrics["return"]
 
     worlds = collect.empty_worlds(env, 1000)
@@ -144,11 +147,14 @@ def test_a_centralized_critic_is_bootstrapped_with_the_actions_that_follow():
     def batch_of(key):
         state = ppo.init(jax.random.key(0), env, config)
         state = state.replace(critic=jax.tree.map(lambda x: x + 0.3, state.critic))
-        worlds = collect.restart(jax.random.key(1), env, state.worlds)
+        starts = collect.draw_starts(jax.random.key(1), env, config.worlds)
+        worlds = collect.restart(jax.random.key(1), state.worlds, starts)
         act = jax.tree_util.Partial(ppo.explore, state.policy, state.log_std)
-        _, flown = collect.collect(jax.random.key(2), env, act, worlds, config.horizon)
-        batch = ppo.batch_of(key, config, state, None, flown)
-        value = ppo.discounted_value(state.critic, batch.critic_obs, (8,), config.gamma)
+        shape = (config.horizon, config.worlds, 2, env.action_size)
+        noise, later = jax.random.normal(jax.random.key(2), shape), jax.random.normal(key, shape)
+        _, flown = collect.collect(jax.random.key(2), env, act, worlds, config.horizon, noise=noise, starts=starts)
+        batch = ppo.batch_of(config, state, None, flown, later)
+        value = ppo.discounted_value(config, state.critic, batch.critic_obs)
         return flown.terminated, flown.done, batch, value
 
     terminated, done, batch, value = jax.tree.map(np.asarray, batch_of(jax.random.key(3)))
@@ -226,19 +232,18 @@ def test_a_privileged_critic_learns_the_value_of_drawn_parameters():
 @pytest.mark.float32
 def test_episodes_that_ended_stay_as_they_are_and_do_not_count_until_they_are_restarted():
     env = envs.make("hover", duration=0.05)  # five steps
-    worlds = collect.restart(jax.random.key(0), env, collect.empty_worlds(env, 2))
+    starts = collect.draw_starts(jax.random.key(0), env, 2)
+    worlds = collect.restart(jax.random.key(0), collect.empty_worlds(env, 2), starts)
 
-    def hover(key, memory, obs):
+    def hover(noise, memory, obs):
         return memory, jnp.zeros((2, 1, 4)), None
 
-    worlds, trajectory = jit_unoptimized(lambda w: collect.collect(jax.random.key(1), env, hover, w, 7, reset=False))(
-        worlds
-    )
+    worlds, trajectory = jit_unoptimized(lambda w: collect.collect(jax.random.key(1), env, hover, w, 7))(worlds)
     np.testing.assert_array_equal(trajectory.was_done[:, 0], [False] * 5 + [True] * 2)
     assert jnp.all(worlds.done)
     np.testing.assert_array_equal(worlds.obs, trajectory.final_obs[4])
     assert jnp.all(discounted_rewards(trajectory, 1.0)[5:] == 0)
-    again = collect.restart(jax.random.key(2), env, worlds)
+    again = collect.restart(jax.random.key(2), worlds, starts)
     assert jnp.all(again.episodes.length == 0) and not jnp.any(again.done)
 
 

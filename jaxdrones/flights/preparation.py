@@ -8,10 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from jaxdrones.errors import UserError
-from jaxdrones.flights.consistency import Motion, contradictions
 from jaxdrones.flights.files import read_log
 from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
 
@@ -61,6 +59,10 @@ def prepare(log: FlightLog, allow_inconsistent: bool = False) -> list[FlightLog]
 
 def inconsistencies(log: FlightLog) -> list[str]:
     """Contradictions between columns of a prepared log, a sentence each with the likely cause."""
+    from scipy.spatial.transform import Rotation  # loading it takes half a second
+
+    from jaxdrones.flights.consistency import Motion, contradictions
+
     flying = np.flatnonzero(log.in_flight)
     rows = slice(int(flying[0]), int(flying[-1]) + 1) if len(flying) else slice(0)
     pos, quat, vel, omega = (np.array(getattr(log, name)[rows, 0]) for name in STATE)  # SciPy needs writable arrays
@@ -97,6 +99,8 @@ def named_apart(logs: Sequence[FlightLog]) -> list[FlightLog]:
 
 def _resampled(log: FlightLog) -> FlightLog:
     """Log resampled to 100 Hz; rows at 100 Hz are unchanged."""
+    from scipy.spatial.transform import Rotation, Slerp
+
     times = log.t
     if np.max(np.abs(times - times[0] - PERIOD * np.arange(len(times)))) <= _MAX_JITTER:
         return log

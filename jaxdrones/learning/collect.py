@@ -142,9 +142,9 @@ def collect(
         worlds: worlds at the start of the trajectory.
         length: control steps.
         noise: (length, w, ...) first argument of `act` in every step.
-        starts: starts of the episodes that follow on those that end, in every step of another world than in the last,
-            so that hard starts do not repeat themselves. By default the drones are frozen after the end of an episode,
-            and all later steps are marked by `was_done`, until `restart` starts a new episode.
+        starts: starts of further episodes. A world whose episode ends continues from the start of another world, of a
+            different one in every step, so that hard starts do not repeat themselves. By default the drones are frozen
+            after the end of an episode, and all later steps are marked by `was_done`, until `restart` starts a new one.
         between_steps: function of the worlds between steps, to change their gradient.
         privileged: whether to record privileged observations.
     """

@@ -163,12 +163,6 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     return TrainState(state.step + 1, key, policy, opt_state, after, log_std, critic, learning_rate), metrics
 
 
-def _most_truncations(env: Env, horizon: int) -> int:
-    """Largest number of truncated episodes in one trajectory."""
-    task = getattr(env, "task", None)
-    return -(-horizon // env.steps) if task and not task.truncations else horizon
-
-
 def train(
     key: jax.Array,
     env: Env,
@@ -199,6 +193,12 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Bat
     entropy = jnp.mean(jnp.sum(log_std + 0.5 + HALF_LOG_2_PI, axis=-1))
     total = -surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
     return total, {"value_loss": value_loss, "kl": jnp.mean(ratio - 1 - log_ratio)}
+
+
+def _most_truncations(env: Env, horizon: int) -> int:
+    """Largest number of truncated episodes in one trajectory."""
+    task = getattr(env, "task", None)
+    return -(-horizon // env.steps) if task and not task.truncations else horizon
 
 
 def _learn(config: Config, state: TrainState, hidden_state: Any, trajectory: collect.Trajectory, noise: Array):

@@ -86,7 +86,9 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("hover", "bptt"): dict(
         updates=600, hidden_sizes=(64, 64), gradient="exact", learning_rate=2e-2, restart_fraction=0.2
     ),
-    ("hover", "ppo"): dict(updates=750, critic_hidden_sizes=(64, 64), privileged_critic=True, target_kl=0.01),
+    ("hover", "ppo"): dict(
+        updates=750, critic_hidden_sizes=(64, 64), privileged_critic=True, target_kl=0.01, anneal_fraction=0.6
+    ),
 }
 _ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {("hover", "bptt"): dict(updates=1200)}
 

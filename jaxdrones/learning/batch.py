@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones.envs.env import Obs
+from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, sharding
 from jaxdrones.learning.critic import critic_observation, discounted_value
 from jaxdrones.learning.exploration import sample
@@ -90,6 +91,12 @@ def minibatches(config: Any, batch: Batch) -> Batch:
     Without a hidden state the axes of steps and worlds are merged, and with a shared network those of the drones, too:
     arrays of fewer axes are faster.
     """
+    worlds = batch.advantage.shape[1]
+    if worlds % config.minibatches:
+        raise UserError(
+            f"each device has {worlds} worlds; give a number of worlds that is a multiple of minibatches, "
+            f"{config.minibatches}, on every device"
+        )
     merged = 0 if batch.starts is not None else 2 if config.per_agent else 3
 
     def cut(x):

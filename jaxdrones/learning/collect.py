@@ -104,7 +104,7 @@ def draw_starts(key: jax.Array, env: Env, count: int, progress: Array | None = N
         progress: progress of training, see `progress_of`.
     """
     obs, episodes = jax.vmap(AutoReset(env, progress).reset)(jax.random.split(key, count))
-    return obs, _without_constants(env, episodes)
+    return sharding.on_every_device((obs, _without_constants(env, episodes)))
 
 
 def restart(key: jax.Array, worlds: Worlds, starts: Starts, fraction: Scalar = 0.0) -> Worlds:

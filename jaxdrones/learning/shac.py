@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ from jaxtyping import Array
 from jaxdrones.checks import check_keywords
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
-from jaxdrones.learning import collect, result
+from jaxdrones.learning import collect, result, sharding
 from jaxdrones.learning.critic import critic_observation, discounted_value, init_critic
 from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
 from jaxdrones.learning.metrics import measure
@@ -115,7 +116,11 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
 
     (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     step, opt_state = _policy_optimizer(config).update(gradient, state.opt_state)
-    critic, critic_opt_state, critic_metrics = _fit_critic(critic_key, config, state, trajectory)
+    replicated = sharding.REPLICATED
+    fit = sharding.map_worlds(
+        functools.partial(_fit_critic, config), (replicated, replicated, sharding.STEPS), replicated
+    )
+    critic, critic_opt_state, critic_metrics = fit(critic_key, state.replace(worlds=None), trajectory)
     target_critic = optax.incremental_update(critic, state.target_critic, config.target_update_rate)
     policy = state.policy.replace(
         params=optax.apply_updates(state.policy.params, step),
@@ -163,7 +168,7 @@ def _final_observation(policy: Policy, trajectory: collect.Trajectory) -> Obs:
     return critic_observation(policy, trajectory.final_obs, hidden_state, trajectory.final_privileged)
 
 
-def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: collect.Trajectory):
+def _fit_critic(config: Config, key: jax.Array, state: TrainState, trajectory: collect.Trajectory):
     """Parameters, optimizer state and metrics of the critic after gradient steps on the TD(lambda) returns."""
     obs = critic_observation(state.policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged)
     now = discounted_value(config, state.target_critic, obs)
@@ -181,7 +186,7 @@ def _fit_critic(key: jax.Array, config: Config, state: TrainState, trajectory: c
         params, opt_state = carry
         start = jax.random.randint(key, (), 0, config.horizon - length + 1)
         batch = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, length), data)
-        cost, gradient = jax.value_and_grad(loss)(params, *batch)
+        cost, gradient = sharding.mean_over_devices(jax.value_and_grad(loss)(params, *batch))
         step, opt_state = _critic_optimizer(config).update(gradient, opt_state)
         return (optax.apply_updates(params, step), opt_state), (cost, optax.tree.norm(gradient))
 

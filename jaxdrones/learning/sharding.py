@@ -86,6 +86,13 @@ def map_worlds(function: Callable, in_specs: Any, out_specs: Any) -> Callable:
     return jax.shard_map(function, in_specs=in_specs, out_specs=out_specs, check_vma=False)
 
 
+def on_every_device(tree: Any) -> Any:
+    """Identity for arrays that every device computes for itself, outside of `map_worlds`."""
+    if jax.sharding.get_abstract_mesh().shape.get(_AXIS, 1) == 1:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, REPLICATED)
+
+
 def mean_over_devices(tree: Any) -> Any:
     """Mean of the arrays of all devices, in one exchange; for functions of `map_worlds`."""
     if jax.sharding.get_abstract_mesh().shape.get(_AXIS, 1) == 1:

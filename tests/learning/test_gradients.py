@@ -119,7 +119,7 @@ def test_images_may_be_constants_for_the_gradient_and_are_the_same():
 
     def depth(pos, image_gradient):
         drones = world.drones.replace(pos=pos)
-        seeing = with_gradient(env, "exact", image_gradient=image_gradient)
+        seeing = with_gradient(env, bptt.Config(image_gradient=image_gradient))
         obs, *_ = seeing.step(jax.random.key(0), world.replace(drones=drones), jnp.zeros((1, 4)))
         return obs["depth"][0, 1, 1]
 

@@ -197,7 +197,7 @@ def test_a_centralized_critic_learns_with_a_policy_per_agent():
     kernel = state.critic["params"]["Dense_0"]["kernel"]
     assert kernel.shape == (2, 25, 8)
     after, metrics = jit_unoptimized(lambda state: ppo.update(env, config, state))(state)
-    assert all(jnp.all(jnp.isfinite(x)) for x in metrics.values())
+    assert all(jnp.isfinite(x) for name, x in metrics.items() if name != "return")  # no episode has ended
     change = after.critic["params"]["Dense_0"]["kernel"] - kernel
     assert jnp.all(jnp.any(change != 0, axis=(1, 2)))
 

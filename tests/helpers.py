@@ -12,6 +12,7 @@ import pytest
 
 import jaxdrones
 from jaxdrones import Params, State
+from jaxdrones.accelerate.compiler import training_options
 
 VEHICLES = ("cf2x", "cf2p", "hb", "racer")
 """The vehicles of gym-pybullet-drones; tests/test_vehicles.py flies all bundled ones."""
@@ -23,9 +24,12 @@ STATE = [field.name for field in dataclasses.fields(State) if field.name != "aux
 CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name != "aux"]
 """Names of the arrays of parameters."""
 
-UNOPTIMIZED = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-jit_unoptimized = partial(jax.jit, compiler_options=UNOPTIMIZED)
-"""`jax.jit` in a third of the time, for large programs that run a few times and whose law is not about compilation."""
+
+def jit_unoptimized(function, **arguments):
+    """`jax.jit` in a third of the time for large programs that run a few times and whose law is not about compiling."""
+    options = training_options(differentiated=True) | {"xla_backend_optimization_level": 0}
+    return jax.jit(function, compiler_options=options, **arguments)
+
 
 make_step = lru_cache(jaxdrones.make_step)  # one compilation for all tests of a module that ask for the same step
 

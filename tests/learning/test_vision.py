@@ -1,5 +1,7 @@
 """Policies that see: what they promise, and that one learns to look."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -87,7 +87,8 @@ def learn(image: str, seeing: bool = True, key: jax.Array = KEY):
     with jd.make(look_at_the_ball(), backend="bullet", vision=(image,), action=climb_and_turn()) as env:
         if not seeing:
             env = dataclasses.replace(env, vision=Blindfold(**vars(env.vision)))
-        config = ppo.Config(updates=30, worlds=64, horizon=15, gamma=0.95, gae_lambda=0.95)
+        rates = dict(epochs=4, learning_rate=2e-3, max_learning_rate=5e-3)
+        config = ppo.Config(updates=30, worlds=64, horizon=15, gamma=0.95, gae_lambda=0.95, **rates)
         trained = ppo.train(key, env, config).policy
         untrained = Policy.init(key, env, config.hidden_sizes)
         return [evaluate(env, policy, jax.random.key(1), episodes=200) for policy in (untrained, trained)]

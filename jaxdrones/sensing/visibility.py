@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
@@ -22,30 +21,10 @@ from jaxdrones import rotation
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.geometry import Components, Interval, nonzero
 from jaxdrones.sensing.shapes import Obstacle
-from jaxdrones.vector import components, safe_sqrt
+from jaxdrones.vector import components, dot
 
 _UNROLL = 2  # solids per iteration; with all in one iteration compilers keep the image of each
 _SLACK = 1e-4  # relative margin for rounding by which the view and the solids are enlarged
-_SIDES = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [-1, 0, 0], [1, 0, 0]])
-"""Outward normals of the left, right, upper, lower, near and far side of the view frustum, in camera axes; the first
-four are those of a view without width and height, of which each unit adds `_WIDTH` or `_HEIGHT`."""
-_WIDTH = np.array([[-1, 0, 0]] * 2 + [[0, 0, 0]] * 4)
-_HEIGHT = np.array([[0, 0, 0]] * 2 + [[-1, 0, 0]] * 2 + [[0, 0, 0]] * 2)
-_NEAR, _FAR = np.array([0, 0, 0, 0, 1, 0]), np.array([0, 0, 0, 0, 0, 1])
-
-
-@jax.custom_batching.custom_vmap
-def largest_of_worlds(count: Array) -> Array:
-    """Identity; under `jax.vmap` the maximum over the worlds.
-
-    As a trip count it gives one loop for all worlds.
-    """
-    return count
-
-
-@largest_of_worlds.def_vmap
-def _largest(worlds: int, batched: list[bool], count: Array) -> tuple[Array, bool]:
-    return (jnp.max(count) if batched[0] else count), False
 
 
 class View(PyTreeNode):
@@ -71,7 +50,7 @@ class View(PyTreeNode):
 
 
 class Placed(PyTreeNode):
-    """Solids of one kind in camera coordinates; arrays have a leading axis over solids."""
+    """A solid in camera coordinates."""
 
     solid: Obstacle
     origin: Array
@@ -87,16 +66,23 @@ class Placed(PyTreeNode):
 
     def in_view(self, view: View) -> Array:
         """Whether the solid may intersect the view frustum: not all of it is beyond one side."""
+        forward, left, up = components(self.axes)
         width, height = ((1 + _SLACK) * jnp.max(jnp.abs(x)) for x in (view.u, view.v))
-        # Constants become arrays of JAX first: 0.10 mixes up those of NumPy where a process changes jax_enable_x64.
-        constants = (jnp.asarray(x, view.far.dtype) for x in (_SIDES, _WIDTH, _HEIGHT, _NEAR, _FAR))
-        sides, wider, higher, near, far = constants
-        normals = sides + width * wider + height * higher
-        length = safe_sqrt(jnp.sum(normals**2, axis=1))
-        outward = (normals / length[:, None]) @ self.axes
-        reach = (1 + _SLACK) * (jax.vmap(self.solid.extent)(outward) + self.solid.rounding)
-        offset = view.far * far - view.near * near
-        return jnp.all(outward @ -self.origin - reach <= offset / length)
+
+        def is_beyond(outward: Array, offset: Array | float) -> Array:
+            reach = (1 + _SLACK) * (self.solid.extent(outward) + self.solid.rounding)
+            return -dot(outward, self.origin) - reach > offset
+
+        def tilted(across: Array, slope: Array) -> Array:
+            return (across - slope * forward) / jnp.sqrt(1 + slope**2)
+
+        sides = [tilted(left, width), tilted(-left, width), tilted(up, height), tilted(-up, height)]
+        beyond = [
+            is_beyond(-forward, -view.near),
+            is_beyond(forward, view.far),
+            *(is_beyond(side, 0) for side in sides),
+        ]
+        return ~functools.reduce(jnp.logical_or, beyond)
 
     def normal(self, u: Array, v: Array, depth: Array) -> tuple[Array, Array]:
         """Components to the left and up, over that along the ray, of the normals where the rays of pixels hit."""
@@ -147,14 +133,10 @@ Solids = list[Obstacle | Ground]
 """Kinds of solids; arrays of each have a leading axis over the solids of the kind."""
 
 
-def _placed(view: View, solids: Any) -> Placed:
-    """Solids of one kind in camera coordinates."""
-
-    def one(solid: Any) -> Placed:
-        to_local = jax.vmap(functools.partial(rotation.rotate_inverse, solid.quat))
-        return Placed(solid, solid.to_local(view.eye), to_local(view.axes))
-
-    return jax.vmap(one)(solids)
+def _placed(view: View, solid: Any) -> Placed:
+    """A solid in camera coordinates."""
+    to_local = jax.vmap(functools.partial(rotation.rotate_inverse, solid.quat))
+    return Placed(solid, solid.to_local(view.eye), to_local(view.axes))
 
 
 @jax.custom_jvp
@@ -225,22 +207,25 @@ def _pass(function: Callable[..., Array], start: Array, view: View, solids: Soli
     """Fold `(image, solid, active, index) -> image` over the solids in view."""
     image, count = start, 0
     for kind, mask in zip(solids, active, strict=True):
-        placed, size = _placed(view, kind), len(mask)
-        there = mask & jax.vmap(lambda solid: solid.in_view(view))(placed)
-        rank = jnp.sum(there[None] & np.tri(size, k=-1, dtype=bool), axis=1)  # among those that are there
-        place = jnp.arange(size + -size % _UNROLL)
-        found = (rank[None] == place[:, None]) & there[None]
-        index = jnp.max(jnp.where(found, np.arange(size)[None], 0), axis=1)
-        xs = jax.tree.map(lambda x, index=index: x[index], placed), jnp.any(found, axis=1), count + index
-        xs = jax.tree.map(lambda x: x.reshape(-1, _UNROLL, *x.shape[1:]), xs)
+        size = len(mask)
+        there = mask & jax.vmap(lambda solid: _placed(view, solid).in_view(view))(kind)
+        following = jax.lax.cummin(jnp.where(there, jnp.arange(size), size), reverse=True)
+        following = jnp.append(following, jnp.full(2, size))  # the first in view from each place on
 
-        def turn(i: Array, image: Array, xs=xs) -> Array:
-            some = jax.tree.map(lambda x: x[i], xs)
+        def turn(
+            carry: tuple[Array, Array], kind=kind, size=size, count=count, following=following
+        ) -> tuple[Array, Array]:
+            at, image = carry
             for k in range(_UNROLL):
-                image = function(image, *jax.tree.map(lambda x, k=k: x[k], some))
-            return image
+                solid = _placed(view, jax.tree.map(lambda x, at=at: x[at], kind))
+                image = function(image, solid, k == 0 or at < size, count + at)
+                at = following[at + 1]
+            return at, image
 
-        image = jax.lax.fori_loop(0, -(-largest_of_worlds(jnp.sum(there)) // _UNROLL), turn, image)
+        def goes_on(carry: tuple[Array, Array], size=size) -> Array:
+            return carry[0] < size
+
+        _, image = jax.lax.while_loop(goes_on, turn, (following[0], image))
         count += size
     return image
 
@@ -275,7 +260,7 @@ def _depth_jvp(primals: tuple[View, Solids, list], tangents: tuple[View, Solids,
 def _rate_of_solids(view: View, solids: Any, changed: Any, index: Int[Array, "h w"]) -> Float[Array, "h w"]:
     """Tangent of a pixel's depth with respect to the solids of one kind; zero where another kind is visible."""
     changed = jax.tree.map(_instantiated, changed, solids, is_leaf=lambda x: isinstance(x, SymbolicZero))
-    placed, tangents = jax.jvp(functools.partial(_placed, view), (solids,), (changed,))
+    placed, tangents = jax.jvp(jax.vmap(functools.partial(_placed, view)), (solids,), (changed,))
 
     @jax.checkpoint
     def add(rate: Array, solid: Placed, tangent: Placed, i: Array) -> Array:

@@ -58,23 +58,24 @@ def between_planes(origin: Array, direction: Array, half: Array) -> Interval:
 
 def within_radius(origin: Components, direction: Components, radius: Number) -> Interval:
     """Interval of lines within `radius` of zero; the empty interval [inf, -inf] for a miss."""
-    square = _product(direction, direction)
+    square = product(direction, direction)
     divisor = nonzero(square)
     per_square = 1 / divisor
-    middle = -_product(origin, direction) * per_square
+    middle = -product(origin, direction) * per_square
     if len(origin) == 2:  # the closest distance is a cross product, and that of the origin where nothing moves
         (x, y), (u, v) = origin, direction
         slack = divisor * radius**2 - (x * v - y * u) ** 2 - (divisor - square) * (x * x + y * y)
         half = safe_sqrt(slack) * per_square
     else:
         closest = [o + middle * d for o, d in zip(origin, direction, strict=True)]
-        slack = radius**2 - _product(closest, closest)
+        slack = radius**2 - product(closest, closest)
         half = safe_sqrt(slack * per_square)
     reach = jnp.where(slack >= 0, half, -jnp.inf)
     return middle - reach, middle + reach
 
 
-def _product(a: Components, b: Components) -> Array:
+def product(a: Components, b: Components) -> Array:
+    """Scalar product of two vectors, or of many."""
     return functools.reduce(jnp.add, (x * y for x, y in zip(a, b, strict=True)))
 
 

@@ -16,10 +16,11 @@ from jaxdrones.checks import check_shape
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.camera import Camera, check_camera
+from jaxdrones.sensing.frustum import Ground, View
 from jaxdrones.sensing.scene import Scene, check_scene
 from jaxdrones.sensing.shading import shade
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle
-from jaxdrones.sensing.visibility import Ground, View, depth, visible
+from jaxdrones.sensing.visibility import depth, visible
 from jaxdrones.state import State
 from jaxdrones.vector import along_z, cross, unit
 
@@ -175,9 +176,9 @@ def _picture(camera: Camera, view: View, around: _Surroundings, seen: Bool[Array
     """Images of one camera, without an axis over drones."""
     seen_kinds = jnp.split(seen, np.cumsum([len(kind.pos) for kind in around.kinds])[:-1])
     depths = depth(view, around.kinds, seen_kinds)
-    still, solids, still_depths = jax.lax.stop_gradient((view, around.kinds, depths))
-    index = visible(still, solids, seen_kinds)
-    rgb = shade(still, solids, around.colors, around.ground, index, still_depths)
+    still, solids = jax.lax.stop_gradient((view, around.kinds))
+    index, about = visible(still, solids, seen_kinds)
+    rgb = shade(still, solids, around.colors, around.ground, index, about)
     width, height = camera.resolution
     shape = height, width
     return Images(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxdrones.sensing.visibility import Solids, View, normals
-from jaxdrones.vector import safe_sqrt
+from jaxdrones.sensing.frustum import Placed, Solids, View, chosen, fold
+from jaxdrones.sensing.geometry import nonzero, product
+from jaxdrones.vector import components, safe_sqrt
 
 SUN = (-0.48, 0.36, 0.8)
 """Unit vector towards the sun, world: behind and to the left of a drone that flies along x."""
@@ -30,32 +34,52 @@ def shade(
         view: rays.
         solids: visible solids.
         colors: of every solid, 0 to 1.
-        ground: index of the ground among the solids, if there is one.
+        ground: index of the ground, the last of the solids, if there is one.
         index: solid of each pixel.
-        depth: of its surface, m.
+        depth: of its surface, m; rounding of it is invisible.
     """
-    normal = -normals(view, solids, index, depth)  # towards the camera
-    facing = jnp.tensordot(view.axes @ jnp.asarray(SUN, depth.dtype), normal, 1)
-    cosine = facing / safe_sqrt(jnp.sum(normal**2, axis=0))
-    light = _AMBIENT + (1 - _AMBIENT) * jnp.maximum(cosine, 0)
+    color = _painted(view, solids if ground is None else solids[:-1], colors, index, depth)
     rays = [x + view.u * y + view.v * z for x, y, z in view.axes.T]  # world
-    color = colors[jnp.minimum(index, len(colors) - 1)]
     if ground is not None:
         x, y = (eye + depth * ray for eye, ray in zip(view.eye[:2], rays[:2], strict=True))
         tiles = _mixed(_DARK, _BRIGHT, _checkered(x, y, _footprint(view, depth, rays)))
-        color = jnp.where((index == ground)[..., None], tiles, color)
-    color = color * light[..., None]
+        color = jnp.where(index == ground, _number([_lit(SUN[2]) * channel for channel in tiles]), color)
     climb = rays[2] / _length(rays)
-    sky = _mixed(_HORIZON, _ZENITH, jnp.clip(climb, 0, 1))
-    color = jnp.where((index < len(colors))[..., None], color, sky)
-    opaque = jnp.ones_like(color[..., :1])
-    return jnp.round(255 * jnp.clip(jnp.concatenate([color, opaque], axis=-1), 0, 1)).astype(jnp.uint8)
+    sky = _number(_mixed(_HORIZON, _ZENITH, jnp.clip(climb, 0, 1)))
+    color = jnp.where(index < len(colors), color, sky).astype(jnp.uint32)
+    shifts = jnp.arange(0, 32, 8, dtype=jnp.uint32)[None, None]
+    return ((color | jnp.uint32(255 << 24))[..., None] >> shifts).astype(jnp.uint8)
 
 
-def _mixed(a: tuple[float, float, float], b: tuple[float, float, float], share: Float[Array, "h w"]) -> Array:
-    """(h, w, 3) linear interpolation between colors a and b."""
-    first, second = jnp.asarray(a, share.dtype), jnp.asarray(b, share.dtype)
-    return first[None, None] + share[..., None] * (second - first)[None, None]
+def _painted(view: View, solids: Solids, colors: Array, index: Array, depth: Array) -> Float[Array, "h w"]:
+    """Numbers of the colors of the solids in the light of the sun."""
+    sun = view.axes @ jnp.asarray(SUN, depth.dtype)
+    colors = jnp.clip(colors, 0, 1)
+
+    def choose(number: Array, solid: Placed, active: Array, i: Array) -> Array:
+        normal = solid.normals(view.u, view.v, depth)
+        length = safe_sqrt(product(normal, normal))
+        light = _lit(product(normal, components(sun @ solid.axes)) / nonzero(length))
+        return chosen(number, (index == i) & active, _number([light * channel for channel in components(colors[i])]))
+
+    active = [jnp.ones(len(kind.pos), bool) for kind in solids]
+    return fold(choose, jnp.full_like(depth, -jnp.inf), view, solids, active)
+
+
+def _lit(cosine: Any) -> Any:
+    """Light on a surface, given the cosine of the angle between its normal and the sun."""
+    return _AMBIENT + (1 - _AMBIENT) * jnp.maximum(cosine, 0)
+
+
+def _number(color: Sequence[Array]) -> Array:
+    """Red, green and blue, 0 to 1, as one whole number of three bytes: exact in a float."""
+    red, green, blue = (jnp.round(255 * channel) for channel in color)
+    return red + 256 * green + 65536 * blue
+
+
+def _mixed(a: tuple[float, float, float], b: tuple[float, float, float], share: Float[Array, "h w"]) -> list[Array]:
+    """Linear interpolation between colors a and b."""
+    return [x + share * (y - x) for x, y in zip(a, b, strict=True)]
 
 
 def _footprint(view: View, depth: Float[Array, "h w"], rays: list[Array]) -> Float[Array, "h w"]:

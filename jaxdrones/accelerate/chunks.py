@@ -69,7 +69,7 @@ class ChunkedProgram:
             NoKernelError: the program cannot be a single kernel.
         """
 
-        @_as_one_kernel
+        @as_one_kernel
         def chunks(consts, leaves):
             def of_a_chunk(*leaves):
                 last = [jnp.moveaxis(x, axis, -1) for x, axis in zip(leaves, self.along, strict=True)]
@@ -123,7 +123,7 @@ def _joined(chunks: Array, worlds: int) -> Array:
     return jnp.concatenate([chunks[:-1].reshape(worlds - rest, *shape), chunks[-1, -rest:]])
 
 
-def _as_one_kernel(function: Callable) -> Callable:
+def as_one_kernel(function: Callable) -> Callable:
     """Compile the function to a single kernel.
 
     XLA computes a single large result in several threads, and aborts for an unused argument. So the first number of

@@ -58,6 +58,11 @@ def kernel_options() -> dict[str, Any]:
     )
 
 
+def small_options() -> dict[str, Any]:
+    """Options of `jax.jit` for a function that may be a single kernel on a CPU: no sums by a library."""
+    return _known(xla_cpu_experimental_ynn_fusion_type="")
+
+
 def training_options(differentiated: bool) -> dict[str, Any]:
     """Options for short compilation and execution of trainings on a CPU; empty on other devices.
 

@@ -44,16 +44,19 @@ class NoKernelError(Exception):
 
 
 def fits_a_kernel(program: Any) -> bool:
-    """Whether a program can and should be a single kernel.
+    """Whether a program of many worlds can and should be a single kernel.
 
-    It should if it has a loop, with otherwise many kernels per iteration. It can if every primitive is on the list of
-    supported ones.
+    It should if it has a loop, with otherwise many kernels per iteration.
     """
+    loops = [eqn for eqn in _equations(program) if eqn.primitive.name == "scan" and eqn.params["length"] > 1]
+    return bool(loops) and can_be_a_kernel(program)
+
+
+def can_be_a_kernel(program: Any) -> bool:
+    """Whether every primitive of a program is on the list of supported ones, and every number real."""
     equations = list(_equations(program))
-    loops = [eqn for eqn in equations if eqn.primitive.name == "scan" and eqn.params["length"] > 1]
     return (
-        bool(loops)
-        and not program.effects
+        not program.effects
         and all(_is_allowed(eqn) for eqn in equations)
         and all(_is_plain(v.aval) for eqn in equations for v in (*eqn.invars, *eqn.outvars))
         and all(_is_plain(v.aval) for v in (*program.invars, *program.constvars))

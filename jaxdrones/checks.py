@@ -19,7 +19,7 @@ from jaxdrones.errors import UserError
 
 _SMALLEST = np.finfo(np.float64).tiny
 _LONGEST = 120  # characters of a value in an error
-_UNIT_LENGTH = 1e-3  # tolerance of the length of a unit quaternion, far above float32 and integrator errors
+UNIT_LENGTH = 1e-3  # tolerance of the length of a unit quaternion, far above float32 and integrator errors
 _NUMBERS = "biuf"  # kinds of dtypes
 POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_rpm")
 """Constants of a vehicle that must be positive."""
@@ -272,7 +272,7 @@ def check_quaternion(name: str, quat: Any) -> None:
         return
     quat = np.asarray(quat, float)
     length = np.sqrt((quat * quat).sum(axis=-1))
-    off = ~(np.abs(length - 1) <= _UNIT_LENGTH)
+    off = ~(np.abs(length - 1) <= UNIT_LENGTH)
     if off.any():
         given, length = quat[off][0].tolist(), np.atleast_1d(length[off])[0]
         raise UserError(f"{name} has length {length:g}: {given}; give a unit quaternion (x, y, z, w)")

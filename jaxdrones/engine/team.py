@@ -94,9 +94,9 @@ class Layout(NamedTuple):
         """Number of columns."""
         return sum(map(math.prod, self.shapes))
 
-    def unpack(self, flat: Any) -> Any:
-        """Pytree of a packed array (n, k) of JAX or NumPy; the inverse of `pack`."""
-        leaves, start = [], 0
+    def unpack(self, flat: Any, start: int = 0) -> Any:
+        """Pytree of the columns of an array (n, k) of JAX or NumPy from `start` on; the inverse of `pack`."""
+        leaves = []
         for shape in self.shapes:
             end = start + math.prod(shape)
             leaves.append(flat[:, start:end].reshape(len(flat), *shape))
@@ -106,5 +106,9 @@ class Layout(NamedTuple):
 
 def pack(tree: Any, n: int) -> Float[Array, "n k"]:
     """Pack a pytree of arrays (n, ...) into one array, a row per drone."""
-    leaves = [jnp.reshape(leaf, (n, -1)) for leaf in jax.tree.leaves(tree)]
-    return jnp.concatenate([jnp.zeros((n, 0)), *leaves], axis=-1)
+    return jnp.concatenate([jnp.zeros((n, 0)), *columns(tree, n)], axis=-1)
+
+
+def columns(tree: Any, n: int) -> list[Array]:
+    """Arrays (n, ...) of a pytree as arrays (n, k)."""
+    return [jnp.reshape(leaf, (n, -1)) for leaf in jax.tree.leaves(tree)]

@@ -10,6 +10,8 @@ from types import ModuleType
 import numpy as np
 
 from jaxdrones.checks import check_choice
+from jaxdrones.engine.bullet.arrays import NEAR, START_OMEGA, reach
+from jaxdrones.engine.bullet.frames import in_body
 from jaxdrones.engine.bullet.surroundings import Surroundings, quiet
 from jaxdrones.errors import UserError, install
 from jaxdrones.sensing import Scene
@@ -53,7 +55,8 @@ class Client:
         self.drones: list[int] = []
         self._damping = float(np.float32(damping))  # Bullet's default of 0.04 is in single precision
         self._collision = collision
-        self._team = np.empty((0, 20))
+        self._team, self._reach = np.empty((0, 20)), np.empty(0)
+        self._colliding: list[bool] = []  # drones in the collision world
         if gui and sys.platform == "linux" and not os.environ.get("DISPLAY"):  # Bullet would end the process
             raise OSError("no window can be opened without a display; start one (or use xvfb-run), or leave gui out")
         self.id = self.p.connect(self.p.GUI if gui else self.p.DIRECT)
@@ -104,6 +107,8 @@ class Client:
             for drone in self.drones:
                 self.p.removeBody(drone, physicsClientId=self.id)
             self.drones = [self._add_drone(*shape) for shape in team[:, _SHAPE].tolist()]
+            self._colliding = [True] * len(team)
+            self._reach = reach(*team[:, :3].T)
         for drone, (mass, *inertia) in zip(self.drones, team[:, _INERTIAL].tolist(), strict=True):
             self.p.changeDynamics(
                 drone,
@@ -128,38 +133,41 @@ class Client:
             labels[around.ground] = GROUND
         return labels
 
-    def matrices(self, quats: np.ndarray) -> np.ndarray:
-        """Rotation matrices (n, 3, 3) of quaternions (n, 4); in double precision, unlike `rotateVector`."""
-        return np.array([self.p.getMatrixFromQuaternion(quat) for quat in quats.tolist()]).reshape(-1, 3, 3)
-
     def place(self, body: np.ndarray) -> None:
-        """Set the position, attitude, velocity and angular velocity (n, 13+) of the drones, world.
-
-        Contact manifolds outlive a change of pose. Removing a drone from the collision world and adding it again clears
-        them, so the result does not depend on earlier steps.
-        """
-        p, client = self.p, self.id
+        """Set the position and attitude (n, 7+) of the drones, world."""
         for drone, row in zip(self.drones, body.tolist(), strict=True):
-            # The client by position: pybullet reads keywords a third slower.
-            p.setCollisionFilterGroupMask(drone, -1, 0, 0, client)
-            p.setCollisionFilterGroupMask(drone, -1, 1, -1, client)
-            p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], client)
-            p.resetBaseVelocity(drone, row[7:10], row[10:13], client)
+            self.p.resetBasePositionAndOrientation(drone, row[:3], row[3:7], self.id)
 
-    def advance(self, body: np.ndarray, loads: np.ndarray) -> np.ndarray:
-        """One physics step from `body` under force and torque (n, 6+), world; returns the next (n, 13)."""
+    def advance(self, team: np.ndarray, loads: np.ndarray) -> np.ndarray:
+        """One physics step of a team (n, 13+) under `loads` (n, 10+), see `arrays`; returns the next (n, 13)."""
         p, client, world = self.p, self.id, self.p.WORLD_FRAME
-        self.place(body)
-        for drone, pos, load in zip(self.drones, body[:, :3].tolist(), loads.tolist(), strict=True):
+        near, before = self._near(team, loads), self._colliding
+        given = zip(self.drones, team.tolist(), loads.tolist(), near, before, strict=True)
+        for drone, row, load, is_near, was_near in given:
+            # Contact manifolds outlive a change of pose. Removing a drone from the collision world and adding it again
+            # clears them, so the result does not depend on earlier steps. Drones that can touch nothing stay outside.
+            if is_near or was_near:
+                p.setCollisionFilterGroupMask(drone, -1, int(is_near), -int(is_near), client)
+            pos = row[:3]  # the client by position: pybullet reads keywords a third slower
+            p.resetBasePositionAndOrientation(drone, pos, row[3:7], client)
+            p.resetBaseVelocity(drone, row[7:10], load[START_OMEGA], client)
             p.applyExternalForce(drone, -1, load[:3], pos, world, client)
             p.applyExternalTorque(drone, -1, load[3:6], world, client)
+        self._colliding = near
         p.stepSimulation(client)
-        after = []
+        after: list[float] = []
         for drone in self.drones:
             pos, quat = p.getBasePositionAndOrientation(drone, client)
             vel, omega = p.getBaseVelocity(drone, client)
-            after.append(pos + quat + vel + omega)
-        return np.array(after)
+            after += pos + quat + vel + in_body(quat, omega)
+        return np.array(after).reshape(-1, 13)
+
+    def _near(self, team: np.ndarray, loads: np.ndarray) -> list[bool]:
+        """Which drones of a team under `loads` may touch something."""
+        near = loads[:, NEAR] > 0
+        if self.surroundings.obstacles:
+            near |= self.surroundings.near(team[:, :3], self._reach)
+        return near.tolist()
 
     def _load_egl(self) -> None:
         spec = importlib.util.find_spec("eglRenderer")

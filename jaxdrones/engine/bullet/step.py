@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from jax.typing import ArrayLike
 
-from jaxdrones import rotation
+from jaxdrones.accelerate.small import jit_small
 from jaxdrones.checks import check_finite, check_params, check_quaternion
 from jaxdrones.engine.bullet import arrays
 from jaxdrones.engine.bullet.camera import drone_pictures, photo, views
@@ -20,7 +20,7 @@ from jaxdrones.engine.bullet.client import Client
 from jaxdrones.engine.bullet.contacts import Contact, contacts_of_last_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import HostStep, is_traced
-from jaxdrones.engine.team import Layout, check_team, pack
+from jaxdrones.engine.team import Layout, check_team, columns, pack
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene
 from jaxdrones.sensing.camera import check_camera
@@ -40,6 +40,7 @@ class BulletStep(HostStep):
         self.client, self.physics, self.substeps, self.dt, self._scene = client, physics, substeps, dt, scene
         client.set_scene(scene)
         self._loads = arrays.make_loads(physics, dt)
+        self._compiled_loads = jit_small(self._loads, static=2)
         self._at_speed = jax.jit(arrays.make_start(physics))
         # Cache of the last concrete call, valid for identical arguments:
         self._params: Params | None = None
@@ -83,20 +84,19 @@ class BulletStep(HostStep):
         return jax.tree.map(lambda b, a: (b - a) / self.dt, after, state)
 
     def _flown(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None, substeps: int) -> State:
-        scene = self._given(scene)
         if is_traced((state, rpm, scene)) or (params is not self._params and is_traced(params)):
             self.client.check_open()
             check_team(params, state, rpm)
-            return _refuse_gradients(functools.partial(self._traced, substeps))(params, state, rpm, scene)
-        acting = self._set_scene(scene)
-        team = self._pack(params, state, rpm)
-        aux = Layout.of(state.aux)
-        for _ in range(substeps):
+            flown = _refuse_gradients(functools.partial(self._traced, substeps))
+            return flown(params, state, rpm, self._given(scene))
+        acting = self._set_scene(self._given(scene))
+        team, aux = self._pack(params, state, rpm), Layout.of(state.aux)
+        for k in range(substeps):
             loads = self._loads_on(team, aux, acting)
-            team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
-            team[:, arrays.BODY] = self.client.advance(team, loads)
-            team[:, arrays.RPM], team[:, arrays.AUX] = loads[:, arrays.NEXT_RPM], loads[:, arrays.NEXT_AUX]
-        return self._unpack(team, state)
+            if k == 0 and loads[:, arrays.SUSPECT].any():
+                _check(state, rpm)
+            team = _following(np, self.client.advance(team, loads), team, loads)
+        return _unpack(team.astype(self._flat_params.dtype), aux)
 
     def contacts(self, params: Params, state: State, scene: Scene | None = None) -> list[Contact]:
         """Contacts in the next physics step, with the rotors held at `state.rpm`.
@@ -106,9 +106,8 @@ class BulletStep(HostStep):
         """
         acting = self._set_scene(self._given(scene))
         team = self._pack(params, state, state.rpm)
-        loads = self._loads_on(team, Layout.of(state.aux), acting)
-        team[:, arrays.OMEGA] = loads[:, arrays.START_OMEGA]
-        self.client.advance(team, loads)
+        _check(state, state.rpm)
+        self.client.advance(team, self._loads_on(team, Layout.of(state.aux), acting))
         return contacts_of_last_step(self.client, self.dt)
 
     def camera(
@@ -168,15 +167,16 @@ class BulletStep(HostStep):
 
     def _place(self, params: Params, state: State) -> np.ndarray:
         team = self._pack(params, state, state.rpm)
+        _check(state, state.rpm)
         self.client.place(team)
         return team
 
     def _loads_on(self, team: np.ndarray, aux: Layout, scene: Scene) -> np.ndarray:
         team = team.astype(self._flat_params.dtype)
-        return np.asarray(self._loads(self._layout, aux, self._flat_params, team, scene))
+        return np.asarray(self._compiled_loads(self._layout, aux, self._flat_params, team, scene))
 
     def _pack(self, params: Params, state: State, rpm: ArrayLike) -> np.ndarray:
-        """Validate a call with concrete arguments, set the team's bodies, and pack the call into one array."""
+        """Validate the shapes of concrete arguments, set the team's bodies, and pack the call into one array."""
         self.client.check_open()
         n = len(state.pos)
         shapes = [np.shape(x) for x in (*jax.tree.leaves(state), rpm)]
@@ -186,25 +186,8 @@ class BulletStep(HostStep):
             self._layout, self._flat_params = Layout.of(params), pack(params, n)
             self.client.set_team(np.asarray(arrays.bodies_of(params), float))
             self._params, self._shapes = params, shapes
-        team = np.empty((n, arrays.COMMAND.stop + Layout.of(state.aux).width))
-        for name, columns in arrays.COLUMNS.items():
-            team[:, columns] = getattr(state, name)
-        team[:, arrays.COMMAND] = rpm
-        if state.aux:
-            team[:, arrays.AUX] = pack(state.aux, n)
-        if not np.isfinite(team).all():
-            check_finite("state", state)
-            check_finite("rpm", rpm)
-        check_quaternion("state.quat", team[:, arrays.QUAT])
-        team[:, arrays.OMEGA] = (self.client.matrices(team[:, arrays.QUAT]) @ team[:, arrays.OMEGA, None])[..., 0]
-        return team
-
-    def _unpack(self, team: np.ndarray, state: State) -> State:
-        """State of a team from its packed array, as NumPy arrays."""
-        team[:, arrays.OMEGA] = (team[:, None, arrays.OMEGA] @ self.client.matrices(team[:, arrays.QUAT]))[:, 0]
-        team = team.astype(self._flat_params.dtype)
-        fields: dict[str, Any] = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
-        return state.replace(**fields, aux=Layout.of(state.aux).unpack(team[:, arrays.AUX]))
+        fields = [state.pos, state.quat, state.vel, state.omega, state.rpm, rpm]
+        return np.concatenate([*fields, *columns(state.aux, n)], axis=1, dtype=float)
 
     def _traced(self, substeps: int, params: Params, state: State, rpm: jax.Array, scene: Scene) -> State:
         """Step in a compiled program, which computes the wrenches and calls back for every physics step."""
@@ -218,17 +201,12 @@ class BulletStep(HostStep):
 
         def substep(team, _):
             loads = self._loads(layout, aux, flat_params, team, acting)
-            team = team.at[:, arrays.OMEGA].set(loads[:, arrays.START_OMEGA])
             after = jax.ShapeDtypeStruct((len(team), arrays.BODY.stop), team.dtype)
             body = jax.pure_callback(advance, after, bodies, handed, team, loads, vmap_method="sequential")
-            return jnp.concatenate(
-                [body, loads[:, arrays.NEXT_RPM], team[:, arrays.COMMAND], loads[:, arrays.NEXT_AUX]], axis=-1
-            ), None
+            return _following(jnp, body, team, loads), None
 
         team, _ = jax.lax.scan(substep, team, length=substeps)
-        fields = {name: team[:, columns] for name, columns in arrays.COLUMNS.items()}
-        state = state.replace(**fields, aux=aux.unpack(team[:, arrays.AUX]))
-        return state.replace(omega=jax.vmap(rotation.rotate_inverse)(state.quat, state.omega))
+        return _unpack(team, aux)
 
     def _traced_camera(self, params: Params, state: State, camera: Camera, scene: Scene) -> Images:
         """Camera images in a compiled program; the callback itself avoids JAX, which would be slow."""
@@ -258,6 +236,25 @@ class BulletStep(HostStep):
         self._params = None
         self.client.set_scene(self._scene if scene is None else jax.tree.map(np.asarray, scene))
         self.client.set_team(np.asarray(bodies, float))
+
+
+def _check(state: State, rpm: ArrayLike) -> None:
+    """Raise unless all numbers are finite and quaternions of unit length."""
+    check_finite("state", state)
+    check_finite("rpm", rpm)
+    check_quaternion("state.quat", state.quat)
+
+
+def _following(xnp: Any, body: Any, team: Any, loads: Any) -> Any:
+    """Array of a team after a physics step that left `body`; of NumPy or JAX, as `xnp` is."""
+    command = team[:, arrays.COMMAND]
+    return xnp.concatenate([body, loads[:, arrays.NEXT_RPM], command, loads[:, arrays.NEXT_AUX]], axis=-1)
+
+
+def _unpack(team: Any, aux: Layout) -> State:
+    """State of a team from its array."""
+    fields = {name: team[:, place] for name, place in arrays.COLUMNS.items()}
+    return State(**fields, aux=aux.unpack(team, arrays.AUX.start))
 
 
 def _refuse_gradients(function: Callable) -> Callable:

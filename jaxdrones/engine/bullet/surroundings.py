@@ -40,6 +40,7 @@ class Surroundings:
         self._scene: Scene | None = None
         self._structure: Any = jax.tree.structure(None)
         self._numbers = np.zeros(0)
+        self._boxes = np.zeros((0, 2, 3))  # around the obstacles: lowest and highest corner, m, world
 
     def set(self, scene: Scene) -> bool:
         """Set the scene, of NumPy arrays; return whether anything changed.
@@ -66,7 +67,20 @@ class Surroundings:
             self._place(number, obstacle)
         for body in self.obstacles.values() if self.ground is None else (self.ground, *self.obstacles.values()):
             self._register(body)
+        self._boxes = np.array([self._box(body) for body in self.obstacles.values()]).reshape(-1, 2, 3)
         return True
+
+    def near(self, pos: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Which balls (n,) with centers (n, 3) and radii (n,), m, meet the box around an obstacle."""
+        low, high = self._boxes[:, 0], self._boxes[:, 1]
+        outside = np.maximum(np.maximum(low - pos[:, None], pos[:, None] - high), 0)
+        return ((outside**2).sum(axis=-1) <= reach[:, None] ** 2).any(axis=-1)
+
+    def _box(self, body: int) -> np.ndarray:
+        """Lowest and highest corner (2, 3) of a body with its links, m, world."""
+        links = range(-1, self.p.getNumJoints(body, self.id))
+        corners = np.array([self.p.getAABB(body, link, self.id) for link in links])
+        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
     def _register(self, body: int) -> None:
         """Register a body again: Bullet resolves contacts in the order of registration."""

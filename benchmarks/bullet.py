@@ -1,6 +1,7 @@
 """How many steps and frames per second does the Bullet backend make?
 
-One process, one thread of Bullet. A physics step is 1/240 s. Medians of repeats, all in one run.
+Per second of processor time of one process, so that other processes matter less. A physics step is 1/240 s. Medians of
+repeats, all in one run.
 """
 
 import argparse
@@ -34,13 +35,13 @@ def hovering(n: int) -> tuple[jd.Params, jd.State, np.ndarray]:
 
 
 def median_rate(work, count: int, repeats: int) -> float:
-    """Units of work per second: `work()` does `count` of them; the first call warms up."""
+    """Units of work per second of processor time: `work()` does `count` of them; the first call warms up."""
     work()
     times = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = time.process_time()
         work()
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     return count / statistics.median(times)
 
 

@@ -53,7 +53,10 @@ Program = Callable[[], object]
 
 
 def in_turn(programs: dict[str, Program], repeats: int, shortest: float = 0.05) -> dict[str, dict[str, float]]:
-    """Median and best seconds of each, warmed up; a turn takes `shortest` s, in many calls if need be."""
+    """Median, best and spread (upper less lower quartile) of the seconds of each, warmed up.
+
+    A turn takes `shortest` s, in many calls if need be.
+    """
     for program in programs.values():
         _seconds(program, 1)
     calls = {name: 1 + int(shortest / _seconds(program, 1)) for name, program in programs.items()}
@@ -61,7 +64,13 @@ def in_turn(programs: dict[str, Program], repeats: int, shortest: float = 0.05) 
     for _ in range(repeats):
         for name, program in programs.items():
             times[name].append(_seconds(program, calls[name]))
-    return {name: {"median": statistics.median(taken), "best": min(taken)} for name, taken in times.items()}
+    return {name: summary(taken) | {"best": min(taken)} for name, taken in times.items()}
+
+
+def summary(times: Sequence[float]) -> dict[str, float]:
+    """Median and spread, the upper less the lower quartile."""
+    quartiles = statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else (0.0, 0.0, 0.0)
+    return {"median": statistics.median(times), "spread": quartiles[2] - quartiles[0]}
 
 
 def _seconds(program: Program, calls: int) -> float:

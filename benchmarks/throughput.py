@@ -4,6 +4,7 @@ A world is one drone with constant rotor speeds of its own. One dispatch flies m
 """
 
 import argparse
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +76,16 @@ def make_step(options) -> jd.Step:
     )
 
 
+def miss(step: jd.Step, params: jd.Params) -> Callable[[jd.State, jax.Array], jax.Array]:
+    """`(start, rpms) -> mean squared final position` of one world, with other rotor speeds in every step."""
+
+    def loss(start: jd.State, rpms: jax.Array) -> jax.Array:
+        final, _ = jax.lax.scan(lambda state, rpm: (step(params, state, rpm), None), start, rpms)
+        return jnp.mean(final.pos**2)
+
+    return loss
+
+
 def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     """Rates in million drone-steps per second; the gradient is against the forward pass of the same rollout."""
     n = options.drones
@@ -84,9 +95,7 @@ def measure(step: jd.Step, worlds: int, options) -> dict[str, float]:
     )
     grad_length = 10 if options.quick else GRADIENT_STEPS
 
-    def loss(start, rpms):
-        final, _ = jax.lax.scan(lambda state, rpm: (step(params, state, rpm), None), start, rpms)
-        return jnp.mean(final.pos**2)
+    loss = miss(step, params)
 
     def many(world):
         return jax.jit(jax.vmap(world)) if options.vmap else jd.over_worlds(world)

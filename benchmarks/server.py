@@ -1,0 +1,46 @@
+"""Measure the programs of programs.py on request, in a process of its own; what against.py compares commits with.
+
+The first line that it writes has the definitions of all rows, as JSON. Then it answers each line that it reads with one
+line: `prepare NAME` compiles a program, `NAME` measures its time, `NAME, compile` compiles it anew. An answer is
+`{"seconds": ...}`, or `{"error": ...}`.
+"""
+
+import functools
+import json
+import sys
+
+from benchmarks.common import in_turn
+from benchmarks.programs import COMPILED, PROGRAMS, Programs
+
+REPEATS = 5
+COMPILE, PREPARE = ", compile", "prepare "
+
+
+def definitions() -> dict[str, str]:
+    """What each row is; rows of commits are comparable if their definitions are the same."""
+    compiling = {name + COMPILE: f"tracing and compiling {PROGRAMS[name].definition}" for name in COMPILED}
+    return compiling | {name: program.definition for name, program in PROGRAMS.items()}
+
+
+def answer(request: str, programs: Programs) -> float:
+    """Seconds of a request."""
+    name = request.removeprefix(PREPARE).removesuffix(COMPILE)
+    if name != request:
+        return programs.compile(name)
+    return in_turn({name: functools.partial(programs.call, name)}, REPEATS)[name]["median"]
+
+
+def main() -> None:
+    answers, sys.stdout = sys.stdout, sys.stderr
+    print(json.dumps(definitions()), file=answers, flush=True)
+    programs = Programs()
+    for line in sys.stdin:
+        try:
+            found: dict[str, object] = {"seconds": answer(line.strip(), programs)}
+        except Exception as error:  # of any kind: the programs of an old commit, or of one that is being made
+            found = {"error": f"{type(error).__name__}: {error}".splitlines()[0]}
+        print(json.dumps(found), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -66,6 +66,12 @@ class Side:
             raise NotMeasured(f"its process ended with {self.process.wait()}")
         return json.loads(line)
 
+    def close(self) -> None:
+        """End the process."""
+        self.process.kill()
+        with contextlib.suppress(BrokenPipeError), self.process:
+            pass
+
 
 @contextlib.contextmanager
 def checked_out(commit: str) -> Iterator[Path]:
@@ -89,12 +95,8 @@ def _git(*arguments: str) -> subprocess.CompletedProcess:
 def sides(folder: Path, until: float) -> Iterator[tuple[Side, Side]]:
     """The old and the new side, in fresh processes."""
     with contextlib.ExitStack() as stack:
-        both = []
-        for place in (folder, ROOT):
-            both.append(Side(place, until))
-            stack.callback(both[-1].process.wait)
-            stack.callback(both[-1].process.kill)
-        yield both[0], both[1]
+        old, new = (stack.enter_context(contextlib.closing(Side(place, until))) for place in (folder, ROOT))
+        yield old, new
 
 
 def compare(folder: Path, names: Sequence[str], until: float) -> tuple[dict[str, list[float]], dict[str, str]]:

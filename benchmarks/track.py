@@ -85,15 +85,17 @@ def draw(lines: Sequence[dict], path: Path) -> None:
 
     units = dict.fromkeys(row["unit"] for row in lines[-1]["rows"])
     commits = [line["commit"] for line in lines]
-    with style.figure(5.5 * len(units), 5) as figure:
+    with style.figure(4.5 * len(units), 7) as figure:
         for axes, unit in zip(figure.subplots(1, len(units), squeeze=False)[0], units, strict=True):
             for name in [row["name"] for row in lines[-1]["rows"] if row["unit"] == unit]:
                 found = [(i, row) for i, line in enumerate(lines) for row in line["rows"] if row["name"] == name]
-                medians, spreads = ([row[key] for _, row in found] for key in ("median", "spread"))
-                axes.errorbar([i for i, _ in found], medians, spreads, marker="o", capsize=3, label=name)
+                medians, halves = [row["median"] for _, row in found], [row["spread"] / 2 for _, row in found]
+                axes.errorbar([i for i, _ in found], medians, halves, marker="o", capsize=3, label=name)
             axes.set_xticks(range(len(commits)), commits, rotation=60)
             axes.set(title=unit if unit != "s" else "s to compile", yscale="log")
-            axes.legend(fontsize="small")
+            for formatted in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+                formatted("{x:g}")
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25))
         machine = lines[-1]["machine"]
         figure.suptitle(f"Time of each program, by commit; {machine['cores']} cores of {machine['cpu']}")
         style.save(figure, path)

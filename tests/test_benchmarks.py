@@ -137,6 +137,14 @@ def test_devices_reports_one_and_all():
 
 
 @pytest.mark.slow
+def test_options_reports_every_set_that_the_compiler_knows():
+    result = quick("options")
+    (row,) = result["rows"]
+    assert set(row["run"]) == set(row["compile"]) == set(result["options"]) - set(result["unknown"])
+    assert len(row["run"]) >= 7 and min(*row["run"].values(), *row["compile"].values()) > 0
+
+
+@pytest.mark.slow
 def test_learning_reports_every_seed():
     rows = quick("learning")["rows"]
     assert rows and all(0 <= row["success"] <= 1 for row in rows)

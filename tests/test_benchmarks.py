@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
+from benchmarks import accelerator, published
 from benchmarks.__main__ import NAMES
 from benchmarks.common import success_rate
 from jaxdrones.visualization.browser import find_browser
@@ -157,7 +158,7 @@ def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_
     assert not result["stopped"] and {row["section"] for row in result["rows"]} == SECTIONS
     assert json.loads((tmp_path / "result.json").read_text()) == result
     for row in result["rows"]:
-        assert row["value"] > 0 and ("ratio" in row) == ("source" in row.get("published", {}))
+        assert row["value"] > 0 and all(figure["ratio"] > 0 and figure["source"] for figure in row.get("published", ()))
     assert result["rows"][0]["failed"] == []
 
 
@@ -172,6 +173,14 @@ def test_accelerator_stops_what_takes_longer_than_its_share(tmp_path):
     benchmark("accelerator", "--budget", "1", "--sections", "plant", "learning", "--output", str(file))
     result = json.loads(file.read_text())
     assert result["rows"] == [] and set(result["stopped"]) == {"plant", "learning"}
+
+
+def test_accelerator_prints_every_published_figure_beside_ours_with_its_source():
+    figures = [published.SKYFLOW_PLANT[65_536], published.L2F]
+    found = accelerator.row("rk4", 1.08e8, figures, worlds=65_536, unit="drone-steps/s", section="plant", note="")
+    lines = accelerator.table({"rows": [found], "stopped": {}})
+    assert "0.1 times 1.08e+09 substeps/s [1]" in lines[1] and "0.0054 times 2e+10 steps/s [2]" in lines[2]
+    assert lines[3].startswith("[1] SkyFlow") and "Synetic-Labs/SkyFlow" in lines[3] and "l2f-benchmark" in lines[4]
 
 
 def test_a_success_rate_is_reported_with_its_interval_if_there_is_one():

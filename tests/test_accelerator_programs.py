@@ -22,7 +22,10 @@ FOR_CPUS = ("xla_cpu", "inlineable", "custom_call", "callback")
 
 @pytest.fixture
 def accelerator(monkeypatch):
-    """What the package sees on a machine with an accelerator; traced programs are forgotten before and after."""
+    """What the package sees on a machine with an accelerator, by which it chooses while it is traced.
+
+    Traced programs are forgotten before and after.
+    """
     with monkeypatch.context() as patch:
         patch.setattr(jax, "default_backend", lambda: "gpu")
         _forget()

@@ -182,7 +182,7 @@ def cameras(quick: bool) -> Iterator[Row]:
             found = benchmark.rates(scene, resolution, count, repeats=1 if quick else 3)
             for way, rate in found["rates"].items():
                 note = f"first call {found['compile'][way]:.1f} s"
-                figures = [published.MUJOCO_WARP] * (scene == "A" and way in ("depth", "all with color"))
+                figures = [published.MUJOCO_WARP] * (resolution == (64, 64) and way in ("depth", "all with color"))
                 yield row(f"scene {scene}, {way}", rate, figures, worlds=count, unit="images/s", note=note)
 
 
@@ -223,7 +223,7 @@ def stepped(what: str, task: str, by_worlds: Mapping[int, published.Figure], qui
     env = make(task, **options)
     for worlds in (4,) if quick else (65_536, 16_384, 1_024):
         rate = env.drones * benchmark.in_jit(env, argparse.Namespace(worlds=worlds, repeats=1 if quick else 3))
-        figures = [published.QUADSWARM[env.drones]] + [by_worlds[worlds]] * (worlds in by_worlds)
+        figures = [published.QUADSWARM[env.drones], *([by_worlds[worlds]] if worlds in by_worlds else [])]
         yield row(what, rate, figures, worlds=worlds, unit="drone-steps/s", note="environment")
 
 

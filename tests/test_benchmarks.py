@@ -183,6 +183,15 @@ def test_accelerator_prints_every_published_figure_beside_ours_with_its_source()
     assert lines[3].startswith("[1] SkyFlow") and "Synetic-Labs/SkyFlow" in lines[3] and "l2f-benchmark" in lines[4]
 
 
+def test_a_plant_stands_beside_the_figures_of_its_integrator_and_number_of_worlds():
+    def sources(name, worlds):
+        return [figure.what.split(",")[0] for figure in accelerator.plants(name, worlds)]
+
+    assert sources("semi-implicit Euler", 65_536) == ["crazyflow"]
+    assert sources("rk4", 65_536) == ["crazyflow", "SkyFlow"] and sources("rk4", 65) == []
+    assert sources(accelerator.TEN_SUBSTEPS, max(accelerator.WORLDS)) == ["l2f"]
+
+
 def test_a_success_rate_is_reported_with_its_interval_if_there_is_one():
     assert success_rate(0.5, (0.25, 0.75)) == "0.5000 [0.2500, 0.7500]"
     assert success_rate(1.0, None) == "1.0000 [1 distinct episode]" and success_rate(None, None) == "no criterion"

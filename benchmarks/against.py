@@ -1,8 +1,8 @@
 """Compare the speed of the working tree with that of another commit; what `track --against` prints.
 
 The commit is checked out into a temporary worktree. Each side is a process with its own package and its own programs
-(server.py); they take turns. A row is measured in up to three rounds, and once more in fresh processes if it lost in
-all of them. It fails if it lost all rounds, both times: a busy machine loses some of them, never all.
+(server.py); they take turns. A row is measured in three rounds, and once more in fresh processes if it lost in all of
+them. It fails if it lost all rounds, both times: a busy machine loses some of them, never all.
 """
 
 import contextlib
@@ -102,28 +102,33 @@ def sides(folder: Path, until: float) -> Iterator[tuple[Side, Side]]:
 def compare(folder: Path, names: Sequence[str], until: float) -> tuple[dict[str, list[float]], dict[str, str]]:
     """Ratios of the speed of rows, new over old, of every round; and why others have none."""
     ratios: dict[str, list[float]] = {}
-    missing: dict[str, str] = {}
     with sides(folder, until) as (old, new):
         theirs, ours = old.read(), new.read()
         missing = {name: "the old commit measures something else" for name in names if theirs.get(name) != ours[name]}
-        try:
-            for name in names:
-                if name not in missing and not name.endswith(COMPILE) and name + COMPILE not in names:
-                    together(old, new, PREPARE + name)
-            for i in range(ROUNDS):
-                for name in names:
-                    if name not in missing and (not name.endswith(COMPILE) or lost(ratios.get(name, []))):
-                        try:
-                            ratios.setdefault(name, []).append(ratio(old, new, name, old_first=i % 2 == 0))
-                        except NotMeasured as why:
-                            missing[name] = str(why)
-        except TimeIsUp:
-            missing |= {name: "the time was up" for name in names if name not in missing}
-    return {name: found for name, found in ratios.items() if found}, missing
+        for name in [name for name in names if name not in missing]:
+            try:
+                ratios[name] = rounds(old, new, name)
+            except NotMeasured as why:
+                missing[name] = str(why)
+            except TimeIsUp:
+                unmeasured = [name for name in names if name not in ratios and name not in missing]
+                missing |= dict.fromkeys(unmeasured, "the time was up")
+                break
+    return ratios, missing
+
+
+def rounds(old: Side, new: Side, name: str) -> list[float]:
+    """Ratios of the rounds of a row; a compilation that was not lost is not repeated."""
+    found: list[float] = []
+    if not name.endswith(COMPILE):
+        together(old, new, PREPARE + name)
+    while len(found) < ROUNDS and not (name.endswith(COMPILE) and not lost(found)):
+        found.append(ratio(old, new, name, old_first=len(found) % 2 == 0))
+    return found
 
 
 def together(old: Side, new: Side, request: str) -> None:
-    """Compile at the same time what is not measured in turn; an error comes again when the program is measured."""
+    """Compile at the same time what need not be measured; an error comes again when the program is measured."""
     for side in (old, new):
         side.ask(request)
     for side in (old, new):

@@ -1,8 +1,8 @@
 """Measure the programs of programs.py on request, in a process of its own; what against.py compares commits with.
 
 The first line that it writes has the definitions of all rows, as JSON. Then it answers each line that it reads with one
-line: `prepare NAME` compiles a program, `NAME` measures its time, `NAME, compile` compiles it anew. An answer is
-`{"seconds": ...}`, or `{"error": ...}`.
+line, `{"seconds": ...}` or `{"error": ...}`: `prepare NAME` compiles a program if need be, `NAME` measures its time,
+`NAME, compile` compiles it anew.
 """
 
 import functools
@@ -18,16 +18,21 @@ COMPILE, PREPARE = ", compile", "prepare "
 
 def definitions() -> dict[str, str]:
     """What each row is; rows of commits are comparable if their definitions are the same."""
-    compiling = {name + COMPILE: f"tracing and compiling {PROGRAMS[name].definition}" for name in COMPILED}
-    return compiling | {name: program.definition for name, program in PROGRAMS.items()}
+    rows = {}
+    for name, program in PROGRAMS.items():
+        if name in COMPILED:
+            rows[name + COMPILE] = f"tracing and compiling {program.definition}"
+        rows[name] = program.definition
+    return rows
 
 
 def answer(request: str, programs: Programs) -> float:
     """Seconds of a request."""
-    name = request.removeprefix(PREPARE).removesuffix(COMPILE)
-    if name != request:
-        return programs.compile(name)
-    return in_turn({name: functools.partial(programs.call, name)}, REPEATS)[name]["median"]
+    if request.endswith(COMPILE):
+        return programs.compile(request.removesuffix(COMPILE))
+    name = request.removeprefix(PREPARE)
+    repeats = REPEATS if name == request else 1
+    return in_turn({name: functools.partial(programs.call, name)}, repeats)[name]["median"]
 
 
 def main() -> None:

@@ -81,7 +81,9 @@ def keep(rows: list[dict], history: Path, figure: Path) -> list[str]:
 
 def draw(lines: Sequence[dict], path: Path) -> None:
     """A panel for each unit: medians, with their spread, against commits, oldest first."""
-    from jaxdrones.visualization import style  # only where a figure is drawn
+    from matplotlib.ticker import LogLocator  # only where a figure is drawn
+
+    from jaxdrones.visualization import style
 
     units = dict.fromkeys(row["unit"] for row in lines[-1]["rows"])
     commits = [line["commit"] for line in lines]
@@ -93,8 +95,8 @@ def draw(lines: Sequence[dict], path: Path) -> None:
                 axes.errorbar([i for i, _ in found], medians, halves, marker="o", capsize=3, label=name)
             axes.set_xticks(range(len(commits)), commits, rotation=60)
             axes.set(title=unit if unit != "s" else "s to compile", yscale="log")
-            for formatted in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-                formatted("{x:g}")
+            axes.yaxis.set(major_locator=LogLocator(subs=(1, 1.5, 2, 3, 5, 7)), major_formatter="{x:g}")
+            axes.yaxis.set_minor_formatter("")
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25))
         machine = lines[-1]["machine"]
         figure.suptitle(f"Time of each program, by commit; {machine['cores']} cores of {machine['cpu']}")

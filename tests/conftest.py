@@ -1,7 +1,13 @@
 """Strict JAX for all tests: float64 (float32 where marked), no rank promotion, one shared compilation cache."""
 
 import importlib.util
+import os
 from pathlib import Path
+
+# Before JAX is imported, and for the processes that tests start, too.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 import jax
 import jaxtyping
@@ -14,9 +20,7 @@ jaxtyping.install_import_hook(sorted(MODULES - {"jaxdrones.ros2.schema"}), "shap
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".jax_cache"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+jax.devices()  # one, whichever test comes first: `jaxdrones train` makes each core one if JAX does not run
 
 pytest_plugins = ["shards"]
 

@@ -3,8 +3,12 @@
 import functools
 import importlib.metadata
 import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 from documents import ROOT
@@ -50,6 +54,43 @@ def test_doctor_names_versions_devices_and_every_extra(no_flight, capsys):
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert "self-test  explicit" in out and out.endswith("all is well\n")
+
+
+WHERE = """
+import jax
+from jaxdrones.cli import machine
+machine.keep_programs()
+machine.use_all_cores()
+print(jax.device_count(), jax.config.jax_compilation_cache_dir)
+"""
+
+
+@pytest.mark.parametrize(
+    ("told", "devices", "folder"),
+    [
+        ({}, min(machine.cores(), 4), "home/.cache/jaxdrones/*"),
+        ({"XDG_CACHE_HOME": "other", "JAX_NUM_CPU_DEVICES": "3"}, 3, "other/jaxdrones/*"),
+        ({"JAX_COMPILATION_CACHE_DIR": "mine", "XLA_FLAGS": "--xla_force_host_platform_device_count=5"}, 5, "mine"),
+        ({"HOME": "a-file"}, min(machine.cores(), 4), "None"),
+    ],
+)
+def test_cores_are_devices_and_programs_are_kept_unless_jax_was_told_otherwise(told, devices, folder, tmp_path):
+    (tmp_path / "a-file").write_text("no folder")
+    names = ("JAX_", "XLA_", "XDG_", "HOME")
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(names)}
+    environment = inherited | {"HOME": "home", "JAX_PLATFORMS": "cpu"} | told
+    done = subprocess.run(
+        [sys.executable, "-c", WHERE], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    count, where = done.stdout.split()
+    assert int(count) == devices and Path(where).match(folder)
+
+
+def test_doctor_says_where_compiled_programs_are_kept(no_flight, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(machine, "program_folder", lambda: tmp_path)
+    (tmp_path / "jit_fly-cache").write_bytes(bytes(1_500_000))
+    assert main(["doctor"]) == 0
+    assert f"programs   1 compiled ones in {tmp_path}, 1.5 MB" in capsys.readouterr().out
 
 
 def test_a_missing_extra_is_named_and_not_wrong(no_flight, monkeypatch, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -32,6 +33,8 @@ class ChunkedProgram:
     program: Any
     consts: list[Array]
     along: tuple[int, ...]
+    used: tuple[bool, ...]
+    """Whether each argument of the function is an input; the others do not matter for its results."""
     chunk: int | None
 
     @classmethod
@@ -51,7 +54,9 @@ class ChunkedProgram:
         if chunk is not None:
             check_whole("chunk", chunk)
         program, consts, shape = compiler.trace(lambda *leaves: function(*tree.unflatten(leaves)), *of_one_world)
-        return cls(program, consts, along, chunk), jax.tree.structure(shape)
+        program, used = compiler.without_dead(program)
+        along = tuple(itertools.compress(along, used))
+        return cls(program, consts, along, tuple(used), chunk), jax.tree.structure(shape)
 
     @functools.cached_property
     def fits_a_kernel(self) -> bool:

@@ -15,6 +15,7 @@ import jax
 try:
     from jax.experimental.xla_metadata import set_xla_metadata
     from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+    from jax.interpreters.partial_eval import dce_jaxpr
 
     AVAILABLE = True
     """Whether this version of JAX supports `over_worlds` beyond `jax.vmap`."""
@@ -110,6 +111,11 @@ def opened(program: Any) -> tuple[Any, list]:
     if hasattr(program, "consts"):
         return getattr(program, "jaxpr", program), list(program.consts)
     return program, []
+
+
+def without_dead(program: Any) -> tuple[Any, list[bool]]:
+    """Program without inputs and equations that no result depends on, and which inputs are left."""
+    return dce_jaxpr(program, [True] * len(program.outvars))
 
 
 def as_function(program: Any, consts: Sequence) -> Callable[..., list]:

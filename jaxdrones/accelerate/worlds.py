@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec, TypeVar, cast
@@ -155,11 +156,13 @@ class _ManyWorlds:
         program, outer = ChunkedProgram.of(self._function, tree, of_one_world, along, self._chunk)
         if has_options and any(isinstance(x, jax.core.Tracer) for x in program.consts):
             raise _ClosureIsTracedError
+        if not any(program.used):
+            return jax.vmap(self._function, axes)(*arguments)
         try:
             if kernel and not program.fits_a_kernel:
                 raise NoKernelError("a primitive is not on the list")
             flown = program.by_one_kernel if kernel else program.by_vmap
-            return outer.unflatten(self._shared(flown, along)(*leaves))
+            return outer.unflatten(self._shared(flown, program.along)(*itertools.compress(leaves, program.used)))
         except compiler.UnknownError as error:
             _warn_of_version(f"has an equation ({error}) other than those")
             raise NoKernelError(str(error)) from error

@@ -33,6 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         options = parser.parse_args(task_first(with_config(sys.argv[1:] if arguments is None else arguments)))
         debug = options.debug
+        machine.keep_programs()
         with lasting_interrupts():
             return options.run(options)
     except BaseException as error:

@@ -5,6 +5,7 @@ import importlib.metadata
 import re
 import shutil
 import time
+from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.options import add_json
@@ -46,6 +47,7 @@ def _doctor(options: argparse.Namespace) -> int:
     present = {extra: _extra(extra, libraries, wrong) for extra, libraries in extras.items()}
     tests = _self_tests(present, wrong) if devices else {}
     result: dict[str, Any] = {"versions": versions, "processor": machine.processor(), "cores": machine.cores()}
+    result["programs"] = _kept_programs(machine.program_folder())
     result |= {"devices": devices, "notes": _notes(devices), "extras": present, "self_test": tests, "wrong": wrong}
     print(as_json(result) if options.json else _text(result))
     return 1 if wrong else 0
@@ -56,6 +58,8 @@ def _text(result: dict[str, Any]) -> str:
     lines.append(f"processor  {result['processor']}, {result['cores']} cores")
     lines.append(f"devices    {', '.join(result['devices']) or 'none'}")
     lines += [f"           {note}" for note in result["notes"]]
+    kept = result["programs"]
+    lines.append(f"programs   {kept['files']} compiled ones in {kept['folder']}, {kept['bytes'] / 1e6:.1f} MB")
     for title, (extra, entry) in zip(["extras", *[""] * len(result["extras"])], result["extras"].items(), strict=False):
         missing = f"missing {', '.join(entry['missing'])}: {entry['install']}"
         state = entry["unavailable"] or (missing if entry["missing"] else "present")
@@ -142,6 +146,12 @@ def _devices(wrong: list[str]) -> list[str]:
     except UserError as error:
         wrong.append(str(error))
         return []
+
+
+def _kept_programs(folder: Path) -> dict[str, Any]:
+    """Folder and size of the compiled programs that JAX keeps."""
+    sizes = [path.stat().st_size for path in folder.glob("*-cache")]
+    return {"folder": str(folder), "files": len(sizes), "bytes": sum(sizes)}
 
 
 def _notes(devices: list[str]) -> list[str]:

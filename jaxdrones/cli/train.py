@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from jaxdrones.cli import machine
 from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS
@@ -30,8 +31,8 @@ from jaxdrones.errors import UserError
 from jaxdrones.visualization import plots
 
 _HOSTS_HELP = (
-    "Worlds are sharded over all devices. A CPU counts as N devices with\n"
-    "XLA_FLAGS=--xla_force_host_platform_device_count=N. On several hosts, start the same command on each, with a\n"
+    "Worlds are sharded over all devices. Each core of a CPU counts as a device, up to four; JAX_NUM_CPU_DEVICES=N\n"
+    "sets another number. On several hosts, start the same command on each, with a\n"
     "different --host. Host 0 writes the files; to --resume, each host needs a copy of the folder:\n"
     "  jaxdrones train hover --hosts 2 --host 0 --coordinator 127.0.0.1:9911"
 )
@@ -60,8 +61,7 @@ def add(commands) -> None:
         "point of that schedule. The best policy is replaced only by a better one.\n\n"
         "A run with your own task or vehicle keeps the text of its file, and executes that text when it is resumed,\n"
         "evaluated or flown: open only runs that you trust.",
-        epilog="JAX_COMPILATION_CACHE_DIR=folder caches compiled programs for a faster start of the next training.\n\n"
-        + _HOSTS_HELP,
+        epilog=_HOSTS_HELP,
         allow_abbrev=False,
     )
     parser.add_argument(
@@ -130,6 +130,7 @@ def _on_hosts(options: argparse.Namespace) -> int:
     """Train on one or several hosts; only the first one prints and keeps its files."""
     hosts = (options.hosts, options.host, options.coordinator)
     if hosts == (None, None, None):
+        machine.use_all_cores()
         return _train(options)
     if None in hosts:
         raise UserError("give all of --hosts, --host and --coordinator, or none; see jaxdrones train --help")

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding
 from jaxtyping import Array, UInt32
 
 from jaxdrones.checks import check_key
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
-from jaxdrones.learning import compilation
+from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
 from jaxdrones.pytree import PyTreeNode
@@ -79,13 +80,16 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
     return _report(env, jax.tree.map(np.asarray, outcomes))
 
 
-def compile_evaluation(env: Env, policy: Any, episodes: int) -> Callable[[AnyPolicy, jax.Array], Report]:
+def compile_evaluation(
+    env: Env, policy: Any, episodes: int, devices: Sequence[jax.Device] | None = None
+) -> Callable[[AnyPolicy, jax.Array], Report]:
     """Compile `evaluate` for policies of one structure: (policy, key) -> report.
 
     Args:
         env: environment of the explicit backend.
         policy: pytree policy, or its shapes.
         episodes: number of episodes.
+        devices: devices of this host that share the episodes, if they can share them equally; by default all of them.
 
     Raises:
         ValueError: more episodes than fit in memory.
@@ -94,9 +98,22 @@ def compile_evaluation(env: Env, policy: Any, episodes: int) -> Callable[[AnyPol
     split = functools.partial(jax.random.split, num=episodes)
     keys = jax.eval_shape(split, jax.random.key(0))
     leaves, structure = jax.tree.flatten(policy)
-    function = compilation.jit(lambda leaves, keys: _outcomes(env, jax.tree.unflatten(structure, leaves), keys))
-    outcomes = function.lower(leaves, keys).compile()
-    return lambda policy, key: _report(env, jax.tree.map(np.asarray, outcomes(jax.tree.leaves(policy), split(key))))
+    devices = jax.local_devices() if devices is None else devices
+    mesh = sharding.make_mesh(episodes, devices if episodes % len(devices) == 0 else devices[:1])
+    shardings = NamedSharding(mesh, sharding.REPLICATED), NamedSharding(mesh, sharding.WORLDS)
+
+    def all_outcomes(leaves: list[Array], keys: jax.Array) -> dict:
+        outcomes = functools.partial(_outcomes, env, jax.tree.unflatten(structure, leaves))
+        return sharding.map_worlds(outcomes, (sharding.WORLDS,), sharding.WORLDS)(keys)
+
+    with jax.set_mesh(mesh):
+        program = compilation.jit(all_outcomes, in_shardings=shardings).lower(leaves, keys).compile()
+
+    def report(policy: AnyPolicy, key: jax.Array) -> Report:
+        outcomes = program(*jax.device_put((jax.tree.leaves(policy), split(key)), shardings))
+        return _report(env, jax.tree.map(np.asarray, outcomes))
+
+    return report
 
 
 def check_episodes(env: Env, episodes: int) -> None:

@@ -129,13 +129,16 @@ def run_training(
 
 def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, total: Array) -> tuple[Any, dict]:
     """Run `count` updates, at most `MAX_CALL`, of a training of `total`; the metrics are arrays (MAX_CALL,)."""
-    config = dataclasses.replace(config, updates=total)
-    shapes = jax.eval_shape(functools.partial(update, env, config), state)[1]
-    metrics = jax.tree.map(lambda x: jnp.zeros((MAX_CALL, *x.shape), x.dtype), shapes)
+
+    @jax.jit  # traced once, for the shapes and the loop
+    def updated(state: Any, total: Array) -> tuple[Any, dict]:
+        return update(env, dataclasses.replace(config, updates=total), state)
+
+    metrics = jax.tree.map(lambda x: jnp.zeros((MAX_CALL, *x.shape), x.dtype), jax.eval_shape(updated, state, total)[1])
 
     def body(i: Array, carry: tuple[Any, dict]) -> tuple[Any, dict]:
         state, metrics = carry
-        state, new = update(env, config, state)
+        state, new = updated(state, total)
         return state, jax.tree.map(lambda all, x: all.at[i].set(x), metrics, new)
 
     return jax.lax.fori_loop(0, count, body, (state, metrics))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -36,7 +37,7 @@ class Trainer:
                 episodes for the success rate to stop at.
         """
         self.recipe, self.episodes = recipe, episodes
-        self.mesh = sharding.make_mesh(recipe.config.worlds)
+        self.mesh = sharding.make_mesh(recipe.config.worlds, _devices(recipe.config))
         self.env, self.practice_env = recipe.env(), recipe.env(practice=True)
         self.learner = algorithms.learner(recipe.algorithm)
         self.compile_seconds = 0.0
@@ -44,21 +45,23 @@ class Trainer:
         check_episodes(self.env, episodes)
         check_stop_at(recipe.stop_at, self.env.task.success is not None, episodes)
         self._check_memory()
-        self.metrics = sorted(jax.eval_shape(self._updates, self.shapes, 1, recipe.config.updates)[1])
+        start = time.perf_counter()
+        self._traced = self._trace_updates()
+        self.metrics = sorted(self._traced.out_info[1])
+        self.compile_seconds = time.perf_counter() - start
 
     def compile(self) -> None:
-        """Compile the programs."""
+        """Compile the programs, the updates beside the others."""
         start = time.perf_counter()
-        count = jnp.zeros((), jnp.int32)
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
         init = compilation.jit(self._init, in_shardings=same, out_shardings=state)
-        shardings = {"in_shardings": (state, same, same), "out_shardings": (state, same)}
-        updates = compilation.jit(self._updates, self.recipe.config, **shardings)
-        with jax.set_mesh(self.mesh):
-            self._start = init.lower(jax.random.key(0)).compile()
-            self._advance = updates.lower(self.shapes, count, count).compile()
-        self.evaluate = compile_evaluation(self.env, self.shapes.policy, self.episodes)
-        self.compile_seconds = time.perf_counter() - start
+        with ThreadPoolExecutor(1) as beside:
+            with jax.set_mesh(self.mesh):
+                updates = beside.submit(self._traced.lower().compile)
+                self._start = init.lower(jax.random.key(0)).compile()
+            self.evaluate = compile_evaluation(self.env, self.shapes.policy, self.episodes, self.mesh.local_devices)
+            self._advance = updates.result()
+        self.compile_seconds += time.perf_counter() - start
 
     def prepare(self, run: Run) -> None:
         """Create the folder of a run and check that its files can be written.
@@ -78,6 +81,15 @@ class Trainer:
         state, metrics = self._advance(state, jnp.asarray(updates, jnp.int32), total)
         return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
 
+    def _trace_updates(self) -> Any:
+        """Traced program of `_updates`."""
+        count = jnp.zeros((), jnp.int32)
+        state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
+        shardings = {"in_shardings": (state, same, same), "out_shardings": (state, same)}
+        updates = compilation.jit(self._updates, self.recipe.config, **shardings)
+        with jax.set_mesh(self.mesh):
+            return updates.trace(self.shapes, count, count)
+
     def _check_memory(self) -> None:
         """Raise if the trajectories of an update do not fit in memory."""
         config, env = self.recipe.config, self.env
@@ -93,3 +105,12 @@ class Trainer:
     def _updates(self, state, count, total):
         """Run `count` updates of a training of `total` updates; both can change without recompilation."""
         return advance(self.learner.update, self.practice_env, self.recipe.config, state, count, total)
+
+
+def _devices(config: Any) -> list[jax.Device]:
+    """All devices of all hosts; of the cores of a single CPU, as many as share worlds and minibatches equally."""
+    devices = jax.devices()
+    if devices[0].platform != "cpu" or jax.process_count() > 1:
+        return devices
+    parts = config.worlds // getattr(config, "minibatches", 1)
+    return devices[: max(n for n in range(1, len(devices) + 1) if parts % n == 0)]

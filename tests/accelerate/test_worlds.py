@@ -88,6 +88,25 @@ def test_an_argument_may_be_of_no_use():
     assert_close(inside, jax.jit(jax.vmap(gradient))(starts, commands), 1e-12)
 
 
+def test_random_numbers_that_do_not_matter_prevent_no_kernel(monkeypatch):
+    def reached(start, commands, key):
+        _ = jax.random.normal(key)  # as in an environment without noise
+        return fly(start, commands).pos
+
+    many = in_chunks(reached, 2)
+    keys = jax.random.split(jax.random.key(0), 5)
+    monkeypatch.setattr(many, "_several_kernels", None)  # an error if called
+    assert_close(many(starts, commands, keys), jax.vmap(reached)(starts, commands, keys), 1e-12)
+
+
+@pytest.mark.parametrize("inside_jit", [False, True])
+def test_results_may_depend_on_no_argument(inside_jit):
+    many = in_chunks(lambda start: (jnp.arange(3.0), jnp.zeros(())), 2)
+    same, nothing = (jax.jit(many) if inside_jit else many)(starts)
+    np.testing.assert_array_equal(same, np.tile(np.arange(3.0), (5, 1)))
+    assert nothing.shape == (5,)
+
+
 @pytest.mark.slow
 def test_with_our_options_gradients_through_contacts_and_downwash_are_one_kernel():
     meeting = jd.make_step((jd.drag, jd.ground_contact), (jd.downwash,))

@@ -1,6 +1,8 @@
 """Episodes are counted as the task says, nothing after their end counts, and the interval is the known one."""
 
 import dataclasses
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -171,3 +173,24 @@ def test_a_task_without_a_criterion_has_no_success():
 def test_episodes_must_be_a_whole_number():
     with pytest.raises(ValueError, match="episodes is 0"):
         flown(0, episodes=0)
+
+
+TWO_DEVICES = """
+import jax, jaxdrones as jd
+from jaxdrones.learning import bptt
+from jaxdrones.learning.evaluation import compile_evaluation
+jax.config.update("jax_num_cpu_devices", 2)
+env = jd.make("hover", duration=0.3)
+policy = bptt.init(jax.random.key(0), env, bptt.Config(worlds=1, hidden_sizes=(4,))).policy
+for episodes in (6, 3):
+    reports = [compile_evaluation(env, policy, episodes, jax.devices()[:n])(policy, jax.random.key(1)) for n in (1, 2)]
+    one, two = map(vars, reports)
+    assert one["distinct_episodes"] == episodes
+    for name in one:
+        assert jax.tree.all(jax.tree.map(lambda a, b: abs(a - b) <= 1e-5 * (1 + abs(a)), one[name], two[name])), name
+"""
+
+
+def test_devices_that_share_the_episodes_report_what_one_reports():
+    done = subprocess.run([sys.executable, "-c", TWO_DEVICES], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -7,6 +7,7 @@ import typing
 import pytest
 
 from jaxdrones.cli import main
+from jaxdrones.learning import bptt
 from jaxdrones.training.algorithms import ALGORITHMS, learner
 from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.trainer import Trainer
@@ -35,6 +36,14 @@ def test_every_setting_has_a_precise_type_with_a_check(name):
 def test_an_unknown_learner_names_the_closest_one():
     with pytest.raises(ValueError, match=r"unknown algorithm 'pppo'; did you mean 'ppo'\?"):
         learner("pppo")
+
+
+def test_a_training_traces_its_update_once(monkeypatch):
+    traced, update = [], bptt.update
+    monkeypatch.setattr(bptt, "update", lambda *arguments: traced.append(arguments) or update(*arguments))
+    trainer = Trainer(Recipe.of("hover", "bptt", worlds=4, horizon=2, hidden_sizes=(4,)), episodes=2)
+    trainer.compile()
+    assert len(traced) == 1
 
 
 @pytest.mark.slow

@@ -19,16 +19,14 @@ from jaxdrones.training.lock import locked
 from jaxdrones.training.run import Run
 
 KILLS = int(os.environ.get("KILLS", 4))
-CACHE = Path(__file__).parent.parent.parent / ".jax_cache"
 CLI = "import sys; from jaxdrones.cli import main; sys.exit(main())"
 TRAIN = ["train", "hover", "--set", "worlds=8", "--set", "horizon=8", "--set", "hidden_sizes=16,"]
 TRAIN += ["--set", "duration=0.2", "--budget", "4000", "--episodes", "50", "--no-figure"]
 
 
 def start(*arguments) -> subprocess.Popen:
-    cached = {"JAX_COMPILATION_CACHE_DIR": str(CACHE), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1"}
     output = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen([sys.executable, "-c", CLI, *map(str, arguments)], env=os.environ | cached, **output)
+    return subprocess.Popen([sys.executable, "-c", CLI, *map(str, arguments)], **output)
 
 
 def finish(process) -> str:

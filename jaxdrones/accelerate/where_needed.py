@@ -1,4 +1,4 @@
-"""Conditional computation of costly functions needed in few worlds."""
+"""Conditional computation of costly functions in many worlds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
+
+
+@jax.custom_batching.custom_vmap
+def in_all_worlds(holds: Array) -> Array:
+    """Whether a condition () holds, under `jax.vmap` in all worlds: a branch on it remains one under `vmap`."""
+    return holds
+
+
+@in_all_worlds.def_vmap
+def _in_all_worlds(worlds: int, batched: list[bool], holds: Array) -> tuple[Array, bool]:
+    return in_all_worlds(jnp.all(holds)), False
 
 
 def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[..., Any]:

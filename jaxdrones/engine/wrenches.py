@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdrones import rotation
+from jaxdrones.accelerate.where_needed import in_all_worlds
 from jaxdrones.checks import check_shape, short_repr
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.errors import UserError
@@ -96,7 +97,7 @@ def from_others(pair: Pair, params: Params, state: State, neighbors: NeighborGri
         sums = on_all()
     else:
         near, meant, complete = neighbors.near(jax.lax.stop_gradient(state.pos))
-        sums = jax.lax.cond(complete, on_near, on_all)
+        sums = jax.lax.cond(in_all_worlds(complete), on_near, on_all)
     return Wrench(jnp.stack(sums[:3], axis=-1), jnp.stack(sums[3:], axis=-1))
 
 

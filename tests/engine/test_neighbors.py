@@ -52,6 +52,18 @@ def test_nobody_within_reach_is_left_out_and_nobody_else_counts(spread):
 
 
 @pytest.mark.slow
+def test_many_worlds_compute_near_pairs_or_all_pairs_and_not_both():
+    cells = jd.NeighborGrid(REACH, capacity=16)
+    (params, near), (_, crowded) = team(8.0), team(1.0)
+    worlds = jax.tree.map(lambda *x: jnp.stack(x), near, crowded)
+    force = jax.vmap(total_wrench((jd.downwash,), cells), (None, 0))
+    program = str(jax.make_jaxpr(force)(params, worlds))
+    assert " cond[" in program  # not a selection, which computes both branches
+    alone = total_wrench((cut_off(jd.downwash),))
+    for wrench, state in zip((force(params, worlds).force), (near, crowded), strict=True):
+        assert_close(wrench, jit_unoptimized(alone)(params, state).force, 1e-13)
+
+
 def test_gradients_are_those_of_all_pairs():
     params, state = team(8.0)
 

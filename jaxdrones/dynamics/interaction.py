@@ -1,5 +1,8 @@
 """Downwash of one drone on another (paper, equation 6)."""
 
+import math
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -13,6 +16,7 @@ from jaxdrones.wrench import Wrench
 _JET_SPEED = 10.11  # center speed over induced speed, at one motor distance per unit of the denominator
 _JET_ORIGIN = 5.817  # motor distances from the virtual origin of the jet to the rotors
 _JET_WIDTH = 0.07668  # half width over distance from the virtual origin
+_JET_SHAPE = math.sqrt(2) - 1
 
 _CUTOFF = 10.0  # m, horizontal cutoff of equation 6 in gym-pybullet-drones (2021)
 _MIN_HEIGHT = 0.05  # m; equation 6 grows without bound below
@@ -30,25 +34,42 @@ def downwash(params: Params, state: State, other: Params, other_state: State) ->
     jet tilts; beyond one half of the thrust the loss levels off (`lost_share`). The law is valid from 2.5 l on
     (Bauersfeld et al. 2024); nearer it is an assumption.
     """
-    length = jnp.sqrt(2.0) * other.arm
+    per_length = 1 / (jnp.sqrt(2.0) * other.arm)
     axis = rotation.z_axis(other_state.quat)
     to_other = other_state.pos - state.pos
-    speed = _JET_SPEED * vector.total(induced_speed(other, jnp.abs(other_state.rpm))) / 4
+    speed = vector.total(induced_speed(other, jnp.abs(other_state.rpm))) / 4
     loss = params.inflow_loss * vector.dot(axis, rotation.z_axis(state.quat))
 
     def share(rotor: Float[Array, "3"]) -> Float[Array, ""]:
-        above = to_other - rotation.rotate(state.quat, rotor)
-        along = vector.dot(axis, above)
-        off_axis = vector.dot(above, above) - along**2
-        z = along / length
-        depth = jnp.maximum(z, 0) + _JET_ORIGIN
-        width = (_JET_WIDTH * depth * length) ** 2
-        spread = width + (jnp.sqrt(2.0) - 1) * off_axis
-        onset = jnp.clip(z, 0, 1)
-        return lost_share(speed * width**2 * onset**2 * (3 - 2 * onset) * loss / (depth * spread**2))
+        above = (to_other - rotation.rotate(state.quat, rotor)) * per_length
+        z = vector.dot(axis, above)
+        return lost_share(loss * speed * _jet(z, vector.dot(above, above) - z**2))
 
     shares = jnp.stack([share(rotor) for rotor in vector.components(params.rotor_pos)])
     return Wrench.of_thrusts(params.rotor_pos, -thrust(params, state) * shares)
+
+
+@jax.custom_jvp
+def _jet(z: Float[Array, ""], off_axis: Float[Array, ""]) -> Float[Array, ""]:
+    """Speed U/U_0 of a jet at the distance z along and the squared distance off its axis, in motor distances."""
+    depth, onset = jnp.maximum(z, 0) + _JET_ORIGIN, jnp.clip(z, 0, 1)
+    width = (_JET_WIDTH * depth) ** 2
+    share = width / (width + _JET_SHAPE * off_axis)
+    return _JET_SPEED * share**2 * onset**2 * (3 - 2 * onset) / depth
+
+
+@_jet.defjvp
+def _(at: tuple, change: tuple) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Speed and its change, in terms of the speed: cheaper than derivatives of each term."""
+    z, off_axis = at
+    depth, onset = jnp.maximum(z, 0) + _JET_ORIGIN, jnp.clip(z, 0, 1)
+    width = (_JET_WIDTH * depth) ** 2
+    spread = width + _JET_SHAPE * off_axis
+    share = width / spread
+    rising = _JET_SPEED * share**2 * onset / depth
+    speed = rising * onset * (3 - 2 * onset)
+    along = jnp.where(z > 0, 6 * rising * (1 - onset) + speed * (3 - 4 * share) / depth, 0)
+    return speed, along * change[0] - 2 * _JET_SHAPE * speed / spread * change[1]
 
 
 def downwash_2021(params: Params, state: State, other: Params, other_state: State) -> Wrench:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxdrones
 from jaxdrones import State, downwash, downwash_2021, rotation
+from jaxdrones.dynamics import interaction
 
 PAGE = (Path(__file__).parents[2] / "docs" / "physics.md").read_text()
 params = jaxdrones.load_params("cf2x")
@@ -128,6 +129,15 @@ def test_the_jet_has_no_jump():
         pos = jnp.array([[0, 0, 0.05]]) + way * direction[None]
         force = jax.vmap(lambda p: on_lower(lower.replace(pos=p)).force[2])(pos)
         assert np.max(np.abs(np.diff(force))) <= 3 * largest / LENGTH * 2e-4
+
+
+@pytest.mark.parametrize("z", [-0.3, 0.2, 0.8, 1.4, 30.0])
+@pytest.mark.parametrize("off_axis", [0.0, 0.5, 4.0])
+def test_the_derivatives_of_the_jet_are_those_of_its_formula(z, off_axis):
+    jet, at = interaction._jet, (jnp.array(z), jnp.array(off_axis))
+    assert_close(jax.grad(jet, (0, 1))(*at), jax.grad(jet.fun, (0, 1))(*at), 1e-14)
+    assert_close(jax.hessian(jet, (0, 1))(*at), jax.hessian(jet.fun, (0, 1))(*at), 1e-13)
+    assert_close(jax.jvp(jet, at, at)[0], jet(*at), 1e-15)
 
 
 def test_the_jet_follows_the_thrust_axis_of_the_upper_drone():

@@ -63,8 +63,8 @@ _FOREST = dict(
 """One and a half seconds of flight: an obstacle is seen in time at the commanded speed."""
 
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
-    # The exact gradient fails for 1 of 10 seeds.
-    ("hover", "bptt"): dict(gradient="decay", gradient_decay=0.99, learning_rate=1.5e-2, restart_fraction=0.3),
+    # The exact gradient fails for 1 of 10 seeds; that of a rigid body costs two thirds, and learns as well.
+    ("hover", "bptt"): dict(gradient="surrogate", learning_rate=1.5e-2, restart_fraction=0.3),
     ("hover", "ppo"): dict(anneal_fraction=0.5),
     ("tracking", "bptt"): dict(updates=400, learning_rate=1e-2),
     ("recovery", "bptt"): dict(updates=250),

@@ -10,6 +10,7 @@ import jaxdrones
 PACKAGE = Path(jaxdrones.__file__).parent
 
 NOUNS = (
+    "arguments",
     "assets",
     "checks",
     "errors",

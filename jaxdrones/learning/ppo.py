@@ -12,7 +12,19 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_keywords, check_number, is_concrete
+from jaxdrones.arguments import (
+    BelowOne,
+    Count,
+    Fraction,
+    HiddenSizes,
+    NotNegative,
+    Positive,
+    PositiveOrInfinite,
+    Switch,
+    TracedCount,
+    checked,
+)
+from jaxdrones.checks import check_number, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, result, settings, sharding
@@ -21,23 +33,12 @@ from jaxdrones.learning.critic import discounted_value, init_critic
 from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.settings import (
-    BelowOne,
-    Bool,
-    Count,
-    Fraction,
-    HiddenSizes,
-    NotNegative,
-    Positive,
-    PositiveOrInfinite,
-    TracedCount,
-    check_config,
-)
+from jaxdrones.learning.settings import check_config
 
 _MAX_LOG_RATIO = 10.0  # far beyond the clipping range, with a finite exponential
 
 
-@check_keywords
+@checked
 @dataclasses.dataclass(frozen=True)
 class Config(settings.Config):
     """Settings; numbers that are not shapes may be traced, for `vmap` over many values."""
@@ -59,9 +60,9 @@ class Config(settings.Config):
     minibatches: Count = 8
     """Minibatches of an epoch, each with all steps of a subset of the worlds."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
-    centralized_critic: Bool = False
+    centralized_critic: Switch = False
     """Whether the critic observes the team and the other drones' actions, or only its own drone."""
-    privileged_critic: Bool = False
+    privileged_critic: Switch = False
     """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
     target_kl: Positive = 0.02
     """Kullback-Leibler divergence of the updated policy from the behavior policy, on the first minibatch. After an
@@ -88,7 +89,6 @@ class Config(settings.Config):
     more thrust, which the mean action alone, as used after training, would lack."""
 
     def __post_init__(self):
-        super().__post_init__()
         if is_concrete(self.min_learning_rate):
             low = float(self.min_learning_rate)
             check_number("max_learning_rate", self.max_learning_rate, "not below min_learning_rate", at_least=low)

@@ -13,12 +13,13 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int
 
+from jaxdrones.arguments import Scalar
 from jaxdrones.checks import check_key, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.settings import Config, Scalar
+from jaxdrones.learning.settings import Config
 from jaxdrones.pytree import PyTreeNode
 
 MAX_CALL = 64

@@ -12,7 +12,17 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_keywords
+from jaxdrones.arguments import (
+    BelowOne,
+    Count,
+    Fraction,
+    HiddenSizes,
+    Positive,
+    PositiveFraction,
+    Switch,
+    TracedCount,
+    checked,
+)
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect, result, sharding
@@ -21,22 +31,12 @@ from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps,
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
-from jaxdrones.learning.settings import (
-    BelowOne,
-    Bool,
-    Count,
-    Fraction,
-    HiddenSizes,
-    Positive,
-    PositiveFraction,
-    TracedCount,
-    check_config,
-)
+from jaxdrones.learning.settings import check_config
 
 _CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 
 
-@check_keywords
+@checked
 @dataclasses.dataclass(frozen=True)
 class Config(GradientConfig):
     """Settings; numbers that are not shapes may be traced, for `vmap` over many values."""
@@ -45,7 +45,7 @@ class Config(GradientConfig):
     gamma: BelowOne = 0.98
     """Discount factor."""
     critic_hidden_sizes: HiddenSizes = (32, 32)
-    privileged_critic: Bool = False
+    privileged_critic: Switch = False
     """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
     critic_learning_rate: Positive = 5e-3
     """Initial learning rate of the critic, with a cosine decay to zero."""

@@ -4,6 +4,7 @@ The decorator `checked` validates the annotated arguments of a function, or of a
 are not shapes may be traced by JAX, and are then not validated; neither are defaults, and `None` where it is allowed.
 """
 
+import dataclasses
 import functools
 import inspect
 import typing
@@ -12,60 +13,60 @@ from typing import Annotated, Any, TypeVar, cast
 
 import jax
 
-from jaxdrones.checks import (
-    check_arguments,
-    check_callable,
-    check_choice,
-    check_key,
-    check_keyword,
-    check_number,
-    check_sequence,
-    check_switch,
-    check_whole,
-    is_concrete,
-    short_repr,
-)
+from jaxdrones import checks
+from jaxdrones.checks import check_key, check_switch, check_whole, is_concrete, short_repr
 from jaxdrones.errors import UserError
+from jaxdrones.limits import check_at_most
 
 Check = Callable[[str, Any], Any]
 """(name, value) of an argument; raises for a wrong value."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    """Check with another name of the argument in messages, such as "number of drones of {function}"."""
+
+    check: Check
+    name: str
+
+    def __call__(self, argument: str, value: Any) -> None:
+        """Raise for a wrong value."""
+        self.check(self.name.format(argument=argument) or argument, value)
+
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def number(unit: str = "", name: str = "", **bounds: Any) -> Check:
+def number(unit: str = "", name: str = "", **bounds: Any) -> Named:
     """One real number within bounds (`at_least`, `above`, `at_most`, `below`); `name` is that of messages."""
-    return lambda argument, value: check_number(name or argument, value, unit, **bounds)
+    return Named(functools.partial(checks.check_number, unit=unit, **bounds), name)
 
 
-def whole(name: str = "", minimum: int = 1) -> Check:
-    """Integer of at least `minimum`."""
-    return lambda argument, value: check_whole(name or argument, value, minimum)
+def whole(name: str = "", minimum: int = 1, limit: int | None = None) -> Named:
+    """Integer of at least `minimum`, and at most `limit`."""
+    if limit is None:
+        return Named(functools.partial(check_whole, minimum=minimum), name)
+    return Named(functools.partial(check_at_most, limit=limit, minimum=minimum), name)
 
 
 def choice(kind: str, known: Iterable[str]) -> Check:
     """One of the known names."""
-    return lambda argument, value: check_choice(kind, value, known)
+    return lambda argument, value: checks.check_choice(kind, value, known)
 
 
 def choices(kind: str, known: Iterable[str], example: str) -> Check:
     """Sequence of known names."""
 
     def check(argument: str, value: Any) -> None:
-        for entry in check_sequence(argument, value, example):
-            check_choice(kind, entry, known)
+        for entry in checks.check_sequence(argument, value, example):
+            checks.check_choice(kind, entry, known)
 
     return check
 
 
-def function(example: str, arguments: tuple[str, ...] | None = None) -> Check:
-    """Function, of these arguments if they are given."""
-
-    def check(argument: str, value: Any) -> None:
-        check_callable(argument, value, example)
-        if arguments is not None:
-            check_arguments(argument, value, arguments)
-
-    return check
+def function(example: str) -> Check:
+    """Function."""
+    return lambda argument, value: checks.check_callable(argument, value, example)
 
 
 def _check_whole_if_known(name: str, value: Any) -> None:
@@ -99,20 +100,20 @@ Key = Annotated[jax.Array, check_key]
 
 
 def checked(function: Function) -> Function:
-    """Decorate a function or dataclass to validate annotated arguments and suggest names for unknown keywords."""
+    """Decorate a function or dataclass to validate annotated arguments, and to name the closest to an unknown one."""
     called: Any = function.__dict__["__init__"] if isinstance(function, type) else function
     parameters = inspect.signature(called).parameters.values()
     positional = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    known = set(inspect.signature(function).parameters)
+    known = {p.name for p in parameters}
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
 
     @functools.wraps(called)
     def checking(*args: Any, **kwargs: Any) -> Any:
-        for keyword in () if takes_any else kwargs:
-            check_keyword(function.__qualname__, keyword, known)
-        checks = _checks(function)
+        ranges = _ranges(function)
         for name, value in (*zip(positional, args, strict=False), *kwargs.items()):
-            optional, to_pass = checks.get(name, (False, ()))
+            if not (takes_any or name in known):
+                checks.check_keyword(function.__qualname__, name, known - {"self", "cls"})
+            optional, to_pass = ranges.get(name, (False, ()))
             for check in () if optional and value is None else to_pass:
                 check(name, value)
         return called(*args, **kwargs)
@@ -124,12 +125,16 @@ def checked(function: Function) -> Function:
 
 
 @functools.cache
-def _checks(function: Callable[..., Any]) -> dict[str, tuple[bool, list[Check]]]:
+def _ranges(function: Callable[..., Any]) -> dict[str, tuple[bool, list[Check]]]:
     """Of every annotated argument, whether it may be `None`, and its checks."""
-    found = {}
+    ranges, called = {}, function.__name__.replace("_", "-")
     for name, hint in typing.get_type_hints(function, include_extras=True).items():
         parts = hint, *typing.get_args(hint)
-        checks = [check for part in parts for check in getattr(part, "__metadata__", ())]
-        if checks:
-            found[name] = any(type(None) in typing.get_args(part) for part in parts), checks
-    return found
+        stated = [_named(check, called) for part in parts for check in getattr(part, "__metadata__", ())]
+        if stated:
+            ranges[name] = any(type(None) in typing.get_args(part) for part in parts), stated
+    return ranges
+
+
+def _named(check: Check, called: str) -> Check:
+    return Named(check.check, check.name.replace("{function}", called)) if isinstance(check, Named) else check

@@ -116,11 +116,6 @@ def _within(value: float, bounds: dict[str, float], infinite: bool) -> bool:
     return all(holds[word](value, bound) for word, bound in bounds.items())
 
 
-def check_positive(name: str, value: float, unit: str) -> None:
-    """Raise unless a concrete number is positive and finite."""
-    check_number(name, value, unit, above=0)
-
-
 def check_whole(name: str, value: int, minimum: int = 1) -> None:
     """Raise unless `value` is an integer of at least `minimum`."""
     try:

@@ -48,13 +48,13 @@ class Battery(PyTreeNode):
 
 @checked
 def lithium_polymer(
-    capacity: Annotated[ArrayLike, number("A s", "capacity of the battery", above=0)] = 900.0,
-    cells: Annotated[ArrayLike, number("in series", "cells of the battery", above=0)] = 1,
-    resistance: Annotated[ArrayLike, number("ohm", "resistance of the battery", at_least=0)] = 0.28,
-    slow_resistance: Annotated[ArrayLike, number("ohm", "slow_resistance of the battery", at_least=0)] = 0.0,
-    slow_time: Annotated[ArrayLike, number("s", "slow_time of the battery", above=0)] = 10.0,
-    efficiency: Annotated[ArrayLike, number("a share", "efficiency of the battery", above=0)] = 0.3,
-    idle_power: Annotated[ArrayLike, number("W", "idle_power of the battery", at_least=0)] = 0.5,
+    capacity: Annotated[ArrayLike, number("A s", "{argument} of the battery", above=0)] = 900.0,
+    cells: Annotated[ArrayLike, number("in series", "{argument} of the battery", above=0)] = 1,
+    resistance: Annotated[ArrayLike, number("ohm", "{argument} of the battery", at_least=0)] = 0.28,
+    slow_resistance: Annotated[ArrayLike, number("ohm", "{argument} of the battery", at_least=0)] = 0.0,
+    slow_time: Annotated[ArrayLike, number("s", "{argument} of the battery", above=0)] = 10.0,
+    efficiency: Annotated[ArrayLike, number("a share", "{argument} of the battery", above=0)] = 0.3,
+    idle_power: Annotated[ArrayLike, number("W", "{argument} of the battery", at_least=0)] = 0.5,
 ) -> Battery:
     """Constants of a battery; the defaults are those of a Crazyflie 2.1 with 250 mAh.
 

@@ -23,6 +23,7 @@ from jaxdrones.vector import safe_sqrt
 
 Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
 
+Supply = Annotated[ArrayLike, number("V", "supply of the motors", above=0)]
 FULL_PWM = 65535
 """PWM command at a duty cycle of 1."""
 
@@ -42,9 +43,6 @@ class Motors(PyTreeNode):
     def voltage(self, thrust: Float[Array, "*n"]) -> Float[Array, "*n"]:
         """Voltage for a thrust (N), V: the single root of the monotonic cubic."""
         return voltage_for(self.coefficients, thrust)
-
-
-Supply = Annotated[ArrayLike, number("V", "supply of the motors", above=0)]
 
 
 @checked

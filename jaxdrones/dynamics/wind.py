@@ -31,7 +31,7 @@ def clock() -> Model:
 @checked
 def in_wind(
     field: Annotated[WindField, function("jaxdrones.logarithmic_wind(5.0)")],
-    effect: Annotated[Effect, function("jaxdrones.drag", ("params", "state"))],
+    effect: Annotated[Effect, function("jaxdrones.drag")],
 ) -> Effect:
     """Wrap an effect in a wind field, which is added to `params.wind` at the position of the drone.
 
@@ -45,6 +45,7 @@ def in_wind(
     """
     arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
     check_arguments("field", field, arguments)
+    check_arguments("effect", effect, ("params", "state"))
 
     @functools.wraps(effect)
     def blown(params: Params, state: State, **scene: Any) -> Wrench:

@@ -12,18 +12,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.arguments import (
-    BelowOne,
-    Count,
-    Fraction,
-    HiddenSizes,
-    NotNegative,
-    Positive,
-    PositiveOrInfinite,
-    Switch,
-    TracedCount,
-    checked,
-)
+from jaxdrones import arguments
+from jaxdrones.arguments import checked
 from jaxdrones.checks import check_number, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
@@ -43,48 +33,48 @@ _MAX_LOG_RATIO = 10.0  # far beyond the clipping range, with a finite exponentia
 class Config(settings.Config):
     """Settings; numbers that are not shapes may be traced, for `vmap` over many values."""
 
-    updates: TracedCount = 200
-    horizon: Count = 96
+    updates: arguments.TracedCount = 200
+    horizon: arguments.Count = 96
     """Control steps of a trajectory. Rotor speeds affect the position within about one second."""
-    obs_stats_freeze: Fraction = 0.1
+    obs_stats_freeze: arguments.Fraction = 0.1
     """Fraction of the updates after which the statistics of observations are frozen."""
-    learning_rate: Positive = 4e-3
+    learning_rate: arguments.Positive = 4e-3
     """Initial learning rate; it adapts to `target_kl`."""
-    gamma: BelowOne = 0.99
+    gamma: arguments.BelowOne = 0.99
     """Discount factor."""
-    restart_fraction: Fraction = 0.05
+    restart_fraction: arguments.Fraction = 0.05
     """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
-    max_grad_norm: PositiveOrInfinite = 0.5
-    epochs: Count = 2
+    max_grad_norm: arguments.PositiveOrInfinite = 0.5
+    epochs: arguments.Count = 2
     """Passes over each trajectory."""
-    minibatches: Count = 8
+    minibatches: arguments.Count = 8
     """Minibatches of an epoch, each with all steps of a subset of the worlds."""
-    critic_hidden_sizes: HiddenSizes = (32, 32)
-    centralized_critic: Switch = False
+    critic_hidden_sizes: arguments.HiddenSizes = (32, 32)
+    centralized_critic: arguments.Switch = False
     """Whether the critic observes the team and the other drones' actions, or only its own drone."""
-    privileged_critic: Switch = False
+    privileged_critic: arguments.Switch = False
     """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
-    target_kl: Positive = 0.02
+    target_kl: arguments.Positive = 0.02
     """Kullback-Leibler divergence of the updated policy from the behavior policy, on the first minibatch. After an
     update the learning rate falls if the divergence was above twice this value and rises if it was below half of it,
     between `min_learning_rate` and `max_learning_rate`."""
-    min_learning_rate: Positive = 1e-5
-    max_learning_rate: Positive = 1.5e-2
-    anneal_fraction: Fraction = 0.3
+    min_learning_rate: arguments.Positive = 1e-5
+    max_learning_rate: arguments.Positive = 1.5e-2
+    anneal_fraction: arguments.Fraction = 0.3
     """Final fraction of the updates in which the upper bound of the learning rate falls to `min_learning_rate`, and
     that of the standard deviation of actions to `final_std`."""
-    gae_lambda: Fraction = 0.99
+    gae_lambda: arguments.Fraction = 0.99
     """Lambda of the generalized advantage estimation."""
-    clip_epsilon: Positive = 0.2
+    clip_epsilon: arguments.Positive = 0.2
     """Clipping range of the probability ratio of actions."""
-    entropy_coef: NotNegative = 0.0
-    value_coef: NotNegative = 0.5
-    init_std: Positive = 0.4
+    entropy_coef: arguments.NotNegative = 0.0
+    value_coef: arguments.NotNegative = 0.5
+    init_std: arguments.Positive = 0.4
     """Initial standard deviation of actions, and its upper bound before annealing."""
-    min_std: Positive = 0.1
+    min_std: arguments.Positive = 0.1
     """Lower bound of the standard deviation of actions until the upper bound is annealed below it. It keeps exploration
     alive."""
-    final_std: Positive = 0.02
+    final_std: arguments.Positive = 0.02
     """Upper bound of the standard deviation after the last update. It is small because fluctuating rotor speeds produce
     more thrust, which the mean action alone, as used after training, would lack."""
 

@@ -5,16 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from jaxdrones.arguments import (
-    Count,
-    Fraction,
-    HiddenSizes,
-    NonNegativeInt,
-    Positive,
-    PositiveOrInfinite,
-    Switch,
-    TracedCount,
-)
+from jaxdrones import arguments
 from jaxdrones.checks import short_repr
 from jaxdrones.errors import UserError
 
@@ -23,26 +14,26 @@ from jaxdrones.errors import UserError
 class Config:
     """Common settings; numbers that are not shapes may be traced, for `vmap` over many values."""
 
-    updates: TracedCount = 200
-    worlds: Count = 256
-    horizon: Count = 64
+    updates: arguments.TracedCount = 200
+    worlds: arguments.Count = 256
+    horizon: arguments.Count = 64
     """Control steps of a trajectory."""
-    hidden_sizes: HiddenSizes = (32, 32)
-    recurrent_size: NonNegativeInt = 0
+    hidden_sizes: arguments.HiddenSizes = (32, 32)
+    recurrent_size: arguments.NonNegativeInt = 0
     """Size of the hidden state of a gated recurrent unit (GRU) in the policy; 0 for none."""
-    obs_stats_window: PositiveOrInfinite = 1e9
+    obs_stats_window: arguments.PositiveOrInfinite = 1e9
     """Averaging window of the statistics of observations, in trajectories."""
-    obs_stats_freeze: Fraction = 0.2
+    obs_stats_freeze: arguments.Fraction = 0.2
     """Fraction of the updates after which the statistics of observations are frozen."""
-    per_agent: Switch = False
+    per_agent: arguments.Switch = False
     """Whether every drone has its own networks; otherwise all drones share them."""
-    learning_rate: Positive = 2e-2
+    learning_rate: arguments.Positive = 2e-2
     """Initial learning rate of the policy."""
-    gamma: Fraction = 1.0
+    gamma: arguments.Fraction = 1.0
     """Discount factor."""
-    restart_fraction: Fraction = 0.2
+    restart_fraction: arguments.Fraction = 0.2
     """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
-    max_grad_norm: PositiveOrInfinite = 0.3
+    max_grad_norm: arguments.PositiveOrInfinite = 0.3
     """Largest norm of a gradient; longer gradients are scaled down."""
 
 

@@ -23,8 +23,8 @@ Check = Callable[[str, Any], Any]
 
 
 @dataclasses.dataclass(frozen=True)
-class Named:
-    """Check with another name of the argument in messages, such as "number of drones of {function}"."""
+class Range:
+    """Check with another name of the argument in messages, such as "{argument} of {function}"."""
 
     check: Check
     name: str
@@ -33,20 +33,24 @@ class Named:
         """Raise for a wrong value."""
         self.check(self.name.format(argument=argument) or argument, value)
 
+    def __repr__(self) -> str:
+        stated = getattr(self.check, "keywords", {}).items()
+        return f"Range({', '.join(f'{name}={bound!r}' for name, bound in stated if bound != '')})"
+
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def number(unit: str = "", name: str = "", **bounds: Any) -> Named:
+def number(unit: str = "", name: str = "", **bounds: Any) -> Range:
     """One real number within bounds (`at_least`, `above`, `at_most`, `below`); `name` is that of messages."""
-    return Named(functools.partial(checks.check_number, unit=unit, **bounds), name)
+    return Range(functools.partial(checks.check_number, unit=unit, **bounds), name)
 
 
-def whole(name: str = "", minimum: int = 1, limit: int | None = None) -> Named:
+def whole(name: str = "", minimum: int = 1, limit: int | None = None) -> Range:
     """Integer of at least `minimum`, and at most `limit`."""
     if limit is None:
-        return Named(functools.partial(check_whole, minimum=minimum), name)
-    return Named(functools.partial(check_at_most, limit=limit, minimum=minimum), name)
+        return Range(functools.partial(check_whole, minimum=minimum), name)
+    return Range(functools.partial(check_at_most, limit=limit, minimum=minimum), name)
 
 
 def choice(kind: str, known: Iterable[str]) -> Check:
@@ -130,11 +134,11 @@ def _ranges(function: Callable[..., Any]) -> dict[str, tuple[bool, list[Check]]]
     ranges, called = {}, function.__name__.replace("_", "-")
     for name, hint in typing.get_type_hints(function, include_extras=True).items():
         parts = hint, *typing.get_args(hint)
-        stated = [_named(check, called) for part in parts for check in getattr(part, "__metadata__", ())]
+        stated = [_of_function(check, called) for part in parts for check in getattr(part, "__metadata__", ())]
         if stated:
             ranges[name] = any(type(None) in typing.get_args(part) for part in parts), stated
     return ranges
 
 
-def _named(check: Check, called: str) -> Check:
-    return Named(check.check, check.name.replace("{function}", called)) if isinstance(check, Named) else check
+def _of_function(check: Check, called: str) -> Check:
+    return Range(check.check, check.name.replace("{function}", called)) if isinstance(check, Range) else check

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, number
-from jaxdrones.checks import check_number
 from jaxdrones.envs.randomize import Randomization
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -100,7 +99,7 @@ def random_pushes(
 def dryden(
     speed: Annotated[float, number("m/s", "speed of the wind at 20 ft", above=0)],
     altitude: Annotated[float, number("m", "altitude of the turbulence", at_least=_LOWEST, at_most=_HIGHEST)] = 6.096,
-    airspeed: float | None = None,
+    airspeed: Annotated[float | None, number("m/s", above=0)] = None,
 ) -> DisturbanceWithMemory:
     """Dryden turbulence at low altitude, added to the wind at the start of the episode.
 
@@ -129,7 +128,6 @@ def dryden(
     """
     mean = speed * math.log(altitude / _ROUGHNESS) / math.log(_REFERENCE / _ROUGHNESS)
     airspeed = mean if airspeed is None else airspeed
-    check_number("airspeed", airspeed, "m/s", above=0)
     (length, across), (height, upwards) = (scales(speed, altitude)[axis] for axis in "uw")
 
     def init(key: jax.Array, params: Params) -> dict[str, Array]:

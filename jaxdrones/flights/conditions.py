@@ -8,8 +8,7 @@ import os
 from typing import Annotated
 
 from jaxdrones import control, optimal
-from jaxdrones.arguments import Count, Seconds, Switch, checked, choice, whole
-from jaxdrones.checks import check_choice
+from jaxdrones.arguments import Count, Seconds, Switch, checked, choice, choices, whole
 from jaxdrones.control import pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.errors import UserError
@@ -43,7 +42,7 @@ class Conditions:
     vehicle: str | os.PathLike = "cf2x"
     """A bundled vehicle or the path of a URDF."""
     drones: Count | None = None
-    effects: tuple[str, ...] | None = None
+    effects: Annotated[tuple[str, ...] | None, choices("effect", EFFECTS | PAIRS, "'drag'")] = None
     """Names of `EFFECTS` and `PAIRS`."""
     controller: Annotated[str | None, choice("controller", CONTROLLERS)] = None
     """A name of `CONTROLLERS`; by default the vehicle's."""
@@ -84,8 +83,6 @@ class Conditions:
         flight = FLIGHTS[self.flight]
         if self.duration > _MAX_DURATION:
             raise UserError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
-        for effect in self.effects:
-            check_choice("effect", effect, EFFECTS | PAIRS)
         _check_once(self.effects)
         if flight.labels and self.drones != len(flight.labels):
             who = ", ".join(flight.labels)

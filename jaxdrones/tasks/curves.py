@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdrones.arguments import Seconds, checked, whole
+from jaxdrones.arguments import Range, Seconds, checked, whole
 from jaxdrones.checks import check_finite
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.pytree import PyTreeNode
@@ -22,6 +22,7 @@ Shape = Callable[[Float[Array, " k"], Float[Array, ""]], Float[Array, "3"]]
 """(random numbers (27,) in [-1, 1], time in periods) -> position relative to the center, m; periodic."""
 Point = Callable[[Int[Array, ""], Float[Array, ""]], Float[Array, "3"]]
 """(drone, time in s) -> position, m, world."""
+Finite = Annotated[float, Range(check_finite, "{function}['{argument}']")]
 Drones = Annotated[int, whole("number of drones")]
 
 
@@ -86,9 +87,8 @@ class Curve(PyTreeNode):
 
 
 @checked
-def circle(radius: float = 0.3, period: Seconds = 10.0, height: float = 0.1, spacing: float = 0.05) -> Curve:
+def circle(radius: Finite = 0.3, period: Seconds = 10.0, height: Finite = 0.1, spacing: Finite = 0.05) -> Curve:
     """Circle about (0, -radius): drones 60 degrees apart, each `spacing` above the one before, m and s."""
-    check_finite("circle", dict(radius=radius, height=height, spacing=spacing))
 
     def point(i, t):
         center = jnp.stack([0 * t, 0 * t - radius, height + i * spacing])
@@ -98,9 +98,8 @@ def circle(radius: float = 0.3, period: Seconds = 10.0, height: float = 0.1, spa
 
 
 @checked
-def crossing(n: int, amplitude: float = 0.5, period: Seconds = 5.0, spacing: float = 0.5) -> Curve:
+def crossing(n: int, amplitude: Finite = 0.5, period: Seconds = 5.0, spacing: Finite = 0.5) -> Curve:
     """Drones above each other oscillate along x, those of neighboring heights in opposition; the last one is lowest."""
-    check_finite("crossing", dict(amplitude=amplitude, spacing=spacing))
 
     def point(i, t):
         x = amplitude * jnp.cos(_angle(t / period + i / 2))
@@ -110,9 +109,8 @@ def crossing(n: int, amplitude: float = 0.5, period: Seconds = 5.0, spacing: flo
 
 
 @checked
-def hop(height: float = 0.014, amplitude: float = 0.15, period: Seconds = 4.0, spacing: float = 1.0) -> Curve:
+def hop(height: Finite = 0.014, amplitude: Finite = 0.15, period: Seconds = 4.0, spacing: Finite = 1.0) -> Curve:
     """Step to `height + amplitude`, with an oscillation of z about it; drones `spacing` (m) apart in x."""
-    check_finite("hop", dict(height=height, amplitude=amplitude, spacing=spacing))
 
     def point(i, t):
         z = height + amplitude * (jnp.sin(_angle(t / period)) + 1)

@@ -3,11 +3,11 @@
 import contextlib
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
-from jaxdrones.arguments import checked, choice
+from jaxdrones.checks import check_choice
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import video
@@ -18,8 +18,7 @@ FPS = 24
 SIZE = (1280, 720)
 
 
-@checked
-def choose_renderer(renderer: Annotated[str | None, choice("renderer", RENDERERS)], path: Path) -> str:
+def choose_renderer(renderer: str | None, path: Path) -> str:
     """Renderer of a film, by default the page if there is a browser, else JAX.
 
     Raises:
@@ -28,6 +27,7 @@ def choose_renderer(renderer: Annotated[str | None, choice("renderer", RENDERERS
     video.check_video(path)
     if renderer is None:
         return "page" if find_browser() else "jax"
+    check_choice("renderer", renderer, RENDERERS)
     if renderer == "page" and not find_browser():
         raise UserError("there is no Chromium for --renderer page; install it, or take --renderer jax")
     if renderer == "bullet":

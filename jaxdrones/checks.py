@@ -9,7 +9,7 @@ import functools
 import inspect
 import operator
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,9 +32,6 @@ _UNKNOWN = (jax.core.Tracer, jax.ShapeDtypeStruct)
 
 class UnexpectedKeyword(TypeError):
     """Python's `TypeError` for an unknown keyword argument, with a hint."""
-
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def is_concrete(value: Any) -> bool:
@@ -117,11 +114,6 @@ def _within(value: float, bounds: dict[str, float], infinite: bool) -> bool:
         return False
     holds = {"at least": operator.ge, "above": operator.gt, "at most": operator.le, "below": operator.lt}
     return all(holds[word](value, bound) for word, bound in bounds.items())
-
-
-def check_positive(name: str, value: float, unit: str) -> None:
-    """Raise unless a concrete number is positive and finite."""
-    check_number(name, value, unit, above=0)
 
 
 def check_whole(name: str, value: int, minimum: int = 1) -> None:
@@ -212,24 +204,6 @@ def bind(function: Callable, **values: Any) -> Callable:
 def with_scene(function: Callable, scene: Any) -> Callable:
     """Bind the parameter `scene` of a function, if it has one."""
     return bind(function, scene=scene)
-
-
-def check_keywords(function: Function) -> Function:
-    """Decorate a function or class to suggest the closest name for an unknown keyword."""
-    called: Any = function.__dict__["__init__"] if isinstance(function, type) else function
-    name = function.__qualname__
-    known = [p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD]
-
-    @functools.wraps(called)
-    def checked(*args: Any, **kwargs: Any) -> Any:
-        for keyword in kwargs:
-            check_keyword(name, keyword, known)
-        return called(*args, **kwargs)
-
-    if isinstance(function, type):
-        setattr(function, "__init__", checked)  # noqa: B010, a type checker does not let it be assigned
-        return function
-    return cast(Function, checked)
 
 
 def check_arrays(name: str, tree: Any) -> None:

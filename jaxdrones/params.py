@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxdrones.arguments import checked, whole
 from jaxdrones.checks import check_params, check_shape, check_whole, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
@@ -136,13 +137,13 @@ def stack(team: Sequence[Params]) -> Params:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *team)
 
 
-def repeat(params: Params, n: int) -> Params:
+@checked
+def repeat(params: Params, n: Annotated[int, whole("number of drones")]) -> Params:
     """Team of `n` equal drones.
 
     Raises:
         ValueError: `n` < 1, or `params` is already a team or cannot fly.
     """
-    check_whole("number of drones", n)
     _check_single("mass", params, "repeat takes the parameters of a single drone")
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (n, *jnp.shape(leaf))), params)
 

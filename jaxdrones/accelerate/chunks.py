@@ -16,7 +16,7 @@ from jaxdrones.accelerate import compiler
 from jaxdrones.accelerate.fitting import fits_a_kernel
 from jaxdrones.accelerate.reordered import has_reordered, store_reordered
 from jaxdrones.accelerate.soa import vmap_for_kernel
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import Count, checked
 
 _ONE_KERNEL = {"xla_cpu_small_call": "true", "inlineable": "false"}
 """Attributes for XLA's CPU compiler: compile this call to a single function, loops included. Otherwise every step of a
@@ -38,21 +38,20 @@ class ChunkedProgram:
     chunk: int | None
 
     @classmethod
+    @checked
     def of(
         cls,
         function: Callable,
         tree: Any,
         of_one_world: Sequence[jax.ShapeDtypeStruct],
         along: tuple[int, ...],
-        chunk: int | None,
+        chunk: Count | None,
     ) -> tuple[ChunkedProgram, Any]:
         """Trace a function of one world; return its program and the structure of its result.
 
         Raises:
             ValueError: a `chunk` that is not a positive integer.
         """
-        if chunk is not None:
-            check_whole("chunk", chunk)
         program, consts, shape = compiler.trace(lambda *leaves: function(*tree.unflatten(leaves)), *of_one_world)
         program, used = compiler.without_dead(program)
         along = tuple(itertools.compress(along, used))

@@ -23,7 +23,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxdrones import envs
 from jaxdrones.adapters.session import rewarding
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import Count, checked
 from jaxdrones.errors import UserError, install
 
 try:
@@ -164,8 +164,9 @@ class _Training(base.Wrapper):
         return after.replace(pipeline_state=place, obs=obs, done=_float(done), info=info)
 
 
+@checked
 def wrap_for_training(
-    env: BraxEnv, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None
+    env: BraxEnv, episode_length: Count, action_repeat: int = 1, randomization_fn: Any = None
 ) -> base.Wrapper:
     """`wrap_env_fn` of the trainers: many worlds, each episode from a new random start.
 
@@ -181,7 +182,6 @@ def wrap_for_training(
     Raises:
         ValueError: an unsupported argument.
     """
-    check_whole("episode_length", episode_length)
     if action_repeat != 1:
         raise UserError(
             f"action_repeat is {action_repeat}; leave it at 1 and make the environment with a lower control_hz"

@@ -22,7 +22,8 @@ from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import SEEDS, Session, as_env, flat, rewarding
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
-from jaxdrones.checks import check_choice, check_whole, short_repr
+from jaxdrones.arguments import Count, checked
+from jaxdrones.checks import check_choice, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 
@@ -38,13 +39,14 @@ class GymnasiumEnv(gymnasium.Env):
 
     metadata = {"render_modes": pictures.MODES, "render_fps": 100}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         task: str | Task | envs.Env,
         *,
         dict_spaces: bool = False,
         team_reward: str = "sum",
-        render_mode: str | None = None,
+        render_mode: pictures.RenderMode = None,
         **options: Any,
     ):
         """Wrap an environment.
@@ -60,7 +62,6 @@ class GymnasiumEnv(gymnasium.Env):
         Raises:
             ValueError: an invalid argument of `jaxdrones.make`.
         """
-        pictures.check_mode(render_mode)
         self.env, self.render_mode = as_env(task, options), render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / self.env.dt)}
         self._layout, self._rewarding = _layout(self.env, dict_spaces), rewarding(team_reward)
@@ -118,17 +119,18 @@ class VectorEnv(gymnasium.vector.VectorEnv):
 
     metadata = {"render_modes": pictures.MODES, "autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
 
+    @checked
     def __init__(
         self,
         task: str | Task | envs.Env,
-        num_envs: int = 1,
+        num_envs: Count = 1,
         *,
         dict_spaces: bool = False,
         team_reward: str = "sum",
         numpy: bool = True,
-        max_episode_steps: int | None = None,
+        max_episode_steps: Count | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
-        render_mode: str | None = None,
+        render_mode: pictures.RenderMode = None,
         **options: Any,
     ):
         """Wrap an environment.
@@ -151,12 +153,9 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             ValueError: an invalid argument of `jaxdrones.make`.
             TypeError: an unknown option.
         """
-        check_whole("num_envs", num_envs)
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
         if max_episode_steps is not None:
-            check_whole("max_episode_steps", max_episode_steps)
             self.env = dataclasses.replace(self.env, steps=max_episode_steps)
-        pictures.check_mode(render_mode)
         self.autoreset_mode, self.render_mode = _autoreset_mode(autoreset_mode), render_mode
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode, "render_fps": round(1 / self.env.dt)}
         self._layout = _layout(self.env, dict_spaces)

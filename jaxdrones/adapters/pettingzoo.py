@@ -10,6 +10,7 @@ import numpy as np
 from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import SEEDS, Session, as_env, flat
 from jaxdrones.adapters.spaces import Layout
+from jaxdrones.arguments import checked
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError, install
 from jaxdrones.tasks.task import Task
@@ -28,7 +29,8 @@ def parallel_env(task: str | Task | Env, **options: Any) -> ParallelEnv:
 class ParallelEnv(pettingzoo.ParallelEnv):
     """One world; episodes begin and end for all agents at once."""
 
-    def __init__(self, task: str | Task | Env, *, render_mode: str | None = None, **options: Any):
+    @checked
+    def __init__(self, task: str | Task | Env, *, render_mode: pictures.RenderMode = None, **options: Any):
         """Wrap an environment.
 
         Args:
@@ -39,7 +41,6 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         Raises:
             ValueError: an invalid argument of `jaxdrones.make`.
         """
-        pictures.check_mode(render_mode)
         self.env = as_env(task, options)
         self.render_mode = render_mode
         self.metadata = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +21,12 @@ _DIRECTION = np.array([-1.2, 0.9, 0.6])  # from the middle of the team to the ca
 _AT_A_TIME = 8  # pictures of worlds at a time, to fit in a cache
 
 
-def check_mode(render_mode: str | None) -> None:
-    """Raise unless the render mode is supported."""
-    if render_mode not in (None, *MODES):
-        raise UserError(f"render_mode is {render_mode!r}; take 'rgb_array' or leave it out")
+def _check_mode(name: str, mode: str) -> None:
+    if mode not in MODES:
+        raise UserError(f"{name} is {mode!r}; take 'rgb_array' or leave it out")
+
+
+RenderMode = Annotated[str | None, _check_mode]
 
 
 def of_world(env: Env, world: World) -> np.ndarray:

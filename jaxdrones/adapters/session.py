@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdrones.adapters import pictures
-from jaxdrones.checks import UnexpectedKeyword, check_choice
+from jaxdrones.arguments import checked, choice
+from jaxdrones.checks import UnexpectedKeyword
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.tasks.task import Task, World
@@ -82,7 +83,8 @@ def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
     return task
 
 
-def rewarding(team_reward: str) -> Callable[[Any], Any]:
+@checked
+def rewarding(team_reward: Annotated[str, choice("team_reward", ("sum", "mean"))]) -> Callable[[Any], Any]:
     """Function from the rewards (*batch, n) of the drones to that (*batch) of their team.
 
     Args:
@@ -91,7 +93,6 @@ def rewarding(team_reward: str) -> Callable[[Any], Any]:
     Raises:
         ValueError: another name.
     """
-    check_choice("team_reward", team_reward, ("sum", "mean"))
     return lambda rewards: getattr(rewards, team_reward)(-1)
 
 

@@ -13,7 +13,7 @@ from jaxdrones.adapters import pictures
 from jaxdrones.adapters.session import SEEDS, as_env
 from jaxdrones.adapters.spaces import Layout
 from jaxdrones.adapters.worlds import Worlds
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import Count, checked
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
@@ -30,10 +30,11 @@ class VectorEnv(BaseVectorEnv):
     Observations and actions have the shapes of `jaxdrones.adapters.gymnasium.VectorEnv`. Infos are empty.
     """
 
+    @checked
     def __init__(
         self,
         task: str | Task | Env,
-        num_envs: int,
+        num_envs: Count,
         *,
         seed: int | None = None,
         team_reward: str = "sum",
@@ -51,7 +52,6 @@ class VectorEnv(BaseVectorEnv):
         Raises:
             ValueError: an invalid argument of `jaxdrones.make`.
         """
-        check_whole("num_envs", num_envs)
         self.env, self.env_num = as_env(task, options), num_envs
         self.is_async = self.is_closed = False
         self._layout = Layout(self.env, None)

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 
 from jaxdrones import user_code
+from jaxdrones.arguments import Check
 from jaxdrones.checks import UnexpectedKeyword
 from jaxdrones.cli import machine
 from jaxdrones.errors import UserError
@@ -133,6 +134,13 @@ def folder(text: str) -> Path:
 def run_folder(task: str, ending: str = "") -> Path:
     """Default folder of a run: `runs/hover`, or `runs/moving_box` for the task `my_task.py:moving_box`."""
     return Path("runs") / (task.rpartition(":")[2] + ending)
+
+
+def check_options(options: argparse.Namespace, **ranges: Check) -> None:
+    """Raise unless the options that are given are in these ranges."""
+    for name, check in ranges.items():
+        if getattr(options, name) is not None:
+            check(name, getattr(options, name))
 
 
 def check_writable(file: Path) -> None:

@@ -4,8 +4,8 @@ import argparse
 import functools
 from typing import Any
 
-from jaxdrones.checks import check_choice, check_number
-from jaxdrones.cli.common import DIVERGED, folder, print_error
+from jaxdrones.arguments import choice, number, whole
+from jaxdrones.cli.common import DIVERGED, check_options, folder, print_error
 from jaxdrones.cli.options import add_backend, add_drones, add_json, add_set, add_vehicle
 from jaxdrones.cli.policies import is_user_policy, open_policy
 from jaxdrones.cli.report import as_json, described, evaluation_table, percent
@@ -53,14 +53,12 @@ def _evaluate(options: argparse.Namespace) -> int:
     import jax
 
     from jaxdrones.learning import evaluate
-    from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
+    from jaxdrones.limits import LARGEST_COUNT, check_seed
     from jaxdrones.training.run import report_as_dict
 
-    check_at_most("episodes", options.episodes, LARGEST_COUNT)
-    check_seed("seed", options.seed)
-    if options.fail_below is not None:
-        check_number("fail-below", options.fail_below, above=0, at_most=1)
-    check_choice("backend", options.backend, BACKENDS)
+    passing = number(name="fail-below", above=0, at_most=1)
+    backend, episodes = choice("backend", BACKENDS), whole(limit=LARGEST_COUNT)
+    check_options(options, episodes=episodes, seed=check_seed, fail_below=passing, backend=backend)
     run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
     about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed, "backend": options.backend}
     if is_user_policy(options.policy):

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxdrones.arguments import choice
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import check_writable, folder, print_error, run_folder
+from jaxdrones.cli.common import check_options, check_writable, folder, print_error, run_folder
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_json, add_no_figure, add_output, add_set
@@ -148,11 +149,10 @@ def _fly_policy(options: argparse.Namespace) -> int:
 
     from jaxdrones.training.episode import EpisodeConditions, fly_episode, to_record
 
-    check_choice("backend", options.backend, BACKENDS)
+    check_options(options, backend=choice("backend", BACKENDS), seed=check_seed)
     run = open_policy(options.policy, options.task, options.realistic, _options_of_task(options))
     seed = options.seed or 0
     recipe = run.recipe()
-    check_seed("seed", seed)
     vehicle = "any vehicle" if recipe.realistic == "any" else str(recipe.options.get("vehicle", "cf2x"))
     if options.pwm:
         check_pwm(vehicle)

@@ -7,15 +7,14 @@ import math
 import time
 from typing import Any
 
-from jaxdrones.checks import check_choice, check_number, check_positive, check_whole
-from jaxdrones.cli.common import folder, print_error, print_warning
+from jaxdrones.arguments import choice, number, whole
+from jaxdrones.cli.common import check_options, folder, print_error, print_warning
 from jaxdrones.cli.options import add_backend, add_drones, add_json, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS, PHYSICS_HZ
-from jaxdrones.limits import check_at_most
 from jaxdrones.params import repeat
 from jaxdrones.ros2 import bag, topics
 from jaxdrones.ros2.command import CONTROLLERS
@@ -118,15 +117,9 @@ def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:
 def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Simulation:
     """Team in hover, side by side."""
     n, hz = options.drones, options.control_hz
-    check_whole("drones", n)
-    check_positive("speed", options.speed, "")
-    if options.duration is not None:
-        check_number("duration", options.duration, "s", at_least=0)
-    check_at_most("control rate (Hz)", hz, _MAX_HZ)
-    check_choice("backend", options.backend, BACKENDS)
-    check_number("height", options.height, "m", above=0)
-    if options.controller is not None:
-        check_choice("controller", options.controller, CONTROLLERS)
+    numbers = dict(drones=whole(), speed=number(above=0), duration=number("s", at_least=0), height=number("m", above=0))
+    names = dict(backend=choice("backend", BACKENDS), controller=choice("controller", CONTROLLERS))
+    check_options(options, control_hz=whole("control rate (Hz)", limit=_MAX_HZ), **numbers, **names)
     params = repeat(load_params(options.vehicle), n)
     state = State.at_rest([[0.0, _SPACING * (i - (n - 1) / 2), options.height] for i in range(n)])
     substeps = math.ceil(PHYSICS_HZ / hz)
@@ -155,7 +148,7 @@ def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int
     for name in vars(options):
         if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
             raise UserError(f"--{name.replace('_', '-')} is an option of flights; leave it out of `replay`")
-    check_number("speed", options.speed, above=0)
+    check_options(options, speed=number(above=0))
     with contextlib.closing(open_transport(options.transport)) as transport:
         report = _published(options, transport)
     _print(options, report)

@@ -9,7 +9,8 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.common import run_folder
+from jaxdrones.arguments import whole
+from jaxdrones.cli.common import check_options, run_folder
 from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
@@ -52,12 +53,10 @@ class Request:
         Raises:
             UserError: options that are out of range or contradictory.
         """
-        check_at_most("seeds", options.seeds, _MAX_SEEDS)
+        episodes = whole(limit=LARGEST_COUNT)
+        check_options(options, seeds=whole(limit=_MAX_SEEDS), seed=check_seed, episodes=episodes)
         if options.seed is not None:
-            check_seed("seed", options.seed)
             check_seed("the last seed", options.seed + options.seeds - 1)
-        if options.episodes is not None:
-            check_at_most("episodes", options.episodes, LARGEST_COUNT)
         if options.resume and options.overwrite:
             raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")
         from jaxdrones.learning.loggers import logger_names

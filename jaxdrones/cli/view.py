@@ -6,8 +6,8 @@ import webbrowser
 import zipfile
 from pathlib import Path
 
-from jaxdrones.checks import check_choice, check_whole
-from jaxdrones.cli.common import check_writable, folder
+from jaxdrones.arguments import choice, whole
+from jaxdrones.cli.common import check_options, check_writable, folder
 from jaxdrones.cli.options import add_json, add_output
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
@@ -55,8 +55,7 @@ def _view(options: argparse.Namespace) -> int:
     output = options.output or logs[0].with_name("flight.html")
     check_writable(output)
     size = _size(options.size)
-    check_choice("camera", options.camera, CAMERAS)
-    check_whole("fps", options.fps)
+    check_options(options, camera=choice("camera", CAMERAS), fps=whole())
     if options.video:
         video.check_video(options.video)
         check_writable(options.video)

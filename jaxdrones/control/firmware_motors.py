@@ -6,12 +6,14 @@ across it, and a command is a fraction of the maximum thrust, at any voltage of 
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import vector
-from jaxdrones.checks import check_choice
+from jaxdrones.arguments import checked, choice
 from jaxdrones.control.allocation import mixer
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -59,13 +61,13 @@ class Command(PyTreeNode):
     """(4,) duty cycles of the motors, 0 to 65535: front right, back right, back left, front left."""
 
 
-def motor(propellers: str = "2.1+") -> Motor:
+@checked
+def motor(propellers: Annotated[str, choice("propellers", PROPELLERS)] = "2.1+") -> Motor:
     """Motor of a Crazyflie with propellers of the 2.1, of the 2.1+, or of the thrust upgrade kit.
 
     Raises:
         ValueError: unknown propellers.
     """
-    check_choice("propellers", propellers, PROPELLERS)
     return Motor(jnp.array(THRUST_CURVES[propellers]), *(jnp.array(x) for x in _COMMANDS[propellers]))
 
 

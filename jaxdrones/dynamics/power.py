@@ -3,12 +3,14 @@
 The circuit is an open-circuit voltage, a resistance, and one pair of resistance and capacitance in series (Thevenin).
 """
 
+from typing import Annotated
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_number
+from jaxdrones.arguments import checked, number
 from jaxdrones.dynamics.model import Model, constants
 from jaxdrones.dynamics.rotors import induced_speed, thrust
 from jaxdrones.params import Params
@@ -44,14 +46,15 @@ class Battery(PyTreeNode):
     """() power of the electronics, W."""
 
 
+@checked
 def lithium_polymer(
-    capacity: ArrayLike = 900.0,
-    cells: ArrayLike = 1,
-    resistance: ArrayLike = 0.28,
-    slow_resistance: ArrayLike = 0.0,
-    slow_time: ArrayLike = 10.0,
-    efficiency: ArrayLike = 0.3,
-    idle_power: ArrayLike = 0.5,
+    capacity: Annotated[ArrayLike, number("A s", "{argument} of the battery", above=0)] = 900.0,
+    cells: Annotated[ArrayLike, number("in series", "{argument} of the battery", above=0)] = 1,
+    resistance: Annotated[ArrayLike, number("ohm", "{argument} of the battery", at_least=0)] = 0.28,
+    slow_resistance: Annotated[ArrayLike, number("ohm", "{argument} of the battery", at_least=0)] = 0.0,
+    slow_time: Annotated[ArrayLike, number("s", "{argument} of the battery", above=0)] = 10.0,
+    efficiency: Annotated[ArrayLike, number("a share", "{argument} of the battery", above=0)] = 0.3,
+    idle_power: Annotated[ArrayLike, number("W", "{argument} of the battery", at_least=0)] = 0.5,
 ) -> Battery:
     """Constants of a battery; the defaults are those of a Crazyflie 2.1 with 250 mAh.
 
@@ -71,19 +74,6 @@ def lithium_polymer(
     Raises:
         ValueError: a number out of range.
     """
-    for name, value, unit in (
-        ("capacity", capacity, "A s"),
-        ("cells", cells, "in series"),
-        ("slow_time", slow_time, "s"),
-        ("efficiency", efficiency, "a share"),
-    ):
-        check_number(f"{name} of the battery", value, unit, above=0)
-    for name, value, unit in (
-        ("resistance", resistance, "ohm"),
-        ("slow_resistance", slow_resistance, "ohm"),
-        ("idle_power", idle_power, "W"),
-    ):
-        check_number(f"{name} of the battery", value, unit, at_least=0)
     numbers = capacity, cells, resistance, slow_resistance, slow_time, efficiency, idle_power
     return Battery(*(jnp.asarray(x, float) for x in numbers))
 

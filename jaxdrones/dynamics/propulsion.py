@@ -2,13 +2,15 @@
 
 import functools
 from collections.abc import Callable
+from typing import Annotated
 
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_choice, check_finite, check_number, check_shape, is_concrete, short_repr
+from jaxdrones.arguments import checked, choice, number
+from jaxdrones.checks import check_finite, check_shape, is_concrete, short_repr
 from jaxdrones.dynamics.model import constants
 from jaxdrones.dynamics.power import battery_voltage
 from jaxdrones.dynamics.rotors import lagging_rotors
@@ -21,6 +23,7 @@ from jaxdrones.vector import safe_sqrt
 
 Rotors = Callable[[Params, State, Float[Array, "4"]], tuple[Float[Array, "4"], Float[Array, "4"]]]
 
+Supply = Annotated[ArrayLike, number("V", "supply of the motors", above=0)]
 FULL_PWM = 65535
 """PWM command at a duty cycle of 1."""
 
@@ -42,7 +45,8 @@ class Motors(PyTreeNode):
         return voltage_for(self.coefficients, thrust)
 
 
-def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
+@checked
+def cubic_motors(coefficients: ArrayLike, supply: Supply = 3.7) -> Motors:
     """Motors with a cubic thrust curve.
 
     Args:
@@ -55,7 +59,6 @@ def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
     """
     check_shape("coefficients of the thrust curve", coefficients, (4,), "those of the powers 0 to 3 of the voltage")
     check_finite("coefficients of the thrust curve", coefficients)
-    check_number("supply of the motors", supply, "V", above=0)
     if is_concrete(coefficients):
         _, b, c, d = np.asarray(coefficients, float)
         if not (d > 0 and c * c < 3 * b * d):
@@ -66,7 +69,10 @@ def cubic_motors(coefficients: ArrayLike, supply: ArrayLike = 3.7) -> Motors:
     return Motors(jnp.asarray(coefficients, float), jnp.asarray(supply, float))
 
 
-def crazyflie_motors(propellers: str = "2.1+", supply: ArrayLike = 3.7) -> Motors:
+@checked
+def crazyflie_motors(
+    propellers: Annotated[str, choice("propellers", THRUST_CURVES)] = "2.1+", supply: Supply = 3.7
+) -> Motors:
     """Motors of the Crazyflie with the firmware's thrust curve.
 
     Args:
@@ -76,7 +82,6 @@ def crazyflie_motors(propellers: str = "2.1+", supply: ArrayLike = 3.7) -> Motor
     Raises:
         ValueError: unknown propellers, or a supply voltage that is not positive.
     """
-    check_choice("propellers", propellers, THRUST_CURVES)
     return cubic_motors(np.array(THRUST_CURVES[propellers]), supply)
 
 

@@ -3,12 +3,13 @@
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arguments, check_callable, check_number
+from jaxdrones.arguments import checked, function, number
+from jaxdrones.checks import check_arguments, check_number
 from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -27,7 +28,11 @@ def clock() -> Model:
     )
 
 
-def in_wind(field: WindField, effect: Effect) -> Effect:
+@checked
+def in_wind(
+    field: Annotated[WindField, function("jaxdrones.logarithmic_wind(5.0)")],
+    effect: Annotated[Effect, function("jaxdrones.drag")],
+) -> Effect:
     """Wrap an effect in a wind field, which is added to `params.wind` at the position of the drone.
 
     Args:
@@ -38,8 +43,6 @@ def in_wind(field: WindField, effect: Effect) -> Effect:
     Raises:
         ValueError: an argument of another type; in flight, a field of time without a clock.
     """
-    check_callable("field", field, "jaxdrones.logarithmic_wind(5.0)")
-    check_callable("effect", effect, "jaxdrones.drag")
     arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
     check_arguments("field", field, arguments)
     check_arguments("effect", effect, ("params", "state"))
@@ -56,8 +59,12 @@ def in_wind(field: WindField, effect: Effect) -> Effect:
     return blown
 
 
+@checked
 def logarithmic_wind(
-    speed: float, height: float = 6.1, roughness: float = 0.0457, direction: float = 0.0
+    speed: Annotated[float, number("m/s", "speed of the wind", at_least=0)],
+    height: float = 6.1,
+    roughness: Annotated[float, number("m", "roughness of the ground", above=0)] = 0.0457,
+    direction: Annotated[float, number("rad", "direction of the wind")] = 0.0,
 ) -> Callable[[Float[Array, "3"]], Float[Array, "3"]]:
     """Logarithmic mean wind over flat ground (MIL-F-8785C, 3.7.3.1).
 
@@ -73,10 +80,7 @@ def logarithmic_wind(
     Raises:
         ValueError: a height that is not above the roughness, or numbers that are not positive.
     """
-    check_number("speed of the wind", speed, "m/s", at_least=0)
-    check_number("roughness of the ground", roughness, "m", above=0)
     check_number("height of the wind's speed", height, "m", above=roughness)
-    check_number("direction of the wind", direction, "rad")
 
     def logarithmic(pos: Float[Array, "3"]) -> Float[Array, "3"]:
         at_height = speed * jnp.log(jnp.maximum(pos[2], roughness) / roughness) / jnp.log(height / roughness)

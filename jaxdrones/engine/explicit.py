@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.shared import recomputed
-from jaxdrones.checks import check_positive, check_whole
+from jaxdrones.arguments import Count, Seconds, checked
 from jaxdrones.dynamics.contact import LARGEST_STEP
 from jaxdrones.dynamics.integrators import Integrator, semi_implicit_euler
 from jaxdrones.dynamics.model import Model
@@ -93,13 +93,14 @@ def _derivative_of(physics: Physics) -> Derivative:
     return derivative
 
 
+@checked
 def make_step(
     effects: Sequence[Effect] = (),
     pairs: Sequence[Pair] = (),
     rotors: Rotors = instant_rotors,
     integrator: Integrator = semi_implicit_euler,
-    dt: float = 1 / 240,
-    substeps: int = 1,
+    dt: Seconds = 1 / 240,
+    substeps: Count = 1,
     *,
     team_effects: Sequence[TeamEffect] = (),
     models: Sequence[Model] = (),
@@ -133,8 +134,6 @@ def make_step(
         ValueError: `dt` or `substeps` not positive, an argument that is not a function or a model, a scene with
             obstacles without an effect that uses it, or contact with `dt` above 1/240 s, where it is unstable.
     """
-    check_positive("dt", dt, "s")
-    check_whole("substeps", substeps)
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
     check_functions("integrator", [integrator])
     contacts = physics.contacts("ground", "obstacles", "drones")

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxdrones.checks import check_positive, check_whole
+from jaxdrones.arguments import Count, checked, number
 
 _FARTHEST = 16_000  # cells from the middle of the team; drones farther out are clamped
 _ROW = 2 * _FARTHEST + 3  # cells, one beyond either end
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class NeighborGrid:
     """Restrict pair effects to drones within a horizontal cutoff."""
 
-    cutoff: float
+    cutoff: Annotated[float, number("m", above=0)]
     """m; pairs farther apart do not interact."""
-    capacity: int = 24
+    capacity: Count = 24
     """Drones in three neighboring cells, each `cutoff` wide; with more, all pairs of the team are computed."""
-
-    def __post_init__(self):
-        check_positive("cutoff", self.cutoff, "m")
-        check_whole("capacity", self.capacity)
 
     def near(self, pos: Float[Array, "n 3"]) -> tuple[Int[Array, "k n"], Bool[Array, "k n"], Bool[Array, ""]]:
         """Indices of candidates within the cutoff of each drone, their mask, and whether the list is complete.

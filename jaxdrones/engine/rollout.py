@@ -2,21 +2,14 @@
 
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import (
-    check_arrays,
-    check_callable,
-    check_finite,
-    check_params,
-    check_quaternion,
-    check_whole,
-    short_repr,
-)
+from jaxdrones.arguments import Count, checked, function
+from jaxdrones.checks import check_arrays, check_finite, check_params, check_quaternion, short_repr
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -28,14 +21,15 @@ Control = Callable[[Params, Any, State, jax.Array], tuple[Any, jax.Array]]
 _LEG = 1 / 30  # s: one leg a screen frame
 
 
+@checked
 def rollout(
     step: Advance,
-    control: Control,
+    control: Annotated[Control, function("lambda params, memory, state, k: (memory, rpm)")],
     params: Params,
     state: State,
     memory: Any,
-    length: int,
-    checkpoint: int | None = None,
+    length: Count,
+    checkpoint: Count | None = None,
 ) -> tuple[State, State]:
     """Fly `length` control steps.
 
@@ -57,8 +51,6 @@ def rollout(
             concrete values that cannot fly: not finite, a mass that is not positive, a quaternion that is not of unit
             length.
     """
-    check_whole("length", length)
-    check_callable("control", control, "lambda params, memory, state, k: (memory, rpm)")
     check_params(params)
     check_arrays("state", state)
     check_finite("state", state)
@@ -78,7 +70,6 @@ def rollout(
     if checkpoint is None:
         (_, final), trajectory = fly((memory, state), ks)
         return final, trajectory
-    check_whole("checkpoint", checkpoint)
     if length % checkpoint:
         raise UserError(f"length is {length}; give a multiple of checkpoint, {checkpoint}")
     (_, final), parts = jax.lax.scan(jax.checkpoint(fly), (memory, state), ks.reshape(-1, checkpoint))

@@ -6,13 +6,13 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_number
+from jaxdrones.arguments import checked, number
 from jaxdrones.envs.randomize import Randomization
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -67,7 +67,12 @@ class DisturbanceWithMemory:
         return described(f"start of: {self.text}", functools.partial(self.start))
 
 
-def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) -> Disturbance:
+@checked
+def random_pushes(
+    force: Annotated[float, number("share of the weight", "force of a push", at_least=0)],
+    interval: Annotated[float, number("s", above=0, infinite=True)] = 1.0,
+    duration: Annotated[float, number("s", above=0, infinite=True)] = 0.1,
+) -> Disturbance:
     """External forces of U(-force, force) (fraction of the weight) along each axis, at random times.
 
     One begins every `interval` seconds and lasts `duration` seconds on average, both with exponential distributions.
@@ -75,9 +80,6 @@ def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) ->
     Raises:
         ValueError: a negative force, or times that are not positive.
     """
-    check_number("force of a push", force, "share of the weight", at_least=0)
-    check_number("interval", interval, "s", above=0, infinite=True)
-    check_number("duration", duration, "s", above=0, infinite=True)
 
     def disturbance(key: jax.Array, params: Params, dt: float) -> Params:
         n = len(params.mass)
@@ -93,7 +95,12 @@ def random_pushes(force: float, interval: float = 1.0, duration: float = 0.1) ->
     )
 
 
-def dryden(speed: float, altitude: float = 6.096, airspeed: float | None = None) -> DisturbanceWithMemory:
+@checked
+def dryden(
+    speed: Annotated[float, number("m/s", "speed of the wind at 20 ft", above=0)],
+    altitude: Annotated[float, number("m", "altitude of the turbulence", at_least=_LOWEST, at_most=_HIGHEST)] = 6.096,
+    airspeed: Annotated[float | None, number("m/s", above=0)] = None,
+) -> DisturbanceWithMemory:
     """Dryden turbulence at low altitude, added to the wind at the start of the episode.
 
     The gusts of different drones are independent. Along the mean wind (along x without mean wind), across it and
@@ -119,11 +126,8 @@ def dryden(speed: float, altitude: float = 6.096, airspeed: float | None = None)
     Raises:
         ValueError: a speed that is not positive, or an altitude out of range.
     """
-    check_number("speed of the wind at 20 ft", speed, "m/s", above=0)
-    check_number("altitude of the turbulence", altitude, "m", at_least=_LOWEST, at_most=_HIGHEST)
     mean = speed * math.log(altitude / _ROUGHNESS) / math.log(_REFERENCE / _ROUGHNESS)
     airspeed = mean if airspeed is None else airspeed
-    check_number("airspeed", airspeed, "m/s", above=0)
     (length, across), (height, upwards) = (scales(speed, altitude)[axis] for axis in "uw")
 
     def init(key: jax.Array, params: Params) -> dict[str, Array]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,8 @@ from jaxtyping import Array
 
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
-from jaxdrones.checks import POSITIVE, check_callable, check_choice, check_number, check_sequence, short_repr
+from jaxdrones.arguments import checked, choice, number
+from jaxdrones.checks import POSITIVE, check_callable, check_number, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -19,6 +20,7 @@ from jaxdrones.state import State
 DELAY = "delay"
 """Key of `Params.aux`: random delay of an episode, control steps."""
 
+Field = Annotated[str, choice("parameter", Params.__dataclass_fields__)]
 Randomization = Callable[[jax.Array, Params], Params]
 """(key, params) of one drone -> its parameters in this episode."""
 Noise = Callable[[jax.Array, State], State]
@@ -26,14 +28,14 @@ Noise = Callable[[jax.Array, State], State]
 
 
 def _check_range(field: str, low: float, high: float) -> None:
-    check_choice("parameter", field, Params.__dataclass_fields__)
     check_number(f"lower bound of {field}", low)
     check_number(f"upper bound of {field}", high)
     if not low <= high:
         raise UserError(f"the range of {field} is ({low}, {high}); give the lower bound first")
 
 
-def scaled(field: str, low: float, high: float) -> Randomization:
+@checked
+def scaled(field: Field, low: float, high: float) -> Randomization:
     """Nominal value times U(low, high), one factor for the whole array.
 
     Raises:
@@ -50,7 +52,8 @@ def scaled(field: str, low: float, high: float) -> Randomization:
     return described(f"{field} times U({low:g}, {high:g})", randomize)
 
 
-def shifted(field: str, low: float, high: float) -> Randomization:
+@checked
+def shifted(field: Field, low: float, high: float) -> Randomization:
     """Nominal value plus U(low, high), drawn for each entry of the array.
 
     Raises:
@@ -65,13 +68,13 @@ def shifted(field: str, low: float, high: float) -> Randomization:
     return described(f"{field} plus U({low:g}, {high:g}), each entry", randomize)
 
 
-def constant_wind(speed: float) -> Randomization:
+@checked
+def constant_wind(speed: Annotated[float, number("m/s", "speed of the wind", at_least=0)]) -> Randomization:
     """Wind U(-speed, speed) (m/s) along x and y and a quarter of that along z, constant in an episode.
 
     Raises:
         ValueError: a negative speed.
     """
-    check_number("speed of the wind", speed, "m/s", at_least=0)
 
     def randomize(key: jax.Array, params: Params) -> Params:
         wind = jax.random.uniform(key, (3,), params.wind.dtype, -speed, speed)
@@ -171,7 +174,13 @@ def drawn_leaves(randomize: Sequence[Randomization], params: Params) -> list[boo
     return [any(flags) for flags in zip(*found, strict=True)] if found else [False] * len(jax.tree.leaves(params))
 
 
-def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, omega: float = 0.02) -> Noise:
+@checked
+def sensor_noise(
+    pos: Annotated[float, number("m", "{argument} of the noise", at_least=0)] = 0.005,
+    vel: Annotated[float, number("m/s", "{argument} of the noise", at_least=0)] = 0.01,
+    angle: Annotated[float, number("rad", "{argument} of the noise", at_least=0)] = 0.005,
+    omega: Annotated[float, number("rad/s", "{argument} of the noise", at_least=0)] = 0.02,
+) -> Noise:
     """White noise on the state with these standard deviations, m, m/s, rad and rad/s.
 
     The defaults for position and velocity are those of Huang et al.'s swarm simulator. Those for angle and rates are
@@ -180,8 +189,6 @@ def sensor_noise(pos: float = 0.005, vel: float = 0.01, angle: float = 0.005, om
     Raises:
         ValueError: a negative standard deviation.
     """
-    for name, value, unit in ("pos", pos, "m"), ("vel", vel, "m/s"), ("angle", angle, "rad"), ("omega", omega, "rad/s"):
-        check_number(f"{name} of the noise", value, unit, at_least=0)
 
     def noise(key: jax.Array, state: State) -> State:
         n = len(state.pos)

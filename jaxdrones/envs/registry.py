@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
-from jaxdrones.checks import (
-    check_callable,
-    check_choice,
-    check_finite,
-    check_params,
-    check_positive,
-    check_sequence,
-    check_switch,
-    check_whole,
-    short_repr,
-)
+from jaxdrones.arguments import Count, Hertz, checked, choice, function
+from jaxdrones.checks import check_choice, check_finite, check_params, check_sequence, check_switch, short_repr
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.dynamics.aero import external_force
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
@@ -57,27 +49,28 @@ from jaxdrones.urdf import load_params
 BACKENDS = ("explicit", "bullet")
 
 
+@checked
 def make(
     task: str | Task | Callable[..., Task],
     *,
-    backend: str = "explicit",
+    backend: Annotated[str, choice("backend", BACKENDS)] = "explicit",
     vehicle: str | os.PathLike | Params | None = None,
     action: str | Action | None = None,
     observation: Sequence[str | ObservationTerm] | None = None,
     vision: Sequence[str] | None = None,
     camera: Camera | None = None,
-    realistic: bool | str = False,
+    realistic: Annotated[bool | str, functools.partial(check_switch, others=("any",))] = False,
     effects: Sequence[str | Callable] | None = None,
     pairs: Sequence[str | Callable] = (),
     team_effects: Sequence[TeamEffect] = (),
     models: Sequence[Model] = (),
     rotors: str | None = None,
     integrator: str = "semi_implicit_euler",
-    control_hz: float | None = None,
-    substeps: int | None = None,
+    control_hz: Hertz | None = None,
+    substeps: Count | None = None,
     randomize: Sequence[Randomization] | None = None,
-    noise: Noise | None = None,
-    disturbance: Disturbance | None = None,
+    noise: Annotated[Noise | None, function("sensor_noise()")] = None,
+    disturbance: Annotated[Disturbance | None, function("random_pushes(0.3)")] = None,
     delay: float | tuple[float, float] | None = None,
     sensors: Sequence[Sensor] = (),
     scene: Scene | DrawScene | None = None,
@@ -121,13 +114,9 @@ def make(
         ImportError: the Bullet backend without pybullet.
     """
     check_process()
-    check_choice("backend", backend, BACKENDS)
-    check_switch("realistic", realistic, ("any",))
     task = make_task(task, options, _OWN_OPTIONS)
     control_hz = task.control_hz if control_hz is None else control_hz
     substeps = task.substeps if substeps is None else substeps
-    check_positive("control_hz", control_hz, "1/s")
-    check_whole("substeps", substeps)
     dt = 1 / control_hz
     preset = _REALISTIC if realistic else _PLAIN
     if randomize is None and realistic != "any":
@@ -140,10 +129,7 @@ def make(
     nominal = nominal_params(randomize, nominal)
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
-    if noise is not None:
-        check_callable("noise", noise, "sensor_noise()")
     if disturbance is not None:
-        check_callable("disturbance", disturbance, "random_pushes(0.3)")
         effects = [*effects, external_force]
     pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
     lagging = inspect.unwrap(cast(Callable, rotors)) is inspect.unwrap(lagging_rotors)  # also inside `failing`

@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.where_due import where_due
-from jaxdrones.checks import check_choice
+from jaxdrones.arguments import checked, choices
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.envs.functions import DrawScene
 from jaxdrones.errors import UserError
@@ -127,7 +127,14 @@ def observation(vector: Float[Array, "n d"], world: World) -> Any:
     return {"state": vector, **world.images} if world.images else vector
 
 
-def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, scene: Scene | DrawScene) -> Vision:
+@checked
+def make_vision(
+    step: Step,
+    images: Annotated[Sequence[str], choices("image", IMAGES, "'depth'")],
+    camera: Annotated[Camera, check_camera],
+    dt: float,
+    scene: Scene | DrawScene,
+) -> Vision:
     """Build the vision of an environment.
 
     Args:
@@ -140,9 +147,6 @@ def make_vision(step: Step, images: Sequence[str], camera: Camera, dt: float, sc
     Raises:
         ValueError: an unknown image, an invalid camera, or more images than control steps.
     """
-    for image in images:
-        check_choice("image", image, IMAGES)
-    check_camera(camera)
     every = 1 if camera.rate is None else 1 / (camera.rate * dt)
     if every < 1 - 1e-6:
         raise UserError(

@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from typing import Annotated
 
 from jaxdrones import control, optimal
-from jaxdrones.checks import check_choice, check_positive, check_switch, check_whole
+from jaxdrones.arguments import Count, Seconds, Switch, checked, choice, choices, whole
 from jaxdrones.control import pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.errors import UserError
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.limits import check_at_most, check_memory, check_seed
+from jaxdrones.limits import check_memory, check_seed
 
 BACKENDS = ("explicit", "bullet")
 CONTROLLERS = (*control.CONTROLLERS, *optimal.CONTROLLERS)
@@ -27,6 +28,7 @@ _PAIR_BYTES = 32  # per pair of drones, while the effects between them are summe
 _VARIANTS = ("_2021", "_world_axes")  # suffixes of the names of other models of the same effect
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Conditions:
     """Options of a flight; `None` is replaced by the default of the flight.
@@ -35,34 +37,33 @@ class Conditions:
         ValueError: an unknown name or a number out of range.
     """
 
-    flight: str
+    flight: Annotated[str, choice("flight", FLIGHTS)]
     """`circle`, `velocity`, `ground-effect` or `downwash`."""
     vehicle: str | os.PathLike = "cf2x"
     """A bundled vehicle or the path of a URDF."""
-    drones: int | None = None
-    effects: tuple[str, ...] | None = None
+    drones: Count | None = None
+    effects: Annotated[tuple[str, ...] | None, choices("effect", EFFECTS | PAIRS, "'drag'")] = None
     """Names of `EFFECTS` and `PAIRS`."""
-    controller: str | None = None
+    controller: Annotated[str | None, choice("controller", CONTROLLERS)] = None
     """A name of `CONTROLLERS`; by default the vehicle's."""
-    feedforward: bool | None = None
+    feedforward: Switch | None = None
     """Whether the controller receives velocity and acceleration of the target beside position and heading. By default
     all but `pid` do: the examples of gym-pybullet-drones (2021) command positions alone."""
-    control_hz: int | None = None
-    duration: float | None = None
+    control_hz: Annotated[int | None, whole("control rate (Hz)", limit=_MAX_HZ)] = None
+    duration: Seconds | None = None
     """Duration of the flight, s."""
-    rotors: str = "instant"
+    rotors: Annotated[str, choice("rotors", ROTORS)] = "instant"
     """`instant` or `lagging`."""
-    integrator: str = "semi_implicit_euler"
+    integrator: Annotated[str, choice("integrator", INTEGRATORS)] = "semi_implicit_euler"
     """A name of `INTEGRATORS`; Bullet has its own."""
-    backend: str = "explicit"
+    backend: Annotated[str, choice("backend", BACKENDS)] = "explicit"
     """`explicit` or `bullet`."""
     obstacles: bool = False
     """Whether to add the obstacles of gym-pybullet-drones (2021), in Bullet only."""
-    seed: int | None = None
+    seed: Annotated[int | None, check_seed] = None
     """Seed of a random displacement of the start, 1 cm standard deviation; by default none."""
 
     def __post_init__(self):
-        check_choice("flight", self.flight, FLIGHTS)
         flight = FLIGHTS[self.flight]
         default = dict(
             drones=flight.drones, effects=flight.effects, control_hz=flight.control_hz, duration=flight.duration
@@ -80,20 +81,8 @@ class Conditions:
 
     def _check(self) -> None:
         flight = FLIGHTS[self.flight]
-        check_whole("drones", self.drones)
-        check_at_most("control rate (Hz)", self.control_hz, _MAX_HZ)
-        check_positive("duration", self.duration, "s")
         if self.duration > _MAX_DURATION:
             raise UserError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
-        if self.seed is not None:
-            check_seed("seed", self.seed)
-        check_choice("controller", self.controller, CONTROLLERS)
-        check_switch("feedforward", self.feedforward)
-        check_choice("rotors", self.rotors, ROTORS)
-        check_choice("integrator", self.integrator, INTEGRATORS)
-        check_choice("backend", self.backend, BACKENDS)
-        for effect in self.effects:
-            check_choice("effect", effect, EFFECTS | PAIRS)
         _check_once(self.effects)
         if flight.labels and self.drones != len(flight.labels):
             who = ", ".join(flight.labels)

@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_keywords
+from jaxdrones.arguments import TracedCount, checked
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect, result
 from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.returns import discounted_rewards
-from jaxdrones.learning.settings import TracedCount, check_config
+from jaxdrones.learning.settings import check_config
 
 
-@check_keywords
+@checked
 @dataclasses.dataclass(frozen=True)
 class Config(GradientConfig):
     """Settings; numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""

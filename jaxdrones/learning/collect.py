@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxdrones.arguments import Scalar
 from jaxdrones.checks import takes
 from jaxdrones.envs import AutoReset, Env
 from jaxdrones.envs.autoreset import Episode
@@ -19,7 +20,6 @@ from jaxdrones.learning import sharding
 from jaxdrones.learning.layers import expand
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics, state_vector
-from jaxdrones.learning.settings import Scalar
 from jaxdrones.pytree import PyTreeNode
 
 Act = Callable[[Any, Any, Obs], tuple[Any, Array, Any]]

@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import NamedSharding
 from jaxtyping import Array, UInt32
 
-from jaxdrones.checks import check_key
+from jaxdrones.arguments import Key, checked
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
@@ -57,7 +57,8 @@ class Report(PyTreeNode):
         return self.success_interval[0] if self.success_interval else self.success or 0.0
 
 
-def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) -> Report:
+@checked
+def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: int = 1000) -> Report:
     """Simulate whole episodes; steps after the end of an episode are ignored.
 
     Args:
@@ -70,7 +71,6 @@ def evaluate(env: Env, policy: AnyPolicy, key: jax.Array, episodes: int = 1000) 
     Raises:
         ValueError: no random key, or more episodes than fit in memory.
     """
-    check_key("key", key)
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, PyTreeNode):

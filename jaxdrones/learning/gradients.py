@@ -26,28 +26,19 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxdrones import vector
-from jaxdrones.checks import check_callable, check_choice
+from jaxdrones.arguments import BelowOne, Fraction, Scalar, Switch, choice, function
 from jaxdrones.dynamics import rotors
 from jaxdrones.dynamics.rigid_body import newton_euler
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
-from jaxdrones.learning.settings import BelowOne, Bool, Config, Fraction, Scalar
+from jaxdrones.learning.settings import Config
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
 GradientName = Literal["exact", "decay", "surrogate", "point_mass"]
-
-
-def _check_gradient(name: str, value: Any) -> None:
-    check_choice(name, value, get_args(GradientName))
-
-
-def _check_surrogate(name: str, step: Any) -> None:
-    if step is not None:
-        check_callable(name, step, "jaxdrones.make_step()")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +48,13 @@ class GradientConfig(Config):
     adam_b2: BelowOne = 0.95
     """Decay rate of Adam's mean of squared gradients, of the policy. It is low because gradients shrink by orders of
     magnitude during training."""
-    gradient: Annotated[GradientName, _check_gradient] = "exact"
+    gradient: Annotated[GradientName, choice("gradient", get_args(GradientName))] = "exact"
     """Kind of gradient: exact, decay, surrogate or point_mass; see `learning.gradients`."""
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
-    surrogate: Annotated[Step | None, _check_surrogate] = None
+    surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
     """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
-    image_gradient: Bool = True
+    image_gradient: Switch = True
     """Whether to differentiate camera images, or treat them as constants."""
 
 

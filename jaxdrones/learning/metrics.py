@@ -7,9 +7,9 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.arguments import Scalar
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect
-from jaxdrones.learning.settings import Scalar
 
 
 def measure(

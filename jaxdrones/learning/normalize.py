@@ -7,8 +7,8 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxdrones.arguments import Scalar
 from jaxdrones.envs.env import Obs
-from jaxdrones.learning.settings import Scalar
 from jaxdrones.pytree import PyTreeNode
 
 _CLIP = 10.0  # standard deviations

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_keywords, check_number, is_concrete
+from jaxdrones import arguments
+from jaxdrones.arguments import checked
+from jaxdrones.checks import check_number, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, result, settings, sharding
@@ -21,74 +23,62 @@ from jaxdrones.learning.critic import discounted_value, init_critic
 from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.settings import (
-    BelowOne,
-    Bool,
-    Count,
-    Fraction,
-    HiddenSizes,
-    NotNegative,
-    Positive,
-    PositiveOrInfinite,
-    TracedCount,
-    check_config,
-)
+from jaxdrones.learning.settings import check_config
 
 _MAX_LOG_RATIO = 10.0  # far beyond the clipping range, with a finite exponential
 
 
-@check_keywords
+@checked
 @dataclasses.dataclass(frozen=True)
 class Config(settings.Config):
     """Settings; numbers that are not shapes may be traced, for `vmap` over many values."""
 
-    updates: TracedCount = 200
-    horizon: Count = 96
+    updates: arguments.TracedCount = 200
+    horizon: arguments.Count = 96
     """Control steps of a trajectory. Rotor speeds affect the position within about one second."""
-    obs_stats_freeze: Fraction = 0.1
+    obs_stats_freeze: arguments.Fraction = 0.1
     """Fraction of the updates after which the statistics of observations are frozen."""
-    learning_rate: Positive = 4e-3
+    learning_rate: arguments.Positive = 4e-3
     """Initial learning rate; it adapts to `target_kl`."""
-    gamma: BelowOne = 0.99
+    gamma: arguments.BelowOne = 0.99
     """Discount factor."""
-    restart_fraction: Fraction = 0.05
+    restart_fraction: arguments.Fraction = 0.05
     """Fraction of the worlds that start a new episode before an update; the others continue theirs."""
-    max_grad_norm: PositiveOrInfinite = 0.5
-    epochs: Count = 2
+    max_grad_norm: arguments.PositiveOrInfinite = 0.5
+    epochs: arguments.Count = 2
     """Passes over each trajectory."""
-    minibatches: Count = 8
+    minibatches: arguments.Count = 8
     """Minibatches of an epoch, each with all steps of a subset of the worlds."""
-    critic_hidden_sizes: HiddenSizes = (32, 32)
-    centralized_critic: Bool = False
+    critic_hidden_sizes: arguments.HiddenSizes = (32, 32)
+    centralized_critic: arguments.Switch = False
     """Whether the critic observes the team and the other drones' actions, or only its own drone."""
-    privileged_critic: Bool = False
+    privileged_critic: arguments.Switch = False
     """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
-    target_kl: Positive = 0.02
+    target_kl: arguments.Positive = 0.02
     """Kullback-Leibler divergence of the updated policy from the behavior policy, on the first minibatch. After an
     update the learning rate falls if the divergence was above twice this value and rises if it was below half of it,
     between `min_learning_rate` and `max_learning_rate`."""
-    min_learning_rate: Positive = 1e-5
-    max_learning_rate: Positive = 1.5e-2
-    anneal_fraction: Fraction = 0.3
+    min_learning_rate: arguments.Positive = 1e-5
+    max_learning_rate: arguments.Positive = 1.5e-2
+    anneal_fraction: arguments.Fraction = 0.3
     """Final fraction of the updates in which the upper bound of the learning rate falls to `min_learning_rate`, and
     that of the standard deviation of actions to `final_std`."""
-    gae_lambda: Fraction = 0.99
+    gae_lambda: arguments.Fraction = 0.99
     """Lambda of the generalized advantage estimation."""
-    clip_epsilon: Positive = 0.2
+    clip_epsilon: arguments.Positive = 0.2
     """Clipping range of the probability ratio of actions."""
-    entropy_coef: NotNegative = 0.0
-    value_coef: NotNegative = 0.5
-    init_std: Positive = 0.4
+    entropy_coef: arguments.NotNegative = 0.0
+    value_coef: arguments.NotNegative = 0.5
+    init_std: arguments.Positive = 0.4
     """Initial standard deviation of actions, and its upper bound before annealing."""
-    min_std: Positive = 0.1
+    min_std: arguments.Positive = 0.1
     """Lower bound of the standard deviation of actions until the upper bound is annealed below it. It keeps exploration
     alive."""
-    final_std: Positive = 0.02
+    final_std: arguments.Positive = 0.02
     """Upper bound of the standard deviation after the last update. It is small because fluctuating rotor speeds produce
     more thrust, which the mean action alone, as used after training, would lack."""
 
     def __post_init__(self):
-        super().__post_init__()
         if is_concrete(self.min_learning_rate):
             low = float(self.min_learning_rate)
             check_number("max_learning_rate", self.max_learning_rate, "not below min_learning_rate", at_least=low)

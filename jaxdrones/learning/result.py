@@ -13,12 +13,13 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int
 
-from jaxdrones.checks import check_key, is_concrete
+from jaxdrones.arguments import Key, Scalar, checked
+from jaxdrones.checks import is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.settings import Config, Scalar
+from jaxdrones.learning.settings import Config
 from jaxdrones.pytree import PyTreeNode
 
 MAX_CALL = 64
@@ -67,10 +68,11 @@ def init_policy(key: jax.Array, env: Env, config: Config, network: Any) -> Polic
     return Policy.init(key, env, config.hidden_sizes, config.per_agent, config.recurrent_size, network)
 
 
+@checked
 def run_training(
     init: Callable,
     update: Callable,
-    key: jax.Array,
+    key: Key,
     env: Env,
     config: Any,
     *,
@@ -99,7 +101,6 @@ def run_training(
         Diverged: gradients that are not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised; see
             `history["nonfinite_gradients"]`.
     """
-    check_key("key", key)
     callbacks = (callback,) if callable(callback) else tuple(callback)
     if compilation.is_tracing() or not all(map(is_concrete, (key, *vars(config).values()))):
         if callbacks:

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxdrones.arguments import Scalar
 from jaxdrones.learning.collect import Trajectory
-from jaxdrones.learning.settings import Scalar
 
 
 def discounted_rewards(trajectory: Trajectory, gamma: Scalar) -> Float[Array, "t w n"]:

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
-from jaxdrones.checks import check_keywords
+from jaxdrones import arguments
+from jaxdrones.arguments import checked
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect, result, sharding
@@ -21,41 +22,31 @@ from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps,
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
-from jaxdrones.learning.settings import (
-    BelowOne,
-    Bool,
-    Count,
-    Fraction,
-    HiddenSizes,
-    Positive,
-    PositiveFraction,
-    TracedCount,
-    check_config,
-)
+from jaxdrones.learning.settings import check_config
 
 _CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 
 
-@check_keywords
+@checked
 @dataclasses.dataclass(frozen=True)
 class Config(GradientConfig):
     """Settings; numbers that are not shapes may be traced, for `vmap` over many values."""
 
-    updates: TracedCount = 220
-    gamma: BelowOne = 0.98
+    updates: arguments.TracedCount = 220
+    gamma: arguments.BelowOne = 0.98
     """Discount factor."""
-    critic_hidden_sizes: HiddenSizes = (32, 32)
-    privileged_critic: Bool = False
+    critic_hidden_sizes: arguments.HiddenSizes = (32, 32)
+    privileged_critic: arguments.Switch = False
     """Whether the critic takes privileged observations: without noise, and with drawn parameters."""
-    critic_learning_rate: Positive = 5e-3
+    critic_learning_rate: arguments.Positive = 5e-3
     """Initial learning rate of the critic, with a cosine decay to zero."""
-    critic_steps: Count = 8
+    critic_steps: arguments.Count = 8
     """Gradient steps of the critic in an update, each on four successive control steps of all worlds."""
-    terminal_value_warmup: PositiveFraction = 0.9
+    terminal_value_warmup: arguments.PositiveFraction = 0.9
     """Fraction of the updates in which the weight of the terminal value rises linearly from 0 to 1."""
-    gae_lambda: Fraction = 0.95
+    gae_lambda: arguments.Fraction = 0.95
     """Lambda of the critic's TD(lambda) targets."""
-    target_update_rate: PositiveFraction = 0.2
+    target_update_rate: arguments.PositiveFraction = 0.2
     """Step size of the target critic towards the critic in an update."""
 
 

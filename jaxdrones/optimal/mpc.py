@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 
-from jaxdrones.checks import check_choice, check_shape
+from jaxdrones.arguments import checked, choice
+from jaxdrones.checks import check_shape
 from jaxdrones.control import Setpoint
 from jaxdrones.control.single import check_single
 from jaxdrones.optimal.coordinates import tracking_error
@@ -37,6 +38,7 @@ _INSIDE = 1e-6  # distance of the bounds from the limits of the motors, over the
 class Mpc:
     """Controller on the host, `mpc(state, setpoints) -> rpm`, warm-started with the last plan."""
 
+    @checked
     def __init__(
         self,
         model: CasadiModel,
@@ -44,7 +46,7 @@ class Mpc:
         horizon: int = 20,
         weights: Weights | None = None,
         terminal: float = 10.0,
-        solver: str = "ipopt",
+        solver: Annotated[str, choice("solver", SOLVERS)] = "ipopt",
     ):
         """Build the nonlinear program and its solver.
 
@@ -60,7 +62,6 @@ class Mpc:
         Raises:
             ValueError: a model of a team, or an unknown solver.
         """
-        check_choice("solver", solver, SOLVERS)
         check_shape("model.params.mass", model.params.mass, (), "the controller is of one drone; make one for each")
         self.model, self.horizon = model, horizon
         self.seconds = float("nan")

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_positive
+from jaxdrones.checks import check_number
 from jaxdrones.dynamics.contact import ground_contact
 from jaxdrones.dynamics.interaction import downwash
 from jaxdrones.engine.explicit import make_step
@@ -66,7 +66,7 @@ class Backend:
         """
         self.names, self._states, self._steps = names, list(states), 0
         self.dt = float(_parameter(node, "dt", 0.0005))
-        check_positive("sim.jaxdrones.dt", self.dt, "s")
+        check_number("sim.jaxdrones.dt", self.dt, "s", above=0)
         with_downwash = _parameter(node, "downwash", True)
         vehicle = load_params(_parameter(node, "vehicle", "cf2x"))
         self._params = repeat(vehicle, len(names))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 import numpy as np
 
-from jaxdrones.checks import check_choice, check_positive
+from jaxdrones.arguments import Seconds, checked, choice
 from jaxdrones.params import Params
 from jaxdrones.ros2.command import Command, Mode
 from jaxdrones.state import State
@@ -21,6 +22,7 @@ class PeerLost(RuntimeError):
     """Missing or invalid commands with the failsafe `stop`."""
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Failsafe:
     """Timeouts of commands, and action after them.
@@ -29,18 +31,13 @@ class Failsafe:
         ValueError: an unknown action, or a time that is not positive.
     """
 
-    action: str = "hover"
+    action: Annotated[str, choice("failsafe", ACTIONS)] = "hover"
     """`hover`: hold the last commanded position, or else the present one. `land`: sink to the ground there and stop the
     rotors. `stop`: end the flight with an error."""
-    timeout: float = 1.0
+    timeout: Seconds = 1.0
     """Seconds without a command before the failsafe acts."""
-    wait: float = 30.0
+    wait: Seconds = 30.0
     """The same before the first command."""
-
-    def __post_init__(self):
-        check_choice("failsafe", self.action, ACTIONS)
-        check_positive("timeout", self.timeout, "s")
-        check_positive("wait", self.wait, "s")
 
 
 class Watch:

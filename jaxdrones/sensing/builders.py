@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
+from jaxdrones.arguments import Key, checked
 from jaxdrones.checks import check_key, check_number, check_shape
 from jaxdrones.errors import UserError
 from jaxdrones.sensing.scene import Scene
@@ -28,8 +29,9 @@ _MAX_TREES = 10_000
 _HEIGHT_OF_FLIGHT = 1.5  # m; default height of the points to keep free
 
 
+@checked
 def forest(
-    key: jax.Array,
+    key: Key,
     *,
     density: float | tuple[float, float] = 0.15,
     length: float = 20.0,
@@ -64,7 +66,6 @@ def forest(
     Raises:
         ValueError: no random key, or more than 10,000 trees.
     """
-    check_key("key", key)
     low, high = np.broadcast_to(np.asarray(density), (2,)).tolist()
     trees = round(high * length * width)
     check_number("density x length x width of a forest", high * length * width, "trees", at_most=_MAX_TREES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +12,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.arguments import checked, number
 from jaxdrones.checks import check_number, check_quaternion, check_whole, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.vector import along_z, cross, unit
 
+_POSITIVE = number(name="{argument} of a camera", above=0)
 
+
+@checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Camera:
     """Pinhole camera on every drone of a team, fixed to the body unless `levelled`.
@@ -28,9 +32,9 @@ class Camera:
 
     resolution: tuple[int, int] = (64, 48)
     """Width and height, pixels."""
-    field_of_view: float = 60.0
+    field_of_view: Annotated[float, number("degrees", "{argument} of a camera", above=0, below=180)] = 60.0
     """Vertical field of view, degrees."""
-    aspect: float | None = None
+    aspect: Annotated[float | None, _POSITIVE] = None
     """Width over height of the view. The default is that of the resolution, which gives square pixels."""
     principal_point: tuple[float, float] = (0.0, 0.0)
     """Principal point, pixels to the right of and below the image center."""
@@ -41,13 +45,13 @@ class Camera:
     """(4,) unit quaternion (x, y, z, w), camera to body."""
     levelled: bool = False
     """Whether the camera points along the body's x axis with the world's z axis up in the image, whatever the roll."""
-    near: float | None = 0.05
+    near: Annotated[float | None, _POSITIVE] = 0.05
     """Smallest visible depth, m. `None`: the arm of the drone."""
     far: float = 1000.0
     """Largest visible depth, m; also the depth of an empty pixel."""
-    rate: float | None = None
+    rate: Annotated[float | None, _POSITIVE] = None
     """Images per second. The default is one every control step."""
-    latency: float = 0.0
+    latency: Annotated[float, number("s", "{argument} of a camera", at_least=0)] = 0.0
     """Age of an image when it is observed for the first time, s."""
     sees_self: bool = False
     """Whether the drone with the camera is visible."""
@@ -61,12 +65,7 @@ class Camera:
         for name, pixels in zip(("width", "height"), self.resolution, strict=True):
             check_whole(f"{name} of a camera", pixels)
         object.__setattr__(self, "resolution", tuple(self.resolution))
-        check_number("field_of_view of a camera", self.field_of_view, "degrees", above=0, below=180)
-        for name in "aspect", "near", "rate":
-            if getattr(self, name) is not None:
-                check_number(f"{name} of a camera", getattr(self, name), above=0)
         check_number("far of a camera", self.far, "m", above=self.near or 0)
-        check_number("latency of a camera", self.latency, "s", at_least=0)
         for name, length in ("principal_point", 2), ("offset", 3), ("orientation", 4):
             value = getattr(self, name)
             if value is not None:
@@ -168,7 +167,7 @@ camera_2021 = Camera(levelled=True, aspect=1.0, principal_point=(0.5, -0.5), off
 corners of the pixels in place of their centers."""
 
 
-def check_camera(camera: Any) -> None:
+def check_camera(name: str, camera: Any) -> None:
     """Raise unless `camera` is a camera."""
     if not isinstance(camera, Camera):
-        raise UserError(f"camera is {short_repr(camera)}; give for example jaxdrones.Camera(resolution=(16, 12))")
+        raise UserError(f"{name} is {short_repr(camera)}; give for example jaxdrones.Camera(resolution=(16, 12))")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Annotated
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_finite, check_positive, check_quaternion
+from jaxdrones.arguments import checked, number
+from jaxdrones.checks import check_finite, check_quaternion
 from jaxdrones.errors import UserError
 from jaxdrones.sensing.shapes import GREY, LENGTHS, Box
 
@@ -38,16 +40,13 @@ class File:
             raise UserError(f"{self.path}: there is no such file; give the path of a mesh or URDF that exists")
 
 
+@checked
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mesh(File):
     """Triangle mesh (.obj, .stl, .dae); Bullet collides with its convex hull."""
 
-    scale: float = 1.0
+    scale: Annotated[float, number("m", "scale of Mesh", above=0)] = 1.0
     """Length of the file's unit, m."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        check_positive("scale of Mesh", self.scale, "m")
 
     def bounding_box(self) -> Box:
         """Bounding box along the mesh's own axes: an obstacle for both backends.

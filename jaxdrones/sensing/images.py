@@ -67,7 +67,7 @@ def render(scene: Scene, params: Params, state: State, camera: Camera = _DEFAULT
 
 
 def _check(scene: Scene, params: Params, state: State, camera: Camera) -> None:
-    check_camera(camera)
+    check_camera("camera", camera)
     check_scene(scene)
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone; for many worlds use jax.vmap")
     check_shape("params.mass", params.mass, (len(state.pos),), f"state.pos has {len(state.pos)} drones")

@@ -14,12 +14,12 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from jaxdrones.arguments import Switch, checked
 from jaxdrones.checks import (
     check_choice,
     check_finite,
     check_quaternion,
     check_shape,
-    check_switch,
     check_whole,
     is_concrete,
     short_repr,
@@ -60,7 +60,8 @@ class Scene(PyTreeNode, kw_only=True):
     """Whether there is a ground plane."""
 
     @classmethod
-    def of(cls, *obstacles: Obstacle | File, ground: bool = True) -> Scene:
+    @checked
+    def of(cls, *obstacles: Obstacle | File, ground: Switch = True) -> Scene:
         """Build a scene of obstacles of any kind.
 
         Args:
@@ -72,7 +73,6 @@ class Scene(PyTreeNode, kw_only=True):
         Raises:
             ValueError: something else than an obstacle, or one of a wrong shape or size.
         """
-        check_switch("ground", ground)
         for obstacle in obstacles:
             if not isinstance(obstacle, Obstacle | File):
                 known = ", ".join(kind.__name__ for kind in (*KINDS.values(), Mesh, Urdf))

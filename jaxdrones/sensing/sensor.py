@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_arguments, check_callable, check_number, check_positive, check_sequence, short_repr
+from jaxdrones.checks import check_arguments, check_callable, check_number, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
@@ -70,7 +70,7 @@ class Sensor:
         check_arguments(begun, self.init, ("key", "params"))
         check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
         if self.rate is not None:
-            check_positive(f"rate of sensor {self.name!r}", self.rate, "1/s")
+            check_number(f"rate of sensor {self.name!r}", self.rate, "1/s", above=0)
         if self.clocked and self.rate is None:
             raise UserError(f"sensor {self.name!r} is clocked, but has no rate; give rate in measurements per second")
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdrones.checks import check_finite, check_positive, check_whole
+from jaxdrones.arguments import Range, Seconds, checked, whole
+from jaxdrones.checks import check_finite
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.pytree import PyTreeNode
 
@@ -20,6 +22,8 @@ Shape = Callable[[Float[Array, " k"], Float[Array, ""]], Float[Array, "3"]]
 """(random numbers (27,) in [-1, 1], time in periods) -> position relative to the center, m; periodic."""
 Point = Callable[[Int[Array, ""], Float[Array, ""]], Float[Array, "3"]]
 """(drone, time in s) -> position, m, world."""
+Finite = Annotated[float, Range(check_finite, "{function}['{argument}']")]
+Drones = Annotated[int, whole("number of drones")]
 
 
 def setpoint_on(point: Callable[[Float[Array, ""]], Float[Array, "3"]], t: Float[Array, ""]) -> Setpoint:
@@ -70,22 +74,21 @@ class Curve(PyTreeNode):
 
     point: Point = flax.struct.field(pytree_node=False)
 
-    def positions(self, n: int, t: float | Array = 0.0) -> Float[Array, "n 3"]:
+    @checked
+    def positions(self, n: Drones, t: float | Array = 0.0) -> Float[Array, "n 3"]:
         """Positions of the n drones of a team at time t (s)."""
-        check_whole("number of drones", n)
         return jax.vmap(self.point, (0, None))(jnp.arange(n), jnp.asarray(t, float))
 
-    def setpoints(self, n: int, t: float | Array = 0.0) -> Setpoint:
+    @checked
+    def setpoints(self, n: Drones, t: float | Array = 0.0) -> Setpoint:
         """Position, velocity and acceleration of the n drones at time t (s)."""
-        check_whole("number of drones", n)
         t = jnp.asarray(t, float)
         return jax.vmap(lambda i: setpoint_on(lambda t: self.point(i, t), t))(jnp.arange(n))
 
 
-def circle(radius: float = 0.3, period: float = 10.0, height: float = 0.1, spacing: float = 0.05) -> Curve:
+@checked
+def circle(radius: Finite = 0.3, period: Seconds = 10.0, height: Finite = 0.1, spacing: Finite = 0.05) -> Curve:
     """Circle about (0, -radius): drones 60 degrees apart, each `spacing` above the one before, m and s."""
-    check_positive("period", period, "s")
-    check_finite("circle", dict(radius=radius, height=height, spacing=spacing))
 
     def point(i, t):
         center = jnp.stack([0 * t, 0 * t - radius, height + i * spacing])
@@ -94,10 +97,9 @@ def circle(radius: float = 0.3, period: float = 10.0, height: float = 0.1, spaci
     return Curve(point)
 
 
-def crossing(n: int, amplitude: float = 0.5, period: float = 5.0, spacing: float = 0.5) -> Curve:
+@checked
+def crossing(n: int, amplitude: Finite = 0.5, period: Seconds = 5.0, spacing: Finite = 0.5) -> Curve:
     """Drones above each other oscillate along x, those of neighboring heights in opposition; the last one is lowest."""
-    check_positive("period", period, "s")
-    check_finite("crossing", dict(amplitude=amplitude, spacing=spacing))
 
     def point(i, t):
         x = amplitude * jnp.cos(_angle(t / period + i / 2))
@@ -106,10 +108,9 @@ def crossing(n: int, amplitude: float = 0.5, period: float = 5.0, spacing: float
     return Curve(point)
 
 
-def hop(height: float = 0.014, amplitude: float = 0.15, period: float = 4.0, spacing: float = 1.0) -> Curve:
+@checked
+def hop(height: Finite = 0.014, amplitude: Finite = 0.15, period: Seconds = 4.0, spacing: Finite = 1.0) -> Curve:
     """Step to `height + amplitude`, with an oscillation of z about it; drones `spacing` (m) apart in x."""
-    check_positive("period", period, "s")
-    check_finite("hop", dict(height=height, amplitude=amplitude, spacing=spacing))
 
     def point(i, t):
         z = height + amplitude * (jnp.sin(_angle(t / period)) + 1)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_positive, check_whole
+from jaxdrones.arguments import Seconds, checked, number
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
@@ -20,7 +21,7 @@ from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, lissajous, setpoint_on
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control
+from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, norm, out_of_control
 from jaxdrones.vector import unit
 
 HEIGHT = 4.0  # m of the center of the leader's curve
@@ -39,8 +40,13 @@ camera = Camera(resolution=(32, 24), field_of_view=60.0)
 _TOUCHED = shaping.variable("touched", "One if the drone has touched another one or the ground.")
 
 
+@checked
 def follow(
-    drones: int = 2, distance: float = 1.5, size: float = 1.5, period: float = 12.0, duration: float = 12.0
+    drones: Team = 2,
+    distance: Annotated[float, number("m", at_least=0.3, at_most=_MAX_DISTANCE)] = 1.5,
+    size: Annotated[float, number("m", above=0, at_most=HEIGHT)] = 1.5,
+    period: Annotated[float, number("s", at_least=_MIN_PERIOD)] = 12.0,
+    duration: Seconds = 12.0,
 ) -> Task:
     """Drone 0 flies along a random curve; every other drone follows the one before it and keeps it in view.
 
@@ -56,11 +62,6 @@ def follow(
     Raises:
         ValueError: a number out of range.
     """
-    check_whole("number of drones of follow", drones, 2)
-    check_number("distance", distance, "m", at_least=0.3, at_most=_MAX_DISTANCE)
-    check_number("size", size, "m", above=0, at_most=HEIGHT)
-    check_number("period", period, "s", at_least=_MIN_PERIOD)
-    check_positive("duration", duration, "s")
 
     def leader(variables: dict[str, Array], t: Array) -> Setpoint:
         """Position of the first drone."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_positive, check_whole
+from jaxdrones.arguments import checked, number
+from jaxdrones.checks import check_number
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
@@ -18,7 +20,7 @@ from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control
+from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm, out_of_control
 from jaxdrones.tasks.touching import touches
 from jaxdrones.vector import safe_sqrt
 
@@ -44,11 +46,12 @@ _METRICS = {
 }
 
 
+@checked
 def forest(
-    drones: int = 1,
-    speed: float = 3.0,
-    density: float = 0.15,
-    length: float = 20.0,
+    drones: Drones = 1,
+    speed: Annotated[float, number("m/s", above=0, at_most=_MAX_SPEED)] = 3.0,
+    density: Annotated[float, number("trees per m^2", at_least=0)] = 0.15,
+    length: Annotated[float, number("m", above=0)] = 20.0,
     width: float = 10.0,
     duration: float | None = None,
 ) -> Task:
@@ -65,10 +68,6 @@ def forest(
     Raises:
         ValueError: a number out of range.
     """
-    check_whole("number of drones of forest", drones)
-    check_number("speed", speed, "m/s", above=0, at_most=_MAX_SPEED)
-    check_number("density", density, "trees per m^2", at_least=0)
-    check_positive("length", length, "m")
     check_number("width", width, "m", above=_SPACING * (drones + 1))
     if duration is None:
         duration = 2 * length / speed + 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_number, check_switch, check_whole, short_repr
+from jaxdrones.arguments import NonNegativeInt, Switch, checked, number
+from jaxdrones.checks import short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -20,7 +22,7 @@ from jaxdrones.sensing import BEAMS, Cylinder, Scene, gate, track
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import hovering, standing_height
-from jaxdrones.tasks.task import ObservationTerm, Task, World, norm, out_of_control
+from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm, out_of_control
 from jaxdrones.tasks.touching import touches
 from jaxdrones.vector import atan2
 
@@ -56,8 +58,13 @@ _POLE_ENTRIES = tuple(
 )
 
 
+@checked
 def gates(
-    drones: int = 1, level: int = 0, duration: float = 12.0, random_start: bool = False, start_spread: float = 0.0
+    drones: Annotated[Drones, number(name="number of drones of {function}", at_most=_MAX_DRONES)] = 1,
+    level: NonNegativeInt = 0,
+    duration: float = 12.0,
+    random_start: Switch = False,
+    start_spread: Annotated[float, number("m", at_least=0, at_most=_MAX_SPREAD)] = 0.0,
 ) -> Task:
     """One lap through four gates.
 
@@ -72,11 +79,6 @@ def gates(
             at the start of the track.
         start_spread: on the ground, drones start within +-start_spread of the start along x and y, m; at most 0.15.
     """
-    check_whole("number of drones of gates", drones)
-    check_number("number of drones of gates", drones, at_most=_MAX_DRONES)
-    check_whole("level", level, minimum=0)
-    check_switch("random_start", random_start)
-    check_number("start_spread", start_spread, "m", at_least=0, at_most=_MAX_SPREAD)
     if level not in LEVELS:
         raise UserError(f"level is {short_repr(level)}; give one of {', '.join(map(str, LEVELS))}")
 

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import checked
 from jaxdrones.control import Setpoint
 from jaxdrones.quantity import described
 from jaxdrones.tasks.starts import above_ground
-from jaxdrones.tasks.task import Task, Term, World, distance, norm, square
+from jaxdrones.tasks.task import Task, Team, Term, World, distance, norm, square
 
 _DURATION_2021, _DURATION_2X = 5.0, 8.0  # s
 _SOLVED = 0.05  # m, at the end of an episode
@@ -95,7 +95,8 @@ def tune(drones: int = 1, start_spread: float = 0.0) -> Task:
     return dataclasses.replace(task, action="pid_gains")
 
 
-def leader_follower(drones: int = 2, start_spread: float = 0.0) -> Task:
+@checked
+def leader_follower(drones: Team = 2, start_spread: float = 0.0) -> Task:
     """Leader, drone 0, hovers at (0, 0, 0.5); the others match its height (equation 13)."""
 
     def cost(target, world):
@@ -105,10 +106,11 @@ def leader_follower(drones: int = 2, start_spread: float = 0.0) -> Task:
         return follower.at[0].set(_squared_distance(target, world)[0])
 
     summary = "follow the leader's height (equation 13)"
-    return _task_2021("leader-follower", summary, drones, start_spread, _at_height(0.5), cost, minimum=2)
+    return _task_2021("leader-follower", summary, drones, start_spread, _at_height(0.5), cost)
 
 
-def flock(drones: int = 2, start_spread: float = 0.0) -> Task:
+@checked
+def flock(drones: Team = 2, start_spread: float = 0.0) -> Task:
     """First drone hovers at (0, 0, 1); every other one matches the height of the one before it."""
 
     def cost(target, world):
@@ -118,10 +120,11 @@ def flock(drones: int = 2, start_spread: float = 0.0) -> Task:
         return follower.at[0].set(_squared_distance(target, world)[0])
 
     summary = "fly at the height of the drone before"
-    return _task_2021("flock", summary, drones, start_spread, _at_height(1.0), cost, minimum=2)
+    return _task_2021("flock", summary, drones, start_spread, _at_height(1.0), cost)
 
 
-def meetup(drones: int = 2, start_spread: float = 0.0) -> Task:
+@checked
+def meetup(drones: Team = 2, start_spread: float = 0.0) -> Task:
     """Drones i and n - 1 - i meet; the reward is the negative squared distance between them."""
 
     def target(starts, t):
@@ -133,7 +136,7 @@ def meetup(drones: int = 2, start_spread: float = 0.0) -> Task:
         return square(world.drones.pos - world.drones.pos[::-1])
 
     more = {"gap": _gap_to_partner}
-    task = _task_2021("meetup", "meet the partner half-way", drones, start_spread, target, cost, _met, 2, more)
+    task = _task_2021("meetup", "meet the partner half-way", drones, start_spread, target, cost, _met, more)
     return dataclasses.replace(task, action="velocity", contact=("ground", "drones"))
 
 
@@ -167,11 +170,8 @@ def _task_2021(
     target: Target,
     cost: Cost,
     success: Criterion | None = _close_at_the_end,
-    minimum: int = 1,
     metrics: Mapping[str, Term] | None = None,
 ) -> Task:
-    check_whole(f"number of drones of {name}", drones, minimum)
-
     def late_cost(task: Task, world: World) -> Float[Array, " n"]:
         """Cost after the step with respect to the target before it."""
         return cost(task.target(world.variables, world.time - world.dt).pos, world)
@@ -197,8 +197,6 @@ def _task_2021(
 def _task_2x(
     name: str, summary: str, drones: int, start_spread: float, target: Target, box: float, success: Criterion | None
 ) -> Task:
-    check_whole(f"number of drones of {name}", drones)
-
     def closeness(task: Task, world: World) -> Float[Array, " n"]:
         """Maximum of 0 and 2 - d^4, with d the distance from the target, m."""
         return jnp.maximum(0, 2 - distance(task, world) ** 4)

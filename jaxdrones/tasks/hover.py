@@ -1,20 +1,21 @@
 """Tasks: hover from any start, recover from a throw, land."""
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number, check_positive, check_whole
+from jaxdrones.arguments import Seconds, checked, number
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import standing_height, thrown
-from jaxdrones.tasks.task import MAX_SPIN, Task, World, out_of_control, upright
+from jaxdrones.tasks.task import MAX_SPIN, Drones, Task, World, out_of_control, upright
 
 SPACING = 3.0  # m between neighboring goals, more than the spread of the starts
 _MAX_REACH = 5.0  # m; a drone is lost 3 m or more beyond it
@@ -22,17 +23,19 @@ _MAX_HEIGHT = 1000.0  # m; float32 resolves 0.1 mm there
 _MAX_SPEED = 100.0  # m/s
 _TOUCHING = 0.02  # m above the ground: height at which the touchdown speed is measured
 _SOFT = 0.6  # m/s
+Height = Annotated[float, number("m", above=0, at_most=_MAX_HEIGHT)]
 SETTLED = 2.0  # s: time in hover at the end for success
 
 
+@checked
 def hover(
-    drones: int = 1,
-    reach: float = 1.0,
-    speed: float = 1.0,
-    omega: float = 1.0,
-    tilt: float = 90.0,
-    height: float = 2.0,
-    duration: float = 5.0,
+    drones: Drones = 1,
+    reach: Annotated[float, number("m", at_least=0, at_most=_MAX_REACH)] = 1.0,
+    speed: Annotated[float, number("m/s", at_least=0, at_most=_MAX_SPEED)] = 1.0,
+    omega: Annotated[float, number("rad/s", at_least=0, below=MAX_SPIN)] = 1.0,
+    tilt: Annotated[float, number("degrees", at_least=0, at_most=180)] = 90.0,
+    height: Height = 2.0,
+    duration: Seconds = 5.0,
 ) -> Task:
     """Fly to the goal and hover there.
 
@@ -48,13 +51,6 @@ def hover(
     Raises:
         ValueError: a number out of range.
     """
-    check_whole("number of drones of hover", drones)
-    check_positive("duration", duration, "s")
-    check_number("reach", reach, "m", at_least=0, at_most=_MAX_REACH)
-    check_number("speed", speed, "m/s", at_least=0, at_most=_MAX_SPEED)
-    check_number("omega", omega, "rad/s", at_least=0, below=MAX_SPIN)
-    check_number("tilt", tilt, "degrees", at_least=0, at_most=180)
-    check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:
         goal = _goals(params, height)
@@ -74,10 +70,9 @@ def hover(
     )
 
 
-def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Task:
+@checked
+def recovery(drones: Drones = 1, height: Height = 5.0, duration: float = 4.0) -> Task:
     """Recover from an upside-down, tumbling start: level out, then fly back. Reports the altitude lost."""
-    check_whole("number of drones of recovery", drones)
-    check_number("height", height, "m", above=0, at_most=_MAX_HEIGHT)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Near the goal, upside down, moving and rotating."""
@@ -117,10 +112,13 @@ def recovery(drones: int = 1, height: float = 5.0, duration: float = 4.0) -> Tas
     )
 
 
-def landing(drones: int = 1, height: float = 1.0, duration: float = 4.0) -> Task:
+@checked
+def landing(
+    drones: Drones = 1,
+    height: Annotated[float, number("m", above=0, at_most=_MAX_REACH)] = 1.0,
+    duration: float = 4.0,
+) -> Task:
     """Land on the pad at the origin softly, and come to rest level."""
-    check_whole("number of drones of landing", drones)
-    check_number("height", height, "m", above=0, at_most=_MAX_REACH)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Above the pad, in slow motion and slightly tilted."""

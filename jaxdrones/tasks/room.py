@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_number, check_whole
+from jaxdrones.arguments import checked, number, whole
+from jaxdrones.checks import check_number
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
@@ -18,7 +20,7 @@ from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import ObservationTerm, Task, World, out_of_control
+from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, out_of_control
 from jaxdrones.tasks.touching import touches
 
 HEIGHT = 1.5  # m, of starts and goals
@@ -38,7 +40,13 @@ _METRICS = {
 }
 
 
-def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float = 8.0) -> Task:
+@checked
+def room(
+    drones: Drones = 4,
+    pillars: Annotated[int, whole("number of pillars of {function}", 0)] = 4,
+    size: Annotated[float, number("m", at_least=2 * _BESIDE + _SPACING)] = 6.0,
+    duration: float = 8.0,
+) -> Task:
     """Drones on a ring in a room exchange places without collisions with each other, walls or pillars.
 
     Args:
@@ -50,9 +58,6 @@ def room(drones: int = 4, pillars: int = 4, size: float = 6.0, duration: float =
     Raises:
         ValueError: a number out of range, or more drones than fit on the ring.
     """
-    check_whole("number of drones of room", drones)
-    check_whole("number of pillars of room", pillars, minimum=0)
-    check_number("size", size, "m", at_least=2 * _BESIDE + _SPACING)
     radius = size / 2 - _BESIDE
     check_number("number of drones of room", drones, at_most=int(2 * math.pi * radius / _SPACING))
     angles = [2 * math.pi * i / drones for i in range(drones)]

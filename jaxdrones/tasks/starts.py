@@ -1,6 +1,7 @@
 """Initial states of episodes."""
 
 from collections.abc import Callable
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -8,13 +9,13 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_number
+from jaxdrones.arguments import checked, number
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
 
 _CLEARANCE = 0.1  # m between the ground and the drones of gym-pybullet-drones at the start
-_MAX_SPREAD = 0.5  # m
+_SPREAD = number("m", "start_spread", at_least=0, at_most=0.5)
 _GRID = 4.0  # arms between consecutive drones in x and in y
 
 
@@ -25,7 +26,8 @@ def hovering(params: Params, pos: Float[Array, "n 3"]) -> State:
     return State(pos, quat, zero, zero, jnp.broadcast_to(params.hover_rpm[:, None], (len(pos), 4)))
 
 
-def above_ground(spread: float) -> Callable[[jax.Array, Params], tuple[State, Float[Array, "n 3"]]]:
+@checked
+def above_ground(spread: Annotated[float, _SPREAD]) -> Callable[[jax.Array, Params], tuple[State, Float[Array, "n 3"]]]:
     """Start of gym-pybullet-drones, optionally with random heights: the state, and its positions.
 
     Args:
@@ -34,7 +36,6 @@ def above_ground(spread: float) -> Callable[[jax.Array, Params], tuple[State, Fl
     Raises:
         ValueError: a number out of range.
     """
-    check_number("start_spread", spread, "m", at_least=0, at_most=_MAX_SPREAD)
     lower = min(spread, _CLEARANCE)
 
     def start(key: jax.Array, params: Params) -> tuple[State, Float[Array, "n 3"]]:

@@ -7,19 +7,20 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import checked
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, World, out_of_control
+from jaxdrones.tasks.task import Task, Team, World, out_of_control
 
 HEIGHT = 2.0  # m
 _MIN_SPACING = 0.6  # m between neighboring places on the ring
 
 
-def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
+@checked
+def swap_goals(drones: Team = 8, duration: float = 6.0) -> Task:
     """Drones on a ring exchange places: each flies the same number of places on, and keeps clear of the others.
 
     Two drones collide when their centers are closer than two collision radii.
@@ -28,7 +29,6 @@ def swap_goals(drones: int = 8, duration: float = 6.0) -> Task:
         drones: number of drones, at least two.
         duration: duration of an episode, s.
     """
-    check_whole("number of drones of swap-goals", drones, 2)
     radius = max(1.0, _MIN_SPACING * drones / (2 * math.pi))
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import flax.struct
 import jax
@@ -13,16 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.checks import (
-    bind,
-    check_arguments,
-    check_choice,
-    check_number,
-    check_sequence,
-    check_switch,
-    check_whole,
-    short_repr,
-)
+from jaxdrones.arguments import Count, Hertz, NonNegativeInt, Seconds, Switch, checked, choices, whole
+from jaxdrones.checks import bind, check_arguments, check_choice, check_number, check_sequence, check_whole, short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -77,9 +69,12 @@ Entries = tuple[Quantity, ...] | Callable[[int, tuple[Quantity, ...]], tuple[Qua
 MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 CONTACTS = ("ground", "drones", "obstacles")
 IMAGES = ("rgb", "depth", "segmentation")
+Drones = Annotated[int, whole("number of drones of {function}")]  # argument of a task
+Team = Annotated[int, whole("number of drones of {function}", 2)]
 _OF_A_WORLD = ("task", "world")
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class ObservationTerm:
     """One term of an observation."""
@@ -88,7 +83,7 @@ class ObservationTerm:
     """(task, world with the measured state) -> entries of every drone."""
     bound: float | tuple[float, ...]
     """Largest magnitude, of all entries or of each, for clipping."""
-    history: int = 2
+    history: Annotated[int, whole("history of an observation")] = 2
     """Number of past actions in the term."""
     entries: Entries = ()
     """Description of each entry of a drone, for `jaxdrones.explain`; optional."""
@@ -99,9 +94,9 @@ class ObservationTerm:
         _check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
             check_number("bound of an observation", bound, above=0, infinite=True)
-        check_whole("history of an observation", self.history)
 
 
+@checked
 @dataclasses.dataclass(frozen=True)
 class Task:
     """Start, target, rewards and terminations of an episode, as functions of one world.
@@ -115,12 +110,14 @@ class Task:
     name: str
     summary: str
     drones: int
-    duration: float
+    duration: Seconds
     """Time after which an episode is truncated, s."""
     start: Callable[..., tuple[State, Any]]
     """(key, params) -> initial state of the team, and the task's variables. Optional parameters are `scene` and
     `progress`, the progress of training in [0, 1], which is 1 outside of training."""
-    target: Callable[[Any, Array], Setpoint]
+    target: Annotated[
+        Callable[[Any, Array], Setpoint], functools.partial(_check_function, arguments=("variables", "time"))
+    ]
     """(variables, time in s) -> set-points of the team; the time may be in the future."""
     rewards: Mapping[str, tuple[float, Term]]
     """Name -> (scale, term); the reward is the sum of scale times term."""
@@ -142,25 +139,25 @@ class Task:
     """Observation terms of this task by name."""
     randomize: tuple[Callable[[jax.Array, Params], Params], ...] = ()
     """Randomizations of the task: (key, params) of one drone -> its parameters in an episode."""
-    control_hz: float = 100.0
+    control_hz: Hertz = 100.0
     """Default control steps per second."""
-    substeps: int = 5
+    substeps: Count = 5
     """Default physics steps per control step."""
     scene: Scene | Callable[[jax.Array], Scene] = dataclasses.field(default_factory=Scene)
     """Obstacles and ground, or a function `(key) -> Scene` that draws them for every episode."""
-    obstacles_terminate: bool = False
+    obstacles_terminate: Switch = False
     """Whether a hit of an obstacle terminates the episode, so that contact forces are not needed."""
     camera: Camera | None = None
     """Default camera of every drone; `None` for `Camera()`."""
-    vision: tuple[str, ...] = ()
+    vision: Annotated[tuple[str, ...], choices("image", IMAGES, "'depth'")] = ()
     """Names of the default images."""
-    contact: tuple[str, ...] = ()
+    contact: Annotated[tuple[str, ...], choices("contact", CONTACTS, "'ground'")] = ()
     """Contact forces of the explicit backend: `ground`, `drones`, `obstacles` (unless `obstacles_terminate`)."""
     action: str = "rpm"
     """Name of the default action type."""
     observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
     """Names of the default observation terms."""
-    extra_steps: int = 0
+    extra_steps: NonNegativeInt = 0
     """Control steps of an episode after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
 
     def __post_init__(self):
@@ -169,19 +166,10 @@ class Task:
             if not isinstance(x := getattr(self, name), kind) or x == "":
                 raise UserError(f"{name} of the task is {short_repr(x)}; give a {what}")
         check_whole(f"number of drones of {self.name}", self.drones)
-        check_number("duration", self.duration, "s", above=0)
-        check_number("control_hz", self.control_hz, "1/s", above=0)
-        check_whole("substeps", self.substeps)
-        check_whole("extra_steps", self.extra_steps, minimum=0)
-        check_switch("obstacles_terminate", self.obstacles_terminate)
         self._check_functions()
-        for contact in check_sequence("contact", self.contact, "'ground'"):
-            check_choice("contact", contact, CONTACTS)
         for name in check_sequence("success_terminations", self.success_terminations, "'reached'"):
             check_choice("success termination", name, self.terminations)
         check_sequence("observation", self.observation, "'position_error'")
-        for image in check_sequence("vision", self.vision, "'depth'"):
-            check_choice("image", image, IMAGES)
         for name, term in _mapping("observations", self.observations, "an ObservationTerm").items():
             if not isinstance(term, ObservationTerm):
                 raise UserError(f"observations[{name!r}] is {short_repr(term)}; give an ObservationTerm")

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdrones.checks import check_choice, check_number, check_positive, check_switch, check_whole
+from jaxdrones.arguments import Seconds, Switch, checked, choice, number
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, SHAPES, setpoint_on
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, out_of_control
+from jaxdrones.tasks.task import Drones, Task, out_of_control
 
 HEIGHT = 2.0  # m
 SPACING = 4.0  # m between the centers of neighboring curves
@@ -23,12 +24,13 @@ _CAUGHT_UP = 1.0  # s: start of the error's evaluation
 _MIN_PERIOD = 0.1  # s; 63 m/s on a circle of 1 m radius
 
 
+@checked
 def tracking(
-    drones: int = 1,
-    curve: str = "figure-eight",
-    period: float = 10.0,
-    duration: float = 10.0,
-    random_start: bool = True,
+    drones: Drones = 1,
+    curve: Annotated[str, choice("curve", SHAPES)] = "figure-eight",
+    period: Annotated[float, number("s", at_least=_MIN_PERIOD)] = 10.0,
+    duration: Seconds = 10.0,
+    random_start: Switch = True,
 ) -> Task:
     """Track a periodic curve.
 
@@ -39,11 +41,6 @@ def tracking(
         duration: duration of an episode, s; of 1 s or less there is no criterion of success.
         random_start: drones start at a random point of the curve, 0.1 m and 0.1 m/s off; else at its start, at rest.
     """
-    check_whole("number of drones of tracking", drones)
-    check_choice("curve", curve, SHAPES)
-    check_positive("duration", duration, "s")
-    check_number("period", period, "s", at_least=_MIN_PERIOD)
-    check_switch("random_start", random_start)
     shape = SHAPES[curve]
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:

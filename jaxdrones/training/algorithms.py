@@ -6,11 +6,11 @@ It holds names of modules, so that the command line can list them without import
 from __future__ import annotations
 
 import importlib
-from typing import Any, Protocol, cast
+from typing import Annotated, Any, Protocol, cast
 
 import jax
 
-from jaxdrones.checks import check_choice
+from jaxdrones.arguments import checked, choice
 from jaxdrones.envs import Env
 
 ALGORITHMS = {
@@ -41,11 +41,11 @@ class Learner(Protocol):
         """Result of all updates."""
 
 
-def learner(algorithm: str) -> Learner:
+@checked
+def learner(algorithm: Annotated[str, choice("algorithm", ALGORITHMS)]) -> Learner:
     """Module of a learner.
 
     Raises:
         ValueError: unknown algorithm.
     """
-    check_choice("algorithm", algorithm, ALGORITHMS)
     return cast(Learner, importlib.import_module(ALGORITHMS[algorithm]))

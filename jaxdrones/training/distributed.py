@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from jaxdrones.checks import check_whole
+from jaxdrones.arguments import Count, checked
 from jaxdrones.errors import UserError
 
 _TIMEOUT = 60.0  # s; timeout of the connection at the start
@@ -22,8 +22,9 @@ _PAUSE = 0.1  # s between two attempts to connect
 _READY = b"ready"  # answer of host 0
 
 
+@checked
 @contextlib.contextmanager
-def join_hosts(hosts: int, host: int, coordinator: str, timeout: float = _TIMEOUT) -> Iterator[None]:
+def join_hosts(hosts: Count, host: int, coordinator: str, timeout: float = _TIMEOUT) -> Iterator[None]:
     """Context of one of several hosts; enter it before any other use of JAX.
 
     Args:
@@ -35,7 +36,6 @@ def join_hosts(hosts: int, host: int, coordinator: str, timeout: float = _TIMEOU
     Raises:
         ValueError: an invalid argument, or a host without connection.
     """
-    check_whole("hosts", hosts)
     if not 0 <= host < hosts:
         raise UserError(f"host is {host}; give 0 to {hosts - 1}, a different number on each of the {hosts} hosts")
     name, _, port = coordinator.rpartition(":")

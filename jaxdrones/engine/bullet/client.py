@@ -9,7 +9,6 @@ from types import ModuleType
 
 import numpy as np
 
-from jaxdrones.checks import check_choice
 from jaxdrones.engine.bullet.arrays import NEAR, START_OMEGA, reach
 from jaxdrones.engine.bullet.frames import in_body
 from jaxdrones.engine.bullet.surroundings import Surroundings, quiet
@@ -49,8 +48,6 @@ class Client:
     """Connection to Bullet; `set_scene` and `set_team` create its bodies."""
 
     def __init__(self, dt: float, damping: float, collision: str, renderer: str, gui: bool):
-        check_choice("collision shape", collision, (BALLS, CYLINDER))
-        check_choice("renderer", renderer, (TINY, EGL))
         self.p = import_pybullet()
         self.drones: list[int] = []
         self._damping = float(np.float32(damping))  # Bullet's default of 0.04 is in single precision

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import jax
 
-from jaxdrones.checks import check_number, check_positive, check_whole
+from jaxdrones.arguments import Count, Seconds, checked, choice, number
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.rotors import instant_rotors
-from jaxdrones.engine.bullet.client import BALLS, TINY, Client
+from jaxdrones.engine.bullet.client import BALLS, CYLINDER, EGL, TINY, Client
 from jaxdrones.engine.bullet.step import BulletStep
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Physics, Rotors
@@ -20,20 +21,21 @@ from jaxdrones.sensing import Scene
 from jaxdrones.sensing.scene import check_scene
 
 
+@checked
 def make_step(
     effects: Sequence[Effect] = (),
     pairs: Sequence[Pair] = (),
     rotors: Rotors = instant_rotors,
-    dt: float = 1 / 240,
-    substeps: int = 1,
+    dt: Seconds = 1 / 240,
+    substeps: Count = 1,
     *,
     team_effects: Sequence[TeamEffect] = (),
     models: Sequence[Model] = (),
     neighbors: NeighborGrid | None = None,
     scene: Scene | None = None,
-    damping: float = 0.0,
-    collision: str = BALLS,
-    renderer: str = TINY,
+    damping: Annotated[float, number("1/s", at_least=0)] = 0.0,
+    collision: Annotated[str, choice("collision shape", (BALLS, CYLINDER))] = BALLS,
+    renderer: Annotated[str, choice("renderer", (TINY, EGL))] = TINY,
     gui: bool = False,
 ) -> BulletStep:
     """Build the step of a world with Bullet as integrator and contact solver.
@@ -63,9 +65,6 @@ def make_step(
         ImportError: pybullet is not installed.
         OSError: `gui` without a display.
     """
-    check_positive("dt", dt, "s")
-    check_whole("substeps", substeps)
-    check_number("damping", damping, "1/s", at_least=0)
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
     contacts = physics.contacts("ground", "obstacles", "drones")
     if contacts:

@@ -120,7 +120,7 @@ class BulletStep(HostStep):
         Raises:
             ValueError: a wrong shape, a closed client, a state that is not finite, or an invalid camera.
         """
-        check_camera(camera)
+        check_camera("camera", camera)
         scene = self._given(scene)
         if is_traced((params, state, scene)):
             self.client.check_open()

@@ -7,13 +7,13 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from jaxdrones.arguments import checked, whole
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
-from jaxdrones.limits import check_at_most
 from jaxdrones.visualization.viewer.payload import encode, encode_rows
 from jaxdrones.visualization.viewer.server import Server
 from jaxdrones.visualization.viewer.show import LAYOUTS, check_size, looks, records_of
@@ -40,14 +40,14 @@ class Live:
         ImportError: the viewer's page is not built.
     """
 
+    @checked
     def __init__(
         self,
-        port: int = 0,
+        port: Annotated[int, whole(minimum=0, limit=65535)] = 0,
         title: str | None = None,
         wait: float = 60.0,
         say: Callable[[str], None] = lambda line: None,
     ) -> None:
-        check_at_most("port", port, 65535, 0)
         try:
             self._server = Server(port, "jaxdrones", self._stream)
         except OSError as error:

@@ -7,13 +7,14 @@ import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_choice, check_params, check_positive, short_repr
+from jaxdrones.arguments import checked, choice, number
+from jaxdrones.checks import check_choice, check_number, check_params, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import read_log
 from jaxdrones.flights.log import FlightLog, ImageSequence, LoggedConditions
@@ -32,6 +33,7 @@ CHANNELS = {"rgb": True, "depth": False, "segmentation": False}
 _MOST = 2_000_000  # states of drones in a page, 60 MB
 
 
+@checked
 def show(
     flight: Any,
     params: Params | None = None,
@@ -41,9 +43,9 @@ def show(
     targets: ArrayLike | None = None,
     labels: Sequence[str] | None = None,
     images: Mapping[str, ArrayLike] | None = None,
-    others: str = "ghosts",
+    others: Annotated[str, choice("layout of other worlds", LAYOUTS)] = "ghosts",
     title: str | None = None,
-    height: int = 600,
+    height: Annotated[int, number("pixels", above=0)] = 600,
 ) -> Page:
     """Make a page that plays flights in 3D, for display in notebooks or `save`.
 
@@ -65,8 +67,6 @@ def show(
     Raises:
         ValueError: an unsupported flight, inconsistent shapes, or too much data for a browser.
     """
-    check_choice("layout of other worlds", others, LAYOUTS)
-    check_positive("height", height, "pixels")
     of_trajectory = {"params": params, "dt": dt, "targets": targets, "labels": labels, "images": images}
     if targets is not None:
         of_trajectory["targets"] = np.asarray(targets, float)
@@ -147,7 +147,7 @@ def _(flight: State, of_trajectory: dict[str, Any]) -> list[FlightLog]:
             raise UserError(
                 f"{name} is left out; a trajectory needs {name}, {what}: jd.show(trajectory, params, dt=1 / 120)"
             )
-    check_positive("dt", dt, "s")
+    check_number("dt", dt, "s", above=0)
     check_params(params)
     check_size(flight.pos)
     flight = jax.tree.map(np.asarray, flight.replace(aux={}))

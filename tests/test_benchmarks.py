@@ -156,7 +156,7 @@ def test_learning_reports_every_seed():
 def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_path):
     result = quick("accelerator", "--output", str(tmp_path / "result.json"))
     assert not result["stopped"] and {row["section"] for row in result["rows"]} == SECTIONS
-    assert json.loads((tmp_path / "result.json").read_text()) == result
+    assert json.loads((tmp_path / "result.json").read_text()) == {key: x for key, x in result.items() if key != "lines"}
     for row in result["rows"]:
         assert row["value"] > 0 and all(figure["ratio"] > 0 and figure["source"] for figure in row.get("published", ()))
     assert result["rows"][0]["failed"] == []

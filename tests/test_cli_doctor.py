@@ -90,7 +90,7 @@ def test_doctor_says_where_compiled_programs_are_kept(no_flight, monkeypatch, tm
     monkeypatch.setattr(machine, "program_folder", lambda: tmp_path)
     (tmp_path / "jit_fly-cache").write_bytes(bytes(1_500_000))
     assert main(["doctor"]) == 0
-    assert f"programs   1 compiled ones in {tmp_path}, 1.5 MB" in capsys.readouterr().out
+    assert f"programs   1 compiled, 1.5 MB, in {tmp_path}" in capsys.readouterr().out
 
 
 def test_a_missing_extra_is_named_and_not_wrong(no_flight, monkeypatch, capsys):

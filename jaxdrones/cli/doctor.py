@@ -59,7 +59,7 @@ def _text(result: dict[str, Any]) -> str:
     lines.append(f"devices    {', '.join(result['devices']) or 'none'}")
     lines += [f"           {note}" for note in result["notes"]]
     kept = result["programs"]
-    lines.append(f"programs   {kept['files']} compiled ones in {kept['folder']}, {kept['bytes'] / 1e6:.1f} MB")
+    lines.append(f"programs   {kept['files']} compiled, {kept['bytes'] / 1e6:.1f} MB, in {kept['folder']}")
     for title, (extra, entry) in zip(["extras", *[""] * len(result["extras"])], result["extras"].items(), strict=False):
         missing = f"missing {', '.join(entry['missing'])}: {entry['install']}"
         state = entry["unavailable"] or (missing if entry["missing"] else "present")

@@ -66,10 +66,12 @@ def use_all_cores() -> None:
 
 def keep_programs() -> None:
     """Keep compiled programs in `program_folder` for the next command, unless JAX was told another folder."""
-    folder = program_folder()
-    if _told_folder() is None:
-        with contextlib.suppress(OSError):  # no folder, nothing kept
-            folder.mkdir(parents=True, exist_ok=True)
+    if _told_folder() is not None:
+        return
+    with contextlib.suppress(OSError, RuntimeError):  # no folder, or no home: nothing is kept
+        folder = program_folder()
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
             jax.config.update("jax_compilation_cache_dir", str(folder))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", _MIN_COMPILE_SECONDS)
 
@@ -85,7 +87,7 @@ def program_folder() -> Path:
 
 def _told_folder() -> str | None:
     """Folder of compiled programs in the settings of JAX."""
-    return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]  # JAX defines settings at run time
 
 
 def _from_cpuinfo(*names: str) -> str:

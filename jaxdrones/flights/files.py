@@ -38,6 +38,7 @@ _MEANINGS = {
     "target_yaw": "commanded heading, rad",
 }
 _IMAGES = "images/"  # prefix of the names of their arrays
+# What NumPy and zipfile raise for damaged files; NotImplementedError for an unknown compression.
 _DAMAGE = (OSError, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError, MemoryError)
 
 
@@ -85,7 +86,7 @@ def read_log(path: str | os.PathLike) -> FlightLog:
             **columns,
             labels=() if labels is None else tuple(map(str, labels)),
             conditions=LoggedConditions(texts.get("conditions", {}), str(arrays.get("about", file.name))),
-            params=None if params is None else Params(**params),  # type: ignore[arg-type]
+            params=None if params is None else Params(**params),  # type: ignore[arg-type]  # names are the file's
             scene=scene_from_dict(texts["scene"]) if "scene" in texts else Scene(),
             images={
                 kind: ImageSequence(*(arrays[f"{_IMAGES}{kind}/{name}"] for name in ImageSequence._fields))

@@ -84,9 +84,9 @@ class Explanation:
         team = {name: text for name, text in self.task.items() if name not in ("name", "summary") and text}
         sections = [
             f"{self.task['name']}: {self.task['summary']}\n{_pairs(team)}",
-            f"Observation: {_count(self.observation)} of each drone\n{_entries(self.observation)}\n{_NUMBERS}",
+            f"Observation: {_count(self.observation)} of each drone\n{entries_table(self.observation)}\n{_NUMBERS}",
             *([f"Images of each drone\n{_pairs(self.images)}"] if self.images else []),
-            f"Action: {_count(self.action)} of each drone\n{_entries(self.action)}",
+            f"Action: {_count(self.action)} of each drone\n{entries_table(self.action)}",
             f"Reward of each drone in each control step: the sum of weight times term\n{_parts(self.rewards)}",
             f"Terminations: the episode ends if one holds for one drone\n{_parts(self.terminations)}",
             f"Truncations: the episode is cut short\n{_parts(self.truncations)}",
@@ -251,7 +251,8 @@ def _plain(entries: Sequence[Entry]) -> list[dict[str, Any]]:
     ]
 
 
-def _entries(entries: Sequence[Entry]) -> str:
+def entries_table(entries: Sequence[Entry]) -> str:
+    """Table of entries, with a heading and a line for each."""
     scaled = any(entry.quantity.values for entry in entries)
     rows = [["", "term", "what", "unit", "frame", "range", *(["-1 is", "0 is", "1 is"] if scaled else [])]]
     for i, entry in enumerate(entries):

@@ -11,7 +11,7 @@ from jaxdrones.arguments import Scalar
 from jaxdrones.envs.env import Obs
 from jaxdrones.pytree import PyTreeNode
 
-_CLIP = 10.0  # standard deviations
+CLIP = 10.0  # standard deviations
 _MIN_STD = 1e-2  # lower bound against amplification of constant entries
 
 
@@ -57,11 +57,15 @@ class RunningStatistics(PyTreeNode):
         var = (old_count * self.var + new.count * new.var) / count + shift**2 * (old_count * new.count / count**2)
         return RunningStatistics(self.mean + shift * (new.count / count), var, old_count + new.count)
 
+    @property
+    def scale(self) -> Array:
+        """(d,) reciprocal of the standard deviation."""
+        return 1 / jnp.maximum(jnp.sqrt(self.var), _MIN_STD)
+
     def normalize(self, obs: Float[Array, "*batch d"]) -> Array:
         """Observations in standard deviations from the mean, clipped at ten."""
-        scale = 1 / jnp.maximum(jnp.sqrt(self.var), _MIN_STD)
         shape = (1,) * (obs.ndim - 1) + self.mean.shape
-        return jnp.clip((obs - self.mean.reshape(shape)) * scale.reshape(shape), -_CLIP, _CLIP)
+        return jnp.clip((obs - self.mean.reshape(shape)) * self.scale.reshape(shape), -CLIP, CLIP)
 
 
 def state_vector(obs: Obs) -> Float[Array, "*batch d"]:

@@ -37,7 +37,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("optimal",),),
     (("envs",), ("flights",)),
     (("adapters",), ("learning",), ("ros2",), ("visualization",)),
-    (("training",),),
+    (("training",), ("export",)),
     (("cli",),),
     (("",),),  # the package itself, which re-exports
 )
@@ -45,7 +45,7 @@ PLACE = {
     module: (layer, peer) for layer, peers in enumerate(LAYERS) for peer, group in enumerate(peers) for module in group
 }
 OPTIONAL = ("gymnasium", "pettingzoo", "brax", "stable_baselines3", "torch", "pybullet", "matplotlib", "tqdm", "casadi")
-OPTIONAL += ("cyclonedds", "rosbags", "rclpy", "ray", "shtab", "tianshou")
+OPTIONAL += ("cyclonedds", "onnx", "rosbags", "rclpy", "ray", "shtab", "tianshou")
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

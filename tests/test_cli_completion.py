@@ -42,6 +42,7 @@ def completed(script: str, words: str) -> list[str]:
         ("jaxdrones fly circle --backend bul", ["bullet"]),
         ("jaxdrones fly circle --vehicle cf", ["cf21", "cf21_brushless", "cf21_thrust", "cf2p", "cf2x"]),
         ("jaxdrones train hover --realistic a", ["any"]),
+        ("jaxdrones export runs/hover --to st", ["stablehlo"]),
         ("jaxdrones completion f", ["fish"]),
     ],
 )

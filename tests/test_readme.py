@@ -12,6 +12,7 @@ from jaxdrones.cli import main
 from jaxdrones.training.trainer import Trainer
 
 ELSEWHERE = {  # page -> the tests that try its commands
+    "docs/export.md": "tests/export/test_page.py",
     "docs/own-policy.md": "tests/test_cli_user_code.py",
     "docs/own-task.md": "tests/test_cli_user_code.py",
     "docs/own-vehicle.md": "tests/test_cli_user_code.py",

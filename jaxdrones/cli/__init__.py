@@ -10,6 +10,7 @@ from jaxdrones.cli import (
     doctor,
     evaluate,
     explain,
+    export,
     fit,
     fly,
     machine,
@@ -50,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help=text)
     parser.add_argument("--version", action="version", version=f"jaxdrones {machine.version('jaxdrones')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
-    for command in (fly, train, evaluate, compare, view, fit, score, ros2, explain, names, doctor, bench):
+    for command in (fly, train, evaluate, compare, view, fit, score, ros2, export, explain, names, doctor, bench):
         command.add(commands)
     completion.add(commands, parser)
     for each in commands.choices.values():  # --debug may stand before the command or after it

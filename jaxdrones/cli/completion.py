@@ -5,6 +5,7 @@ import functools
 from collections.abc import Iterator
 
 from jaxdrones.checks import check_choice
+from jaxdrones.cli.export import TARGETS
 from jaxdrones.cli.names import known_names
 from jaxdrones.cli.settings import REALISTIC_KINDS
 from jaxdrones.errors import UserError, install
@@ -51,6 +52,8 @@ def _completion(root: argparse.ArgumentParser, options: argparse.Namespace) -> i
             action.choices = SHELLS
         elif action.dest == "realistic":
             action.choices = REALISTIC_KINDS
+        elif action.dest == "to":
+            action.choices = TARGETS
         elif action.dest in _KINDS:
             action.choices = names[_KINDS[action.dest]]
         elif action.metavar in (*_FOLDERS, *_FILES):

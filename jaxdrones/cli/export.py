@@ -1,0 +1,71 @@
+"""`jaxdrones export`."""
+
+import argparse
+from typing import Any
+
+from jaxdrones.arguments import choice
+from jaxdrones.cli.common import check_options, folder, run_folder
+from jaxdrones.cli.options import add_drones, add_json, add_output, add_set, add_vehicle
+from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.report import as_json, described
+from jaxdrones.cli.settings import add_realistic, asked_settings
+
+TARGETS = ("c", "onnx", "stablehlo", "js")
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "export",
+        help="write a trained policy as C, ONNX, StableHLO or JavaScript",
+        description="Write the best policy of a run, with its normalization, for use without jaxdrones: a C99 header "
+        "for a flight controller, an ONNX model, a program of jax.export, or an ES module. Each describes its inputs "
+        "and outputs: order, unit, frame and range.",
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "policy",
+        type=folder,
+        metavar="RUN",
+        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed",
+    )
+    parser.add_argument("--to", required=True, metavar="TARGET", help=", ".join(TARGETS))
+    own = parser.add_argument_group("your own policy", "only with file.py:name")
+    own.add_argument("--task", metavar="TASK", help="task of the policy, as for `jaxdrones train`")
+    add_drones(own)
+    add_vehicle(own)
+    add_realistic(own)
+    add_set(own, "option of the environment (action, observation, ...)")
+    add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
+    parser.add_argument("--last", action="store_true", help="the newest policy of the run instead of the best")
+    add_json(parser)
+    parser.set_defaults(run=_export)
+
+
+def _export(options: argparse.Namespace) -> int:
+    from jaxdrones.export import save
+
+    check_options(options, to=choice("target", TARGETS))
+    run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
+    if is_user_policy(options.policy):
+        recipe = run.recipe()
+        title, place = described(recipe), run_folder(options.task, "/export")
+    else:
+        name = "last" if options.last else "best"
+        recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
+        title, place = f"{described(recipe)}, policy of update {update}", options.policy / "export"
+    with recipe.env() as env:
+        policy = run.policy(env) if is_user_policy(options.policy) else run.policy(name, env)
+        exported = save(policy, env, options.to, options.output or place, title=title)
+    if options.json:
+        about: dict[str, Any] = {"policy": str(options.policy), "to": options.to}
+        files = [vars(x) | {"files": [*map(str, x.files)]} for x in exported]
+        print(as_json(about | {"title": title, "exported": files}))
+        return 0
+    print(title)
+    for one in exported:
+        print(f"  wrote {', '.join(map(str, one.files))}")
+        costs = {"multiply-adds": one.multiply_adds, "bytes of weights (flash)": one.flash, "bytes of RAM": one.ram}
+        if shown := [f"{x:,} {what}" for what, x in costs.items() if x is not None]:
+            print(f"    one call: {', '.join(shown)}")
+    return 0

@@ -1,0 +1,134 @@
+"""Files of an exported policy."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdrones import writing
+from jaxdrones.checks import check_choice, short_repr
+from jaxdrones.envs import Env, explain
+from jaxdrones.errors import UserError
+from jaxdrones.export import c, js, onnx, stablehlo
+from jaxdrones.export.calls import program_of
+from jaxdrones.export.layers import Graph, Tensor, layers_of
+from jaxdrones.export.text import Description
+from jaxdrones.learning.networks import OwnNetwork, Policy
+
+Contents = tuple[dict[str, bytes], Description]
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """Files of the policy of one drone, and what a call of it costs."""
+
+    files: tuple[Path, ...]
+    multiply_adds: int | None
+    """Multiply-adds of one call; `None` for a network of your own."""
+    flash: int | None
+    """Bytes of the weights; `None` for a network of your own."""
+    ram: int | None
+    """Bytes of working memory and hidden state, for C and JavaScript."""
+
+
+def save(
+    policy: Any, env: Env, to: str, folder: str | os.PathLike, name: str = "policy", title: str = ""
+) -> list[Exported]:
+    """Write the deterministic policy of a drone, with its normalization, for use without this library.
+
+    Args:
+        policy: policy of `jaxdrones.learning`; the drones of a team share one file, or with `per_agent` have one each.
+        env: environment of the policy, which describes its inputs and outputs.
+        to: `c`, `onnx`, `stablehlo` or `js`.
+        folder: folder of the files; it is created.
+        name: name of the files, and prefix of the names in C.
+        title: origin of the policy, for the descriptions; by default the name of the task.
+
+    Returns:
+        Result of each file, in the order of the drones.
+
+    Raises:
+        ValueError: an unknown target, a policy that it cannot express, or a missing library.
+        OSError: a file that cannot be written.
+    """
+    check_choice("target", to, TARGETS)
+    if not c.is_identifier(name):
+        raise UserError(f"name is {name!r}; give a letter, then letters, digits and underscores")
+    if not isinstance(policy, Policy):
+        raise UserError(
+            f"the policy is {short_repr(policy)}; give one of jaxdrones.learning (Policy), because the layers of a "
+            "function are unknown, and `jax.export` saves any function"
+        )
+    explanation = explain(env)
+    if policy.obs_stats.mean.shape != (env.observation_size,):
+        raise UserError(
+            f"the policy observes {policy.obs_stats.mean.size} numbers, and {env.task.name} has "
+            f"{env.observation_size}; give the environment of the policy"
+        )
+    images = tuple(Tensor(x, space.shape, np.dtype(space.dtype).name) for x, space in sorted(env.image_spaces.items()))
+    policies = [policy]
+    if policy.per_agent:
+        policies = [
+            policy.replace(params=jax.tree.map(lambda x: x[i], policy.params), per_agent=False)  # noqa: B023
+            for i in range(env.drones)
+        ]
+    folder, results = Path(folder), []
+    for i, one in enumerate(policies):
+        own_name = f"{name}_{i}" if policy.per_agent else name
+        own_title = (title or env.task.name) + f", drone {i}" * policy.per_agent
+        description = Description(own_title, explanation, env.dt)
+        contents, description = TARGETS[to](one, images, description, own_name)
+        folder.mkdir(parents=True, exist_ok=True)
+        for file, content in contents.items():
+            writing.write(folder / file, content)
+        files = tuple(folder / file for file in contents)
+        results.append(Exported(files, description.multiply_adds, description.flash, description.ram))
+    return results
+
+
+def _with_costs(description: Description, graph: Graph, ram: int | None = None) -> Description:
+    return dataclasses.replace(
+        description,
+        hidden_size=graph.hidden_size,
+        multiply_adds=graph.multiply_adds,
+        flash=graph.weight_bytes,
+        ram=ram,
+    )
+
+
+def _c(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
+    graph = layers_of(policy, images)
+    program = program_of(graph)
+    description = _with_costs(description, graph, program.ram)
+    return {f"{name}.h": c.header(graph, program, description, name).encode()}, description
+
+
+def _js(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
+    graph = layers_of(policy, images)
+    program = program_of(graph)
+    description = _with_costs(description, graph, program.ram)
+    return {f"{name}.js": js.module(graph, program, description, name).encode()}, description
+
+
+def _onnx(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
+    graph = layers_of(policy, images)
+    description = _with_costs(description, graph)
+    return {f"{name}.onnx": onnx.model(graph, description)}, description
+
+
+def _stablehlo(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
+    if not isinstance(policy.network, OwnNetwork):
+        description = _with_costs(description, layers_of(policy, images))
+    about = json.dumps(description.as_dict(), indent=2)
+    return {f"{name}.stablehlo": stablehlo.program(policy, images), f"{name}.json": about.encode()}, description
+
+
+TARGETS: dict[str, Callable[..., Contents]] = {"c": _c, "onnx": _onnx, "stablehlo": _stablehlo, "js": _js}
+"""Targets by name: files and costs of the policy of one drone."""

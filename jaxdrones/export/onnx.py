@@ -1,0 +1,173 @@
+"""Policies as ONNX models with a dynamic batch."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.errors import UserError, install
+from jaxdrones.export.layers import (
+    Activation,
+    Color,
+    Concatenate,
+    Convolution,
+    Dense,
+    Flatten,
+    Gates,
+    Graph,
+    Layer,
+    Nearness,
+    Normalize,
+    Tensor,
+)
+from jaxdrones.export.text import Description
+
+_OPSET, _IR_VERSION = 17, 8  # of 2022, which every runtime of today reads
+_ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu", "elu": "Elu"}
+
+
+class _Nodes:
+    """Nodes and initializers of a model, built layer by layer."""
+
+    def __init__(self, onnx: Any):
+        self.onnx = onnx
+        self.nodes: list[Any] = []
+        self.initializers: list[Any] = []
+
+    def constant(self, name: str, value: Any) -> str:
+        if all(name != x.name for x in self.initializers):
+            self.initializers.append(self.onnx.numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+    def node(self, kind: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
+        self.nodes.append(self.onnx.helper.make_node(kind, inputs, [output], name=output, **attributes))
+        return output
+
+    def add(self, layer: Layer) -> None:
+        """Nodes of one layer; images have the axes (batch, height, width, channels)."""
+        y, inputs = layer.output.name, [x.name for x in layer.inputs]
+        constants = {
+            name: self.constant(f"{y}_{name}", x)
+            for name, x in layer.constants.items()
+            if not isinstance(layer, Convolution)
+        }
+        match layer:
+            case Normalize():
+                shifted = self.node("Sub", [*inputs, constants["mean"]], f"{y}_shifted")
+                scaled = self.node("Mul", [shifted, constants["scale"]], f"{y}_scaled")
+                low = self.constant(f"{y}_low", np.float32(-layer.clip))
+                self.node("Clip", [scaled, low, self.constant(f"{y}_high", np.float32(layer.clip))], y)
+            case Dense():
+                self.node("Gemm", [*inputs, *constants.values()], y)
+            case Convolution():
+                self.convolution(layer)
+            case Activation(function="silu"):
+                self.node("Mul", [*inputs, self.node("Sigmoid", inputs, f"{y}_sigmoid")], y)
+            case Activation():
+                self.node(_ACTIVATIONS[layer.function], inputs, y)
+            case Gates():
+                self.gates(inputs, y)
+            case Nearness():
+                scale = self.constant(f"{y}_scale", np.float32(layer.depth_scale))
+                ahead = self.node("Max", [*inputs, self.constant("zero", np.float32(0))], f"{y}_ahead")
+                near = self.node("Div", [scale, self.node("Add", [ahead, scale], f"{y}_sum")], f"{y}_near")
+                self.node("Unsqueeze", [near, self.constant("last_axis", np.array([-1]))], y)
+            case Color():
+                ends = [
+                    self.constant(f"{y}_{name}", np.array([x])) for name, x in (("from", 0), ("to", 3), ("axis", 3))
+                ]
+                floats = self.node("Cast", inputs, f"{y}_float", to=self.onnx.TensorProto.FLOAT)
+                rgb = self.node("Slice", [floats, *ends], f"{y}_rgb")
+                self.node("Div", [rgb, self.constant(f"{y}_largest", np.float32(255))], y)
+            case Concatenate():
+                self.node("Concat", inputs, y, axis=-1)
+            case Flatten():
+                self.node("Reshape", [*inputs, self.constant(f"{y}_shape", np.array([-1, layer.output.size]))], y)
+            case _:
+                raise AssertionError(layer)
+
+    def convolution(self, layer: Convolution) -> None:
+        y, stride = layer.output.name, layer.stride
+        square = layer.constants["kernel"].reshape(stride, stride, layer.inputs[0].shape[-1], -1)
+        kernel = self.constant(f"{y}_kernel", np.ascontiguousarray(np.transpose(square, (3, 2, 0, 1))))
+        bias = self.constant(f"{y}_bias", layer.constants["bias"])
+        (top, bottom), (left, right) = layer.margin
+        first = self.node("Transpose", [layer.inputs[0].name], f"{y}_channels_first", perm=[0, 3, 1, 2])
+        sizes = {"kernel_shape": [stride, stride], "strides": [stride, stride], "pads": [top, left, bottom, right]}
+        found = self.node("Conv", [first, kernel, bias], f"{y}_found", **sizes)
+        self.node("Transpose", [found], y, perm=[0, 2, 3, 1])
+
+    def gates(self, inputs: Sequence[str], y: str) -> None:
+        *sums, hidden = inputs
+        parts = {}
+        for name, x in zip(("in", "state"), sums, strict=True):
+            outputs = [f"{y}_{gate}_{name}" for gate in ("reset", "keep", "new")]
+            self.nodes.append(self.onnx.helper.make_node("Split", [x], outputs, name=f"{y}_split_{name}", axis=-1))
+            parts[name] = outputs
+        reset, keep = (
+            self.node(
+                "Sigmoid", [self.node("Add", [parts["in"][i], parts["state"][i]], f"{y}_{gate}_sum")], f"{y}_{gate}"
+            )
+            for i, gate in enumerate(("reset", "keep"))
+        )
+        scaled = self.node("Mul", [reset, parts["state"][2]], f"{y}_new_scaled")
+        new = self.node("Tanh", [self.node("Add", [parts["in"][2], scaled], f"{y}_new_sum")], f"{y}_new")
+        rest = self.node("Sub", [self.constant("one", np.float32(1)), keep], f"{y}_rest")
+        kept = self.node("Mul", [keep, hidden], f"{y}_kept")
+        self.node("Add", [kept, self.node("Mul", [rest, new], f"{y}_added")], y)
+
+
+def model(graph: Graph, description: Description) -> bytes:
+    """Serialized ONNX model of a policy.
+
+    Args:
+        graph: layers of the policy.
+        description: meaning of inputs and outputs, for the metadata.
+
+    Returns:
+        Model with the inputs `obs` (batch, d), images (batch, height, width, ...) and `hidden_state` (batch, size),
+        and the outputs `act` (batch, a) and `next_hidden_state`.
+
+    Raises:
+        ValueError: onnx is not installed.
+    """
+    try:
+        import onnx
+        import onnx.checker
+        import onnx.helper
+        import onnx.numpy_helper
+    except ImportError:
+        raise UserError(f"onnx is not installed; {install('export')}") from None
+    nodes = _Nodes(onnx)
+    for layer in graph.layers:
+        nodes.add(layer)
+    outputs = {"act": graph.action}
+    if graph.next_hidden_state:
+        outputs["next_hidden_state"] = graph.next_hidden_state
+    for name, x in outputs.items():
+        nodes.node("Identity", [x.name], name)
+
+    def value(name: str, x: Tensor) -> Any:
+        kind = onnx.TensorProto.UINT8 if x.dtype == "uint8" else onnx.TensorProto.FLOAT
+        return onnx.helper.make_tensor_value_info(name, kind, ["batch", *x.shape])
+
+    network = onnx.helper.make_graph(
+        nodes.nodes,
+        "policy",
+        [value(x.name, x) for x in graph.inputs],
+        [value(name, x) for name, x in outputs.items()],
+        nodes.initializers,
+    )
+    made = onnx.helper.make_model(
+        network,
+        opset_imports=[onnx.helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="jaxdrones",
+        doc_string="\n".join(description.lines()),
+    )
+    onnx.helper.set_model_props(made, {name: json.dumps(x) for name, x in description.as_dict().items()})
+    onnx.checker.check_model(made, full_check=True)
+    return made.SerializeToString()

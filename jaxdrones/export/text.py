@@ -1,0 +1,76 @@
+"""Text that the targets share: the description of inputs and outputs, and numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.envs.explanation import Explanation, entries_table
+
+WIDTH = 120
+
+
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """Meaning of the inputs and outputs of an exported policy."""
+
+    title: str
+    """Task, learner and update, in one line."""
+    explanation: Explanation
+    """Of the environment of the policy."""
+    period: float
+    """Time between two calls, s."""
+    hidden_size: int = 0
+    """Length of the hidden state of a recurrent policy; 0 without one, and for a network of unknown layers."""
+    multiply_adds: int | None = None
+    """Of one call; `None` for a network of unknown layers."""
+    flash: int | None = None
+    """Bytes of the weights."""
+    ram: int | None = None
+    """Bytes of working memory and hidden state, of targets that manage their own memory."""
+
+    def lines(self) -> list[str]:
+        """Text of inputs and outputs, a table row a line."""
+        text = [
+            f"{self.title}: deterministic policy of one drone, written by `jaxdrones export`.",
+            f"Call it {1 / self.period:g} times per second.",
+        ]
+        if self.multiply_adds is not None and self.flash is not None:
+            ram = "" if self.ram is None else f", {self.ram:,} bytes of RAM (working memory and hidden state)"
+            text.append(f"One call: {self.multiply_adds:,} multiply-adds{ram}, {self.flash:,} bytes of weights.")
+        text += ["", "Observation; clip values beyond the range:", *self._table("observation")]
+        for name, meaning in self.explanation.images.items():
+            text += ["", f"Image {name}, row by row: {meaning}"]
+        if self.hidden_size:
+            text += ["", f"Hidden state: {self.hidden_size} numbers, kept between calls; 0 at the start of a flight"]
+        return [*text, "", "Action, in (-1, 1):", *self._table("action")]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Title, rate and entries for JSON."""
+        entries = self.explanation.as_dict()
+        own = {name: entries[name] for name in ("observation", "images", "action")}
+        return {"title": self.title, "period_s": self.period, "hidden_size": self.hidden_size, **own}
+
+    def _table(self, name: str) -> list[str]:
+        return entries_table(getattr(self.explanation, name)).splitlines()
+
+
+def block_comment(lines: list[str]) -> str:
+    """Lines as a comment of C and JavaScript, which nothing in them can end or upset."""
+    for text, harmless in (("*/", "* /"), ("/*", "/ *"), ("??", "? ?"), ("\\", "/")):
+        lines = [line.replace(text, harmless) for line in lines]
+    return "\n".join(["/*", *(f" * {line}".rstrip() for line in lines), " */"])
+
+
+def number(x: float) -> str:
+    """Shortest decimal number that is this number in float32."""
+    return str(np.float32(x))
+
+
+def numbers(array: np.ndarray, suffix: str = "") -> str:
+    """Indented lines of an array's numbers, row by row."""
+    text = ", ".join(f"{number(x)}{suffix}" for x in array.ravel())
+    return textwrap.fill(text, WIDTH, initial_indent="    ", subsequent_indent="    ", break_long_words=False)

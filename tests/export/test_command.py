@@ -1,0 +1,234 @@
+"""`jaxdrones export`: what it writes and describes, and its messages."""
+
+import contextlib
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import exported
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdrones as jd
+from jaxdrones.cli import main
+from jaxdrones.export import TARGETS, save
+from jaxdrones.learning import OwnNetwork
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import RunningStatistics
+from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.run import Run
+
+pytestmark = pytest.mark.float32
+
+needs_onnx, needs_flatbuffers = pytest.mark.needs("onnx"), pytest.mark.needs("flatbuffers")
+
+
+@pytest.fixture(scope="module")
+def env():
+    with jax.enable_x64(False):
+        return jd.make("hover")
+
+
+@pytest.fixture(scope="module")
+def run(env, tmp_path_factory):
+    """Folder with a policy as of a training."""
+    folder = tmp_path_factory.mktemp("runs") / "hover"
+    with jax.enable_x64(False):
+        policy = exported.random_policy(env)
+        about = {"recipe": Recipe.of("hover").as_dict(), "update": 3, "run_id": "a"}
+        Run(folder).save_policy("best", policy, **about)
+        Run(folder).save_policy("last", policy.replace(params=jax.tree.map(jnp.zeros_like, policy.params)), **about)
+    return folder
+
+
+def own_policy(env, module) -> Policy:
+    network = OwnNetwork(module, env.action_size)
+    params = network.init(jax.random.key(0), jnp.zeros(env.observation_size))
+    return Policy(params, RunningStatistics.empty(env.observation_size), network)
+
+
+class Leaky(nn.Module):
+    """Linear, with a dictionary as hidden state."""
+
+    def initial_hidden_state(self):
+        return {"sum": jnp.zeros(4)}
+
+    @nn.compact
+    def __call__(self, hidden_state, obs):
+        y = 0.5 * hidden_state["sum"] + nn.Dense(4)(obs)
+        return {"sum": y}, y
+
+
+def test_the_command_writes_the_best_policy_into_the_folder_of_the_run(run, capsys):
+    assert main(["export", str(run), "--to", "c"]) == 0
+    said = capsys.readouterr().out
+    assert "hover by bptt, policy of update 3" in said and f"wrote {run}/export/policy.h" in said
+    assert "311 multiply-adds, 1,412 bytes of weights (flash), 124 bytes of RAM" in said
+    best = (run / "export" / "policy.h").read_text()
+    assert main(["export", str(run), "--to", "c", "--last", "--output", str(run / "last"), "--json"]) == 0
+    (one,) = json.loads(capsys.readouterr().out)["exported"]
+    assert one["files"] == [f"{run}/last/policy.h"] and one["flash"] == 1412
+    assert (run / "last" / "policy.h").read_text() != best
+
+
+def test_costs_are_those_of_the_layers(env, tmp_path):
+    (one,) = save(exported.random_policy(env, (9, 7), recurrent_size=6), env, "c", tmp_path)
+    weights = 22 * 18 + 18 + 6 * 18 + 28 * 9 + 9 + 9 * 7 + 7 + 7 * 4 + 4
+    assert one.flash == 4 * (2 * 22 + weights)
+    assert one.multiply_adds == 22 + 22 * 18 + 6 * 18 + 28 * 9 + 9 * 7 + 7 * 4
+    assert one.ram == 4 * (22 + 18 + 18 + 6)  # observation, both parts of the gates, hidden state
+
+
+@pytest.mark.parametrize("to", [pytest.param("c"), pytest.param("js")])
+def test_order_unit_and_frame_of_every_number_are_in_the_comment(to, run, env, tmp_path):
+    (one,) = save(exported.random_policy(env, recurrent_size=6), env, to, tmp_path, title="a */ b /* c \\")
+    comment = one.files[0].read_text().split("*/")[0]
+    assert "a * / b / * c /" in comment and "Call it 100 times per second" in comment
+    entries = (*jd.explain(env).observation, *jd.explain(env).action)
+    lines = [line.removeprefix(" * ") for line in comment.splitlines()]
+    rows = [line.split() for line in lines if line.strip()[:1].isdigit()]
+    assert len(rows) == len(entries) == 26
+    for row, entry in zip(rows, entries, strict=True):
+        text = " ".join(row)
+        assert all(
+            part in text for part in (entry.term, entry.quantity.name, entry.quantity.unit, entry.quantity.frame)
+        )
+    assert [int(row[0]) for row in rows] == [*range(22), *range(4)]
+    assert "Hidden state: 6 numbers, kept between calls; 0 at the start of a flight" in comment
+
+
+@needs_onnx
+def test_onnx_has_the_meaning_of_its_numbers_and_a_dynamic_batch(env, tmp_path):
+    import onnx
+
+    (one,) = save(exported.random_policy(env, recurrent_size=6), env, "onnx", tmp_path)
+    model = onnx.load(one.files[0])
+    about = {entry.key: json.loads(entry.value) for entry in model.metadata_props}
+    expected = json.loads(json.dumps(jd.explain(env).as_dict()))
+    assert about["observation"] == expected["observation"] and about["action"] == expected["action"]
+    assert about["period_s"] == env.dt and about["hidden_size"] == 6
+    assert "0  x of the target, from the drone" in " ".join(model.doc_string.split()).replace("0 position_error", "0 ")
+    shapes = {
+        x.name: [d.dim_param or d.dim_value for d in x.type.tensor_type.shape.dim]
+        for x in (*model.graph.input, *model.graph.output)
+    }
+    assert shapes == {
+        "obs": ["batch", 22],
+        "hidden_state": ["batch", 6],
+        "act": ["batch", 4],
+        "next_hidden_state": ["batch", 6],
+    }
+
+
+@needs_flatbuffers
+@pytest.mark.parametrize("library", ["linen", "nnx", "equinox"])
+def test_a_network_of_a_user_leaves_as_stablehlo(library, env, tmp_path):
+    if library == "linen":
+        module = nn.Dense(4)
+    elif library == "nnx":
+        from flax import nnx
+
+        module = nnx.Linear(22, 4, rngs=nnx.Rngs(0))
+    else:
+        module = pytest.importorskip("equinox").nn.Linear(22, 4, key=jax.random.key(0))
+    policy, inputs = own_policy(env, module), exported.random_inputs(env)
+    (one,) = save(policy, env, "stablehlo", tmp_path)
+    assert one.multiply_adds is None
+    actions = exported.actions_of_stablehlo(one.files[0], inputs, 4)
+    np.testing.assert_allclose(actions, exported.expected_actions(policy, inputs), atol=1e-6)
+    for to in TARGETS.keys() - {"stablehlo"}:
+        with pytest.raises(ValueError, match=r"a network of your own, \w+, whose layers are unknown; give --to stabl"):
+            save(policy, env, to, tmp_path)
+
+
+@needs_flatbuffers
+def test_the_hidden_state_of_a_users_network_is_an_argument(env, tmp_path):
+    policy, inputs = own_policy(env, Leaky()), exported.random_inputs(env)
+    (one,) = save(policy, env, "stablehlo", tmp_path)
+    call = jax.export.deserialize(bytearray(one.files[0].read_bytes())).call
+    state, expected = {"sum": jnp.zeros((exported.DRONES, 4))}, exported.expected_actions(policy, inputs)
+    for t in range(exported.STEPS):
+        action, state = call(inputs["obs"][t], state)
+        np.testing.assert_allclose(action, expected[t], atol=1e-6)
+
+
+def test_what_cannot_be_exported_is_said(env, tmp_path):
+    policy = exported.random_policy(env)
+    with pytest.raises(ValueError, match=r"the policy is <function .*; give one of jaxdrones.learning"):
+        save(lambda obs: obs[:, :4], env, "c", tmp_path)
+    with pytest.raises(ValueError, match="unknown target 'rust'"):
+        save(policy, env, "rust", tmp_path)
+    with pytest.raises(ValueError, match="name is '2fast'; give a letter"):
+        save(policy, env, "c", tmp_path, name="2fast")
+    with pytest.raises(ValueError, match="the policy observes 22 numbers, and leader-follower has 12"):
+        save(policy, jd.make("leader-follower"), "c", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def damaged(run: Path, folder: Path, file: str, content: bytes | None) -> Path:
+    """Copy of a run with a file replaced or removed."""
+    shutil.copytree(run, folder)
+    if content is None:
+        (folder / file).unlink()
+    else:
+        (folder / file).write_bytes(content)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("best.json", None, "best.json does not exist"),
+        ("best.json", b"{}", "best.json has format None"),
+        ("best.json", b"not JSON", "best.json is damaged"),
+        ("best.msgpack", b"nonsense", "best.msgpack is damaged"),
+        ("best.msgpack", None, "best.msgpack does not exist"),
+    ],
+)
+def test_a_damaged_run_is_one_line(file, content, message, run, tmp_path, capsys):
+    folder = damaged(run, tmp_path / "run", file, content)
+    assert main(["export", str(folder), "--to", "c", "--output", str(tmp_path / "c")]) == 2
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1 and message in said.err and not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "the following arguments are required"),
+        (["RUN"], "the following arguments are required: --to"),
+        (["RUN", "--to", "onxx"], "unknown target 'onxx'; did you mean 'onnx'"),
+        (["RUN", "--to", "c", "--task", "hover"], "--task is given beside the run"),
+        (["missing", "--to", "c"], "best.json does not exist"),
+        (["RUN", "--to", "c", "--output", "RUN/best.json"], "best.json: "),
+        (["mine.py:policy", "--to", "c"], "--task is missing"),
+        (["mine.py:policy", "--to", "c", "--task", "hover"], "the layers of a function are unknown"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments, message, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("def policy(obs):\n    return obs[:, :4]\n")
+    with pytest.raises(SystemExit) if "required" in message else contextlib.nullcontext():
+        code = main(["export", *(text.replace("RUN", str(run)) for text in arguments)])
+        assert code == 2
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1 and message in said.err
+
+
+@pytest.mark.parametrize(("to", "library"), [("onnx", "onnx"), ("stablehlo", "flatbuffers")])
+def test_a_missing_library_is_said_with_the_extra(to, library, run, tmp_path, monkeypatch, capsys):
+    for name in (*(x for x in sys.modules if x.split(".")[0] == library), library):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert main(["export", str(run), "--to", to, "--output", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert f"{library} is not installed" in said and "[export]" in said and said.count("\n") == 1
+
+
+def test_the_targets_of_the_command_are_those_of_the_library():
+    from jaxdrones.cli.export import TARGETS as NAMES
+
+    assert tuple(TARGETS) == NAMES

@@ -1,0 +1,160 @@
+"""What is exported computes the actions of `Policy.act`, in C, ONNX Runtime, Node.js and by `jax.export`."""
+
+import functools
+import importlib.util
+import shutil
+
+import exported
+import jax
+import numpy as np
+import pytest
+
+import jaxdrones as jd
+from jaxdrones.export import save
+from jaxdrones.learning.networks import Policy
+
+pytestmark = pytest.mark.float32
+
+TOLERANCE = 1e-6  # of the largest action: rounding of float32 in sums of up to 400 products
+DIFFERENT = 1e-3  # of the largest action: a mistake
+PROGRAMS = {"c": "cc", "js": "node"}
+LIBRARIES = {"onnx": "onnxruntime", "stablehlo": "flatbuffers"}
+TARGETS = [
+    pytest.param(to, marks=pytest.mark.skipif(not found, reason=f"{needed} is not installed"))
+    for to, needed in (PROGRAMS | LIBRARIES).items()
+    for found in [shutil.which(needed) if to in PROGRAMS else importlib.util.find_spec(needed)]
+]
+needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is not installed")
+ODD = jd.Camera(resolution=(13, 11))  # padded to multiples of the strides, differently along each axis
+POLICIES = {
+    "mlp": ("hover", {}, {}),
+    "relu": ("hover", {}, {"activation": "relu"}),
+    "elu": ("hover", {}, {"activation": "elu"}),
+    "silu": ("hover", {}, {"activation": "silu", "hidden_sizes": (5,)}),
+    "gru": ("hover", {}, {"recurrent_size": 6}),
+    "cnn": ("forest", {}, {"hidden_sizes": (32, 16)}),
+    "both": ("hover", {"vision": ("rgb", "depth"), "camera": ODD}, {"recurrent_size": 5}),
+    "team": ("leader-follower", {}, {}),
+}
+
+
+@functools.cache
+def made(kind: str) -> tuple:
+    """Environment, policy, inputs and expected actions of one kind."""
+    task, options, settings = POLICIES[kind]
+    env = jd.make(task, **options)
+    policy, inputs = exported.random_policy(env, **settings), exported.random_inputs(env)
+    return env, policy, inputs, exported.expected_actions(policy, inputs)
+
+
+def difference(actions: np.ndarray, expected: np.ndarray) -> float:
+    assert actions.shape == expected.shape and np.isfinite(actions).all()
+    return np.abs(actions - expected).max() / np.abs(expected).max()
+
+
+@pytest.mark.parametrize("to", TARGETS)
+@pytest.mark.parametrize("kind", POLICIES)
+def test_what_is_exported_acts_as_the_policy(kind, to, tmp_path):
+    env, policy, inputs, expected = made(kind)
+    assert 0.1 < np.abs(expected).mean() < 0.95  # where a difference is seen
+    (one,) = save(policy, env, to, tmp_path)
+    assert one.files[0] == tmp_path / f"policy.{exported.SUFFIX[to]}"
+    assert difference(exported.RUN[to](one.files[0], inputs, env.action_size), expected) < TOLERANCE
+
+
+@pytest.mark.parametrize("to", TARGETS)
+def test_drones_with_their_own_networks_have_a_file_each(to, tmp_path):
+    env = made("team")[0]
+    policy, inputs = exported.random_policy(env, per_agent=True), made("team")[2]
+    results = save(policy, env, to, tmp_path)
+    assert [one.files[0].stem for one in results] == ["policy_0", "policy_1"]
+    seen = np.stack([inputs["obs"]] * 2, axis=-2)  # the same by both
+    both = jax.jit(policy.act)(None, seen)[1]
+    for i, one in enumerate(results):
+        actions = exported.RUN[to](one.files[0], inputs, env.action_size)
+        assert difference(actions, np.asarray(both[..., i, :])) < TOLERANCE
+        assert difference(actions, np.asarray(both[..., 1 - i, :])) > DIFFERENT
+
+
+@functools.cache
+def flown() -> dict[str, np.ndarray]:
+    """Observations (steps, drones, d) of flights by the policy."""
+    env, policy, *_ = made("mlp")
+    obs, world = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), exported.DRONES))
+    step = jax.jit(jax.vmap(lambda world, obs: env.step(jax.random.key(0), world, policy(obs))[:2]))
+    found = []
+    for _ in range(exported.STEPS):
+        found.append(np.asarray(obs[:, 0]))
+        for _ in range(5):
+            obs, world = step(world, obs)
+    return {"obs": np.stack(found)}
+
+
+@pytest.mark.parametrize("to", TARGETS)
+def test_what_is_exported_acts_as_the_policy_in_flight(to, tmp_path):
+    (env, policy, *_), inputs = made("mlp"), flown()
+    (one,) = save(policy, env, to, tmp_path)
+    actions = exported.RUN[to](one.files[0], inputs, env.action_size)
+    assert difference(actions, exported.expected_actions(policy, inputs)) < TOLERANCE
+
+
+MISTAKES = [  # kind of policy, and what is written in place of what
+    ("mlp", "z < -clip ? -clip : z > clip ? clip : z", "z"),
+    ("mlp", "z < -clip ? -clip : z > clip ? clip : z", "z < -clip ? -clip : z"),
+    ("mlp", "(x[i] - mean[i]) * scale[i]", "x[i] - mean[i]"),
+    ("mlp", "(x[i] - mean[i]) * scale[i]", "x[i] * scale[i]"),
+    ("mlp", "kernel[i * m + j]", "kernel[j * n + i]"),
+    ("mlp", "bias ? bias[j] : 0.0f", "bias ? 0.0f : 0.0f"),
+    ("mlp", "policy_apply_tanh(4, act);", ""),
+    ("gru", "inputs[i] + states[i]", "inputs[n + i] + states[i]"),
+    ("gru", "policy_sigmoid(inputs[n + i] + states[n + i])", "1.0f - policy_sigmoid(inputs[n + i] + states[n + i])"),
+    ("gru", "reset * states[2 * n + i]", "states[2 * n + i]"),
+    ("gru", "hidden[i] = keep", "(void)new_value; hidden[i] = 0.0f * keep"),
+    ("gru", "keep * hidden[i] +", "0.0f * keep * hidden[i] +"),
+    ("gru", "hidden[i] = 0.0f;", "hidden[i] = 1.0f;"),
+    ("cnn", "x[i] < 0.0f ? 0.0f : x[i]", "x[i]"),
+    ("cnn", "row * stride + k / (stride * c)", "row * stride + k % stride"),
+    ("cnn", "y[i] < 0.0f ? 0.0f : y[i]", "y[i]"),
+    ("both", "column * stride + k / c % stride - left", "column * stride + k / c % stride"),
+    ("both", "v * w + u", "v * h + u"),
+    ("both", "x[4 * i + j]", "x[4 * i + 2 - j]"),
+    ("both", "y[i * stride + j] = x[i * n + j]", "y[i + j * rows] = x[i * n + j]; (void)stride"),
+]
+
+
+@needs_cc
+@pytest.mark.parametrize(("kind", "text", "mistake"), MISTAKES)
+def test_the_comparison_sees_a_mistake(kind, text, mistake, tmp_path):
+    env, policy, inputs, expected = made(kind)
+    (one,) = save(policy, env, "c", tmp_path)
+    right = one.files[0].read_text()
+    assert text in right
+    one.files[0].write_text(right.replace(text, mistake))
+    actions = exported.actions_of_c(one.files[0], inputs, env.action_size, warn=False)
+    assert not difference(np.nan_to_num(actions), expected) < DIFFERENT
+
+
+@pytest.mark.slow
+@needs_cc
+def test_a_policy_in_c_flies_as_well_as_the_policy(tmp_path):
+    from jaxdrones.learning import bptt, evaluate
+    from jaxdrones.training.presets import preset
+
+    env, config = preset("hover", "bptt")
+    policy = bptt.train(jax.random.key(0), env, config).policy
+    (one,) = save(policy, env, "c", tmp_path)
+    library = exported.compiled_c(one.files[0])
+
+    def act(obs):
+        rows = np.asarray(obs).reshape(1, -1, env.observation_size)
+        return exported.run_c(library, {"obs": rows}, env.action_size).reshape(*obs.shape[:-1], env.action_size)
+
+    def in_c(obs):
+        shape = jax.ShapeDtypeStruct((*obs.shape[:-1], env.action_size), np.float32)
+        return jax.pure_callback(act, shape, obs, vmap_method="expand_dims")
+
+    assert isinstance(policy, Policy)
+    reports = [evaluate(env, one, jax.random.key(1), episodes=1000) for one in (policy, in_c)]
+    assert reports[0].success > 0.9
+    assert abs(reports[0].success - reports[1].success) <= 0.005
+    assert abs(reports[0].rms_error - reports[1].rms_error) < 1e-3  # m

@@ -1,0 +1,174 @@
+"""Policies with random weights, and programs that run what is exported of them."""
+
+import ctypes
+import json
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdrones.learning.layers import make_network
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import RunningStatistics
+
+COMPILE = ("cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-O2", "-shared", "-fPIC")
+STEPS, DRONES = 6, 16  # of the sequences with which programs are compared
+
+_DRIVER = """
+#include "NAME.h"
+void run(int steps, int drones, ARGUMENTS float *act);
+void run(int steps, int drones, ARGUMENTS float *act)
+{
+    for (int i = 0; i < drones; ++i) {
+        SETUP
+        for (int t = 0; t < steps; ++t) {
+            const int k = t * drones + i;
+            NAME_step(INPUTS act + k * UPPER_ACT_SIZE);
+        }
+    }
+}
+"""
+_NODE = """
+import * as policy from "PATH";
+let text = "";
+for await (const part of process.stdin) text += part;
+const inputs = JSON.parse(text, (_, x) => (x === null ? Infinity : x));
+const act = inputs.obs.map((rows) => rows.map(() => null));
+for (let i = 0; i < inputs.obs[0].length; ++i) {
+  const hidden = policy.initialHiddenState ? [policy.initialHiddenState()] : [];
+  for (let t = 0; t < inputs.obs.length; ++t) {
+    act[t][i] = Array.from(policy.step(...Object.values(inputs).map((x) => x[t][i]), ...hidden));
+  }
+}
+console.log(JSON.stringify(act));
+"""
+
+
+def random_policy(env, hidden_sizes=(9, 7), recurrent_size=0, activation="tanh", per_agent=False, seed=0) -> Policy:
+    """Policy with random weights and statistics, whose actions are neither near zero nor saturated."""
+    rng = np.random.default_rng(seed)
+    obs = {"state": jnp.zeros(env.observation_size)}
+    obs |= {name: jnp.zeros(space.shape, space.dtype) for name, space in env.image_spaces.items()}
+    obs = obs if env.image_spaces else obs["state"]
+    network = make_network(obs, hidden_sizes, env.action_size, 1.0, recurrent_size).clone(activation=activation)
+    shapes = jax.eval_shape(network.init, jax.random.key(0), obs)
+    team = (env.drones,) if per_agent else ()
+
+    def weights(shape):
+        fan_in = shape.shape[0] if shape.ndim > 1 else 4
+        return jnp.asarray(rng.normal(size=team + shape.shape) / np.sqrt(fan_in), jnp.float32)
+
+    mean, var = rng.normal(size=env.observation_size), rng.uniform(0.0, 2.0, env.observation_size)
+    var[0] = 1e-9  # below the lower bound
+    stats = RunningStatistics(jnp.asarray(mean, jnp.float32), jnp.asarray(var, jnp.float32), jnp.float32(100))
+    return Policy(jax.tree.map(weights, shapes), stats, network, per_agent)
+
+
+def random_inputs(env, seed=1) -> dict[str, np.ndarray]:
+    """Observations (steps, drones, d) and images of many drones; some entries are far from the mean."""
+    rng = np.random.default_rng(seed)
+    obs = rng.normal(size=(STEPS, DRONES, env.observation_size))
+    obs[:, ::3, ::4] *= 20
+    inputs = {"obs": obs.astype(np.float32)}
+    for name, space in sorted(env.image_spaces.items()):
+        shape = (STEPS, DRONES, *space.shape)
+        inputs[name] = rng.uniform(-0.1, 8, shape) if name == "depth" else rng.integers(0, 256, shape)
+        inputs[name] = inputs[name].astype(space.dtype)
+    if "depth" in inputs:
+        inputs["depth"][0, 0, 0] = np.inf
+    return inputs
+
+
+def expected_actions(policy: Policy, inputs: dict[str, np.ndarray]) -> np.ndarray:
+    """Actions (steps, drones, a) of `Policy.act`, one observation after the other."""
+    hidden_state = policy.initial_hidden_state((inputs["obs"].shape[1],))
+    act, actions = jax.jit(policy.act), []
+    for t in range(len(inputs["obs"])):
+        obs = {"state" if name == "obs" else name: jnp.asarray(x[t]) for name, x in inputs.items()}
+        hidden_state, action = act(hidden_state, obs if len(obs) > 1 else obs["state"])
+        actions.append(np.asarray(action))
+    return np.stack(actions)
+
+
+def compiled_c(header: Path, warn: bool = True) -> ctypes.CDLL:
+    """Library of a header, with the function `run(steps, drones, inputs..., act)`; warnings are errors or ignored."""
+    name = header.stem
+    defined = {
+        line.split()[1]: int(line.split()[2])
+        for line in header.read_text().splitlines()
+        if "_SIZE " in line and line.startswith("#define")
+    }
+    inputs = [key.removeprefix(f"{name.upper()}_").removesuffix("_SIZE").lower() for key in defined]
+    inputs = [x for x in inputs if x not in ("act", "hidden")]
+    hidden = f"{name.upper()}_HIDDEN_SIZE" in defined
+    kinds = {x: "const uint8_t" if x == "rgb" else "const float" for x in inputs}
+    texts = {
+        "ARGUMENTS": " ".join(f"{kind} *{x}," for x, kind in kinds.items()),
+        "SETUP": f"float hidden[{name.upper()}_HIDDEN_SIZE]; {name}_reset(hidden);" if hidden else "",
+        "INPUTS": "".join(f"{x} + k * UPPER_{x.upper()}_SIZE, " for x in inputs) + "hidden, " * hidden,
+    }
+    driver = _DRIVER
+    for key, text in texts.items():
+        driver = driver.replace(key, text)
+    source, library = header.with_suffix(".c"), header.with_suffix(".so")
+    source.write_text(driver.replace("NAME", name).replace("UPPER", name.upper()))
+    command = COMPILE if warn else (*COMPILE, "-w", "-O0")
+    subprocess.run([*command, str(source), "-o", str(library), "-lm"], check=True)
+    return ctypes.CDLL(str(library))
+
+
+def run_c(library: ctypes.CDLL, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
+    """Actions (steps, drones, a) of a library of `compiled_c`."""
+    act = np.empty((*inputs["obs"].shape[:2], action_size), np.float32)
+    arrays = [np.ascontiguousarray(x) for x in inputs.values()]
+    library.run(*act.shape[:2], *(x.ctypes.data_as(ctypes.c_void_p) for x in (*arrays, act)))
+    return act
+
+
+def actions_of_c(file: Path, inputs: dict[str, np.ndarray], action_size: int, warn: bool = True) -> np.ndarray:
+    return run_c(compiled_c(file, warn), inputs, action_size)
+
+
+def actions_of_js(file: Path, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
+    """Actions in Node.js; JSON has no infinity, which is sent as null."""
+    lists = {name: x.reshape(*x.shape[:2], -1).tolist() for name, x in inputs.items()}
+    text = json.dumps(lists).replace("Infinity", "null")
+    code = _NODE.replace("PATH", file.absolute().as_uri())
+    command = ["node", "--input-type=module", "-e", code]
+    done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)
+    return np.array(json.loads(done.stdout), np.float32)
+
+
+def actions_of_onnx(file: Path, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    sizes = {x.name: x.shape[1:] for x in session.get_inputs()}
+    state = {name: np.zeros((DRONES, *size), np.float32) for name, size in sizes.items() if name == "hidden_state"}
+    actions = []
+    for t in range(len(inputs["obs"])):
+        action, *next_state = session.run(None, {name: x[t] for name, x in inputs.items()} | state)
+        state = dict(zip(state, next_state, strict=True))
+        actions.append(action)
+    return np.stack(actions)
+
+
+def actions_of_stablehlo(file: Path, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
+    exported = jax.export.deserialize(bytearray(file.read_bytes()))
+    (arguments, _) = jax.tree.unflatten(exported.in_tree, exported.in_avals)
+    state = [np.zeros((DRONES, *x.shape[1:]), np.float32) for x in arguments[len(inputs) :]]
+    actions = []
+    for t in range(len(inputs["obs"])):
+        action = exported.call(*(x[t] for x in inputs.values()), *state)
+        if state:
+            action, *state = action
+        actions.append(np.asarray(action))
+    return np.stack(actions)
+
+
+RUN = {"c": actions_of_c, "js": actions_of_js, "onnx": actions_of_onnx, "stablehlo": actions_of_stablehlo}
+SUFFIX = {"c": "h", "js": "js", "onnx": "onnx", "stablehlo": "stablehlo"}

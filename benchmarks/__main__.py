@@ -13,7 +13,18 @@ from pathlib import Path
 
 from benchmarks.common import about
 
-HELPERS = ("__init__", "__main__", "against", "cameras_scenes", "common", "programs", "published", "server", "tables")
+HELPERS = (
+    "__init__",
+    "__main__",
+    "against",
+    "cameras_scenes",
+    "common",
+    "exported",
+    "programs",
+    "published",
+    "server",
+    "tables",
+)
 NAMES = sorted(path.stem for path in Path(__file__).parent.glob("*.py") if path.stem not in HELPERS)
 
 

@@ -153,6 +153,16 @@ def test_learning_reports_every_seed():
 
 @pytest.mark.needs("pybullet")
 @pytest.mark.slow
+@pytest.mark.needs("onnx", "onnxruntime", "flatbuffers")
+@pytest.mark.skipif(not (shutil.which("cc") and shutil.which("node")), reason="cc or node is not installed")
+def test_export_reports_costs_differences_and_success():
+    rows = quick("export")["rows"]
+    assert [row["task"] for row in rows] == ["hover", "recovery", "forest, untrained"]
+    assert all(max(row["differences"].values()) < 1e-4 and row["code"] > 100 for row in rows)
+    assert all(row["success"][0] == row["success"][1] for row in rows[:2])
+
+
+@pytest.mark.slow
 def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_path):
     result = quick("accelerator", "--output", str(tmp_path / "result.json"))
     assert not result["stopped"] and {row["section"] for row in result["rows"]} == SECTIONS

@@ -37,6 +37,7 @@ def add(commands) -> None:
     add_realistic(own)
     add_set(own, "option of the environment (action, observation, ...)")
     add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
+    parser.add_argument("--name", default="policy", help="name of the files, and prefix of the names in C (policy)")
     parser.add_argument("--last", action="store_true", help="the newest policy of the run instead of the best")
     add_json(parser)
     parser.set_defaults(run=_export)
@@ -56,7 +57,7 @@ def _export(options: argparse.Namespace) -> int:
         title, place = f"{described(recipe)}, policy of update {update}", options.policy / "export"
     with recipe.env() as env:
         policy = run.policy(env) if is_user_policy(options.policy) else run.policy(name, env)
-        exported = save(policy, env, options.to, options.output or place, title=title)
+        exported = save(policy, env, options.to, options.output or place, options.name, title)
     if options.json:
         about: dict[str, Any] = {"policy": str(options.policy), "to": options.to}
         files = [vars(x) | {"files": [*map(str, x.files)]} for x in exported]

@@ -6,7 +6,6 @@ import shutil
 import sys
 from pathlib import Path
 
-import exported
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
+from benchmarks import exported
 from jaxdrones.cli import main
 from jaxdrones.export import TARGETS, save
 from jaxdrones.learning import OwnNetwork
@@ -69,10 +69,10 @@ def test_the_command_writes_the_best_policy_into_the_folder_of_the_run(run, caps
     assert "hover by bptt, policy of update 3" in said and f"wrote {run}/export/policy.h" in said
     assert "311 multiply-adds, 1,412 bytes of weights (flash), 124 bytes of RAM" in said
     best = (run / "export" / "policy.h").read_text()
-    assert main(["export", str(run), "--to", "c", "--last", "--output", str(run / "last"), "--json"]) == 0
+    assert main(["export", str(run), "--to", "c", "--last", "-o", str(run / "last"), "--json", "--name", "hover"]) == 0
     (one,) = json.loads(capsys.readouterr().out)["exported"]
-    assert one["files"] == [f"{run}/last/policy.h"] and one["flash"] == 1412
-    assert (run / "last" / "policy.h").read_text() != best
+    assert one["files"] == [f"{run}/last/hover.h"] and one["flash"] == 1412
+    assert (run / "last" / "hover.h").read_text().replace("hover_", "policy_") != best
 
 
 def test_costs_are_those_of_the_layers(env, tmp_path):
@@ -138,7 +138,7 @@ def test_a_network_of_a_user_leaves_as_stablehlo(library, env, tmp_path):
     policy, inputs = own_policy(env, module), exported.random_inputs(env)
     (one,) = save(policy, env, "stablehlo", tmp_path)
     assert one.multiply_adds is None
-    actions = exported.actions_of_stablehlo(one.files[0], inputs, 4)
+    actions = exported.actions_of_stablehlo(one.files[0], inputs)
     np.testing.assert_allclose(actions, exported.expected_actions(policy, inputs), atol=1e-6)
     for to in TARGETS.keys() - {"stablehlo"}:
         with pytest.raises(ValueError, match=r"a network of your own, \w+, whose layers are unknown; give --to stabl"):

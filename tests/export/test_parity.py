@@ -1,17 +1,19 @@
 """What is exported computes the actions of `Policy.act`, in C, ONNX Runtime, Node.js and by `jax.export`."""
 
+import dataclasses
 import functools
 import importlib.util
 import shutil
 
-import exported
 import jax
 import numpy as np
 import pytest
 
 import jaxdrones as jd
+from benchmarks import exported
 from jaxdrones.export import save
-from jaxdrones.learning.networks import Policy
+from jaxdrones.learning import bptt, evaluate
+from jaxdrones.training.presets import preset
 
 pytestmark = pytest.mark.float32
 
@@ -59,7 +61,7 @@ def test_what_is_exported_acts_as_the_policy(kind, to, tmp_path):
     assert 0.1 < np.abs(expected).mean() < 0.95  # where a difference is seen
     (one,) = save(policy, env, to, tmp_path)
     assert one.files[0] == tmp_path / f"policy.{exported.SUFFIX[to]}"
-    assert difference(exported.RUN[to](one.files[0], inputs, env.action_size), expected) < TOLERANCE
+    assert difference(exported.RUN[to](one.files[0], inputs), expected) < TOLERANCE
 
 
 @pytest.mark.parametrize("to", TARGETS)
@@ -71,7 +73,7 @@ def test_drones_with_their_own_networks_have_a_file_each(to, tmp_path):
     seen = np.stack([inputs["obs"]] * 2, axis=-2)  # the same by both
     both = jax.jit(policy.act)(None, seen)[1]
     for i, one in enumerate(results):
-        actions = exported.RUN[to](one.files[0], inputs, env.action_size)
+        actions = exported.RUN[to](one.files[0], inputs)
         assert difference(actions, np.asarray(both[..., i, :])) < TOLERANCE
         assert difference(actions, np.asarray(both[..., 1 - i, :])) > DIFFERENT
 
@@ -94,7 +96,7 @@ def flown() -> dict[str, np.ndarray]:
 def test_what_is_exported_acts_as_the_policy_in_flight(to, tmp_path):
     (env, policy, *_), inputs = made("mlp"), flown()
     (one,) = save(policy, env, to, tmp_path)
-    actions = exported.RUN[to](one.files[0], inputs, env.action_size)
+    actions = exported.RUN[to](one.files[0], inputs)
     assert difference(actions, exported.expected_actions(policy, inputs)) < TOLERANCE
 
 
@@ -130,31 +132,20 @@ def test_the_comparison_sees_a_mistake(kind, text, mistake, tmp_path):
     right = one.files[0].read_text()
     assert text in right
     one.files[0].write_text(right.replace(text, mistake))
-    actions = exported.actions_of_c(one.files[0], inputs, env.action_size, warn=False)
+    actions = exported.actions_of_c(one.files[0], inputs, warn=False)
     assert not difference(np.nan_to_num(actions), expected) < DIFFERENT
 
 
 @pytest.mark.slow
 @needs_cc
-def test_a_policy_in_c_flies_as_well_as_the_policy(tmp_path):
-    from jaxdrones.learning import bptt, evaluate
-    from jaxdrones.training.presets import preset
-
-    env, config = preset("hover", "bptt")
-    policy = bptt.train(jax.random.key(0), env, config).policy
+@pytest.mark.parametrize(("task", "settings"), [("hover", {}), ("recovery", {"recurrent_size": 16, "updates": 100})])
+def test_a_policy_in_c_flies_as_well_as_the_policy(task, settings, tmp_path):
+    env, config = preset(task, "bptt")
+    policy = bptt.train(jax.random.key(0), env, dataclasses.replace(config, **settings)).policy
     (one,) = save(policy, env, "c", tmp_path)
-    library = exported.compiled_c(one.files[0])
-
-    def act(obs):
-        rows = np.asarray(obs).reshape(1, -1, env.observation_size)
-        return exported.run_c(library, {"obs": rows}, env.action_size).reshape(*obs.shape[:-1], env.action_size)
-
-    def in_c(obs):
-        shape = jax.ShapeDtypeStruct((*obs.shape[:-1], env.action_size), np.float32)
-        return jax.pure_callback(act, shape, obs, vmap_method="expand_dims")
-
-    assert isinstance(policy, Policy)
-    reports = [evaluate(env, one, jax.random.key(1), episodes=1000) for one in (policy, in_c)]
+    in_c = exported.CompiledPolicy(one.files[0])
+    assert not in_c.reset(1).any() or not settings
+    reports = [evaluate(env, each, jax.random.key(1), episodes=1000) for each in (policy, in_c)]
     assert reports[0].success > 0.9
     assert abs(reports[0].success - reports[1].success) <= 0.005
     assert abs(reports[0].rms_error - reports[1].rms_error) < 1e-3  # m

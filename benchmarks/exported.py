@@ -2,8 +2,11 @@
 
 import ctypes
 import json
+import math
+import re
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,21 +16,25 @@ from jaxdrones.learning.layers import make_network
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
 
-COMPILE = ("cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-O2", "-shared", "-fPIC")
+COMPILE = ("cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-O2")
 STEPS, DRONES = 6, 16  # of the sequences with which programs are compared
 
 _DRIVER = """
 #include "NAME.h"
-void run(int steps, int drones, ARGUMENTS float *act);
-void run(int steps, int drones, ARGUMENTS float *act)
+void reset(float *hidden);
+void reset(float *hidden)
 {
-    for (int i = 0; i < drones; ++i) {
-        SETUP
-        for (int t = 0; t < steps; ++t) {
+    RESET;
+}
+void run(int steps, int drones, INPUTS, float *act);
+void run(int steps, int drones, INPUTS, float *act)
+{
+    (void)hidden;
+    for (int t = 0; t < steps; ++t)
+        for (int i = 0; i < drones; ++i) {
             const int k = t * drones + i;
-            NAME_step(INPUTS act + k * UPPER_ACT_SIZE);
+            NAME_step(ADVANCE);
         }
-    }
 }
 """
 _NODE = """
@@ -92,46 +99,79 @@ def expected_actions(policy: Policy, inputs: dict[str, np.ndarray]) -> np.ndarra
     return np.stack(actions)
 
 
-def compiled_c(header: Path, warn: bool = True) -> ctypes.CDLL:
-    """Library of a header, with the function `run(steps, drones, inputs..., act)`; warnings are errors or ignored."""
-    name = header.stem
-    defined = {
-        line.split()[1]: int(line.split()[2])
-        for line in header.read_text().splitlines()
-        if "_SIZE " in line and line.startswith("#define")
-    }
-    inputs = [key.removeprefix(f"{name.upper()}_").removesuffix("_SIZE").lower() for key in defined]
-    inputs = [x for x in inputs if x not in ("act", "hidden")]
-    hidden = f"{name.upper()}_HIDDEN_SIZE" in defined
-    kinds = {x: "const uint8_t" if x == "rgb" else "const float" for x in inputs}
-    texts = {
-        "ARGUMENTS": " ".join(f"{kind} *{x}," for x, kind in kinds.items()),
-        "SETUP": f"float hidden[{name.upper()}_HIDDEN_SIZE]; {name}_reset(hidden);" if hidden else "",
-        "INPUTS": "".join(f"{x} + k * UPPER_{x.upper()}_SIZE, " for x in inputs) + "hidden, " * hidden,
-    }
-    driver = _DRIVER
-    for key, text in texts.items():
-        driver = driver.replace(key, text)
-    source, library = header.with_suffix(".c"), header.with_suffix(".so")
-    source.write_text(driver.replace("NAME", name).replace("UPPER", name.upper()))
-    command = COMPILE if warn else (*COMPILE, "-w", "-O0")
-    subprocess.run([*command, str(source), "-o", str(library), "-lm"], check=True)
-    return ctypes.CDLL(str(library))
+class CompiledPolicy:
+    """Policy of a C header, called in a library; also a recurrent policy for `jaxdrones.learning.evaluate`."""
+
+    def __init__(self, header: Path, warn: bool = True):
+        """Compile a header; warnings are errors, or else ignored."""
+        name = header.stem
+        defined = re.findall(rf"#define {name.upper()}_(\w+)_SIZE (\d+)", header.read_text())
+        self.sizes = {key.lower(): int(size) for key, size in defined}
+        self.action_size, self.hidden_size = self.sizes.pop("act"), self.sizes.pop("hidden", 0)
+        kinds = {key: "const uint8_t" if key == "rgb" else "const float" for key in self.sizes}
+        advance = [f"{key} + k * {size}" for key, size in self.sizes.items()]
+        advance += [f"hidden + i * {self.hidden_size}"] * (self.hidden_size > 0) + [f"act + k * {self.action_size}"]
+        texts = {
+            "INPUTS": "".join(f"{kind} *{key}, " for key, kind in kinds.items()) + "float *hidden",
+            "ADVANCE": ", ".join(advance),
+            "RESET": f"{name}_reset(hidden)" if self.hidden_size else "(void)hidden",
+            "NAME": name,
+        }
+        driver = _DRIVER
+        for key, text in texts.items():
+            driver = driver.replace(key, text)
+        source, library = header.with_suffix(".c"), header.with_suffix(".so")
+        source.write_text(driver)
+        command = COMPILE if warn else (*COMPILE, "-w", "-O0")
+        subprocess.run([*command, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"], check=True)
+        self.library = ctypes.CDLL(str(library))
+
+    def reset(self, drones: int) -> np.ndarray:
+        """Hidden states (drones, size) at the start of flights."""
+        one = np.full(max(1, self.hidden_size), np.nan, np.float32)
+        self.library.reset(_address(one))
+        return np.tile(one, (drones, 1))
+
+    def run(self, inputs: dict[str, np.ndarray], hidden: np.ndarray) -> np.ndarray:
+        """Actions (steps, drones, a) of inputs (steps, drones, ...); changes the hidden states."""
+        steps, drones = inputs["obs"].shape[:2]
+        act = np.empty((steps, drones, self.action_size), np.float32)
+        arrays = [np.ascontiguousarray(inputs[key]) for key in self.sizes]
+        self.library.run(steps, drones, *map(_address, (*arrays, hidden, act)))
+        return act
+
+    def initial_hidden_state(self, batch: tuple[int, ...]) -> jax.Array:
+        """Zeros."""
+        return jnp.zeros((*batch, max(1, self.hidden_size)), jnp.float32)
+
+    def act(self, hidden_state: jax.Array, obs: Any) -> tuple[jax.Array, jax.Array]:
+        """Hidden states and actions of the drones of a team, or of many teams."""
+
+        def host(hidden_state: Any, obs: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+            shape, hidden = np.shape(hidden_state)[:-1], np.array(hidden_state, np.float32)
+            rows = {
+                key: np.asarray(x).reshape(1, math.prod(shape), *np.shape(x)[len(shape) :]) for key, x in obs.items()
+            }
+            return hidden, self.run(rows, hidden).reshape(*shape, self.action_size)
+
+        named = (
+            {"obs" if key == "state" else key: x for key, x in obs.items()} if isinstance(obs, dict) else {"obs": obs}
+        )
+        action = jax.ShapeDtypeStruct((*hidden_state.shape[:-1], self.action_size), jnp.float32)
+        state = jax.ShapeDtypeStruct(hidden_state.shape, hidden_state.dtype)
+        return jax.pure_callback(host, (state, action), hidden_state, named, vmap_method="broadcast_all")
 
 
-def run_c(library: ctypes.CDLL, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
-    """Actions (steps, drones, a) of a library of `compiled_c`."""
-    act = np.empty((*inputs["obs"].shape[:2], action_size), np.float32)
-    arrays = [np.ascontiguousarray(x) for x in inputs.values()]
-    library.run(*act.shape[:2], *(x.ctypes.data_as(ctypes.c_void_p) for x in (*arrays, act)))
-    return act
+def _address(array: np.ndarray) -> ctypes.c_void_p:
+    return array.ctypes.data_as(ctypes.c_void_p)
 
 
-def actions_of_c(file: Path, inputs: dict[str, np.ndarray], action_size: int, warn: bool = True) -> np.ndarray:
-    return run_c(compiled_c(file, warn), inputs, action_size)
+def actions_of_c(file: Path, inputs: dict[str, np.ndarray], warn: bool = True) -> np.ndarray:
+    policy = CompiledPolicy(file, warn)
+    return policy.run(inputs, policy.reset(inputs["obs"].shape[1]))
 
 
-def actions_of_js(file: Path, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
+def actions_of_js(file: Path, inputs: dict[str, np.ndarray]) -> np.ndarray:
     """Actions in Node.js; JSON has no infinity, which is sent as null."""
     lists = {name: x.reshape(*x.shape[:2], -1).tolist() for name, x in inputs.items()}
     text = json.dumps(lists).replace("Infinity", "null")
@@ -141,14 +181,18 @@ def actions_of_js(file: Path, inputs: dict[str, np.ndarray], action_size: int) -
     return np.array(json.loads(done.stdout), np.float32)
 
 
-def actions_of_onnx(file: Path, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
+def actions_of_onnx(file: Path, inputs: dict[str, np.ndarray]) -> np.ndarray:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
     sizes = {x.name: x.shape[1:] for x in session.get_inputs()}
-    state = {name: np.zeros((DRONES, *size), np.float32) for name, size in sizes.items() if name == "hidden_state"}
+    state = {
+        name: np.zeros((inputs["obs"].shape[1], *size), np.float32)
+        for name, size in sizes.items()
+        if name == "hidden_state"
+    }
     actions = []
     for t in range(len(inputs["obs"])):
         action, *next_state = session.run(None, {name: x[t] for name, x in inputs.items()} | state)
@@ -157,10 +201,10 @@ def actions_of_onnx(file: Path, inputs: dict[str, np.ndarray], action_size: int)
     return np.stack(actions)
 
 
-def actions_of_stablehlo(file: Path, inputs: dict[str, np.ndarray], action_size: int) -> np.ndarray:
+def actions_of_stablehlo(file: Path, inputs: dict[str, np.ndarray]) -> np.ndarray:
     exported = jax.export.deserialize(bytearray(file.read_bytes()))
     (arguments, _) = jax.tree.unflatten(exported.in_tree, exported.in_avals)
-    state = [np.zeros((DRONES, *x.shape[1:]), np.float32) for x in arguments[len(inputs) :]]
+    state = [np.zeros((inputs["obs"].shape[1], *x.shape[1:]), np.float32) for x in arguments[len(inputs) :]]
     actions = []
     for t in range(len(inputs["obs"])):
         action = exported.call(*(x[t] for x in inputs.values()), *state)

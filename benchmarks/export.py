@@ -1,0 +1,128 @@
+"""How far is an exported policy from the policy, what does a call cost, and does it fly as well?
+
+Policies of bptt are compared on what they observe in 16 of their flights, an untrained one with a camera on random
+observations; the hidden state of a recurrent policy is kept for the whole flight. The difference is the largest of any
+action, whose range is -1 to 1; that of float64 is the rounding of the policy itself. The code is what `cc -Os` makes of
+the functions without the weights, and a call in C is timed on this machine. Whole evaluations are flown by the policy
+and by its C.
+"""
+
+import argparse
+import dataclasses
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import exported
+from jaxdrones.envs import Env
+from jaxdrones.export import Exported, save
+from jaxdrones.learning import bptt, evaluate
+from jaxdrones.learning.networks import Policy
+from jaxdrones.training.presets import preset
+
+TRAINED = {"hover": {}, "recovery": {"recurrent_size": 32}}
+NAMES = {"c": "C", "js": "JavaScript", "onnx": "ONNX", "stablehlo": "StableHLO", "float64": "float64"}
+QUICK = {"updates": 2, "worlds": 4, "horizon": 4}
+_FLIGHTS, _CALLS = 16, 20_000
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--episodes", type=int, default=1000, help="of an evaluation (1000)")
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
+    rows = []
+    for task, settings in TRAINED.items():
+        env, config = preset(task, "bptt")
+        config = dataclasses.replace(config, **settings | (QUICK if options.quick else {}))
+        policy = bptt.train(jax.random.key(0), env, config).policy
+        rows.append({"task": task} | row(env, policy, flown(env, policy), 10 if options.quick else options.episodes))
+    env, config = preset("forest", "bptt")
+    policy = exported.random_policy(env, config.hidden_sizes)
+    rows.append({"task": "forest, untrained"} | row(env, policy, exported.random_inputs(env)))
+    return {"rows": rows}, [line for each in rows for line in text(each)]
+
+
+def row(env: Env, policy: Policy, inputs: dict[str, np.ndarray], episodes: int = 0) -> dict:
+    """Costs and differences of one policy, and with `episodes` the success of both."""
+    expected = exported.expected_actions(policy, inputs)
+    with tempfile.TemporaryDirectory() as folder:
+        files: dict[str, Exported] = {to: save(policy, env, to, folder)[0] for to in exported.RUN}
+        found = {to: exported.RUN[to](one.files[0], inputs) for to, one in files.items()}
+        in_c = exported.CompiledPolicy(files["c"].files[0])
+        code = code_size(files["c"].files[0])
+    costs = {name: getattr(files["c"], name) for name in ("multiply_adds", "flash", "ram")}
+    result = costs | {"code": code, "observations": inputs["obs"].shape[0] * inputs["obs"].shape[1]}
+    found["float64"] = in_float64(policy, inputs)
+    result["differences"] = {to: float(np.abs(actions - expected).max()) for to, actions in found.items()}
+    result["microseconds"] = microseconds(in_c, inputs)
+    if episodes:
+        result["episodes"] = episodes
+        reports = [evaluate(env, each, jax.random.key(1), episodes) for each in (policy, in_c)]
+        result["success"] = [report.success for report in reports]
+    return result
+
+
+def in_float64(policy: Policy, inputs: dict[str, np.ndarray]) -> np.ndarray:
+    """Actions of the policy in float64."""
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float64), policy)
+        floats = {name: x if x.dtype == np.uint8 else x.astype(np.float64) for name, x in inputs.items()}
+        return exported.expected_actions(wide, floats)
+
+
+def flown(env: Env, policy: Policy) -> dict[str, np.ndarray]:
+    """Observations (steps, flights, d) of flights by a policy."""
+
+    def flight(key: jax.Array) -> jax.Array:
+        def control_step(carry, key):
+            hidden_state, obs, world = carry
+            hidden_state, action = policy.act(hidden_state, obs)
+            return (hidden_state, *env.step(key, world, action)[:2]), obs[0]
+
+        start, *keys = jax.random.split(key, 1 + env.steps)
+        carry = (policy.initial_hidden_state((env.drones,)), *env.reset(start))
+        return jax.lax.scan(control_step, carry, jnp.stack(keys))[1]
+
+    obs = jax.jit(jax.vmap(flight))(jax.random.split(jax.random.key(2), _FLIGHTS))
+    return {"obs": np.ascontiguousarray(np.moveaxis(np.asarray(obs), 0, 1))}
+
+
+def microseconds(policy: exported.CompiledPolicy, inputs: dict[str, np.ndarray]) -> float:
+    """Duration of a call in C, the best of three runs."""
+    calls = inputs["obs"].shape[0] * inputs["obs"].shape[1]
+    repeats, times = max(1, _CALLS // calls), []
+    for _ in range(3):
+        hidden, start = policy.reset(inputs["obs"].shape[1]), time.perf_counter()
+        for _ in range(repeats):
+            policy.run(inputs, hidden)
+        times.append((time.perf_counter() - start) / repeats / calls)
+    return 1e6 * min(times)
+
+
+def code_size(header: Path) -> int:
+    """Bytes of machine code that the compiler makes of a header, from its symbols."""
+    source, made = header.with_name("size.c"), header.with_name("size.o")
+    lines = ["void *used(void);", "void *used(void) {", f"    return (void *){header.stem}_step;", "}"]
+    source.write_text("\n".join([f'#include "{header.name}"', *lines, ""]))
+    subprocess.run(["cc", "-std=c99", "-Os", "-c", str(source), "-o", str(made)], check=True)
+    done = subprocess.run(["nm", "--size-sort", "-t", "d", str(made)], capture_output=True, text=True, check=True)
+    return sum(
+        int(size) for size, kind, name in map(str.split, done.stdout.splitlines()) if kind in "tT" and name != "used"
+    )
+
+
+def text(row: dict) -> list[str]:
+    lines = [f"{row['task']}: {row['multiply_adds']:,} multiply-adds, {row['microseconds']:.1f} us per call in C"]
+    lines.append(f"  bytes: {row['flash']:,} of weights, {row['code']:,} of code, {row['ram']:,} of RAM")
+    worst = ", ".join(f"{NAMES[to]} {x:.1e}" for to, x in row["differences"].items())
+    lines.append(f"  largest difference over {row['observations']:,} observations: {worst}")
+    if "success" in row:
+        policy, in_c = (f"{100 * x:.1f} %" for x in row["success"])
+        lines.append(f"  success over {row['episodes']:,} episodes: {policy}, in C {in_c}")
+    return lines

@@ -58,6 +58,8 @@ def row(env: Env, policy: Policy, inputs: dict[str, np.ndarray], episodes: int =
         code = code_size(files["c"].files[0])
     costs = {name: getattr(files["c"], name) for name in ("multiply_adds", "flash", "ram")}
     result = costs | {"code": code, "observations": inputs["obs"].shape[0] * inputs["obs"].shape[1]}
+    if policy.is_recurrent:
+        result["one call"] = one_call(policy, in_c, inputs)
     found["float64"] = in_float64(policy, inputs)
     result["differences"] = {to: float(np.abs(actions - expected).max()) for to, actions in found.items()}
     result["microseconds"] = microseconds(in_c, inputs)
@@ -66,6 +68,16 @@ def row(env: Env, policy: Policy, inputs: dict[str, np.ndarray], episodes: int =
         reports = [evaluate(env, each, jax.random.key(1), episodes) for each in (policy, in_c)]
         result["success"] = [report.success for report in reports]
     return result
+
+
+def one_call(policy: Policy, in_c: exported.CompiledPolicy, inputs: dict[str, np.ndarray]) -> float:
+    """Largest difference of any action in C, if every call starts from the hidden state of the policy."""
+    act, hidden_state, worst = jax.jit(policy.act), policy.initial_hidden_state((inputs["obs"].shape[1],)), 0.0
+    for obs in inputs["obs"]:
+        actions = in_c.run({"obs": obs[None]}, np.array(hidden_state))[0]
+        hidden_state, expected = act(hidden_state, obs)
+        worst = max(worst, float(np.abs(actions - expected).max()))
+    return worst
 
 
 def in_float64(policy: Policy, inputs: dict[str, np.ndarray]) -> np.ndarray:
@@ -122,6 +134,10 @@ def text(row: dict) -> list[str]:
     lines.append(f"  bytes: {row['flash']:,} of weights, {row['code']:,} of code, {row['ram']:,} of RAM")
     worst = ", ".join(f"{NAMES[to]} {x:.1e}" for to, x in row["differences"].items())
     lines.append(f"  largest difference over {row['observations']:,} observations: {worst}")
+    if "one call" in row:
+        lines.append(
+            f"  largest difference if every call in C starts from the policy's hidden state: {row['one call']:.1e}"
+        )
     if "success" in row:
         policy, in_c = (f"{100 * x:.1f} %" for x in row["success"])
         lines.append(f"  success over {row['episodes']:,} episodes: {policy}, in C {in_c}")

@@ -65,7 +65,7 @@ def random_policy(env, hidden_sizes=(9, 7), recurrent_size=0, activation="tanh",
 
     def weights(shape):
         fan_in = shape.shape[0] if shape.ndim > 1 else 4
-        return jnp.asarray(rng.normal(size=team + shape.shape) / np.sqrt(fan_in), jnp.float32)
+        return jnp.asarray(rng.normal(size=team + shape.shape) * 0.7 / np.sqrt(fan_in), jnp.float32)
 
     mean, var = rng.normal(size=env.observation_size), rng.uniform(0.0, 2.0, env.observation_size)
     var[0] = 1e-9  # below the lower bound

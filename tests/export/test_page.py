@@ -22,7 +22,8 @@ SHORT = "--set worlds=8 --set horizon=4 --budget 2 --episodes 8 --no-figure"
 def test_what_is_on_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in blocks(PAGE, "text"):
-        Path(re.match(r"(?:/\*|//) ([\w.]+)", block.code)[1]).write_text(block.code)
+        if name := re.match(r"(?:/\*|//) ([\w.]+)", block.code):
+            Path(name[1]).write_text(block.code)
     printed = []
     for line in (line for block in blocks(PAGE, "sh") for line in block.code.splitlines()):
         if line.startswith("jaxdrones "):

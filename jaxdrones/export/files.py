@@ -67,10 +67,11 @@ def save(
             "function are unknown, and `jax.export` saves any function"
         )
     explanation = explain(env)
-    if policy.obs_stats.mean.shape != (env.observation_size,):
+    sizes = policy.obs_stats.mean.size, policy.network.output_size
+    if sizes != (env.observation_size, env.action_size):
         raise UserError(
-            f"the policy observes {policy.obs_stats.mean.size} numbers, and {env.task.name} has "
-            f"{env.observation_size}; give the environment of the policy"
+            f"observations and actions of the policy have {sizes} numbers, those of {env.task.name} "
+            f"{(env.observation_size, env.action_size)}; give the environment of the policy"
         )
     images = tuple(Tensor(x, space.shape, np.dtype(space.dtype).name) for x, space in sorted(env.image_spaces.items()))
     policies = [policy]

@@ -12,7 +12,7 @@ from jaxdrones.checks import check_arguments
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.functions import check_policy
 from jaxdrones.errors import UserError
-from jaxdrones.learning.networks import AnyPolicy, RecurrentPolicy
+from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +53,11 @@ class UserPolicy:
         policy = user_code.load(self.reference)
         sizes = (env.drones, env.observation_size), (env.drones, env.action_size)
         recurrent = isinstance(policy, RecurrentPolicy)
+        if isinstance(policy, Policy) and policy.obs_stats.mean.size != env.observation_size:
+            raise UserError(
+                f"{self.reference} observes {policy.obs_stats.mean.size} numbers, {self.task} has "
+                f"{env.observation_size}; give the task and the options that it was trained with"
+            )
         if isinstance(policy, type) or not (callable(policy) or recurrent):
             raise UserError(
                 f"{self.reference} is {policy!r:.60}; give a function from observations {sizes[0]} to actions "

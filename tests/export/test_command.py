@@ -164,7 +164,7 @@ def test_what_cannot_be_exported_is_said(env, tmp_path):
         save(policy, env, "rust", tmp_path)
     with pytest.raises(ValueError, match="name is '2fast'; give a letter"):
         save(policy, env, "c", tmp_path, name="2fast")
-    with pytest.raises(ValueError, match="the policy observes 22 numbers, and leader-follower has 12"):
+    with pytest.raises(ValueError, match=r"policy have \(22, 4\) numbers, those of leader-follower \(12, 1\)"):
         save(policy, jd.make("leader-follower"), "c", tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -207,11 +207,15 @@ def test_a_damaged_run_is_one_line(file, content, message, run, tmp_path, capsys
         (["RUN", "--to", "c", "--output", "RUN/best.json"], "best.json: "),
         (["mine.py:policy", "--to", "c"], "--task is missing"),
         (["mine.py:policy", "--to", "c", "--task", "hover"], "the layers of a function are unknown"),
+        (["mine.py:trained", "--to", "c", "--task", "leader-follower"], "observes 22 numbers, leader-follower has 12"),
     ],
 )
 def test_a_mistake_is_one_line(arguments, message, run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    Path("mine.py").write_text("def policy(obs):\n    return obs[:, :4]\n")
+    Path("mine.py").write_text(
+        "from jaxdrones.learning.checkpoint import load\n\n\ndef policy(obs):\n    return obs[:, :4]\n\n\n"
+        f"trained = load({str(run / 'best')!r})\n"
+    )
     with pytest.raises(SystemExit) if "required" in message else contextlib.nullcontext():
         code = main(["export", *(text.replace("RUN", str(run)) for text in arguments)])
         assert code == 2

@@ -34,9 +34,9 @@ def _to_bytes(auxdata: Any) -> bytes:
 
 
 def _from_bytes(data: bytes | bytearray) -> Any:
-    return _as_tuple(json.loads(bytes(data)))
+    return as_tuple(json.loads(bytes(data)))
 
 
-def _as_tuple(value: Any) -> Any:
+def as_tuple(value: Any) -> Any:
     """Convert JSON's lists back to tuples."""
-    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
+    return tuple(map(as_tuple, value)) if isinstance(value, list) else value

@@ -45,8 +45,7 @@ class DoubleIntegrator:
         cost = 100 * x[:, 0] ** 2 + 10 * x[:, 1] ** 2 + 10 * action[:, 0] ** 2
         x = x @ jnp.asarray(a.T, x.dtype) + action * jnp.asarray(b.T, x.dtype)
         world = PointWorld(Point(x), world.step + 1)
-        info = {"metrics": {"error": jnp.abs(x[:, 0])}}
-        return x, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+        return x, world, -cost, *outcome(self, jnp.zeros((), bool), world, jnp.abs(x[:, 0]))
 
 
 class Cue:
@@ -74,9 +73,8 @@ class Cue:
     def step(self, key, world, action):
         cost = (action[:, 0] - world.drones.pos[:, 0]) ** 2
         world = self.with_images(None, key, world.replace(step=world.step + 1))
-        info = {"metrics": {"error": jnp.sqrt(cost)}}
         obs = observation(self.vector(world), world)
-        return obs, world, -cost, jnp.zeros((), bool), world.step >= self.steps, info
+        return obs, world, -cost, *outcome(self, jnp.zeros((), bool), world, jnp.sqrt(cost))
 
     def visible(self, world):
         return jnp.where(world.step < self.shown, world.drones.pos, 0)
@@ -110,8 +108,15 @@ class Clock:
         world = world.replace(step=world.step + 1)
         reward = 1 + jnp.arange(self.drones, dtype=action.dtype) + 0 * action[:, 0]
         obs = jnp.full((self.drones, 1), world.step, action.dtype)
-        info = {"metrics": {"error": reward}}
-        return obs, world, reward, world.drones.pos[0, 0] > 0, world.step >= self.steps, info
+        return obs, world, reward, *outcome(self, world.drones.pos[0, 0] > 0, world, reward)
+
+
+def outcome(env, terminated, world, error):
+    """Ends of a team, and info."""
+    truncated = world.step >= env.steps
+    of_team = {"terminated": terminated, "truncated": truncated, "active": jnp.ones((), bool)}
+    info = {name: jnp.broadcast_to(x, (env.drones,)) for name, x in of_team.items()}
+    return terminated, truncated, info | {"metrics": {"error": error}}
 
 
 def dynamics():

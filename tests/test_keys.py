@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from double_integrator import outcome
 from helpers import Keys, mostly_slow
 
 import jaxdrones as jd
@@ -169,8 +170,7 @@ class Toss:
     def step(self, key, world, action):
         x = world.drones.pos + jax.random.normal(jax.random.fold_in(key, 0), (1, 2)) + action
         world = TossWorld(Place(x), world.step + 1)
-        no = jnp.zeros((), bool)
-        return x, world, -(x[:, 0] ** 2), no, world.step >= self.steps, {"metrics": {"error": jnp.abs(x[:, 0])}}
+        return x, world, -(x[:, 0] ** 2), *outcome(self, jnp.zeros((), bool), world, jnp.abs(x[:, 0]))
 
 
 class Place(flax.struct.PyTreeNode):

@@ -97,7 +97,7 @@ class BraxEnv(base.Env):
         world, key = state.pipeline_state
         action = jnp.reshape(action, (self.env.drones, self.env.action_size))
         obs, world, reward, terminated, _, info = self.env.step(jax.random.fold_in(key, world.step), world, action)
-        cut = functools.reduce(jnp.logical_or, info["truncations"].values(), jnp.zeros((), bool))
+        cut = jnp.any(functools.reduce(jnp.logical_or, info["truncations"].values(), jnp.zeros((), bool)))
         return state.replace(
             pipeline_state=(world, key),
             obs=self._flat(obs),

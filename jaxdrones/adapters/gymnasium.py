@@ -33,8 +33,8 @@ NAMESPACE = "jaxdrones"
 class GymnasiumEnv(gymnasium.Env):
     """One world.
 
-    `info` has the terms of the reward (`reward_position`, ...) and the metrics (`metric_...`) of every drone, and the
-    conditions of the team (`termination_...`, `truncation_...`).
+    `info` has the terms of the reward (`reward_position`, ...), the metrics (`metric_...`) and the conditions
+    (`termination_...`, `truncation_...`) of every drone.
     """
 
     metadata = {"render_modes": pictures.MODES, "render_fps": 100}  # noqa: RUF012
@@ -87,7 +87,7 @@ class GymnasiumEnv(gymnasium.Env):
         obs, reward, terminated, truncated, info = self._session.step(self._layout.gather(action))
         info = flat(info)
         if self.env.drones == 1:
-            info = {name: x if isinstance(x, bool) else x.item() for name, x in info.items()}
+            info = {name: x.item() for name, x in info.items()}
         return self._layout.arrange(obs), float(self._rewarding(reward)), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:

@@ -143,11 +143,8 @@ class JaxMARLEnv:
         return by_agent
 
     def _outcome(self, reward: Array, terminated: Array, truncated: Array, info: dict[str, Any]) -> tuple:
-        done = terminated | truncated
-        infos = {"rewards": info["rewards"], "metrics": info["metrics"]}
-        infos |= {
-            name: jnp.broadcast_to(x, (self.num_agents,))
-            for name, x in (("terminated", terminated), ("truncated", truncated))
-        }
+        infos = {name: info[name] for name in ("rewards", "metrics", "terminated", "truncated")}
+        ended = info["terminated"] | info["truncated"] | ~info["active"]
         rewards = {agent: reward[i] for i, agent in enumerate(self.agents)}
-        return rewards, dict.fromkeys((*self.agents, ALL), done), infos
+        dones = {agent: ended[i] for i, agent in enumerate(self.agents)} | {ALL: terminated | truncated}
+        return rewards, dones, infos

@@ -27,7 +27,7 @@ def parallel_env(task: str | Task | Env, **options: Any) -> ParallelEnv:
 
 
 class ParallelEnv(pettingzoo.ParallelEnv):
-    """One world; episodes begin and end for all agents at once."""
+    """One world; an agent leaves `agents` when its episode has ended, by default with all others. See `Task.ends`."""
 
     @checked
     def __init__(self, task: str | Task | Env, *, render_mode: pictures.RenderMode = None, **options: Any):
@@ -83,16 +83,19 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         """
         if not self._session.running:
             raise UserError("step is called before reset or after the end of an episode; call reset")
-        obs, reward, terminated, truncated, info = self._session.step(self._layout.gather(actions))
-        agents = self.agents
-        if not self._session.running:
-            self.agents = []
+        drones = {agent: i for i, agent in enumerate(self.possible_agents) if agent in self.agents}
+        idle = np.zeros(self.env.action_size, np.float32)
+        actions = {agent: idle for agent in self.possible_agents if agent not in drones} | actions
+        obs, reward, _, _, info = self._session.step(self._layout.gather(actions))
+        observed = self._observed(obs)
+        ended = info["terminated"] | info["truncated"]
+        self.agents = [agent for agent, i in drones.items() if not ended[i]]
         return (
-            self._observed(obs),
-            dict(zip(agents, reward.tolist(), strict=True)),
-            dict.fromkeys(agents, terminated),
-            dict.fromkeys(agents, truncated),
-            {agent: _of_drone(info, i) for i, agent in enumerate(agents)},
+            {agent: observed[agent] for agent in drones},
+            {agent: reward[i].item() for agent, i in drones.items()},
+            {agent: bool(info["terminated"][i]) for agent, i in drones.items()},
+            {agent: bool(info["truncated"][i]) for agent, i in drones.items()},
+            {agent: _of_drone(info, i) for agent, i in drones.items()},
         )
 
     def state(self) -> np.ndarray:
@@ -128,4 +131,4 @@ class ParallelEnv(pettingzoo.ParallelEnv):
 
 
 def _of_drone(info: dict[str, Any], i: int) -> dict[str, Any]:
-    return {name: x if isinstance(x, bool) else x[i].item() for name, x in flat(info).items()}
+    return {name: x[i].item() for name, x in flat(info).items()}

@@ -45,6 +45,7 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
         """Start an episode; a seed makes it and the following ones reproducible. There are no options."""
         if seed is not None:
             self._seeds = np.random.default_rng(seed)
+        self.agents = list(self.possible_agents)
         obs = self._session.reset(int(self._seeds.integers(SEEDS)) if seed is None else seed)
         return self._layout.arrange(obs), {agent: {} for agent in self.agents}
 
@@ -56,14 +57,18 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
         """
         if not self._session.running:
             raise UserError("step is called before reset or after the end of an episode; call reset")
-        obs, reward, terminated, truncated, _ = self._session.step(self._layout.gather(action_dict))
-        everyone = (*self.agents, "__all__")
+        drones = {agent: i for i, agent in enumerate(self.possible_agents) if agent in self.agents}
+        idle = np.zeros(self.env.action_size, np.float32)
+        actions = {agent: idle for agent in self.possible_agents if agent not in drones} | action_dict
+        obs, reward, terminated, truncated, info = self._session.step(self._layout.gather(actions))
+        observed, ended = self._layout.arrange(obs), info["terminated"] | info["truncated"]
+        self.agents = [agent for agent, i in drones.items() if not ended[i]]
         return (
-            self._layout.arrange(obs),
-            dict(zip(self.agents, reward.tolist(), strict=True)),
-            dict.fromkeys(everyone, terminated),
-            dict.fromkeys(everyone, truncated),
-            {agent: {} for agent in self.agents},
+            {agent: observed[agent] for agent in drones},
+            {agent: reward[i].item() for agent, i in drones.items()},
+            {agent: bool(info["terminated"][i]) for agent, i in drones.items()} | {"__all__": terminated},
+            {agent: bool(info["truncated"][i]) for agent, i in drones.items()} | {"__all__": truncated},
+            {agent: {} for agent in drones},
         )
 
     def close(self) -> None:

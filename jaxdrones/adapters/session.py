@@ -51,8 +51,6 @@ class Session:
         obs, reward, terminated, truncated, info = _numpy(outcome)
         terminated, truncated = bool(terminated), bool(truncated)
         self.running = not (terminated or truncated)
-        for group in ("terminations", "truncations"):
-            info[group] = {name: bool(condition) for name, condition in info[group].items()}
         return obs, reward, terminated, truncated, info
 
     def photo(self) -> np.ndarray:

@@ -26,6 +26,8 @@ from jaxdrones.sensing import Scene
 from jaxdrones.sensing.sensor import Sensor
 from jaxdrones.tasks.task import ObservationTerm, Task, World
 
+RowSet = tuple[int, int, int, float]
+"""First column of a set in an observation, number of rows, length of a row, and reach (m); see `ObservationTerm`."""
 Obs = Any  # (n, d), or with cameras a dict of arrays with a leading drone axis
 
 
@@ -146,6 +148,13 @@ class Env:
         return bounds(self.terms, self.term_sizes)
 
     @property
+    def sets(self) -> tuple[RowSet, ...]:
+        """Sets in the observation."""
+        starts = np.cumsum([0, *self.term_sizes]).tolist()
+        terms = zip(self.terms, starts, self.term_sizes, strict=False)
+        return tuple((at, term.rows, size // term.rows, term.reach) for term, at, size in terms if term.rows)
+
+    @property
     def observation_size(self) -> int:
         """Length of the observation of one drone, without images."""
         return len(self.observation_bound)
@@ -208,8 +217,9 @@ class Env:
 
         Returns:
             The observation; the world; the reward (n,); terminated (), whether the episode ended in a terminal state;
-            truncated (), whether it was cut; and info: `rewards` and `metrics` by name (n,), `terminations` and
-            `truncations` by name ().
+            truncated (), whether it was cut; and info (n,): `rewards`, `metrics`, `terminations` and `truncations` by
+            name; `terminated` and `truncated`, whether the episode of each drone ended in this step; and `active`,
+            whether it had not ended before. After its end a drone has no reward; see `Task.ends`.
 
         Raises:
             ValueError: no random key, a wrong shape, or numbers that are not finite (unless traced).

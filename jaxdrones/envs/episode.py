@@ -22,6 +22,7 @@ DISTURBANCE, NOISE, START, RANDOMIZE, RESET, SENSORS, SCENE, VISION = range(8)
 """Random streams to fold into a key, so that only used draws cost time."""
 
 Key = Any  # a random key; `None` where nothing is drawn
+_AWAY, _APART = 1e4, 100.0  # m: place of the drones whose episode has ended, and distance between them
 
 
 def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
@@ -38,6 +39,7 @@ def start(env: Any, key: jax.Array, progress: float | Array = 1.0) -> World:
         memory=env.action.team_memory(env.drones),
         actions=jnp.zeros((env.drones, history, env.action_size), drones.pos.dtype),
         step=jnp.zeros((), jnp.int32),
+        active=jnp.ones(env.drones, bool),
         dt=env.dt,
         scene=scene,
     )
@@ -92,6 +94,8 @@ def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Arr
     if env.disturbance:
         params = env.disturbance(jax.random.fold_in(key, DISTURBANCE), params, env.dt)
     world = world.replace(actions=actions, params=params)
+    if env.task.ends == "drone":
+        world = world.replace(drones=_without_ended(world))
 
     def of_drone(params, memory, state, action, setpoint):
         return env.action.rpm(params, memory, state, action, setpoint, env.dt)
@@ -100,7 +104,19 @@ def command(env: Any, key: Key, world: World, action: Array) -> tuple[World, Arr
     known = randomize.scaling_params(env.randomize, params, env.params)
     delayed, target = randomize.delayed(actions, delay), env.task.target_now(world)
     memory, rpm = jax.vmap(of_drone)(known, world.memory, world.drones, delayed, target)
+    if env.task.ends == "drone":
+        rpm = jnp.where(world.active[:, None], rpm, 0)
     return world.replace(memory=memory), rpm
+
+
+def _without_ended(world: World) -> State:
+    """State of the team, in which drones whose episode has ended are far away from the others and from each other."""
+    n, dtype = len(world.active), world.drones.pos.dtype
+    place = jnp.stack([_AWAY + _APART * jnp.arange(n, dtype=dtype), jnp.zeros(n, dtype), jnp.full(n, _AWAY, dtype)], -1)
+    away = State.at_rest(place).replace(aux=jax.tree.map(jnp.zeros_like, world.drones.aux))
+    return jax.vmap(lambda active, *states: jax.tree.map(functools.partial(jnp.where, active), *states))(
+        world.active, world.drones, away
+    )
 
 
 def outcome(
@@ -112,16 +128,36 @@ def outcome(
     if rate is not None:
         world = _measured(env, jax.random.fold_in(key, SENSORS), world, rate)
     world = world.replace(variables=task.advance(task, world))
+    active = world.active
     rewards = {name: scale * term(task, world) for name, (scale, term) in task.rewards.items()}
+    if task.ends == "drone":
+        rewards = {name: jnp.where(active, term, 0) for name, term in rewards.items()}
     terminations, truncations = (
-        {name: jnp.any(condition(task, world)) for name, condition in conditions.items()}
+        {name: active & condition(task, world) for name, condition in conditions.items()}
         for conditions in (task.terminations, task.truncations)
     )
-    terminated = functools.reduce(jnp.logical_or, terminations.values(), jnp.zeros((), bool))
-    truncated = functools.reduce(jnp.logical_or, truncations.values(), world.step >= env.steps)
+    terminated = task.shared(jnp.any, _any_of(terminations, jnp.zeros_like(active)))
+    truncated = task.shared(jnp.any, _any_of(truncations, active & (world.step >= env.steps)))
+    world = world.replace(active=active & ~(terminated | truncated))
     info = dict(rewards=rewards, metrics=task.measure(world), terminations=terminations, truncations=truncations)
+    info |= dict(active=active, terminated=terminated, truncated=truncated)
     obs = _noisy_observation(env, key, world)
-    return obs, world, sum(rewards.values()), terminated, truncated, info
+    return obs, world, sum(rewards.values()), *_ends_of_team(env, world, terminated, truncated), info
+
+
+def _any_of(conditions: dict[str, Array], start: Array) -> Array:
+    return functools.reduce(jnp.logical_or, conditions.values(), start)
+
+
+def _ends_of_team(env: Any, world: World, terminated: Array, truncated: Array) -> tuple[Array, Array]:
+    """Whether the episode of the team terminated and whether it was truncated.
+
+    With `ends="drone"` it ends with the last drone: truncated at the time limit, else terminated.
+    """
+    if env.task.ends == "team":
+        return terminated[0], truncated[0]
+    over = world.step >= env.steps
+    return ~jnp.any(world.active) & ~over, over
 
 
 def _noisy_observation(env: Any, key: Key, world: World) -> Array:

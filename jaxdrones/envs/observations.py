@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.envs.team_observations import adjacency, encounters, neighbors
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.quantity import Quantity, quantities
@@ -122,11 +123,6 @@ def normalized_kinematics(task: Task, world: World) -> Array:
     return jnp.concatenate([columns, turn * (turns / jnp.where(turns, speed, 1))[:, None]], -1)
 
 
-def adjacency(task: Task, world: World, radius: float = 10.0) -> Array:
-    """Equation 8: 1 for every drone within `radius` (m) and for the drone itself, else 0."""
-    return (_distances(world) < radius).astype(world.drones.pos.dtype)
-
-
 def last_actions(count: int) -> ObservationTerm:
     """Observation term of the last actions, oldest first."""
 
@@ -139,32 +135,6 @@ def last_actions(count: int) -> ObservationTerm:
         return tuple(dataclasses.replace(entry, name=f"{age}: {entry.name}") for age in ages for entry in action)
 
     return ObservationTerm(observe, _UNIT, history=count, entries=entries, name=f"last_actions({count})")
-
-
-def neighbors(count: int) -> ObservationTerm:
-    """Observation term of the nearest drones, nearest first: relative position (m) and velocity (m/s), world axes.
-
-    It is padded with zeros for smaller teams.
-    """
-
-    def observe(task: Task, world: World) -> Array:
-        """Position and velocity of the nearest drones, relative to the drone."""
-        n = len(world.drones.pos)
-        away = jnp.where(jnp.eye(n, dtype=bool), jnp.inf, _distances(world))
-        motion = jnp.concatenate([world.drones.pos, world.drones.vel], -1)
-        relative = [jnp.zeros((n, 0), motion.dtype)]
-        for _ in range(min(count, n - 1)):  # the nearest, the next one, ...: faster than sorting while they are few
-            nearest = jnp.argmin(away, axis=-1)
-            relative.append(motion[nearest] - motion)
-            away = jnp.where(jnp.arange(n)[None] == nearest[:, None], jnp.inf, away)
-        return jnp.pad(jnp.concatenate(relative, -1), ((0, 0), (0, 6 * max(count - n + 1, 0))))
-
-    entries: list[Quantity] = []
-    for i in range(count):
-        which = f"{i + 1}-th nearest drone" if i else "nearest drone"
-        entries += quantities(f"position of the {which}", "m", "world")
-        entries += quantities(f"velocity of the {which}", "m/s", "world")
-    return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=f"neighbors({count})")
 
 
 def reading(sensor: str, bound: float = math.inf, entries: tuple[Quantity, ...] = ()) -> ObservationTerm:
@@ -232,11 +202,6 @@ def _to_body(world: World, v: Array) -> Array:
     return jax.vmap(rotation.rotate_inverse)(world.drones.quat, v)
 
 
-def _distances(world: World) -> Float[Array, "n n"]:
-    pos = world.drones.pos
-    return jax.vmap(lambda own: norm(pos - own[None]))(pos)
-
-
 _TURN = math.pi + 1e-6
 _KINEMATICS = (
     (_MAX_DISTANCE,) * 3 + (_UNIT,) * 4 + (_TURN,) * 3 + (_MAX_SPEED,) * 3 + (_MAX_RATE,) * 3 + (_MAX_RPM,) * 4
@@ -295,5 +260,6 @@ OBSERVATIONS: dict[str, ObservationTerm] = {
     "last_action": last_actions(1),
     "last_actions_2x": last_actions(15),
     "neighbors": neighbors(2),
+    "encounters": encounters(8),
     "preview": preview(0.1, 0.2, 0.3),
 }

@@ -33,9 +33,13 @@ class Batch(PyTreeNode):
     """(1, w, n, ...) hidden state of the policy at the start of the trajectories; `None` without one."""
     starts: Array | None = None
     """(t, w) whether a new episode starts; `None` for a policy without a hidden state."""
+    valid: Array | None = None
+    """Whether the transition counts; `None` if all do."""
 
 
-def batch_of(config: Any, state: Any, hidden_state: Any, trajectory: collect.Trajectory, noise: Array) -> Batch:
+def batch_of(
+    config: Any, state: Any, hidden_state: Any, trajectory: collect.Trajectory, noise: Array, ends_alone: bool = False
+) -> Batch:
     """Transitions of a trajectory with normalized advantages and value targets.
 
     Args:
@@ -45,14 +49,16 @@ def batch_of(config: Any, state: Any, hidden_state: Any, trajectory: collect.Tra
         trajectory: trajectory.
         noise: (k, w, n, a) standard normal noise of the actions of a centralized critic after the end of the trajectory
             and of truncated episodes; at most k - 1 episodes of a world are truncated.
+        ends_alone: whether a drone's episode may end before that of its team.
     """
     policy, action = state.policy, trajectory.action if config.centralized_critic else None
     critic_obs = critic_observation(policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged, action)
     value = discounted_value(config, state.critic, critic_obs)
     next_value = _next_value(config, state, trajectory, value, noise)
     advantage = trajectory_advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
-    centered = advantage - sharding.mean_over_devices(jnp.mean(advantage))
-    std = jnp.sqrt(sharding.mean_over_devices(jnp.mean(centered**2)))
+    valid = ~trajectory.was_done if ends_alone else None
+    centered = advantage - sharding.mean_over_devices(jnp.mean(advantage, where=valid))
+    std = jnp.sqrt(sharding.mean_over_devices(jnp.mean(centered**2, where=valid)))
     return Batch(
         obs=map_state_vector(policy.obs_stats.normalize, trajectory.obs),
         action=trajectory.action,
@@ -62,6 +68,7 @@ def batch_of(config: Any, state: Any, hidden_state: Any, trajectory: collect.Tra
         value_target=value + advantage,
         hidden_state=jax.tree.map(lambda x: x[None], hidden_state),
         starts=None if hidden_state is None else jnp.roll(trajectory.done, 1, axis=0).at[0].set(False),
+        valid=valid,
     )
 
 
@@ -71,7 +78,7 @@ def _next_value(config: Any, state: Any, trajectory: collect.Trajectory, value: 
     They are those before the next step. Only for the last step and for truncated episodes the critic is evaluated.
     """
     policy = state.policy
-    ends = trajectory.truncated.at[-1].set(True)
+    ends = jnp.any(trajectory.truncated, axis=-1).at[-1].set(True)
     order = jnp.cumsum(ends, axis=0) - 1
     steps = jax.vmap(lambda i: jnp.argmax(ends & (order == i), axis=0))(jnp.arange(len(noise)))  # (k, w)
     final = trajectory.hidden_state, trajectory.final_obs, trajectory.final_privileged

@@ -53,10 +53,8 @@ def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.T
 
     (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     step, opt_state = _optimizer(config).update(gradient, state.opt_state)
-    policy = state.policy.replace(
-        params=optax.apply_updates(state.policy.params, step),
-        obs_stats=collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step),
-    )
+    obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
+    policy = state.policy.replace(params=optax.apply_updates(state.policy.params, step)).with_obs_stats(obs_stats)
     norm = optax.tree.norm(gradient)
     metrics = {"gradient_norm": norm, "nonfinite_gradients": result.count_nonfinite(norm)}
     worlds, measured = measure(env, config, state.step, worlds, trajectory)

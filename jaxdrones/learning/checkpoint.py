@@ -20,6 +20,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning.files import ADVICE, load_bytes, one_line, read_sidecar, save_bytes
 from jaxdrones.learning.networks import MLP, Network, OwnNetwork, Policy
 from jaxdrones.learning.normalize import RunningStatistics
+from jaxdrones.pytree import as_tuple
 
 
 def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
@@ -55,9 +56,7 @@ def load(path: str | os.PathLike, network: Any = None) -> Policy:
         raise UserError(f"{path} holds no policy; found {', '.join(sidecar)}")
     arrays = _restore(path, sidecar)
     try:
-        settings: dict[str, Any] = {
-            name: tuple(x) if isinstance(x, list) else x for name, x in sidecar["policy"]["network"].items()
-        }
+        settings: dict[str, Any] = {name: as_tuple(x) for name, x in sidecar["policy"]["network"].items()}
         obs_stats = RunningStatistics(**{name: jnp.asarray(x) for name, x in arrays["obs_stats"].items()})
         params = jax.tree.map(jnp.asarray, arrays["params"])
         if "own" in settings:

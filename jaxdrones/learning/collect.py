@@ -59,9 +59,11 @@ class Trajectory(PyTreeNode):
     reward: Array
     """(t, w, n)"""
     terminated: Array
-    """(t, w) whether the episode terminated; the state after it has no value."""
+    """(t, w, n) whether the episode of the drone terminated; the state after it has no value."""
     truncated: Array
-    """(t, w) whether the episode was truncated."""
+    """(t, w, n) whether the episode of the drone was truncated."""
+    done: Array
+    """(t, w) whether the step ended the episode of the team."""
     final_obs: Obs
     """(t, w, n, d) observations after the step, before a new episode starts."""
     episode_return: Array
@@ -75,14 +77,10 @@ class Trajectory(PyTreeNode):
     final_privileged: PrivilegedObservation | None
     """(t, w, n, ...) privileged observations after the step, before a new episode starts."""
     was_done: Array
-    """(t, w) whether the episode had ended before the step, which is then invalid. Always false with `starts`."""
+    """(t, w, n) whether the episode of the drone had ended before the step, which is then invalid. Always false with
+    `starts`, unless drones end alone."""
     hidden_state: Any = None
     """(t, w, n, ...) hidden state of the policy after the observations before the step; `None` without one."""
-
-    @property
-    def done(self) -> Array:
-        """(t, w) whether the step ended the episode."""
-        return self.terminated | self.truncated
 
 
 def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
@@ -171,24 +169,24 @@ def collect(
             action=action,
             extras=extras,
             reward=reward,
-            terminated=terminated,
-            truncated=truncated & ~terminated,
+            terminated=info["terminated"],
+            truncated=info["truncated"] & ~info["terminated"],
+            done=terminated | truncated,
             final_obs=obs,
             episode_return=info["episode"]["return"],
             length=info["episode"]["length"],
             error=info["metrics"]["error"],
             privileged=privileged_of(worlds.episodes),
             final_privileged=privileged_of(episodes),
-            was_done=worlds.done,
+            was_done=worlds.done[:, None] | ~info["active"],
             hidden_state=hidden_state,
         )
-        ended = terminated | truncated
         after = worlds.replace(episodes=episodes, obs=obs, hidden_state=hidden_state)
         if starts is not None:
             first = (index[0] + t + 1) % count
             following = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, first, len(keys)), starts)
-            return _select(ended, _started(after, following), after), recorded
-        after = after.replace(done=worlds.done | ended)
+            return _select(recorded.done, _started(after, following), after), recorded
+        after = after.replace(done=worlds.done | recorded.done)
         return _select(worlds.done, worlds, after), recorded  # otherwise a lost drone would fly on to infinity
 
     def control_steps(
@@ -255,8 +253,7 @@ def update_obs_stats(
         step: () updates made.
     """
     obs = state_vector(trajectory.obs)
-    counts = jnp.broadcast_to(~trajectory.was_done[..., None], obs.shape[:-1])
-    new = statistics.update(obs, window=config.obs_stats_window * obs[..., 0].size, where=counts)
+    new = statistics.update(obs, window=config.obs_stats_window * obs[..., 0].size, where=~trajectory.was_done)
     frozen = step >= config.obs_stats_freeze * config.updates
     return jax.tree.map(lambda new, old: jnp.where(frozen, old, new), new, statistics)
 

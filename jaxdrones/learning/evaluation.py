@@ -32,8 +32,8 @@ class Report(PyTreeNode):
     distinct_episodes: int
     """Number of distinct episodes, by start or random draws; 1 if all are the same flight."""
     success: float | None
-    """Fraction of the episodes without a failure in which every drone met the task's criterion of success; `None` for a
-    task without a criterion."""
+    """Fraction of the episodes without a failure in which every drone met the task's criterion of success, or of such
+    drones in a task with `ends="drone"`; `None` for a task without a criterion."""
     success_interval: tuple[float, float] | None
     """95 % confidence interval of `success` (Wilson) from the distinct episodes; `None` for only one."""
     final_error: float
@@ -47,7 +47,7 @@ class Report(PyTreeNode):
     mean_length: float
     """Mean length of an episode, s."""
     end_rates: dict[str, float]
-    """Fraction of the episodes that ended by each termination or truncation of the task."""
+    """Fraction of the episodes that ended by each termination or truncation of the task; of drones as in `success`."""
     final_metrics: dict[str, float]
     """Mean over drones of each of the task's metrics at the end of an episode."""
 
@@ -147,26 +147,30 @@ def _outcome(env: Env, policy: AnyPolicy, key: jax.Array) -> dict:
         state, obs, world, diverged, done, last, episode_return, length = carry
         state, action = act(policy, state, obs)
         obs, world, reward, terminated, truncated, info = env.step(key, world, action)
-        last = jax.tree.map(lambda new, old: jnp.where(done, old, new), _metrics_and_ends(info), last)
-        episode_return = episode_return + jnp.where(done, 0, reward)
-        length = length + ~done
-        diverged = diverged | (~done & ~jnp.all(jnp.isfinite(world.drones.pos)))
+        counts = info["active"] & ~done
+        last = jax.tree.map(lambda new, old: jnp.where(counts, new, old), _metrics_and_ends(info), last)
+        episode_return = episode_return + jnp.where(counts, reward, 0)
+        length = length + counts
+        diverged = diverged | (counts & ~jnp.all(jnp.isfinite(world.drones.pos), axis=-1))
         return (state, obs, world, diverged, done | terminated | truncated, last, episode_return, length), last[0]
 
     zero = jnp.zeros(env.drones, world.drones.pos.dtype)
-    false = jnp.zeros((), bool)
-    carry = (initial_hidden_state(policy, env.drones), obs, world, false, false, zeros, zero, jnp.zeros((), jnp.int32))
+    none = jnp.zeros(env.drones, bool)
+    hidden_state, false = initial_hidden_state(policy, env.drones), jnp.zeros((), bool)
+    carry = (hidden_state, obs, world, none, false, zeros, zero, jnp.zeros(env.drones, jnp.int32))
     carry, metrics = jax.lax.scan(control_step, carry, jax.random.split(key, env.steps))
     _, _, _, diverged, _, (final_metrics, ends), episode_return, length = carry
     flown = jnp.arange(env.steps)[:, None]
-    counts = (flown >= length // 5) & (flown < length)
+    counts = (flown >= length[None] // 5) & (flown < length[None])
     rms_error = jnp.sqrt(jnp.mean(metrics["error"] ** 2, axis=0, where=counts))
-    success = {} if env.task.success is None else {"success": env.task.succeeded(metrics, ends, env.dt) & ~diverged}
+    success = {}
+    if env.task.success is not None:
+        success["success"] = env.task.shared(jnp.all, env.task.succeeded(metrics, ends, env.dt) & ~diverged)
     return success | {
         "start": start,
         "first_state": first_state,
         "final_metrics": final_metrics,
-        "ends": ends,
+        "ends": {name: env.task.shared(jnp.any, ended) for name, ended in ends.items()},
         "return": episode_return,
         "length": length,
         "rms_error": rms_error,
@@ -225,7 +229,7 @@ def _report(env: Env, outcomes: dict) -> Report:
         episodes=episodes,
         distinct_episodes=distinct,
         success=success,
-        success_interval=None if success is None or distinct == 1 else wilson_interval(success * distinct, distinct),
+        success_interval=None if success is None or distinct == 1 else _interval(outcomes["success"], distinct),
         final_error=float(np.mean(error)),
         final_error_percentiles={q: float(np.percentile(error, q)) for q in (50, 95, 99)},
         rms_error=float(np.sqrt(np.mean(outcomes["rms_error"] ** 2))),
@@ -234,6 +238,17 @@ def _report(env: Env, outcomes: dict) -> Report:
         end_rates={name: float(np.mean(ended)) for name, ended in outcomes["ends"].items()},
         final_metrics={name: float(np.mean(x)) for name, x in outcomes["final_metrics"].items()},
     )
+
+
+def _interval(success: np.ndarray, distinct: int) -> tuple[float, float]:
+    """Confidence interval of the success (episodes, n) of drones, which are not independent within an episode.
+
+    An episode counts as many independent trials as the spread of its share of successes says: one if all its drones
+    share their fate, or if nothing failed, at most n.
+    """
+    p, variance = np.mean(success), np.var(np.mean(success, axis=1))
+    trials = np.clip(p * (1 - p) / variance, 1, success.shape[1]) if variance > 0 else 1
+    return wilson_interval(p * distinct * trials, distinct * trials)
 
 
 def wilson_interval(successes: float, trials: int, z: float = 1.959964) -> tuple[float, float]:

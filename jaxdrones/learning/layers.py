@@ -11,10 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_choice
-from jaxdrones.envs.env import Obs
+from jaxdrones.envs.env import Obs, RowSet
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
 _SMALL_IMAGE = 100  # pixels, below which a stride is 2 instead of 4
+_FADE = 1.5  # inverse of the share of its reach in which a row of a set fades out
 _LARGEST_GRID = 20  # largest number of pixels after the last convolution
 
 
@@ -118,8 +119,38 @@ class GRU(nn.Module):
         return jax.lax.scan(restarted_step, hidden_state, (inputs, starts))[1]
 
 
+class SetEncoder(nn.Module):
+    """Sum over the rows of a set of a network of the row and the drone's own observation (Zaheer et al. 2017).
+
+    A row fades out at `reach` (m), the length of its first three entries. The result does not depend on the order of
+    the rows, nor on their number.
+    """
+
+    sizes: Sequence[int]
+    reach: float
+
+    @nn.compact
+    def __call__(self, own: Float[Array, "*batch d"], rows: Float[Array, "*batch k f"]) -> Float[Array, "*batch size"]:
+        """Features of the set."""
+        x = nn.Dense(self.sizes[0])(rows) + jnp.expand_dims(nn.Dense(self.sizes[0], use_bias=False)(own), -2)
+        for size in self.sizes[1:]:
+            x = nn.Dense(size)(nn.tanh(x))
+        away = jnp.sqrt(jnp.sum(rows[..., :3] ** 2, axis=-1, keepdims=True) + 1e-8)
+        weight = jnp.clip(_FADE * (1 - away / self.reach), 0, 1)
+        return jnp.sum(weight * nn.tanh(x), axis=-2)
+
+
+def split_sets(sets: Sequence[RowSet], x: Float[Array, "*batch d"]) -> tuple[Array, list[Array]]:
+    """Entries (*batch, e) of an observation outside of its sets, and rows (*batch, k, f) of each set."""
+    ends = [(at, at + rows * size) for at, rows, size, _ in sets]
+    borders = [0, *(border for end in ends for border in end), x.shape[-1]]
+    own = jnp.concatenate([x[..., a:b] for a, b in zip(borders[::2], borders[1::2], strict=True)], axis=-1)
+    each = zip(ends, sets, strict=True)
+    return own, [x[..., a:b].reshape(*x.shape[:-1], rows, size) for (a, b), (_, rows, size, _) in each]
+
+
 class Network(nn.Module):
-    """MLP of the observed vector, the CNN features of images, and the hidden state of a GRU."""
+    """MLP of the observed vector, the features of its sets and of images, and the hidden state of a GRU."""
 
     hidden_sizes: Sequence[int]
     output_size: int
@@ -131,17 +162,23 @@ class Network(nn.Module):
     depth_scale: float = 3.0
     """Depth that maps to a nearness of 1/2, m; 0.3, 5 and 10 m map to 0.91, 0.38 and 0.23."""
     recurrent_size: int = 0
+    sets: Sequence[RowSet] = ()
+    set_sizes: Sequence[int] = ()
 
     @nn.compact
     def __call__(
         self, obs: Obs, hidden_state: Array | None = None, starts: Array | None = None
     ) -> tuple[Array | None, Array]:
         """Hidden state after the observations, and outputs (*batch, output_size); see `GRU`."""
-        x = obs
+        x = obs["state"] if isinstance(obs, dict) else obs
+        if self.sets:
+            x, rows = split_sets(self.sets, x)
+            encoded = [SetEncoder(self.set_sizes, s[-1])(x, r) for s, r in zip(self.sets, rows, strict=True)]
+            x = jnp.concatenate([x, *encoded], axis=-1)
         if isinstance(obs, dict):
             images = image_channels({name: x for name, x in obs.items() if name != "state"}, self.depth_scale)
             features = CNN(self.channels, self.strides, self.features)(images)
-            x = jnp.concatenate([obs["state"], features], axis=-1)
+            x = jnp.concatenate([x, features], axis=-1)
         if self.recurrent_size:
             hidden_state = GRU(self.recurrent_size)(x, hidden_state, starts)
             x = jnp.concatenate([x, hidden_state], axis=-1)
@@ -149,7 +186,13 @@ class Network(nn.Module):
 
 
 def make_network(
-    obs: Obs, hidden_sizes: Sequence[int], output_size: int, output_scale: float, recurrent_size: int = 0
+    obs: Obs,
+    hidden_sizes: Sequence[int],
+    output_size: int,
+    output_scale: float,
+    recurrent_size: int = 0,
+    sets: Sequence[RowSet] = (),
+    set_sizes: Sequence[int] = (),
 ) -> MLP | Network:
     """Network for the given observations, with a CNN for the resolution of the images.
 
@@ -159,6 +202,8 @@ def make_network(
         output_size: number of outputs.
         output_scale: scale of the initial outputs.
         recurrent_size: size of the hidden state of a GRU; 0 for none.
+        sets: sets in the observation.
+        set_sizes: sizes of the layers that encode a row of a set.
 
     Raises:
         ValueError: an unsupported kind of image.
@@ -171,7 +216,7 @@ def make_network(
             check_choice("image for a policy", name, IMAGE_CHANNELS)
         batch = obs["state"].ndim - 1
         channels, strides = convolutions(*obs[names[0]].shape[batch : batch + 2])
-    elif not recurrent_size:
+    elif not (recurrent_size or sets):
         return MLP(tuple(hidden_sizes), output_size, output_scale)
     return Network(
         tuple(hidden_sizes),
@@ -180,6 +225,8 @@ def make_network(
         channels=channels,
         strides=strides,
         recurrent_size=recurrent_size,
+        sets=tuple(sets),
+        set_sizes=tuple(set_sizes),
     )
 
 

@@ -34,8 +34,8 @@ def measure(
     episodes_fit = config.horizon >= env.steps
     could_end = (config.restart_fraction < 1) & ((step + 1) * config.horizon >= env.steps) | episodes_fit
     return worlds, {
-        "reward": jnp.mean(trajectory.reward, where=counts[..., None]),
-        "error": jnp.mean(trajectory.error, where=counts[..., None]),
+        "reward": jnp.mean(trajectory.reward, where=counts),
+        "error": jnp.mean(trajectory.error, where=counts),
         "termination_rate": jnp.mean(trajectory.terminated.astype(trajectory.reward.dtype), where=counts),
         "return": jnp.where(could_end, mean_return(worlds), jnp.nan),
     }
@@ -52,7 +52,7 @@ def with_returns(worlds: collect.Worlds, trajectory: collect.Trajectory, restart
         trajectory: trajectory.
         restart_fraction: probability of being cut before an update.
     """
-    ended = trajectory.done & ~trajectory.was_done
+    ended = trajectory.done & ~jnp.all(trajectory.was_done, axis=-1)
     t = jnp.arange(len(ended))[:, None]
     last = jnp.max(jnp.where(ended, t, -1), axis=0)
     chosen = t == last[None]  # an index would make devices exchange worlds

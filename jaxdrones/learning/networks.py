@@ -138,6 +138,7 @@ class Policy(PyTreeNode):
         per_agent: bool = False,
         recurrent_size: int = 0,
         network: Any = None,
+        set_sizes: Sequence[int] = (32, 32),
     ) -> Policy:
         """Create a policy with actions near zero, which is hover in most action types.
 
@@ -148,12 +149,15 @@ class Policy(PyTreeNode):
             per_agent: whether every drone has its own network; otherwise all drones share one.
             recurrent_size: size of the hidden state of a GRU; 0 for none.
             network: user-defined network in place of these sizes, see `OwnNetwork`.
+            set_sizes: sizes of the layers that encode a row of a set in the observation.
 
         Raises:
             ValueError: a network with the wrong input or output for the environment.
         """
         obs = example_observation(env)
-        own = make_network(obs, hidden_sizes, env.action_size, 0.01, recurrent_size)
+        own = make_network(
+            obs, hidden_sizes, env.action_size, 0.01, recurrent_size, getattr(env, "sets", ()), set_sizes
+        )
         network = own if network is None else OwnNetwork(network, env.action_size)
         params = init_params(key, network, obs, env.drones if per_agent else None)
         policy = cls(params, RunningStatistics.empty(env.observation_size), network, per_agent)
@@ -180,6 +184,14 @@ class Policy(PyTreeNode):
         counted = f", statistics of {float(count):,.0f} observations" if known else ""
         whose = ", one network per drone" if self.per_agent else ""
         return f"<Policy {layers}, {numbers:,} parameters{whose}{counted}>"
+
+    def with_obs_stats(self, obs_stats: RunningStatistics) -> Policy:
+        """Policy with new statistics, except for the rows of sets, which are not normalized: their order is random."""
+        for at, rows, size, _ in getattr(self.network, "sets", ()):
+            columns = slice(at, at + rows * size)
+            mean, var = obs_stats.mean.at[columns].set(0), obs_stats.var.at[columns].set(1)
+            obs_stats = obs_stats.replace(mean=mean, var=var)
+        return self.replace(obs_stats=obs_stats)
 
     @property
     def is_recurrent(self) -> bool:

@@ -136,7 +136,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         privileged=config.privileged_critic,
     )
     learn = sharding.map_worlds(
-        functools.partial(_learn, config),
+        functools.partial(_learn, config, _ends_alone(env)),
         (sharding.REPLICATED, sharding.WORLDS, sharding.STEPS, sharding.STEPS),
         sharding.REPLICATED,
     )
@@ -147,7 +147,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     max_std = result.annealed(config, state.step, config.init_std, config.final_std)
     log_std = jnp.clip(log_std, jnp.log(jnp.minimum(config.min_std, max_std)), jnp.log(max_std))
     obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
-    policy = state.policy.replace(params=params, obs_stats=obs_stats)
+    policy = state.policy.replace(params=params).with_obs_stats(obs_stats)
     after, measured = measure(env, config, state.step, after, trajectory)
     metrics |= measured | {"action_std": jnp.mean(jnp.exp(log_std)), "learning_rate": learning_rate}
     return TrainState(state.step + 1, key, policy, opt_state, after, log_std, critic, learning_rate), metrics
@@ -177,12 +177,12 @@ def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Bat
     log_ratio = log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(jnp.clip(log_ratio, -_MAX_LOG_RATIO, _MAX_LOG_RATIO))
     clipped = jnp.clip(ratio, 1 - config.clip_epsilon, 1 + config.clip_epsilon)
-    surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage), where=batch.valid)
     value_error = (1 - config.gamma) * (discounted_value(config, critic, batch.critic_obs) - batch.value_target)
-    value_loss = jnp.mean(value_error**2)
+    value_loss = jnp.mean(value_error**2, where=batch.valid)
     entropy = jnp.mean(jnp.sum(log_std + 0.5 + HALF_LOG_2_PI, axis=-1))
     total = -surrogate + config.value_coef * value_loss - config.entropy_coef * entropy
-    return total, {"value_loss": value_loss, "kl": jnp.mean(ratio - 1 - log_ratio)}
+    return total, {"value_loss": value_loss, "kl": jnp.mean(ratio - 1 - log_ratio, where=batch.valid)}
 
 
 def _most_truncations(env: Env, horizon: int) -> int:
@@ -191,9 +191,22 @@ def _most_truncations(env: Env, horizon: int) -> int:
     return -(-horizon // env.steps) if task and not task.truncations else horizon
 
 
-def _learn(config: Config, state: TrainState, hidden_state: Any, trajectory: collect.Trajectory, noise: Array):
+def _ends_alone(env: Env) -> bool:
+    """Whether a drone's episode may end before that of its team."""
+    task = getattr(env, "task", None)
+    return task is not None and task.ends == "drone"
+
+
+def _learn(
+    config: Config,
+    ends_alone: bool,
+    state: TrainState,
+    hidden_state: Any,
+    trajectory: collect.Trajectory,
+    noise: Array,
+):
     """Epochs of gradient steps on a trajectory: (policy parameters, log_std, critic), optimizer state, metrics."""
-    batch = minibatches(config, batch_of(config, state, hidden_state, trajectory, noise))
+    batch = minibatches(config, batch_of(config, state, hidden_state, trajectory, noise, ends_alone))
 
     def cost(variables, minibatch):
         params, log_std, critic = variables

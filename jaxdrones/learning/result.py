@@ -65,7 +65,8 @@ class Result(PyTreeNode):
 
 def init_policy(key: jax.Array, env: Env, config: Config, network: Any) -> Policy:
     """Policy before the first update, with the network of the settings or of the user."""
-    return Policy.init(key, env, config.hidden_sizes, config.per_agent, config.recurrent_size, network)
+    sizes = (config.recurrent_size, network, config.set_sizes)
+    return Policy.init(key, env, config.hidden_sizes, config.per_agent, *sizes)
 
 
 @checked

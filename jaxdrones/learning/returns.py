@@ -13,7 +13,7 @@ from jaxdrones.learning.collect import Trajectory
 def discounted_rewards(trajectory: Trajectory, gamma: Scalar) -> Float[Array, "t w n"]:
     """Rewards up to the end of each episode, discounted from the start of the trajectory."""
     weight = gamma ** jnp.arange(len(trajectory.reward), dtype=trajectory.reward.dtype)
-    return jnp.where(trajectory.was_done[..., None], 0, weight[:, None, None] * trajectory.reward)
+    return jnp.where(trajectory.was_done, 0, weight[:, None, None] * trajectory.reward)
 
 
 def trajectory_advantages(
@@ -23,10 +23,10 @@ def trajectory_advantages(
     gamma: Scalar,
     gae_lambda: Scalar,
 ) -> Float[Array, "t w n"]:
-    """Advantages of every drone in a trajectory, see `advantages`; the episodes of a team end together."""
-    terminated = jnp.broadcast_to(trajectory.terminated[..., None], value.shape)
-    truncated = jnp.broadcast_to(trajectory.truncated[..., None], value.shape)
-    return advantages(trajectory.reward, value, next_value, terminated, truncated, gamma, gae_lambda)
+    """Advantages of every drone in a trajectory, see `advantages`."""
+    return advantages(
+        trajectory.reward, value, next_value, trajectory.terminated, trajectory.truncated, gamma, gae_lambda
+    )
 
 
 def advantages(

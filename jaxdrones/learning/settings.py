@@ -21,6 +21,8 @@ class Config:
     hidden_sizes: arguments.HiddenSizes = (32, 32)
     recurrent_size: arguments.NonNegativeInt = 0
     """Size of the hidden state of a gated recurrent unit (GRU) in the policy; 0 for none."""
+    set_sizes: arguments.HiddenSizes = (32, 32)
+    """Sizes of the layers that encode a row of a set in the observation, such as `encounters`."""
     obs_stats_window: arguments.PositiveOrInfinite = 1e9
     """Averaging window of the statistics of observations, in trajectories."""
     obs_stats_freeze: arguments.Fraction = 0.2

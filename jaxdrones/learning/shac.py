@@ -19,6 +19,7 @@ from jaxdrones.envs.env import Obs
 from jaxdrones.learning import collect, result, sharding
 from jaxdrones.learning.critic import critic_observation, discounted_value, init_critic
 from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
+from jaxdrones.learning.layers import expand
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
@@ -101,7 +102,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
         bootstrap = trajectory.truncated.at[-1].set(~trajectory.terminated[-1]) & ~trajectory.was_done
         final_obs = _final_observation(policy, _at(bootstrap, trajectory))
         terminal_value = weight * config.gamma * discounted_value(config, state.target_critic, final_obs)
-        reward = trajectory.reward + jnp.where(bootstrap[..., None], terminal_value[None], 0)
+        reward = trajectory.reward + jnp.where(bootstrap, terminal_value[None], 0)
         returns = jnp.sum(discounted_rewards(trajectory.replace(reward=reward), config.gamma), axis=0)
         return -jnp.mean(returns) / config.horizon, (after, trajectory)
 
@@ -113,10 +114,8 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     )
     critic, critic_opt_state, critic_metrics = fit(critic_key, state.replace(worlds=None), trajectory)
     target_critic = optax.incremental_update(critic, state.target_critic, config.target_update_rate)
-    policy = state.policy.replace(
-        params=optax.apply_updates(state.policy.params, step),
-        obs_stats=collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step),
-    )
+    obs_stats = collect.update_obs_stats(state.policy.obs_stats, trajectory, config, state.step)
+    policy = state.policy.replace(params=optax.apply_updates(state.policy.params, step)).with_obs_stats(obs_stats)
     norm = optax.tree.norm(gradient)
     metrics = {
         "gradient_norm": norm,
@@ -143,11 +142,10 @@ def train(
 
 
 def _at(chosen: Array, trajectory: collect.Trajectory) -> collect.Trajectory:
-    """Inputs of the critic at the chosen step (t, w) of each trajectory, (w, ...)."""
+    """Inputs of the critic at the chosen step (t, w, n) of each drone's trajectory, (w, n, ...)."""
 
     def select(x: Array) -> Array:  # an index would make devices exchange worlds
-        condition = chosen.reshape(chosen.shape + (1,) * (x.ndim - 2))
-        return jnp.sum(jnp.where(condition, x, 0), axis=0, dtype=x.dtype)
+        return jnp.sum(jnp.where(expand(chosen, x.ndim), x, 0), axis=0, dtype=x.dtype)
 
     names = ("hidden_state", "final_obs", "final_privileged")
     return trajectory.replace(**{name: jax.tree.map(select, getattr(trajectory, name)) for name in names})
@@ -165,8 +163,7 @@ def _fit_critic(config: Config, key: jax.Array, state: TrainState, trajectory: c
     now = discounted_value(config, state.target_critic, obs)
     later = discounted_value(config, state.target_critic, _final_observation(state.policy, trajectory))
     target = now + trajectory_advantages(trajectory, now, later, config.gamma, config.gae_lambda)
-    mask = jnp.broadcast_to(~trajectory.was_done[..., None], now.shape)
-    data = jax.lax.stop_gradient((obs, target, mask.astype(target.dtype)))
+    data = jax.lax.stop_gradient((obs, target, (~trajectory.was_done).astype(target.dtype)))
     length = min(_CRITIC_BATCH, config.horizon)
 
     def loss(params, obs, target, mask):

@@ -19,9 +19,10 @@ from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Camera
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, lissajous, setpoint_on
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, norm, out_of_control
+from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, norm
 from jaxdrones.vector import unit
 
 HEIGHT = 4.0  # m of the center of the leader's curve

@@ -19,8 +19,9 @@ from jaxdrones.sensing import Camera, Cylinder, Scene
 from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm, out_of_control
+from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 from jaxdrones.tasks.touching import touches
 from jaxdrones.vector import safe_sqrt
 

@@ -21,8 +21,9 @@ from jaxdrones.quantity import described, quantities
 from jaxdrones.sensing import BEAMS, Cylinder, Scene, gate, track
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.starts import hovering, standing_height
-from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm, out_of_control
+from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 from jaxdrones.tasks.touching import touches
 from jaxdrones.vector import atan2
 

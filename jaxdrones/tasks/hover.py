@@ -14,8 +14,9 @@ from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import MAX_SPIN, out_of_control
 from jaxdrones.tasks.starts import standing_height, thrown
-from jaxdrones.tasks.task import MAX_SPIN, Drones, Task, World, out_of_control, upright
+from jaxdrones.tasks.task import Drones, Task, World, upright
 
 SPACING = 3.0  # m between neighboring goals, more than the spread of the starts
 _MAX_REACH = 5.0  # m; a drone is lost 3 m or more beyond it

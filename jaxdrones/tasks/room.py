@@ -19,8 +19,9 @@ from jaxdrones.sensing import Scene
 from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, out_of_control
+from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World
 from jaxdrones.tasks.touching import touches
 
 HEIGHT = 1.5  # m, of starts and goals

@@ -12,8 +12,9 @@ from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Task, Team, World, out_of_control
+from jaxdrones.tasks.task import Task, Team, World
 
 HEIGHT = 2.0  # m
 _MIN_SPACING = 0.6  # m between neighboring places on the ring

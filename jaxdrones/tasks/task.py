@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
 
@@ -13,13 +14,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Count, Hertz, NonNegativeInt, Seconds, Switch, checked, choices, whole
+from jaxdrones.arguments import Count, Hertz, NonNegativeInt, Seconds, Switch, checked, choice, choices, number, whole
 from jaxdrones.checks import bind, check_arguments, check_choice, check_number, check_sequence, check_whole, short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.quantity import Quantity, described
+from jaxdrones.quantity import Quantity
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
@@ -40,6 +41,8 @@ class World(PyTreeNode):
     """(n, h, a) last h actions, newest last; initially zero."""
     step: Array
     """() number of control steps since the start."""
+    active: Array
+    """(n,) whether the episode of each drone goes on; see `Task.ends`."""
     dt: float = flax.struct.field(pytree_node=False)
     """Control period, s."""
     scene: Scene = flax.struct.field(default_factory=Scene)
@@ -66,7 +69,6 @@ class World(PyTreeNode):
 
 Entries = tuple[Quantity, ...] | Callable[[int, tuple[Quantity, ...]], tuple[Quantity, ...]]
 """Quantities, or a function (number of drones, quantities of an action) -> quantities."""
-MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 CONTACTS = ("ground", "drones", "obstacles")
 IMAGES = ("rgb", "depth", "segmentation")
 Drones = Annotated[int, whole("number of drones of {function}")]  # argument of a task
@@ -89,6 +91,11 @@ class ObservationTerm:
     """Description of each entry of a drone, for `jaxdrones.explain`; optional."""
     name: str = ""
     """Name of the term, set by `jaxdrones.make`."""
+    rows: NonNegativeInt = 0
+    """Number of rows of equal length, side by side, of a set whose order has no meaning; 0 for a vector. A row begins
+    with a position relative to the drone, m."""
+    reach: Annotated[float, number("m", above=0, infinite=True)] = math.inf
+    """Distance from which on a row has no effect, m."""
 
     def __post_init__(self):
         _check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
@@ -104,7 +111,7 @@ class Task:
     Rewards, conditions and metrics are functions `(task, world)`. The task is that of the environment, so
     `task.target_now(world)` is its target, also after `dataclasses.replace`.
 
-    An episode belongs to the whole team: it ends when a condition is true for one drone.
+    By default an episode belongs to the whole team: it ends when a condition is true for one drone. See `ends`.
     """
 
     name: str
@@ -125,13 +132,17 @@ class Task:
     """Name -> condition that terminates the episode in a state without future value."""
     truncations: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
     """Name -> condition that truncates the episode."""
+    ends: Annotated[str, choice("ends", ("team", "drone"))] = "team"
+    """Whose episode a condition ends: that of the `team`, or of the `drone` alone, which leaves the world while the
+    others continue."""
     advance: Callable[[Task, World], Any] = lambda task, world: world.variables
     """(task, world after a step with the variables before it) -> variables of the task after the step."""
     metrics: Mapping[str, Term] = dataclasses.field(default_factory=dict)
     """Reported quantities without reward, beside the `error` (m) and `speed` (m/s) of every task."""
     success: Callable[[Mapping[str, Array], float], Array] | None = None
     """(metrics over an episode (T, n), control period) -> (n,): success of every drone. Metrics keep their last values
-    after the end of an episode. An episode that ends by a failure is no success."""
+    after the end of an episode. An episode that ends by a failure is no success. With `ends="team"` a success is one of
+    all drones."""
     success_terminations: tuple[str, ...] = ()
     """Names of the terminations that are no failure, such as a reached goal. Every other termination, and every
     truncation but that of the time, is a failure."""
@@ -204,17 +215,24 @@ class Task:
         standard = {"error": distance(self, world), "speed": norm(world.drones.vel)}
         return standard | {name: metric(self, world) for name, metric in self.metrics.items()}
 
-    def succeeded(self, metrics: Mapping[str, Array], ends: Mapping[str, Array], dt: float) -> Bool[Array, ""]:
-        """Whether every drone met the criterion of success in an episode without a failure.
+    def succeeded(self, metrics: Mapping[str, Array], ends: Mapping[str, Array], dt: float) -> Bool[Array, " n"]:
+        """Whether a drone, or with `ends="team"` every drone, met the criterion of success without a failure.
 
         Args:
             metrics: (T, n) metrics over the longest possible episode, with their last values after its end.
-            ends: () by name, terminations and truncations in the last step of the episode.
+            ends: (n,) by name, terminations and truncations in the last step of each drone's episode.
             dt: control period, s.
         """
         assert self.success is not None, "the task has no criterion of success"
-        failures = [jnp.asarray(ended) for name, ended in ends.items() if name not in self.success_terminations]
-        return jnp.all(self.success(metrics, dt)) & ~functools.reduce(jnp.logical_or, failures, jnp.zeros((), bool))
+        succeeded = self.success(metrics, dt)
+        for name, ended in ends.items():
+            if name not in self.success_terminations:
+                succeeded &= ~jnp.asarray(ended)
+        return self.shared(jnp.all, succeeded)
+
+    def shared(self, reduce: Callable[[Array], Array], x: Bool[Array, " n"]) -> Bool[Array, " n"]:
+        """The reduction of x for all drones with `ends="team"`, else x."""
+        return jnp.broadcast_to(reduce(x), x.shape) if self.ends == "team" else x
 
     def target_now(self, world: World) -> Setpoint:
         """Present set-points of the team."""
@@ -259,30 +277,3 @@ def distance(task: Task, world: World) -> Float[Array, " n"]:
 def upright(task: Task, world: World) -> Float[Array, " n"]:
     """Cosine of the tilt: 1 is level, 0 on edge, -1 upside down."""
     return jax.vmap(rotation.z_axis)(world.drones.quat)[:, 2]
-
-
-def out_of_control(reach: float, center: tuple[float, float, float] | None = None) -> dict[str, Condition]:
-    """Conditions of an unrecoverable flight or a state that is not finite.
-
-    `lost`: a drone is farther than `reach` (m) from `center` (m, world; by default its target) along some axis.
-    `spinning`: it rotates faster than 100 rad/s about some axis.
-    """
-
-    def lost(task: Task, world: World) -> Bool[Array, " n"]:
-        pos = world.drones.pos
-        middle = task.target_now(world).pos if center is None else jnp.asarray(center, pos.dtype)[None]
-        return _beyond(pos - middle, reach)
-
-    def spinning(task: Task, world: World) -> Bool[Array, " n"]:
-        return _beyond(world.drones.omega, MAX_SPIN)
-
-    place = "the target" if center is None else f"({', '.join(f'{x:g}' for x in center)}) m"
-    return {
-        "lost": described(f"A drone is {reach:g} m or more from {place} along some axis.", lost),
-        "spinning": described(f"A drone rotates at {MAX_SPIN:g} rad/s or faster about some axis.", spinning),
-    }
-
-
-def _beyond(v: Float[Array, "n 3"], limit: float) -> Bool[Array, " n"]:
-    x, y, z = (jnp.abs(column) < limit for column in v.T)  # false for NaN
-    return ~(x & y & z)

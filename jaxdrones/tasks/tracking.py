@@ -14,9 +14,10 @@ from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, SHAPES, setpoint_on
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Drones, Task, out_of_control
+from jaxdrones.tasks.task import Drones, Task
 
 HEIGHT = 2.0  # m
 SPACING = 4.0  # m between the centers of neighboring curves

@@ -145,14 +145,14 @@ def fly_episode(
         return carry, jax.tree.map(lambda *x: np.stack(x), *rows)
 
     def log(rows, first, success=None):
-        drones, target, reward, metrics, ends, images = rows
+        drones, target, reward, metrics, ends, images, _ = rows
         return EpisodeLog(
             t=env.dt * np.arange(first + 1, first + len(reward) + 1),
             drones=drones,
             target=target,
             reward=reward,
             metrics=metrics,
-            ended_by=tuple(name for name, ended in ends.items() if ended[-1]),
+            ended_by=tuple(name for name, ended in ends.items() if np.any(ended)),
             images=images or {},
             params=params,
             scene=scene,
@@ -170,13 +170,15 @@ def fly_episode(
     params, scene = jax.device_get((start.params, start.scene))
     carry: Any = (hidden_state, obs, world)
     leg = env.steps if watch is None else leg_length(env.dt)
-    flown, ended, parts = 0, False, []
+    flown, ended = 0, False
+    parts: list[tuple] = []
     while flown < env.steps and not ended:
         ahead = np.arange(flown, flown + leg)
         used = ahead[ahead < env.steps] if fly is loop else np.minimum(ahead, env.steps - 1)  # one length: one program
         carry, (rows, done) = fly(carry, keys[used])
         count = min(int(np.argmax(done)) + 1 if np.any(done) else len(done), env.steps - flown)
-        parts.append(jax.tree.map(lambda x, count=count: np.asarray(x)[:count], rows))
+        rows = jax.tree.map(lambda x, count=count: np.asarray(x)[:count], rows)
+        parts.append(_held(rows, parts[-1] if parts else rows) if env.task.ends == "drone" else rows)
         if watch is not None:
             watch(log(parts[-1], flown), env.steps * env.dt)
         flown, ended = flown + count, bool(np.any(done[:count]))
@@ -196,8 +198,23 @@ def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple
         info["metrics"],
         info["terminations"] | info["truncations"],
         world.images,
+        info["active"],
     )
     return (hidden_state, obs, world), (row, terminated | truncated)
+
+
+def _held(rows: tuple, before: tuple) -> tuple:
+    """Rows of a leg with the last values of every drone whose episode has ended.
+
+    Args:
+        rows: the leg.
+        before: rows before it, or for the first leg its own, all of whose drones are still active in the first row.
+    """
+    at = slice(0, 1) if before is rows else slice(-1, None)
+    rows = jax.tree.map(lambda old, new: np.concatenate([old[at], new]), before, rows)
+    active = rows[-1]
+    last = np.maximum.accumulate(np.where(active, np.arange(len(active))[:, None], 0), axis=0)[1:]
+    return jax.tree.map(lambda x: x[last, np.arange(active.shape[1])], rows)
 
 
 def _leg(env: Env, policy: AnyPolicy, carry: tuple, keys: jax.Array) -> tuple[tuple, tuple]:
@@ -216,5 +233,5 @@ def _success(env: Env, drones: State, metrics: dict[str, np.ndarray], ends: dict
         return None
     missing = env.steps - len(drones.pos)
     padded = {name: jnp.asarray(np.pad(x, ((0, missing), (0, 0)), mode="edge")) for name, x in metrics.items()}
-    last = {name: ended[-1] for name, ended in ends.items()}
-    return bool(env.task.succeeded(padded, last, env.dt)) and bool(np.isfinite(drones.pos).all())
+    ended = {name: np.any(x, axis=0) for name, x in ends.items()}
+    return bool(jnp.all(env.task.succeeded(padded, ended, env.dt))) and bool(np.isfinite(drones.pos).all())

@@ -19,7 +19,7 @@ def test_agents_are_drones_and_all_end_at_once():
         obs, reward, terminated, truncated, _ = env.step(actions)
         steps += 1
         assert all(env.observation_spaces[agent].contains(x) for agent, x in obs.items())
-        assert set(reward) == set(env.agents) and not terminated["__all__"]
+        assert set(reward) == set(env.possible_agents) and not terminated["__all__"]
     assert steps == round(0.25 / env.env.dt) and all(truncated.values())
     with pytest.raises(ValueError, match="call reset"):
         env.step(actions)

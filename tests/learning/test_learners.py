@@ -155,7 +155,7 @@ def test_a_centralized_critic_is_bootstrapped_with_the_actions_that_follow():
         _, flown = collect.collect(jax.random.key(2), env, act, worlds, config.horizon, noise=noise, starts=starts)
         batch = ppo.batch_of(config, state, None, flown, later)
         value = ppo.discounted_value(config, state.critic, batch.critic_obs)
-        return flown.terminated, flown.done, batch, value
+        return flown.terminated[..., 0], flown.done, batch, value
 
     terminated, done, batch, value = jax.tree.map(np.asarray, batch_of(jax.random.key(3)))
     within = ~done[:-1]
@@ -239,7 +239,7 @@ def test_episodes_that_ended_stay_as_they_are_and_do_not_count_until_they_are_re
         return memory, jnp.zeros((2, 1, 4)), None
 
     worlds, trajectory = jit_unoptimized(lambda w: collect.collect(jax.random.key(1), env, hover, w, 7))(worlds)
-    np.testing.assert_array_equal(trajectory.was_done[:, 0], [False] * 5 + [True] * 2)
+    np.testing.assert_array_equal(trajectory.was_done[:, 0, 0], [False] * 5 + [True] * 2)
     assert jnp.all(worlds.done)
     np.testing.assert_array_equal(worlds.obs, trajectory.final_obs[4])
     assert jnp.all(discounted_rewards(trajectory, 1.0)[5:] == 0)

@@ -14,7 +14,7 @@ from jaxdrones.training.recipe import Recipe
 
 LEARNERS = {"bptt": bptt, "shac": shac, "ppo": ppo}
 KEY = jax.random.key(0)
-WORDS = {"hidden_sizes", "critic_hidden_sizes", "gradient", "surrogate"}
+WORDS = {"hidden_sizes", "set_sizes", "critic_hidden_sizes", "gradient", "surrogate"}
 SWITCHES = {"per_agent", "centralized_critic", "privileged_critic", "image_gradient"}
 ZERO_MAKES_SENSE = {
     *("obs_stats_freeze", "restart_fraction", "anneal_fraction", "gradient_decay"),
@@ -59,6 +59,8 @@ def test_layers_switches_and_words_are_refused_where_they_make_no_sense(learner)
     for sizes in ((), (0,), (-1,), (2.5,), 32, "32", None, (32, "a")):
         with pytest.raises(ValueError, match=r"sizes is .*; give"):
             config(hidden_sizes=sizes)
+        with pytest.raises(ValueError, match=r"sizes is .*; give"):
+            config(set_sizes=sizes)
     for value in ("yes", 1, None, np.nan):
         with pytest.raises(ValueError, match=r"per_agent is .*; give True or False"):
             config(per_agent=value)

@@ -1,0 +1,104 @@
+"""Observations of the other drones of a team."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxdrones.arguments import Count, checked, number
+from jaxdrones.quantity import Quantity, quantities
+from jaxdrones.tasks.pairs import closest_approach, others, seen_from
+from jaxdrones.tasks.task import ObservationTerm, Task, World, norm
+
+_MAX_DISTANCE = 20.0  # m: bound of the observations, and place of a drone that does not exist
+_HORIZON = 1.5  # s: latest closest approach
+_NEAR, _NEARNESS = 0.1, 0.3  # m: direction of a drone, scaled by nearness
+
+
+def adjacency(task: Task, world: World, radius: float = 10.0) -> Array:
+    """Equation 8: 1 for every drone within `radius` (m) and for the drone itself, else 0."""
+    return (_distances(world.drones.pos) < radius).astype(world.drones.pos.dtype)
+
+
+@checked
+def neighbors(count: Count) -> ObservationTerm:
+    """Observation term of the nearest drones, nearest first: relative position (m) and velocity (m/s), world axes.
+
+    In smaller teams the remaining rows are a drone at rest in 35 m.
+    """
+
+    def observe(task: Task, world: World) -> Array:
+        """Position and velocity of the nearest drones, relative to the drone."""
+        drones = world.drones
+        nearest = _nearest(drones.pos, min(count, len(drones.pos) - 1))
+        rows = jnp.concatenate([seen_from(drones.pos, nearest), seen_from(drones.vel, nearest)], axis=-1)
+        return _flat(rows, count)
+
+    entries: list[Quantity] = []
+    for which in _names(count):
+        entries += quantities(f"position of the {which}", "m", "world")
+        entries += quantities(f"velocity of the {which}", "m/s", "world")
+    return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=f"neighbors({count})")
+
+
+@checked
+def encounters(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2) -> ObservationTerm:
+    """Observation term of the nearest drones as a set, for a network that does not depend on their number or order.
+
+    A row has the position (m), the velocity (m/s), the position at the closest approach within 1.5 s at constant
+    velocities (m), the time until then (s), and the direction, scaled by nearness; relative to the drone, world axes.
+
+    Args:
+        count: number of drones; in smaller teams the remaining rows are beyond `reach`.
+        reach: distance at which a drone is out of sight, m.
+    """
+
+    def observe(task: Task, world: World) -> Array:
+        """Position, velocity and closest approach of the nearest drones, relative to the drone."""
+        drones, n = world.drones, len(world.drones.pos)
+        nearest = others(n) if count >= n - 1 else _nearest(drones.pos, count)
+        pos, vel = seen_from(drones.pos, nearest), seen_from(drones.vel, nearest)
+        time, approach = closest_approach(pos, vel, _HORIZON)
+        away = jnp.sqrt(jnp.sum(pos**2, axis=-1, keepdims=True) + 1e-8)
+        direction = pos / away * (_NEARNESS / (away + _NEAR))
+        return _flat(jnp.concatenate([pos, vel, approach, time[..., None], direction], axis=-1), count)
+
+    entries: list[Quantity] = []
+    for which in _names(count):
+        entries += quantities(f"position of the {which}", "m", "world")
+        entries += quantities(f"velocity of the {which}", "m/s", "world")
+        entries += quantities(f"closest approach of the {which}", "m", "world")
+        entries += [Quantity(f"time to the closest approach of the {which}", "s")]
+        entries += quantities(f"direction of the {which}, by nearness", "-", "world")
+    name = f"encounters({count}, {reach:g})"
+    return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=name, rows=count, reach=reach)
+
+
+def _names(count: int) -> list[str]:
+    return [f"{i + 1}-th nearest drone" if i else "nearest drone" for i in range(count)]
+
+
+def _flat(rows: Float[Array, "n k f"], count: int) -> Float[Array, "n d"]:
+    """Rows side by side, followed by drones that are far away, up to `count` rows."""
+    n, known, size = rows.shape
+    far = jnp.zeros((n, count - known, size), rows.dtype).at[..., :3].set(_MAX_DISTANCE)
+    return jnp.concatenate([rows, far], axis=1).reshape(n, -1)
+
+
+def _nearest(pos: Float[Array, "n 3"], count: int) -> Int[Array, "n k"]:
+    """Indices of the nearest other drones, nearest first."""
+    n = len(pos)
+    away = jnp.where(jnp.eye(n, dtype=bool), jnp.inf, _distances(jax.lax.stop_gradient(pos)))
+    found = [jnp.zeros((n, 0), int)]
+    for _ in range(count):  # the nearest, the next one, ...: faster than sorting while they are few
+        nearest = jnp.argmin(away, axis=-1)
+        found.append(nearest[:, None])
+        away = jnp.where(jnp.arange(n)[None] == nearest[:, None], jnp.inf, away)
+    return jnp.concatenate(found, axis=1)
+
+
+def _distances(pos: Float[Array, "n 3"]) -> Float[Array, "n n"]:
+    return jax.vmap(lambda own: norm(pos - own[None]))(pos)

@@ -1,0 +1,167 @@
+"""Task: a crowd of drones crosses a box without touching."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.arguments import Switch, checked, number
+from jaxdrones.control import Setpoint
+from jaxdrones.params import Params
+from jaxdrones.quantity import quantities
+from jaxdrones.state import State
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.conditions import out_of_control
+from jaxdrones.tasks.pairs import nearest_on_the_way, others, seen_from
+from jaxdrones.tasks.starts import thrown
+from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, distance
+
+FLOOR = 2.0  # m, height of the box above the ground
+_SPACING = 4.0  # collision radii between starts, and between goals (GCBF+, arXiv 2401.14554)
+_TRIES = 32  # random places of a drone, of which the first free one is taken
+_SPEED = 1.2  # m/s, to the goal
+_SLOW_WITHIN = 0.8  # m of the goal
+_SETTLING = 6.0  # s of an episode beyond the straight flight
+_SIGHT = 2.0  # m, length at which the observed vector to the goal is clipped
+_ARRIVED = 0.1  # m
+_MARGIN, _MARGIN_TIME, _SOFTNESS = 0.14, 0.3, 0.04  # m, s, m: gap below which the reward falls
+_NARROWEST, _LONGEST = 0.6, 2.0  # sides of a random box over those of the cube
+
+
+@checked
+def crowd(
+    drones: Team = 8,
+    density: Annotated[float, number("1/m^3", above=0, at_most=8)] = 1.0,
+    random_box: Switch = False,
+    patience: Annotated[float, number(at_least=1)] = 1.0,
+) -> Task:
+    """Drones fly from random starts to random goals in a cube whose volume grows with their number.
+
+    Starts are four collision radii apart where a random place permits it, and so are goals. Two drones touch when their
+    centers come closer than two collision radii. A drone out of control ends its own episode.
+
+    Args:
+        drones: number of drones, at least two.
+        density: drones per volume of the cube.
+        random_box: whether the sides are drawn for every episode: 0.6 to 1.1 times those of the cube, in every second
+            box with one side up to twice as long, in which drones meet at full speed. Meant for training.
+        patience: duration of an episode over that of a straight flight along the diagonal plus 6 s.
+    """
+    side = (drones / density) ** (1 / 3)
+    longest = side * (_LONGEST if random_box else 1)
+    duration = patience * (_SETTLING + math.hypot(longest, side, side) / _SPEED)
+
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+        """Nearly at rest at random places in the box."""
+        box_key, start_key, place_key, goal_key = jax.random.split(key, 4)
+        sides = _random_sides(box_key, side) if random_box else jnp.full(3, side)
+        spacing = _SPACING * jnp.max(params.collision_radius)
+        middle = jnp.array([[0, 0, FLOOR + side / 2]])
+        place, goal = (middle + _places(k, drones, sides, spacing) for k in (place_key, goal_key))
+        state = thrown(start_key, params, place, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)
+        return state, {"goal": goal, "pos": state.pos, "touched": jnp.zeros(drones, bool)}
+
+    def target(variables: dict[str, Array], t: Array) -> Setpoint:
+        """Goal."""
+        return Setpoint.at(variables["goal"])
+
+    return Task(
+        name="crowd",
+        summary="cross a box full of drones without touching",
+        drones=drones,
+        duration=duration,
+        start=start,
+        target=target,
+        rewards={
+            "alive": (2.0, shaping.alive),
+            "position": (-1.0, shaping.position),
+            "velocity": (-0.5, _velocity),
+            "approach": (-8.0, _approach),
+            "omega": (-0.02, shaping.body_rates),
+            "action_change": (-0.02, shaping.action_change),
+        },
+        terminations=out_of_control(longest + 4.0, center=(0, 0, FLOOR + side / 2)),
+        ends="drone",
+        advance=_advance,
+        metrics={
+            "safe": _safe,
+            "reached": _reached,
+        },
+        success=_arrived_untouched,
+        observations={
+            "goal": ObservationTerm(_goal, _SIGHT, entries=quantities("goal, from the drone, up to 2 m", "m", "world"))
+        },
+        control_hz=50.0,
+        action="thrust_and_rates",
+        observation=("goal", "rotation_matrix", "velocity", "omega", "encounters"),
+    )
+
+
+def _random_sides(key: jax.Array, side: float) -> Float[Array, "3"]:
+    """Sides of a random box, m."""
+    sides_key, which_key, long_key = jax.random.split(key, 3)
+    sides = jax.random.uniform(sides_key, (3,), minval=_NARROWEST * side, maxval=1.1 * side)
+    long = jax.random.uniform(long_key, (), minval=side, maxval=_LONGEST * side)
+    return jnp.where(jnp.arange(3) == jax.random.randint(which_key, (), 0, 6), long, sides)
+
+
+def _places(key: jax.Array, n: int, sides: Array, spacing: Array) -> Float[Array, "n 3"]:
+    """Random places about the origin, `spacing` apart where one of the tries is."""
+    tries = jax.random.uniform(key, (n, _TRIES, 3), minval=-0.5, maxval=0.5) * sides[None, None]
+
+    def place(taken: Array, drone: tuple[Array, Array]) -> tuple[Array, None]:
+        i, tries = drone
+        apart = jnp.linalg.norm(tries[:, None] - taken[None], axis=-1)
+        free = jnp.min(jnp.where(jnp.arange(n)[None] < i, apart, jnp.inf), axis=-1)
+        first = jnp.argmax(jnp.where(free > spacing, spacing + _TRIES - jnp.arange(_TRIES), free))
+        return taken.at[i].set(tries[first]), None
+
+    return jax.lax.scan(place, jnp.zeros((n, 3)), (jnp.arange(n), tries))[0]
+
+
+def _advance(task: Task, world: World) -> dict[str, Array]:
+    variables, pos = world.variables, world.drones.pos
+    touching = nearest_on_the_way(variables["pos"], pos) < 2 * world.params.collision_radius
+    return variables | {"pos": pos, "touched": variables["touched"] | touching}
+
+
+def _goal(task: Task, world: World) -> Float[Array, "n 3"]:
+    """Vector to the goal, m, world axes, of a length up to 2 m."""
+    away = world.variables["goal"] - world.drones.pos
+    return away * jnp.minimum(1, _SIGHT / shaping.length(away, 1e-3 * _SIGHT))[:, None]
+
+
+def _velocity(task: Task, world: World) -> Float[Array, " n"]:
+    """Difference from the velocity straight to the goal, m/s."""
+    return shaping.length(world.drones.vel - shaping.velocity_to_target(task, world, _SPEED, _SLOW_WITHIN), 0.1)
+
+
+def _approach(task: Task, world: World) -> Float[Array, " n"]:
+    """Sum over the other drones of the smoothed penetration of a margin that grows with the closing speed, m."""
+    index = others(len(world.active))
+    pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
+    apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + 1e-8)
+    closing = jnp.maximum(-jnp.sum(pos * vel, axis=-1) / apart, 0)
+    gap = apart - 2 * world.params.collision_radius[:, None]
+    inside = _MARGIN + _MARGIN_TIME * closing - gap
+    return jnp.sum((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS), axis=-1)
+
+
+def _safe(task: Task, world: World) -> Float[Array, " n"]:
+    """One if the drone has touched no other one."""
+    return 1 - world.variables["touched"].astype(world.drones.pos.dtype)
+
+
+def _reached(task: Task, world: World) -> Float[Array, " n"]:
+    """One if the drone is within 10 cm of its goal."""
+    return (distance(task, world) < _ARRIVED).astype(world.drones.pos.dtype)
+
+
+def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone was within 10 cm of its goal in the end and never touched another one."""
+    return (metrics["reached"][-1] == 1) & (metrics["safe"][-1] == 1)

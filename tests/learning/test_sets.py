@@ -1,0 +1,124 @@
+"""A network of a set sees neither its order nor its size, and one policy flies teams of any size."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones import envs
+from jaxdrones.envs.observations import encounters, neighbors
+from jaxdrones.learning import bptt, checkpoint
+from jaxdrones.learning.layers import SetEncoder, split_sets
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import RunningStatistics
+
+KEY = jax.random.key(0)
+REACH = 1.2
+
+
+def encoded(own, rows):
+    encoder = SetEncoder((8, 4), REACH)
+    params = encoder.init(KEY, own, rows)
+    return lambda own, rows: np.asarray(encoder.apply(params, own, rows))
+
+
+def test_the_features_of_a_set_depend_on_neither_order_nor_far_rows():
+    rng = np.random.default_rng(0)
+    own, rows = jnp.asarray(rng.normal(size=(5, 6))), jnp.asarray(rng.uniform(-0.6, 0.6, (5, 7, 13)))
+    features = encoded(own, rows)
+    expected = features(own, rows)
+    np.testing.assert_allclose(features(own, rows[:, rng.permutation(7)]), expected, rtol=1e-6)
+    far = jnp.asarray(rng.normal(size=(5, 3, 13))).at[..., :3].set([REACH, 0.01, 0])
+    np.testing.assert_allclose(features(own, jnp.concatenate([far, rows], axis=1)), expected, rtol=1e-6)
+    for other in (features(own, rows[:, :6]), features(own.at[:, 0].add(1), rows)):
+        assert np.all(np.max(np.abs(other - expected), axis=-1) > 1e-3)
+
+
+def test_a_row_fades_out_without_a_jump():
+    own, rows = jnp.ones(2), jnp.ones((1, 5))
+
+    def size(away):
+        return np.linalg.norm(encoded(own, rows)(own, rows.at[0, :3].set(jnp.array([away, 0.0, 0.0]))))
+
+    assert size(REACH) < 1e-5 < size(0.99 * REACH) < 0.05 * size(0.3 * REACH)
+
+
+def test_sets_are_cut_out_of_an_observation_where_they_stand():
+    x = jnp.arange(20.0).reshape(2, 10)
+    own, (first, second) = split_sets(((1, 2, 2, 1.0), (6, 1, 3, 2.0)), x)
+    np.testing.assert_array_equal(own, x[:, [0, 5, 9]])
+    np.testing.assert_array_equal(first, x[:, 1:5].reshape(2, 2, 2))
+    np.testing.assert_array_equal(second, x[:, None, 6:9])
+
+
+def crowd(drones, count=3):
+    return envs.make("crowd", drones=drones, observation=("goal", "velocity", encounters(count, REACH)))
+
+
+@pytest.mark.float32
+def test_one_policy_flies_teams_of_any_size():
+    policy = Policy.init(KEY, crowd(4), (8,), set_sizes=(8, 8))
+    for drones in (2, 9):
+        env = crowd(drones)
+        obs, _ = env.reset(KEY)
+        assert policy(obs).shape == (drones, env.action_size)
+
+
+@pytest.mark.float32
+def test_rows_are_not_normalized_and_all_else_is(tmp_path):
+    env = crowd(4)
+    config = bptt.Config(updates=2, worlds=4, horizon=3, hidden_sizes=(8,), set_sizes=(6, 5))
+    policy = bptt.train(KEY, env, config).policy
+    ((at, rows, size, reach),) = env.sets
+    assert (at, rows, size, reach) == (6, 3, 13, REACH)
+    assert np.all(policy.obs_stats.mean[at:] == 0) and np.all(policy.obs_stats.var[at:] == 1)
+    assert np.all(policy.obs_stats.var[:at] != 1)
+    checkpoint.save(tmp_path / "crowd", policy)
+    again = checkpoint.load(tmp_path / "crowd")
+    obs, _ = env.reset(KEY)
+    assert again.network == policy.network
+    np.testing.assert_array_equal(again(obs), policy(obs))
+
+
+def test_the_statistics_of_a_policy_without_sets_are_kept():
+    policy = Policy.init(KEY, envs.make("hover"), (4,))
+    stats = RunningStatistics.of(jnp.ones((3, policy.obs_stats.mean.size)))
+    np.testing.assert_array_equal(policy.with_obs_stats(stats).obs_stats.mean, stats.mean)
+
+
+def observed(term, pos, vel):
+    env = envs.make("crowd", drones=len(pos))
+    _, world = env.reset(KEY)
+    world = world.replace(drones=world.drones.replace(pos=jnp.asarray(pos), vel=jnp.asarray(vel)))
+    return np.asarray(term.observe(env.task, world))
+
+
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_encounters_are_those_of_the_nearest_drones_at_constant_velocity(count):
+    rng = np.random.default_rng(1)
+    pos, vel = rng.uniform(-2, 2, (4, 3)), rng.normal(size=(4, 3))
+    rows = observed(encounters(count), pos, vel).reshape(4, count, 13)
+    for i in range(4):
+        others = [j for j in range(4) if j != i]
+        nearest = sorted(others, key=lambda j: np.linalg.norm(pos[j] - pos[i]))[:count]
+        found = rows[i][np.argsort(np.linalg.norm(rows[i][:, :3], axis=1))]
+        np.testing.assert_allclose(found[: len(nearest), :3], pos[nearest] - pos[i], atol=1e-12)
+        np.testing.assert_allclose(found[: len(nearest), 3:6], vel[nearest] - vel[i], atol=1e-12)
+        assert np.all(np.linalg.norm(found[len(nearest) :, :3], axis=1) > 20)
+        times = np.linspace(0, 1.5, 20001)
+        for row in found[: len(nearest)]:
+            away = np.linalg.norm(row[:3] + times[:, None] * row[3:6], axis=1)
+            assert np.linalg.norm(row[6:9]) < away.min() + 0.03  # a small term keeps slow drones smooth
+            np.testing.assert_allclose(row[6:9], row[:3] + row[9] * row[3:6], atol=1e-12)
+            np.testing.assert_allclose(np.cross(row[10:], row[:3]), 0, atol=1e-9)
+
+
+def test_a_missing_neighbor_is_far_away():
+    rows = observed(neighbors(3), [[0.0, 0, 1], [1.0, 0, 1]], np.zeros((2, 3))).reshape(2, 3, 6)
+    np.testing.assert_allclose(rows[0, 0], [1, 0, 0, 0, 0, 0])
+    assert np.all(np.linalg.norm(rows[:, 1:, :3], axis=-1) > 30) and np.all(rows[:, 1:, 3:] == 0)
+
+
+def test_a_learner_that_knows_of_no_sets_is_unchanged():
+    env = envs.make("hover")
+    assert env.sets == () and not hasattr(Policy.init(KEY, env, (4,)).network, "sets")

@@ -1,0 +1,82 @@
+"""The crowd: random starts and goals at a constant density, and a touch that no control step misses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdrones.envs import make
+from jaxdrones.tasks.crowd import FLOOR
+from jaxdrones.tasks.pairs import closest_approach, nearest_on_the_way
+
+KEYS = jax.random.split(jax.random.key(0), 20)
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("drones, density", [(2, 1.0), (8, 1.0), (8, 4.0), (27, 1.0)])
+def test_starts_and_goals_fill_a_cube_of_the_density_and_keep_their_distance(drones, density):
+    env = make("crowd", drones=drones, density=density)
+    _, worlds = jax.vmap(env.reset)(KEYS)
+    side = (drones / density) ** (1 / 3)
+    radius = float(env.params.collision_radius[0])
+    for places in (np.asarray(worlds.drones.pos), np.asarray(worlds.variables["goal"])):
+        inside = places - [0, 0, FLOOR + side / 2]
+        assert np.abs(inside).max() <= side / 2
+        np.testing.assert_allclose(np.abs(inside).mean(), side / 4, rtol=0.25)
+        apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + 9 * np.eye(drones)
+        assert apart.min() > 4 * radius
+    assert np.linalg.norm(worlds.variables["goal"] - worlds.drones.pos, axis=-1).mean() > 0.4 * side
+
+
+@pytest.mark.float32
+def test_random_boxes_are_narrow_or_long():
+    env = make("crowd", random_box=True)
+    _, worlds = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 200))
+    places = np.concatenate([worlds.drones.pos, worlds.variables["goal"]], axis=1)
+    sides = np.ptp(places, axis=1)
+    assert sides.min() > 0.3 and 1.0 < np.median(sides) < 2.0
+    assert 0.2 < np.mean(sides.max(axis=1) > 2.2) < 0.5 and sides.max() < 4
+
+
+def test_drones_that_pass_between_two_control_steps_have_touched():
+    """Four meters a second: 16 cm between two control steps, more than the two drones are wide."""
+    env = make("crowd", drones=3)
+    _, world = env.reset(jax.random.key(0))
+    radius = float(env.params.collision_radius[0])
+    for gap, touches in ((1.9, True), (2.1, False)):
+        before = jnp.array([[0.0, 0, 3], [0.16, gap * radius, 3], [0, 3, 3]])
+        after = jnp.array([[0.08, 0, 3], [0.08 - 1e-3, gap * radius, 3], [0, 3, 3]])
+        after = after.at[:2, 0].set(jnp.array([0.16, 0.0]))
+        now = world.replace(
+            drones=world.drones.replace(pos=after),
+            variables=world.variables | {"pos": before, "touched": jnp.zeros(3, bool)},
+        )
+        variables = env.task.advance(env.task, now)
+        np.testing.assert_array_equal(variables["touched"], [touches, touches, False])
+        later = now.replace(variables=variables)
+        np.testing.assert_array_equal(env.task.measure(later)["safe"], [not touches, not touches, True])
+
+
+def test_the_nearest_point_of_two_ways_is_that_of_a_fine_search():
+    rng = np.random.default_rng(0)
+    before, after = rng.normal(size=(2, 5, 3))
+    share = np.linspace(0, 1, 20001)[:, None, None]
+    way = before + share * (after - before)
+    apart = np.linalg.norm(way[:, :, None] - way[:, None], axis=-1) + 9 * np.eye(5)
+    found = nearest_on_the_way(jnp.asarray(before), jnp.asarray(after))
+    np.testing.assert_allclose(found, apart.min(axis=(0, 2)), atol=1e-4)
+
+
+def test_the_gradient_of_the_closest_approach_is_finite_for_drones_at_rest_and_at_one_place():
+    for pos, vel in (([1.0, 0, 0], [0.0, 0, 0]), ([0.0, 0, 0], [0.0, 0, 0])):
+        gradient = jax.grad(lambda p, v: jnp.sum(closest_approach(p, v, 1.5)[1]), (0, 1))(
+            jnp.array(pos), jnp.array(vel)
+        )
+        assert np.all(np.isfinite(gradient))
+
+
+@pytest.mark.float32
+def test_the_longer_the_patience_the_longer_the_episode():
+    assert make("crowd", patience=2.0).steps == pytest.approx(2 * make("crowd").steps, abs=1)
+    with pytest.raises(ValueError, match="patience"):
+        make("crowd", patience=0.5)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -99,6 +100,14 @@ def test_order_unit_and_frame_of_every_number_are_in_the_comment(to, run, env, t
         )
     assert [int(row[0]) for row in rows] == [*range(22), *range(4)]
     assert "Hidden state: 6 numbers, kept between calls; 0 at the start of a flight" in comment
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_the_module_refuses_an_observation_of_another_length(env, tmp_path):
+    (one,) = save(exported.random_policy(env), env, "js", tmp_path)
+    code = f'import {{ step }} from "{one.files[0].as_uri()}"; step([1, 2]);'
+    done = subprocess.run(["node", "--input-type=module", "-e", code], capture_output=True, text=True)
+    assert done.returncode and "RangeError: obs has 2 numbers, not 22" in done.stderr
 
 
 @needs_onnx

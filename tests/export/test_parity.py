@@ -29,7 +29,7 @@ TARGETS = [
     for found in [shutil.which(needed) if to in PROGRAMS else importlib.util.find_spec(needed)]
 ]
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="cc is not installed")
-ODD = jd.Camera(resolution=(13, 11))  # padded to multiples of the strides, differently along each axis
+ODD = jd.Camera(resolution=(26, 21))  # two convolutions, with images padded differently along each axis
 POLICIES = {
     "mlp": ("hover", {}, {}),
     "relu": ("hover", {}, {"activation": "relu"}),

@@ -59,7 +59,8 @@ def random_policy(env, hidden_sizes=(9, 7), recurrent_size=0, activation="tanh",
     obs = {"state": jnp.zeros(env.observation_size)}
     obs |= {name: jnp.zeros(space.shape, space.dtype) for name, space in env.image_spaces.items()}
     obs = obs if env.image_spaces else obs["state"]
-    network = make_network(obs, hidden_sizes, env.action_size, 1.0, recurrent_size).clone(activation=activation)
+    network = make_network(obs, hidden_sizes, env.action_size, 1.0, recurrent_size, env.sets, (8, 6))
+    network = network.clone(activation=activation)
     shapes = jax.eval_shape(network.init, jax.random.key(0), obs)
     team = (env.drones,) if per_agent else ()
 
@@ -70,7 +71,7 @@ def random_policy(env, hidden_sizes=(9, 7), recurrent_size=0, activation="tanh",
     mean, var = rng.normal(size=env.observation_size), rng.uniform(0.0, 2.0, env.observation_size)
     var[0] = 1e-9  # below the lower bound
     stats = RunningStatistics(jnp.asarray(mean, jnp.float32), jnp.asarray(var, jnp.float32), jnp.float32(100))
-    return Policy(jax.tree.map(weights, shapes), stats, network, per_agent)
+    return Policy(jax.tree.map(weights, shapes), stats, network, per_agent).with_obs_stats(stats)
 
 
 def random_inputs(env, seed=1) -> dict[str, np.ndarray]:

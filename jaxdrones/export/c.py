@@ -26,14 +26,17 @@ static inline void NAME_normalize(int n, const float x[], const float mean[], co
 }
 """,
     "dense": """
-/* y = x kernel + bias, with a kernel of n rows and m columns. */
-static inline void NAME_dense(int n, int m, const float x[], const float kernel[], const float bias[], float y[])
+/* y = x kernel + bias for each row of x, with a kernel of n rows and m columns. */
+static inline void NAME_dense(int rows, int n, int m, const float x[], const float kernel[], const float bias[],
+                              float y[])
 {
-    for (int j = 0; j < m; ++j)
-        y[j] = bias ? bias[j] : 0.0f;
-    for (int i = 0; i < n; ++i)
+    for (int row = 0; row < rows; ++row, x += n, y += m) {
         for (int j = 0; j < m; ++j)
-            y[j] += x[i] * kernel[i * m + j];
+            y[j] = bias ? bias[j] : 0.0f;
+        for (int i = 0; i < n; ++i)
+            for (int j = 0; j < m; ++j)
+                y[j] += x[i] * kernel[i * m + j];
+    }
 }
 """,
     "convolution": """
@@ -65,6 +68,29 @@ static inline void NAME_gates(int n, const float inputs[], const float states[],
         const float keep = NAME_sigmoid(inputs[n + i] + states[n + i]);
         const float new_value = tanhf(inputs[2 * n + i] + reset * states[2 * n + i]);
         hidden[i] = keep * hidden[i] + (1.0f - keep) * new_value;
+    }
+}
+""",
+    "add_to_rows": """
+static inline void NAME_add_to_rows(int rows, int m, const float x[], float y[])
+{
+    for (int i = 0; i < rows * m; ++i)
+        y[i] += x[i % m];
+}
+""",
+    "sum_of_rows": """
+/* Sum of rows of m features, weighted by the length of the first three of n numbers: 0 from the reach on. */
+static inline void NAME_sum_of_rows(int rows, int m, int n, const float features[], const float x[], float fade,
+                                    float inverse_reach, float small, float y[])
+{
+    for (int j = 0; j < m; ++j)
+        y[j] = 0.0f;
+    for (int row = 0; row < rows; ++row, features += m, x += n) {
+        const float away = sqrtf(x[0] * x[0] + x[1] * x[1] + x[2] * x[2] + small);
+        const float nearness = fade * (1.0f - away * inverse_reach);
+        const float weight = nearness < 0.0f ? 0.0f : nearness > 1.0f ? 1.0f : nearness;
+        for (int j = 0; j < m; ++j)
+            y[j] += weight * features[j];
     }
 }
 """,

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxdrones.export.layers import (
     Activation,
+    AddToRows,
     Color,
     Concatenate,
     Convolution,
@@ -20,8 +21,11 @@ from jaxdrones.export.layers import (
     Layer,
     Nearness,
     Normalize,
+    Slice,
+    SumOfRows,
     Tensor,
 )
+from jaxdrones.learning.layers import FADE, SMALL_SQUARE
 
 _BYTES = 4  # of a number
 
@@ -90,7 +94,8 @@ def _calls(layer: Layer, inputs: Sequence[Span], output: Span) -> list[Call]:
             arguments = size, inputs[0], constant("mean"), constant("scale"), layer.clip, output
         case Dense():
             function = "dense"
-            arguments = shape[-1], layer.output.shape[-1], inputs[0], constant("kernel"), constant("bias"), output
+            arguments = layer.rows, shape[-1], layer.output.shape[-1], inputs[0]
+            arguments += constant("kernel"), constant("bias"), output
         case Convolution():
             (top, _), (left, _) = layer.margin
             rows, columns, outputs = layer.output.shape
@@ -105,9 +110,14 @@ def _calls(layer: Layer, inputs: Sequence[Span], output: Span) -> list[Call]:
             function, arguments = "nearness", (size, inputs[0], layer.depth_scale, output)
         case Color():
             function, arguments = "color", (size // 3, inputs[0], output)
+        case AddToRows():  # in place
+            function, arguments = "add_to_rows", (*shape, inputs[1], output)
+        case SumOfRows():
+            function = "sum_of_rows"
+            arguments = *shape, layer.inputs[1].shape[1], *inputs, FADE, 1 / layer.reach, SMALL_SQUARE, output
         case Concatenate():
             return _copies(layer, inputs, output)
-        case Flatten():
+        case Flatten() | Slice():
             return []
         case _:
             raise AssertionError(layer)
@@ -125,28 +135,36 @@ def _copies(layer: Layer, inputs: Sequence[Span], output: Span) -> list[Call]:
 
 def _spans(graph: Graph) -> tuple[dict[Tensor, Span], int]:
     """Where each tensor lies, and the length of the working memory, in which the space of tensors is used again."""
-    root: dict[Tensor, Tensor] = {x: x for x in graph.inputs}
+    root: dict[Tensor, tuple[Tensor, int]] = {x: (x, 0) for x in graph.inputs}  # tensor -> tensor and offset in it
     last_use: dict[Tensor, int] = {}
     for i, layer in enumerate(graph.layers):
-        root[layer.output] = _in_place(layer, root) or layer.output
-        last_use |= {root[x]: i for x in (*layer.inputs, layer.output)}
+        root[layer.output] = _inside(layer, root) or (layer.output, 0)
+        last_use |= {root[x][0]: i for x in (*layer.inputs, layer.output)}
     spans = {x: Span("hidden" if x.name == "hidden_state" else x.name) for x in graph.inputs}
-    spans[root[graph.action]] = Span("act")
+    spans[root[graph.action][0]] = Span("act")
     live: list[tuple[int, int, int]] = []  # (start, end, layer of the last use)
     for i, layer in enumerate(graph.layers):
-        x = root[layer.output]
+        x, _ = root[layer.output]
         if x not in spans:
             live = sorted(place for place in live if place[2] >= i)
             start = _first_gap(live, x.size)
             live.append((start, start + x.size, last_use[x]))
             spans[x] = Span("work", start)
     ends = [spans[x].start + x.size for x in last_use if spans[x].array == "work"]
-    return {x: spans[its_root] for x, its_root in root.items()}, max(ends, default=0)
+    return {x: spans[outer] + offset for x, (outer, offset) in root.items()}, max(ends, default=0)
 
 
-def _in_place(layer: Layer, root: dict[Tensor, Tensor]) -> Tensor | None:
-    """Tensor that a layer overwrites, or that its output is another shape of."""
-    return root[layer.inputs[-1]] if isinstance(layer, Activation | Flatten | Gates) else None
+def _inside(layer: Layer, root: dict[Tensor, tuple[Tensor, int]]) -> tuple[Tensor, int] | None:
+    """Tensor that a layer overwrites, or that its output is a part of, and the offset in it."""
+    match layer:
+        case Activation() | AddToRows() | Flatten():
+            return root[layer.inputs[0]]
+        case Gates():
+            return root[layer.inputs[-1]]
+        case Slice():
+            outer, offset = root[layer.inputs[0]]
+            return outer, offset + layer.start
+    return None
 
 
 def _first_gap(live: Sequence[tuple[int, int, int]], size: int) -> int:

@@ -18,7 +18,8 @@ from jaxdrones.envs import Env, explain
 from jaxdrones.errors import UserError
 from jaxdrones.export import c, js, onnx, stablehlo
 from jaxdrones.export.calls import program_of
-from jaxdrones.export.layers import Graph, Tensor, layers_of
+from jaxdrones.export.layers import Graph, Tensor
+from jaxdrones.export.network import layers_of
 from jaxdrones.export.text import Description
 from jaxdrones.learning.networks import OwnNetwork, Policy
 

@@ -23,11 +23,13 @@ function normalize(n, x, mean, scale, clip, y) {
 }
 """,
     "dense": """
-// y = x kernel + bias, with a kernel of n rows and m columns.
-function dense(n, m, x, kernel, bias, y) {
-  for (let j = 0; j < m; ++j) y[j] = bias ? bias[j] : 0;
-  for (let i = 0; i < n; ++i) {
-    for (let j = 0; j < m; ++j) y[j] += f32(x[i] * kernel[i * m + j]);
+// y = x kernel + bias for each row of x, with a kernel of n rows and m columns.
+function dense(rows, n, m, x, kernel, bias, y) {
+  for (let row = 0, from = 0, to = 0; row < rows; ++row, from += n, to += m) {
+    for (let j = 0; j < m; ++j) y[to + j] = bias ? bias[j] : 0;
+    for (let i = 0; i < n; ++i) {
+      for (let j = 0; j < m; ++j) y[to + j] += f32(x[from + i] * kernel[i * m + j]);
+    }
   }
 }
 """,
@@ -56,6 +58,23 @@ function gates(n, inputs, states, hidden) {
     const keep = sigmoid(f32(inputs[n + i] + states[n + i]));
     const value = f32(Math.tanh(f32(inputs[2 * n + i] + f32(reset * states[2 * n + i]))));
     hidden[i] = f32(keep * hidden[i]) + f32(f32(1 - keep) * value);
+  }
+}
+""",
+    "add_to_rows": """
+function add_to_rows(rows, m, x, y) {
+  for (let i = 0; i < rows * m; ++i) y[i] += x[i % m];
+}
+""",
+    "sum_of_rows": """
+// Sum of rows of m features, weighted by the length of the first three of n numbers: 0 from the reach on.
+function sum_of_rows(rows, m, n, features, x, fade, inverseReach, small, y) {
+  for (let j = 0; j < m; ++j) y[j] = 0;
+  for (let row = 0; row < rows; ++row) {
+    const [a, b, c] = x.subarray(row * n, row * n + 3);
+    const away = f32(Math.sqrt(f32(a * a + b * b + c * c + small)));
+    const weight = Math.min(Math.max(f32(fade * f32(1 - f32(away * inverseReach))), 0), 1);
+    for (let j = 0; j < m; ++j) y[j] += f32(weight * features[row * m + j]);
   }
 }
 """,

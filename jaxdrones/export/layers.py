@@ -1,17 +1,13 @@
-"""Network of a policy as a list of layers, from which C, JavaScript and ONNX are written."""
+"""Layers of an exported network, from which C, JavaScript and ONNX are written."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
-from jaxdrones.errors import UserError
-from jaxdrones.learning.layers import MLP, Network
-from jaxdrones.learning.networks import OwnNetwork, Policy
 from jaxdrones.learning.normalize import CLIP
 
 _BYTES = 4  # of a weight, float32
@@ -59,11 +55,16 @@ class Normalize(Layer):
 
 
 class Dense(Layer):
-    """`x @ kernel + bias` with a kernel (inputs, outputs); the bias may be missing."""
+    """`x @ kernel + bias` of a vector or of rows, with a kernel (inputs, outputs); the bias may be missing."""
+
+    @property
+    def rows(self) -> int:
+        """Number of rows; 1 of a vector."""
+        return math.prod(self.output.shape[:-1])
 
     @property
     def multiply_adds(self) -> int:  # noqa: D102
-        return self.constants["kernel"].size
+        return self.rows * self.constants["kernel"].size
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -117,6 +118,32 @@ class Color(Layer):
     """Channels (height, width, 3) in [0, 1] of red, green, blue and opacity in bytes."""
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Slice(Layer):
+    """Entries of a vector from `start` on, in the shape of the output."""
+
+    start: int = 0
+
+
+class AddToRows(Layer):
+    """Sum of each row (k, size) of the first input and the second input (size,)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SumOfRows(Layer):
+    """Sum of rows of features (k, size), weighted by the nearness of the rows (k, n) that they are features of.
+
+    The weight is `clip(FADE * (1 - away / reach), 0, 1)`, where `away` is the length of the first three entries; see
+    `jaxdrones.learning.layers.SetEncoder`.
+    """
+
+    reach: float = math.inf
+
+    @property
+    def multiply_adds(self) -> int:  # noqa: D102
+        return self.inputs[0].size
+
+
 class Concatenate(Layer):
     """Concatenation along the last axis."""
 
@@ -151,92 +178,3 @@ class Graph:
     def weight_bytes(self) -> int:
         """Bytes of all weights and of the normalization."""
         return _BYTES * sum(x.size for layer in self.layers for x in layer.constants.values())
-
-
-class _Layers:
-    """Layers in the order of computation, with numbered names."""
-
-    def __init__(self) -> None:
-        self.layers: list[Layer] = []
-
-    def add(self, kind: Any, inputs: tuple[Tensor, ...], shape: tuple[int, ...], **settings: Any) -> Tensor:
-        word = kind.__name__.lower()
-        number = sum(type(layer) is kind for layer in self.layers)
-        output = Tensor(f"{word}_{number}", shape)
-        self.layers.append(kind(inputs, output, **settings))
-        return output
-
-    def dense(self, x: Tensor, weights: Mapping[str, Any]) -> Tensor:
-        constants = {name: _float32(weights[name]) for name in ("kernel", "bias") if name in weights}
-        return self.add(Dense, (x,), (*x.shape[:-1], constants["kernel"].shape[1]), constants=constants)
-
-    def activation(self, x: Tensor, function: str) -> Tensor:
-        return self.add(Activation, (x,), x.shape, function=function)
-
-    def concatenate(self, tensors: tuple[Tensor, ...]) -> Tensor:
-        size = sum(x.shape[-1] for x in tensors)
-        return self.add(Concatenate, tensors, (*tensors[0].shape[:-1], size))
-
-    def mlp(self, x: Tensor, network: MLP | Network, params: Mapping[str, Any]) -> Tensor:
-        for i in range(len(network.hidden_sizes)):
-            x = self.activation(self.dense(x, params[f"Dense_{i}"]), network.activation)
-        return self.dense(x, params[f"Dense_{len(network.hidden_sizes)}"])
-
-    def image_features(self, images: tuple[Tensor, ...], network: Network, params: Mapping[str, Any]) -> Tensor:
-        channels = []
-        for image in images:
-            if image.name == "depth":
-                shape = (*image.shape, 1)
-                channels.append(self.add(Nearness, (image,), shape, depth_scale=network.depth_scale))
-            else:
-                channels.append(self.add(Color, (image,), (*image.shape[:2], 3)))
-        x = channels[0] if len(channels) == 1 else self.concatenate(tuple(channels))
-        for i, (size, stride) in enumerate(zip(network.channels, network.strides, strict=True)):
-            rows, columns = (math.ceil(length / stride) for length in x.shape[:2])
-            constants = {name: _float32(params[f"Dense_{i}"][name]) for name in ("kernel", "bias")}
-            x = self.add(Convolution, (x,), (rows, columns, size), constants=constants, stride=stride)
-            x = self.activation(x, "relu")
-        x = self.add(Flatten, (x,), (x.size,))
-        return self.activation(self.dense(x, params[f"Dense_{len(network.channels)}"]), "relu")
-
-    def gru(self, x: Tensor, hidden_state: Tensor, params: Mapping[str, Any]) -> Tensor:
-        gates = self.dense(x, params["Dense_0"]), self.dense(hidden_state, {"kernel": params["recurrent_kernel"]})
-        return self.add(Gates, (*gates, hidden_state), hidden_state.shape)
-
-
-def layers_of(policy: Policy, images: tuple[Tensor, ...]) -> Graph:
-    """Layers of a policy whose drones share one network.
-
-    Args:
-        policy: policy with a network of this library.
-        images: images that it observes, in the order of their names: `depth` (height, width) and `rgb`
-            (height, width, 4).
-
-    Raises:
-        ValueError: a user's network, whose layers are unknown.
-    """
-    assert not policy.per_agent, "give the policy of one drone"
-    network = policy.network
-    if isinstance(network, OwnNetwork):
-        name = type(network.module).__name__
-        raise UserError(f"the policy has a network of your own, {name}, whose layers are unknown; give --to stablehlo")
-    layers, params = _Layers(), policy.params["params"]
-    obs = Tensor("obs", np.shape(policy.obs_stats.mean))
-    inputs: tuple[Tensor, ...] = (obs, *images)
-    constants = {"mean": _float32(policy.obs_stats.mean), "scale": _float32(policy.obs_stats.scale)}
-    x, next_hidden_state = layers.add(Normalize, (obs,), obs.shape, constants=constants), None
-    if isinstance(network, Network):
-        if images:
-            x = layers.concatenate((x, layers.image_features(images, network, params["CNN_0"])))
-        if network.recurrent_size:
-            hidden_state = Tensor("hidden_state", (network.recurrent_size,))
-            inputs += (hidden_state,)
-            next_hidden_state = layers.gru(x, hidden_state, params["GRU_0"])
-            x = layers.concatenate((x, next_hidden_state))
-        params = params["MLP_0"]
-    action = layers.activation(layers.mlp(x, network, params), "tanh")
-    return Graph(inputs, tuple(layers.layers), action, next_hidden_state)
-
-
-def _float32(x: Any) -> np.ndarray:
-    return np.asarray(x, np.float32)

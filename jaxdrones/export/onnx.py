@@ -11,6 +11,7 @@ import numpy as np
 from jaxdrones.errors import UserError, install
 from jaxdrones.export.layers import (
     Activation,
+    AddToRows,
     Color,
     Concatenate,
     Convolution,
@@ -21,9 +22,12 @@ from jaxdrones.export.layers import (
     Layer,
     Nearness,
     Normalize,
+    Slice,
+    SumOfRows,
     Tensor,
 )
 from jaxdrones.export.text import Description
+from jaxdrones.learning.layers import FADE, SMALL_SQUARE
 
 _OPSET, _IR_VERSION = 17, 8  # of 2022, which every runtime of today reads
 _ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu", "elu": "Elu"}
@@ -60,6 +64,9 @@ class _Nodes:
                 scaled = self.node("Mul", [shifted, constants["scale"]], f"{y}_scaled")
                 low = self.constant(f"{y}_low", np.float32(-layer.clip))
                 self.node("Clip", [scaled, low, self.constant(f"{y}_high", np.float32(layer.clip))], y)
+            case Dense() if len(layer.output.shape) > 1:
+                product = self.node("MatMul", [*inputs, constants["kernel"]], f"{y}_product")
+                self.node("Add", [product, constants["bias"]], y)
             case Dense():
                 self.node("Gemm", [*inputs, *constants.values()], y)
             case Convolution():
@@ -76,18 +83,42 @@ class _Nodes:
                 near = self.node("Div", [scale, self.node("Add", [ahead, scale], f"{y}_sum")], f"{y}_near")
                 self.node("Unsqueeze", [near, self.constant("last_axis", np.array([-1]))], y)
             case Color():
-                ends = [
-                    self.constant(f"{y}_{name}", np.array([x])) for name, x in (("from", 0), ("to", 3), ("axis", 3))
-                ]
                 floats = self.node("Cast", inputs, f"{y}_float", to=self.onnx.TensorProto.FLOAT)
-                rgb = self.node("Slice", [floats, *ends], f"{y}_rgb")
+                rgb = self.slice(floats, f"{y}_rgb", 0, 3)
                 self.node("Div", [rgb, self.constant(f"{y}_largest", np.float32(255))], y)
+            case Slice():
+                part = self.slice(inputs[0], f"{y}_part", layer.start, layer.start + layer.output.size)
+                self.node("Reshape", [part, self.constant(f"{y}_shape", np.array([-1, *layer.output.shape]))], y)
+            case AddToRows():
+                one_row = self.node("Unsqueeze", [inputs[1], self.constant("second_axis", np.array([1]))], f"{y}_row")
+                self.node("Add", [inputs[0], one_row], y)
+            case SumOfRows():
+                self.sum_of_rows(layer)
             case Concatenate():
                 self.node("Concat", inputs, y, axis=-1)
             case Flatten():
                 self.node("Reshape", [*inputs, self.constant(f"{y}_shape", np.array([-1, layer.output.size]))], y)
             case _:
                 raise AssertionError(layer)
+
+    def slice(self, x: str, output: str, start: int, end: int) -> str:
+        """Entries along the last axis."""
+        ends = [self.constant(f"{output}_{name}", np.array([i])) for name, i in (("start", start), ("end", end))]
+        return self.node("Slice", [x, *ends, self.constant("last_axis", np.array([-1]))], output)
+
+    def sum_of_rows(self, layer: SumOfRows) -> None:
+        y, (features, rows) = layer.output.name, (x.name for x in layer.inputs)
+        scalars = {"fade": FADE, "inverse": 1 / layer.reach, "small": SMALL_SQUARE, "low": 0, "high": 1}
+        names = {name: self.constant(f"{y}_{name}", np.float32(x)) for name, x in scalars.items()}
+        vector = self.slice(rows, f"{y}_vector", 0, 3)
+        square = [self.node("Mul", [vector, vector], f"{y}_square"), self.constant("last_axis", np.array([-1]))]
+        total = self.node("Add", [self.node("ReduceSum", square, f"{y}_sum"), names["small"]], f"{y}_total")
+        away = self.node("Mul", [self.node("Sqrt", [total], f"{y}_away"), names["inverse"]], f"{y}_share")
+        near = self.node("Sub", [self.constant("one", np.float32(1)), away], f"{y}_near")
+        faded = self.node("Mul", [near, names["fade"]], f"{y}_faded")
+        weight = self.node("Clip", [faded, names["low"], names["high"]], f"{y}_weight")
+        weighted = self.node("Mul", [weight, features], f"{y}_weighted")
+        self.node("ReduceSum", [weighted, self.constant("second_axis", np.array([1]))], y, keepdims=0)
 
     def convolution(self, layer: Convolution) -> None:
         y, stride = layer.output.name, layer.stride

@@ -15,7 +15,8 @@ from jaxdrones.envs.env import Obs, RowSet
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "elu": nn.elu, "silu": nn.silu}
 _SMALL_IMAGE = 100  # pixels, below which a stride is 2 instead of 4
-_FADE = 1.5  # inverse of the share of its reach in which a row of a set fades out
+SMALL_SQUARE = 1e-8  # m^2, for the gradient of a length at zero
+FADE = 1.5  # inverse of the share of its reach in which a row of a set fades out
 _LARGEST_GRID = 20  # largest number of pixels after the last convolution
 
 
@@ -135,8 +136,8 @@ class SetEncoder(nn.Module):
         x = nn.Dense(self.sizes[0])(rows) + jnp.expand_dims(nn.Dense(self.sizes[0], use_bias=False)(own), -2)
         for size in self.sizes[1:]:
             x = nn.Dense(size)(nn.tanh(x))
-        away = jnp.sqrt(jnp.sum(rows[..., :3] ** 2, axis=-1, keepdims=True) + 1e-8)
-        weight = jnp.clip(_FADE * (1 - away / self.reach), 0, 1)
+        away = jnp.sqrt(jnp.sum(rows[..., :3] ** 2, axis=-1, keepdims=True) + SMALL_SQUARE)
+        weight = jnp.clip(FADE * (1 - away / self.reach), 0, 1)
         return jnp.sum(weight * nn.tanh(x), axis=-2)
 
 

@@ -13,6 +13,7 @@ import jaxdrones as jd
 from benchmarks import exported
 from benchmarks.export import flown as flown_by
 from benchmarks.export import one_call
+from jaxdrones.envs.observations import encounters
 from jaxdrones.export import save
 from jaxdrones.learning import bptt, evaluate
 from jaxdrones.training.presets import preset
@@ -38,6 +39,8 @@ POLICIES = {
     "gru": ("hover", {}, {"recurrent_size": 6}),
     "cnn": ("forest", {}, {"hidden_sizes": (32, 16)}),
     "both": ("hover", {"vision": ("rgb", "depth"), "camera": ODD}, {"recurrent_size": 5}),
+    "set": ("crowd", {"drones": 4}, {}),
+    "one_row": ("crowd", {"observation": ("velocity", encounters(1, 1.2), "goal")}, {"recurrent_size": 3}),
     "team": ("leader-follower", {}, {}),
 }
 
@@ -119,6 +122,9 @@ MISTAKES = [  # kind of policy, and what is written in place of what
     ("cnn", "x[i] < 0.0f ? 0.0f : x[i]", "x[i]"),
     ("cnn", "row * stride + k / (stride * c)", "row * stride + k % stride"),
     ("cnn", "y[i] < 0.0f ? 0.0f : y[i]", "y[i]"),
+    ("set", "inverse_reach)", "1.0f)"),
+    ("set", "y[i] += x[i % m]", "y[i] += x[i / m]"),
+    ("set", "nearness > 1.0f ? 1.0f : nearness", "nearness"),
     ("both", "column * stride + k / c % stride - left", "column * stride + k / c % stride"),
     ("both", "v * w + u", "v * h + u"),
     ("both", "x[4 * i + j]", "x[4 * i + 2 - j]"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -21,7 +22,7 @@ from jaxdrones.export.calls import program_of
 from jaxdrones.export.layers import Graph, Tensor
 from jaxdrones.export.network import layers_of
 from jaxdrones.export.text import Description
-from jaxdrones.learning.networks import OwnNetwork, Policy
+from jaxdrones.learning.networks import Policy
 
 Contents = tuple[dict[str, bytes], Description]
 
@@ -32,9 +33,9 @@ class Exported:
 
     files: tuple[Path, ...]
     multiply_adds: int | None
-    """Multiply-adds of one call; `None` for a network of your own."""
+    """Multiply-adds of one call; `None` for unknown layers."""
     flash: int | None
-    """Bytes of the weights; `None` for a network of your own."""
+    """Bytes of the weights; `None` for unknown layers."""
     ram: int | None
     """Bytes of working memory and hidden state, for C and JavaScript."""
 
@@ -126,7 +127,7 @@ def _onnx(policy: Policy, images: tuple[Tensor, ...], description: Description, 
 
 
 def _stablehlo(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
-    if not isinstance(policy.network, OwnNetwork):
+    with contextlib.suppress(UserError):  # unknown layers, whose costs are unknown too
         description = _with_costs(description, layers_of(policy, images))
     about = json.dumps(description.as_dict(), indent=2)
     return {f"{name}.stablehlo": stablehlo.program(policy, images), f"{name}.json": about.encode()}, description

@@ -175,6 +175,11 @@ class Graph:
         return sum(layer.multiply_adds for layer in self.layers)
 
     @property
+    def weights(self) -> int:
+        """Number of all weights, with those of the normalization."""
+        return sum(x.size for layer in self.layers for x in layer.constants.values())
+
+    @property
     def weight_bytes(self) -> int:
-        """Bytes of all weights and of the normalization."""
-        return _BYTES * sum(x.size for layer in self.layers for x in layer.constants.values())
+        """Bytes of all weights."""
+        return _BYTES * self.weights

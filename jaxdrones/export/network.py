@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxdrones.envs.env import RowSet
@@ -111,7 +112,7 @@ def layers_of(policy: Policy, images: tuple[Tensor, ...]) -> Graph:
             (height, width, 4).
 
     Raises:
-        ValueError: a user's network, whose layers are unknown.
+        ValueError: a user's network, or another one with unknown layers.
     """
     assert not policy.per_agent, "give the policy of one drone"
     network = policy.network
@@ -135,7 +136,10 @@ def layers_of(policy: Policy, images: tuple[Tensor, ...]) -> Graph:
             x = layers.concatenate((x, next_hidden_state))
         params = params["MLP_0"]
     action = layers.activation(layers.mlp(x, network, params), "tanh")
-    return Graph(inputs, tuple(layers.layers), action, next_hidden_state)
+    graph = Graph(inputs, tuple(layers.layers), action, next_hidden_state)
+    if graph.weights - 2 * obs.size != sum(x.size for x in jax.tree.leaves(policy.params)):
+        raise UserError("the policy has weights of layers that are unknown here; give --to stablehlo")
+    return graph
 
 
 def _float32(x: Any) -> np.ndarray:

@@ -169,6 +169,9 @@ def test_what_cannot_be_exported_is_said(env, tmp_path):
     policy = exported.random_policy(env)
     with pytest.raises(ValueError, match=r"the policy is <function .*; give one of jaxdrones.learning"):
         save(lambda obs: obs[:, :4], env, "c", tmp_path)
+    params = policy.params["params"] | {"Gate_0": {"kernel": jnp.ones((2, 2))}}
+    with pytest.raises(ValueError, match="weights of layers that are unknown here; give --to stablehlo"):
+        save(policy.replace(params={"params": params}), env, "c", tmp_path)
     with pytest.raises(ValueError, match="unknown target 'rust'"):
         save(policy, env, "rust", tmp_path)
     with pytest.raises(ValueError, match="name is '2fast'; give a letter"):

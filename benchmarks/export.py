@@ -1,6 +1,6 @@
 """How far is an exported policy from the policy, what does a call cost, and does it fly as well?
 
-Policies of bptt are compared on what they observe in 16 of their flights, an untrained one with a camera on random
+Policies of bptt are compared on what they observe in 16 of their flights, untrained ones on random
 observations; the hidden state of a recurrent policy is kept for the whole flight. The difference is the largest of any
 action, whose range is -1 to 1; that of float64 is the rounding of the policy itself. The code is what `cc -Os` makes of
 the functions without the weights, and a call in C is timed on this machine. Whole evaluations are flown by the policy
@@ -25,6 +25,7 @@ from jaxdrones.learning import bptt, evaluate
 from jaxdrones.learning.networks import Policy
 from jaxdrones.training.presets import preset
 
+UNTRAINED = ("forest", "crowd")
 TRAINED = {"hover": {}, "recovery": {"recurrent_size": 32}}
 NAMES = {"c": "C", "js": "JavaScript", "onnx": "ONNX", "stablehlo": "StableHLO", "float64": "float64"}
 QUICK = {"updates": 2, "worlds": 4, "horizon": 4}
@@ -42,9 +43,10 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         config = dataclasses.replace(config, **settings | (QUICK if options.quick else {}))
         policy = bptt.train(jax.random.key(0), env, config).policy
         rows.append({"task": task} | row(env, policy, flown(env, policy), 10 if options.quick else options.episodes))
-    env, config = preset("forest", "bptt")
-    policy = exported.random_policy(env, config.hidden_sizes)
-    rows.append({"task": "forest, untrained"} | row(env, policy, exported.random_inputs(env)))
+    for task in UNTRAINED:
+        env, config = preset(task, "bptt")
+        policy = exported.random_policy(env, config.hidden_sizes, set_sizes=config.set_sizes)
+        rows.append({"task": f"{task}, untrained"} | row(env, policy, exported.random_inputs(env)))
     return {"rows": rows}, [line for each in rows for line in text(each)]
 
 

@@ -53,13 +53,15 @@ console.log(JSON.stringify(act));
 """
 
 
-def random_policy(env, hidden_sizes=(9, 7), recurrent_size=0, activation="tanh", per_agent=False, seed=0) -> Policy:
+def random_policy(
+    env, hidden_sizes=(9, 7), recurrent_size=0, activation="tanh", per_agent=False, set_sizes=(8, 6)
+) -> Policy:
     """Policy with random weights and statistics, whose actions are neither near zero nor saturated."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     obs = {"state": jnp.zeros(env.observation_size)}
     obs |= {name: jnp.zeros(space.shape, space.dtype) for name, space in env.image_spaces.items()}
     obs = obs if env.image_spaces else obs["state"]
-    network = make_network(obs, hidden_sizes, env.action_size, 1.0, recurrent_size, env.sets, (8, 6))
+    network = make_network(obs, hidden_sizes, env.action_size, 1.0, recurrent_size, env.sets, set_sizes)
     network = network.clone(activation=activation)
     shapes = jax.eval_shape(network.init, jax.random.key(0), obs)
     team = (env.drones,) if per_agent else ()

@@ -158,7 +158,7 @@ def test_learning_reports_every_seed():
 def test_export_reports_costs_differences_and_success():
     rows = quick("export")["rows"]
     assert [row["task"] for row in rows] == ["hover", "recovery", "forest, untrained", "crowd, untrained"]
-    assert all(max(row["differences"].values()) < 1e-4 and row["code"] > 100 for row in rows)
+    assert all(max(row["differences"].values()) < 1e-3 and row["code"] > 100 for row in rows)
     assert all(row["success"][0] == row["success"][1] for row in rows[:2])
 
 

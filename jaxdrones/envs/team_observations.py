@@ -6,11 +6,11 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxdrones.arguments import Count, checked, number
 from jaxdrones.quantity import Quantity, quantities
-from jaxdrones.tasks.pairs import closest_approach, others, seen_from
+from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, seen_from
 from jaxdrones.tasks.task import ObservationTerm, Task, World, norm
 
 _MAX_DISTANCE = 20.0  # m: bound of the observations, and place of a drone that does not exist
@@ -33,8 +33,8 @@ def neighbors(count: Count) -> ObservationTerm:
     def observe(task: Task, world: World) -> Array:
         """Position and velocity of the nearest drones, relative to the drone."""
         drones = world.drones
-        nearest = _nearest(drones.pos, min(count, len(drones.pos) - 1))
-        rows = jnp.concatenate([seen_from(drones.pos, nearest), seen_from(drones.vel, nearest)], axis=-1)
+        index = nearest(drones.pos, count)
+        rows = jnp.concatenate([seen_from(drones.pos, index), seen_from(drones.vel, index)], axis=-1)
         return _flat(rows, count)
 
     entries: list[Quantity] = []
@@ -58,9 +58,9 @@ def encounters(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2
 
     def observe(task: Task, world: World) -> Array:
         """Position, velocity and closest approach of the nearest drones, relative to the drone."""
-        drones, n = world.drones, len(world.drones.pos)
-        nearest = others(n) if count >= n - 1 else _nearest(drones.pos, count)
-        pos, vel = seen_from(drones.pos, nearest), seen_from(drones.vel, nearest)
+        drones = world.drones
+        index = nearby(drones.pos, count)
+        pos, vel = seen_from(drones.pos, index), seen_from(drones.vel, index)
         time, approach = closest_approach(pos, vel, _HORIZON)
         away = jnp.sqrt(jnp.sum(pos**2, axis=-1, keepdims=True) + 1e-8)
         direction = pos / away * (_NEARNESS / (away + _NEAR))
@@ -86,18 +86,6 @@ def _flat(rows: Float[Array, "n k f"], count: int) -> Float[Array, "n d"]:
     n, known, size = rows.shape
     far = jnp.zeros((n, count - known, size), rows.dtype).at[..., :3].set(_MAX_DISTANCE)
     return jnp.concatenate([rows, far], axis=1).reshape(n, -1)
-
-
-def _nearest(pos: Float[Array, "n 3"], count: int) -> Int[Array, "n k"]:
-    """Indices of the nearest other drones, nearest first."""
-    n = len(pos)
-    away = jnp.where(jnp.eye(n, dtype=bool), jnp.inf, _distances(jax.lax.stop_gradient(pos)))
-    found = [jnp.zeros((n, 0), int)]
-    for _ in range(count):  # the nearest, the next one, ...: faster than sorting while they are few
-        nearest = jnp.argmin(away, axis=-1)
-        found.append(nearest[:, None])
-        away = jnp.where(jnp.arange(n)[None] == nearest[:, None], jnp.inf, away)
-    return jnp.concatenate(found, axis=1)
 
 
 def _distances(pos: Float[Array, "n 3"]) -> Float[Array, "n n"]:

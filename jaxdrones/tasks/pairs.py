@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 _SLOW = 0.05  # m^2/s^2, added to squared speeds
 
 
-def others(n: int) -> Int[Array, "n k"]:
-    """Indices of the other drones of every drone, k = n - 1."""
-    return jnp.asarray((np.arange(n)[:, None] + np.arange(1, n)) % n)
+def nearest(pos: Float[Array, "n 3"], count: int) -> Int[Array, "n k"]:
+    """Indices of the nearest other drones of every drone, nearest first; k is at most n - 1."""
+    n = len(pos)
+    x, y, z = jax.lax.stop_gradient(pos).T
+    away = sum((c[None] - c[:, None]) ** 2 for c in (x, y, z))
+    return jax.lax.top_k(-jnp.where(jnp.eye(n, dtype=bool), jnp.inf, away), min(count, n - 1))[1]
 
 
-def seen_from(x: Float[Array, "n 3"], index: Int[Array, "n k"]) -> Float[Array, "n k 3"]:
-    """Vectors of the indexed drones, relative to those of each drone."""
-    return x[index] - x[:, None]
+def nearby(pos: Float[Array, "n 3"], count: int) -> Int[Array, "n k"] | None:
+    """Indices of the nearest other drones; `None` for all others if they are at most `count`."""
+    return None if count >= len(pos) - 1 else nearest(pos, count)
+
+
+def seen_from(x: Float[Array, "n 3"], index: Int[Array, "n k"] | None) -> Float[Array, "n k 3"]:
+    """Vectors of the indexed drones relative to those of each drone; with `None` of all others.
+
+    Without an index the derivative needs no scatter, which takes as many serial steps as there are pairs.
+    """
+    if index is not None:
+        return x[index] - x[:, None]
+    turned = [jnp.roll(x, -k, axis=0) - x for k in range(1, len(x))]
+    return jnp.stack(turned, axis=1)
 
 
 def closest_approach(
@@ -33,14 +47,16 @@ def closest_approach(
     return time, pos + vel * time[..., None]
 
 
-def nearest_on_the_way(before: Float[Array, "n 3"], pos: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Smallest distance of every drone from another one on straight ways between two control steps, m.
+def nearest_on_the_way(
+    before: Float[Array, "n 3"], pos: Float[Array, "n 3"], index: Int[Array, "n k"] | None
+) -> Float[Array, " n"]:
+    """Smallest distance of every drone from the indexed ones on straight ways between two control steps, m.
 
     Args:
         before: positions at the last control step, m.
         pos: positions now, m.
+        index: other drones of every drone; `None` for all.
     """
-    index = others(len(pos))
     start, move = seen_from(before, index), seen_from(pos - before, index)
     length = jnp.sum(move**2, axis=-1)
     share = jnp.clip(-jnp.sum(start * move, axis=-1) / jnp.where(length > 0, length, 1), 0, 1)

@@ -7,7 +7,7 @@ import pytest
 
 from jaxdrones.envs import make
 from jaxdrones.tasks.crowd import FLOOR
-from jaxdrones.tasks.pairs import closest_approach, nearest_on_the_way
+from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, nearest_on_the_way, seen_from
 
 KEYS = jax.random.split(jax.random.key(0), 20)
 
@@ -57,14 +57,25 @@ def test_drones_that_pass_between_two_control_steps_have_touched():
         np.testing.assert_array_equal(env.task.measure(later)["safe"], [not touches, not touches, True])
 
 
-def test_the_nearest_point_of_two_ways_is_that_of_a_fine_search():
+@pytest.mark.parametrize("count", [3, 4])
+def test_the_nearest_point_of_two_ways_is_that_of_a_fine_search(count):
     rng = np.random.default_rng(0)
     before, after = rng.normal(size=(2, 5, 3))
     share = np.linspace(0, 1, 20001)[:, None, None]
     way = before + share * (after - before)
     apart = np.linalg.norm(way[:, :, None] - way[:, None], axis=-1) + 9 * np.eye(5)
-    found = nearest_on_the_way(jnp.asarray(before), jnp.asarray(after))
+    found = nearest_on_the_way(jnp.asarray(before), jnp.asarray(after), nearby(jnp.asarray(after), count))
     np.testing.assert_allclose(found, apart.min(axis=(0, 2)), atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [1, 3, 6, 9])
+def test_the_nearest_are_those_of_a_sorted_search(count):
+    pos = jax.random.normal(jax.random.key(0), (7, 3))
+    away = np.linalg.norm(pos[:, None] - pos[None], axis=-1) + 99 * np.eye(7)
+    expected = np.argsort(away, axis=1)[:, : min(count, 6)]
+    np.testing.assert_array_equal(nearest(pos, count), expected)
+    seen = np.linalg.norm(seen_from(pos, nearby(pos, count)), axis=-1)
+    np.testing.assert_allclose(np.sort(seen, axis=1), np.take_along_axis(away, expected, axis=1), rtol=1e-6)
 
 
 def test_the_gradient_of_the_closest_approach_is_finite_for_drones_at_rest_and_at_one_place():

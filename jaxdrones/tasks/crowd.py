@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated
 
 import jax
@@ -13,24 +12,16 @@ from jaxtyping import Array, Float
 from jaxdrones.arguments import Switch, checked, number
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.quantity import quantities
 from jaxdrones.state import State
-from jaxdrones.tasks import shaping
+from jaxdrones.tasks import crossing
 from jaxdrones.tasks.conditions import out_of_control
-from jaxdrones.tasks.pairs import nearby, nearest_on_the_way, seen_from
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, distance
+from jaxdrones.tasks.task import Task, Team
 
 FLOOR = 2.0  # m, height of the box above the ground
 _SPACING = 4.0  # collision radii between starts, and between goals (GCBF+, arXiv 2401.14554)
 _TRIES = 32  # random places of a drone, of which the first free one is taken
-_SPEED = 1.2  # m/s, to the goal
-_SLOW_WITHIN = 0.8  # m of the goal
 _SETTLING = 6.0  # s of an episode beyond the straight flight
-_SIGHT = 2.0  # m, length at which the observed vector to the goal is clipped
-_ARRIVED = 0.1  # m
-_MARGIN, _MARGIN_TIME, _SOFTNESS = 0.14, 0.3, 0.04  # m, s, m: gap below which the reward falls
-_SEEN = 8  # nearest drones that count; at a density of one there are 0.6 within the margin at full speed
 _NARROWEST, _LONGEST = 0.6, 2.0  # sides of a random box over those of the cube
 
 
@@ -55,7 +46,7 @@ def crowd(
     """
     side = (drones / density) ** (1 / 3)
     longest = side * (_LONGEST if random_box else 1)
-    duration = patience * (_SETTLING + math.hypot(longest, side, side) / _SPEED)
+    duration = patience * (_SETTLING + math.hypot(longest, side, side) / crossing.SPEED)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Nearly at rest at random places in the box."""
@@ -65,7 +56,7 @@ def crowd(
         middle = jnp.array([[0, 0, FLOOR + side / 2]])
         place, goal = (middle + _places(k, drones, sides, spacing) for k in (place_key, goal_key))
         state = thrown(start_key, params, place, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)
-        return state, {"goal": goal, "pos": state.pos, "touched": jnp.zeros(drones, bool)}
+        return state, crossing.variables(state, goal)
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
         """Goal."""
@@ -78,28 +69,16 @@ def crowd(
         duration=duration,
         start=start,
         target=target,
-        rewards={
-            "alive": (2.0, shaping.alive),
-            "position": (-1.0, shaping.position),
-            "velocity": (-0.5, _velocity),
-            "approach": (-8.0, _approach),
-            "omega": (-0.02, shaping.body_rates),
-            "action_change": (-0.02, shaping.action_change),
-        },
+        rewards=crossing.REWARDS,
         terminations=out_of_control(longest + 4.0, center=(0, 0, FLOOR + side / 2)),
         ends="drone",
-        advance=_advance,
-        metrics={
-            "safe": _safe,
-            "reached": _reached,
-        },
-        success=_arrived_untouched,
-        observations={
-            "goal": ObservationTerm(_goal, _SIGHT, entries=quantities("goal, from the drone, up to 2 m", "m", "world"))
-        },
+        advance=crossing.advance,
+        metrics=crossing.METRICS,
+        success=crossing.arrived_untouched,
+        observations=crossing.GOAL,
         control_hz=50.0,
         action="thrust_and_rates",
-        observation=("goal", "rotation_matrix", "velocity", "omega", "encounters"),
+        observation=crossing.OBSERVATION,
     )
 
 
@@ -123,47 +102,3 @@ def _places(key: jax.Array, n: int, sides: Array, spacing: Array) -> Float[Array
         return taken.at[i].set(tries[first]), None
 
     return jax.lax.scan(place, jnp.zeros((n, 3)), (jnp.arange(n), tries))[0]
-
-
-def _advance(task: Task, world: World) -> dict[str, Array]:
-    variables, pos = world.variables, world.drones.pos
-    closest = nearest_on_the_way(variables["pos"], pos, nearby(pos, _SEEN))
-    touching = closest < 2 * world.params.collision_radius
-    return variables | {"pos": pos, "touched": variables["touched"] | touching}
-
-
-def _goal(task: Task, world: World) -> Float[Array, "n 3"]:
-    """Vector to the goal, m, world axes, of a length up to 2 m."""
-    away = world.variables["goal"] - world.drones.pos
-    return away * jnp.minimum(1, _SIGHT / shaping.length(away, 1e-3 * _SIGHT))[:, None]
-
-
-def _velocity(task: Task, world: World) -> Float[Array, " n"]:
-    """Difference from the velocity straight to the goal, m/s."""
-    return shaping.length(world.drones.vel - shaping.velocity_to_target(task, world, _SPEED, _SLOW_WITHIN), 0.1)
-
-
-def _approach(task: Task, world: World) -> Float[Array, " n"]:
-    """Sum over the nearest drones of the smoothed penetration of a margin that grows with the closing speed, m."""
-    index = nearby(world.drones.pos, _SEEN)
-    pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
-    apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + 1e-8)
-    closing = jnp.maximum(-jnp.sum(pos * vel, axis=-1) / apart, 0)
-    gap = apart - 2 * world.params.collision_radius[:, None]
-    inside = _MARGIN + _MARGIN_TIME * closing - gap
-    return jnp.sum((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS), axis=-1)
-
-
-def _safe(task: Task, world: World) -> Float[Array, " n"]:
-    """One if the drone has touched no other one."""
-    return 1 - world.variables["touched"].astype(world.drones.pos.dtype)
-
-
-def _reached(task: Task, world: World) -> Float[Array, " n"]:
-    """One if the drone is within 10 cm of its goal."""
-    return (distance(task, world) < _ARRIVED).astype(world.drones.pos.dtype)
-
-
-def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Whether a drone was within 10 cm of its goal in the end and never touched another one."""
-    return (metrics["reached"][-1] == 1) & (metrics["safe"][-1] == 1)

@@ -29,8 +29,8 @@ def seen_from(x: Float[Array, "n 3"], index: Int[Array, "n k"] | None) -> Float[
     """
     if index is not None:
         return x[index] - x[:, None]
-    turned = [jnp.roll(x, -k, axis=0) - x for k in range(1, len(x))]
-    return jnp.stack(turned, axis=1)
+    turned = [(jnp.roll(x, -k, axis=0) - x)[:, None] for k in range(1, len(x))]
+    return jnp.concatenate([jnp.zeros((len(x), 0, 3), x.dtype), *turned], axis=1)
 
 
 def closest_approach(

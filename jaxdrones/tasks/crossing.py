@@ -1,0 +1,85 @@
+"""Flight of every drone of a team to its goal without touching another one: what `crowd` and `swap-goals` share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdrones.quantity import quantities
+from jaxdrones.state import State
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.pairs import nearby, nearest_on_the_way, seen_from
+from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, distance
+
+SPEED = 1.2  # m/s, to the goal
+_SLOW_WITHIN = 0.8  # m of the goal
+_SIGHT = 2.0  # m, length at which the observed vector to the goal is clipped
+_ARRIVED = 0.1  # m
+_MARGIN, _MARGIN_TIME, _SOFTNESS = 0.14, 0.3, 0.04  # m, s, m: gap below which the reward falls
+_SEEN = 8  # nearest drones that count
+
+
+def variables(state: State, goal: Float[Array, "n 3"]) -> dict[str, Array]:
+    """Task variables at the start."""
+    return {"goal": goal, "pos": state.pos, "touched": jnp.zeros(len(goal), bool)}
+
+
+def advance(task: Task, world: World) -> dict[str, Array]:
+    """Task variables after a step; two drones touch when they come closer than two collision radii on the way."""
+    variables, pos = world.variables, world.drones.pos
+    closest = nearest_on_the_way(variables["pos"], pos, nearby(pos, _SEEN))
+    touching = closest < 2 * world.params.collision_radius
+    return variables | {"pos": pos, "touched": variables["touched"] | touching}
+
+
+def arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+    """Whether a drone was within 10 cm of its goal in the end and never touched another one."""
+    return (metrics["reached"][-1] == 1) & (metrics["safe"][-1] == 1)
+
+
+def _goal(task: Task, world: World) -> Float[Array, "n 3"]:
+    """Vector to the goal, m, world axes, of a length up to 2 m."""
+    away = world.variables["goal"] - world.drones.pos
+    return away * jnp.minimum(1, _SIGHT / jnp.maximum(shaping.length(away, 1e-3), 1e-3))[:, None]
+
+
+def _velocity(task: Task, world: World) -> Float[Array, " n"]:
+    """Difference from the velocity straight to the goal, m/s."""
+    return shaping.length(world.drones.vel - shaping.velocity_to_target(task, world, SPEED, _SLOW_WITHIN), 0.1)
+
+
+def _approach(task: Task, world: World) -> Float[Array, " n"]:
+    """Sum over the nearest drones of the smoothed penetration of a margin that grows with the closing speed, m."""
+    index = nearby(world.drones.pos, _SEEN)
+    pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
+    apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + 1e-8)
+    closing = jnp.maximum(-jnp.sum(pos * vel, axis=-1) / apart, 0)
+    gap = apart - 2 * world.params.collision_radius[:, None]
+    inside = _MARGIN + _MARGIN_TIME * closing - gap
+    return jnp.sum((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS), axis=-1)
+
+
+def _safe(task: Task, world: World) -> Float[Array, " n"]:
+    """One if the drone has touched no other one."""
+    return 1 - world.variables["touched"].astype(world.drones.pos.dtype)
+
+
+def _reached(task: Task, world: World) -> Float[Array, " n"]:
+    """One if the drone is within 10 cm of its goal."""
+    return (distance(task, world) < _ARRIVED).astype(world.drones.pos.dtype)
+
+
+REWARDS: dict[str, tuple[float, Term]] = {
+    "alive": (2.0, shaping.alive),
+    "position": (-1.0, shaping.position),
+    "velocity": (-0.5, _velocity),
+    "approach": (-8.0, _approach),
+    "omega": (-0.02, shaping.body_rates),
+    "action_change": (-0.02, shaping.action_change),
+}
+METRICS: dict[str, Term] = {"safe": _safe, "reached": _reached}
+GOAL = {"goal": ObservationTerm(_goal, _SIGHT, entries=quantities("goal, from the drone, up to 2 m", "m", "world"))}
+OBSERVATION = ("goal", "rotation_matrix", "velocity", "omega", "encounters")

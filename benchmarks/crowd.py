@@ -1,0 +1,107 @@
+"""How many drones of a crowd reach their goals without touching, with a policy that was trained with eight?
+
+One drone per cubic meter; starts and goals are random. `safe`: the drone never came closer to another one than two
+collision radii, also between control steps; `reached`: it was within 10 cm of its goal in the end; `success`: both, with
+a 95 % interval that counts the drones of a world as far as they are independent.
+
+Policies: `bptt`, the preset; `blind`, the same without a view of the others; `ppo`, the same network by PPO in the time
+that `bptt` took.
+"""
+
+import argparse
+import dataclasses
+import time
+
+import jax
+
+import jaxdrones as jd
+from benchmarks.common import success_rate
+from jaxdrones.envs.observations import encounters
+from jaxdrones.learning import bptt, checkpoint, evaluate, ppo
+from jaxdrones.tasks.crossing import OBSERVATION
+from jaxdrones.training.presets import preset
+
+WORLDS = {8: 256, 16: 128, 32: 64, 64: 32, 128: 20, 256: 20, 512: 20}
+LEARNERS = {"bptt": bptt, "blind": bptt, "ppo": ppo}
+TIMED = 3  # updates that tell how many PPO makes in a given time
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--learner", choices=LEARNERS, default="bptt")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=250.0, help="of the training by ppo, without compiling")
+    parser.add_argument("--drones", type=int, nargs="+", default=list(WORLDS))
+    parser.add_argument("--density", type=float, default=1.0, help="drones per cubic meter in flight")
+    parser.add_argument("--patience", type=float, default=1.0, help="of the task")
+    parser.add_argument("--downwash", action="store_true", help="each flies in the wakes of the others; not trained")
+    parser.add_argument("--save", help="path of the policy to write, without a suffix")
+    parser.add_argument("--policy", help="path of a policy to fly in place of training one")
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
+    if options.quick:
+        options.drones, options.seconds = [2, 4], 0.0
+    if options.policy:
+        policy, spent = checkpoint.load(options.policy), {}
+    else:
+        policy, spent = train(options)
+    if options.save:
+        checkpoint.save(options.save, policy)
+    rows = [fly(policy, n, options) for n in options.drones]
+    lines = ["drones | worlds | safe % | reached % | success [95 % interval] | s"]
+    lines += [
+        f"{row['drones']:6} | {row['worlds']:6} | {100 * row['safe']:6.2f} | {100 * row['reached']:9.2f} |"
+        f" {success_rate(row['success'], row['interval'])} | {row['seconds']:.0f}"
+        for row in rows
+    ]
+    about = {name: getattr(options, name) for name in ("learner", "seed", "density", "patience", "downwash")}
+    return {"about": about | spent, "rows": rows}, lines
+
+
+def train(options: argparse.Namespace) -> tuple[jd.learning.networks.Policy, dict]:
+    """Policy of a learner, and the seconds that it took with compiling."""
+    learner = LEARNERS[options.learner]
+    blind = {"observation": _observation(options)} if options.learner == "blind" else {}
+    env, config = preset("crowd", learner.__name__.rpartition(".")[2], practice=True, **blind)
+    if options.quick:
+        config = dataclasses.replace(config, updates=2, worlds=8, horizon=4)
+    key = jax.random.key(options.seed)
+    if learner is ppo and not options.quick:
+        config = dataclasses.replace(config, updates=_updates_in(options.seconds, env, config))
+    start = time.perf_counter()
+    result = jax.block_until_ready(learner.train(key, env, config))
+    return result.policy, {"updates": config.updates, "train s": round(time.perf_counter() - start, 1)}
+
+
+def _updates_in(seconds: float, env: jd.envs.Env, config: ppo.Config) -> int:
+    """Number of updates of PPO in a given time."""
+    few = dataclasses.replace(config, updates=TIMED)
+    jax.block_until_ready(ppo.train(jax.random.key(0), env, few))
+    start = time.perf_counter()
+    jax.block_until_ready(ppo.train(jax.random.key(1), env, few))
+    return max(1, round(seconds * TIMED / (time.perf_counter() - start)))
+
+
+def fly(policy: jd.learning.networks.Policy, drones: int, options: argparse.Namespace) -> dict:
+    """Rates of success of a team of this size."""
+    made = dict(density=options.density, patience=options.patience, observation=_observation(options))
+    env = jd.make("crowd", drones=drones, pairs=("downwash",) if options.downwash else (), **made)
+    worlds = 2 if options.quick else WORLDS.get(drones, 20)
+    start = time.perf_counter()
+    report = evaluate(env, policy, jax.random.key(1_000_000), worlds)
+    return {
+        "drones": drones,
+        "worlds": worlds,
+        "safe": report.final_metrics["safe"],
+        "reached": report.final_metrics["reached"],
+        "success": report.success,
+        "interval": report.success_interval,
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _observation(options: argparse.Namespace) -> tuple:
+    """Observation of the task, without a view of the others for `blind`."""
+    if options.learner != "blind":
+        return OBSERVATION
+    return (*OBSERVATION[:-1], encounters(8, reach=1e-3))

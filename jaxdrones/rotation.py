@@ -98,19 +98,24 @@ def to_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 def from_matrix(r: Float[Array, "3 3"]) -> Float[Array, "4"]:
     """Quaternion of a rotation matrix by Shepperd's method, with division by the largest component."""
-    trace = r[0, 0] + r[1, 1] + r[2, 2]
-    diagonal = jnp.append(2 * jnp.diagonal(r) - trace, trace)  # 4 q_i^2 - 1
-    skew = jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])  # 4 w (x, y, z)
-    products = jnp.zeros((4, 4), r.dtype).at[:3, :3].set(r + r.T).at[3, :3].set(skew).at[:3, 3].set(skew)
-    products = products.at[jnp.diag_indices(4)].set(1 + diagonal)  # 4 q_i q_j
-    return normalize(products[jnp.argmax(diagonal)])
+    (a, b, c), (d, e, f), (g, h, i) = (components(row) for row in components(r))
+    squares = [1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i]  # 4 q_i^2
+    products = [  # 4 q_i q_j
+        jnp.stack([squares[0], b + d, c + g, h - f]),
+        jnp.stack([b + d, squares[1], f + h, c - g]),
+        jnp.stack([c + g, f + h, squares[2], d - b]),
+        jnp.stack([h - f, c - g, d - b, squares[3]]),
+    ]
+    largest, row = squares[0], products[0]
+    for square, other in zip(squares[1:], products[1:], strict=True):
+        row = jnp.where(square > largest, other, row)
+        largest = jnp.maximum(largest, square)
+    return normalize(row)
 
 
 def from_rpy(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
     """Quaternion of roll, pitch, yaw (rad) about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    sin, cos = sin_cos(rpy / 2)
-    cr, cp, cy = components(cos)
-    sr, sp, sy = components(sin)
+    (sr, cr), (sp, cp), (sy, cy) = [sin_cos(angle / 2) for angle in components(rpy)]
     return jnp.stack(
         [
             sr * cp * cy - cr * sp * sy,

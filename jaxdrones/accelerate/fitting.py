@@ -34,6 +34,9 @@ IDENTITIES = frozenset("copy copy_p optimization_barrier xla_metadata_value".spl
 
 REDUCTIONS = frozenset("reduce_sum reduce_prod reduce_max reduce_min reduce_and reduce_or".split())
 
+PRODUCTS = frozenset(["dot_general"])
+"""Products of matrices and vectors, in a kernel up to the size `LARGEST`; larger ones are faster by a library."""
+
 _BY_VMAP = frozenset("dynamic_slice dynamic_update_slice gather iota reduce_precision".split())
 _ALLOWED = compiler.CALLS | ELEMENTWISE | SHAPES | REDUCTIONS | _BY_VMAP | IDENTITIES | {"scan"}
 """Primitives that XLA's CPU compiler can fuse into a single kernel, in their form in `soa`."""
@@ -83,6 +86,8 @@ def _is_allowed(eqn: compiler.Equation) -> bool:
             return eqn.params["length"] > 0
         case "bitcast_convert_type":
             return eqn.invars[0].aval.shape == eqn.outvars[0].aval.shape
+        case name if name in PRODUCTS:
+            return all(v.aval.size <= LARGEST for v in (*eqn.invars, *eqn.outvars))
         case name:
             return name in _ALLOWED
 

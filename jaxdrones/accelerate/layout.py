@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler
-from jaxdrones.accelerate.fitting import ELEMENTWISE, REDUCTIONS
+from jaxdrones.accelerate.fitting import ELEMENTWISE, PRODUCTS, REDUCTIONS
 
 _MAX_UNROLLED = 32
 """Largest number of terms of an unrolled reduction; a loop is used for more."""
@@ -81,6 +83,8 @@ def number_by_number(eqn: compiler.Equation, inputs: list[Apart]) -> list[Apart]
             rows = rows.reshape(-1, *rows.shape[len(p["axes"]) :])
             totals = [functools.reduce(_OPERATIONS[name], _alike(rows[:, *i])) for i in np.ndindex(rows.shape[1:])]
             return [of_numbers(totals, rows.shape[1:])]
+        case name if name in PRODUCTS:
+            return product(eqn, *inputs)
         case "broadcast_in_dim":
             shape = np.ones(len(p["shape"]), int)
             shape[list(p["broadcast_dimensions"])] = x.shape
@@ -120,6 +124,22 @@ def reduced(eqn: compiler.Equation, x: Array) -> list[Array]:
     if len(rows) <= _MAX_UNROLLED:
         return [functools.reduce(operation, jnp.unstack(rows))]
     return [jax.lax.scan(lambda total, row: (operation(total, row), None), rows[0], rows[1:])[0]]
+
+
+def product(eqn: compiler.Equation, a: Any, b: Any) -> list[Any]:
+    """Product of two small arrays, of numbers or of entries, as a sum of products."""
+    (contracted_a, contracted_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
+    shape = eqn.outvars[0].aval.shape
+
+    def terms(x: Any, contracted: Sequence[int], batch: Sequence[int]) -> Any:
+        """Array (batch, free, contracted), each axis flattened."""
+        free = [axis for axis in range(x.ndim) if axis not in (*contracted, *batch)]
+        sizes = [math.prod(x.shape[axis] for axis in axes) for axes in (batch, free, contracted)]
+        return x.transpose(*batch, *free, *contracted).reshape(sizes)
+
+    a, b = terms(a, contracted_a, batch_a), terms(b, contracted_b, batch_b)
+    products = [a[:, :, None, k] * b[:, None, :, k] for k in range(a.shape[-1])]
+    return [functools.reduce(operator.add, products).reshape(shape)]
 
 
 def _elementwise(eqn: compiler.Equation, inputs: list[Apart]) -> Apart:

@@ -21,16 +21,18 @@ from jaxdrones.accelerate.fitting import (
     ELEMENTWISE,
     IDENTITIES,
     LARGEST,
+    PRODUCTS,
     REDUCTIONS,
     SHAPES,
     NoKernelError,
     fits_number_by_number,
 )
-from jaxdrones.accelerate.layout import Value, Whole, apart, number_by_number, of_numbers, reduced, whole
+from jaxdrones.accelerate.layout import Value, Whole, apart, number_by_number, of_numbers, product, reduced, whole
 from jaxdrones.accelerate.reordered import store_reordered
 from jaxdrones.accelerate.shared import store_shared
 
-_BY_NUMBERS = ELEMENTWISE | SHAPES | REDUCTIONS
+_BY_NUMBERS = ELEMENTWISE | SHAPES | REDUCTIONS | PRODUCTS
+_RULES = dict.fromkeys(REDUCTIONS, reduced) | dict.fromkeys(PRODUCTS, product)
 
 
 def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Array]) -> list[Array]:
@@ -45,9 +47,7 @@ def vmap_for_kernel(program: Any, consts: Sequence[Array], leaves: Sequence[Arra
         NoKernelError: the program cannot be a single kernel.
     """
     if not fits_number_by_number(program):
-        return jax.vmap(
-            functools.partial(store_reordered, program, consts, rules=dict.fromkeys(REDUCTIONS, reduced)), -1, -1
-        )(*leaves)
+        return jax.vmap(functools.partial(store_reordered, program, consts, rules=_RULES), -1, -1)(*leaves)
 
     def evaluated(consts, leaves):
         results = _evaluate(program, [Whole(x, False) for x in consts], [Whole(x, True) for x in leaves])

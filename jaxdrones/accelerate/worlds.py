@@ -36,8 +36,8 @@ def over_worlds(
     take derivatives inside, `over_worlds(jax.grad(miss))`.
 
     On a CPU the worlds are computed in chunks that fit in the cache. A function of loops and arithmetic, such as a
-    flight or its gradient, is compiled to a single kernel on one core. With sorting, matrix products, solvers, random
-    numbers or branches it is compiled as usual; so it is, with a warning, if the single kernel does not compile.
+    flight or its gradient, is compiled to a single kernel on one core. With sorting, large matrix products, solvers,
+    random numbers or branches it is compiled as usual; so it is, with a warning, if the single kernel does not compile.
 
     Args:
         function: function of one world; it may close over values common to all worlds.

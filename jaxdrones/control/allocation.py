@@ -1,15 +1,16 @@
 """Control allocation: rotor speeds from thrust and torque, given the geometry of the rotors."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdrones.params import Params
-from jaxdrones.vector import largest, safe_sqrt
+from jaxdrones.vector import dot, largest, safe_sqrt
 
 _MIN_SHARE = 0.01  # smallest significant share of a rotor in thrust or yaw; usually each rotor has 0.25
-_ACTIVE_SETS = np.array([[i >> k & 1 for k in range(4)] for i in range(16)], bool)  # rotors whose speed is not zero
+_OTHERS = tuple(tuple(j for j in range(4) if j != i) for i in range(4))  # the other rotors of each one
 
 
 def mixer(params: Params) -> Float[Array, "4 3"]:
@@ -31,13 +32,12 @@ def rpm_from_wrench(params: Params, thrust: Float[Array, ""], torque: Float[Arra
     """
     x, y, _ = params.rotor_pos.T
     arm = params.arm
-    matrix = jnp.stack([jnp.ones_like(x), y / arm, -x / arm, params.rotor_spin])
     torque_scale = jnp.stack([params.kf * arm, params.kf * arm, params.km])
     target = jnp.append(thrust / params.kf, torque / torque_scale)
-    inverses = _inverses(matrix)
-    inverse, limit = inverses[-1], _square_of_limit(params)
+    inverses = _inverses(jnp.stack([jnp.ones_like(x), y / arm, -x / arm, params.rotor_spin], axis=-1))
+    inverse, limit = jnp.stack([rows[-1] for rows in inverses]), _square_of_limit(params)
     target = _within_authority(inverse, target, limit)
-    squares = _non_negative_least_squares(matrix, inverses, target)
+    squares = _non_negative_least_squares(inverses, target)
     squares = squares - _excess(squares, limit, inverse[:, 0]) * inverse[:, 0]
     return jnp.minimum(safe_sqrt(squares), params.max_rpm)
 
@@ -67,7 +67,7 @@ def _within_authority(
     too_fast = _excess(squares, limit, yaw)
     backwards = jnp.where(jnp.isinf(limit), 0, _excess(-squares, 0.0, -yaw))
     given_up = jnp.minimum(jnp.maximum(too_fast, backwards), jnp.abs(target[3]))
-    return target.at[3].add(-sign * given_up)
+    return jnp.append(target[:3], target[3] - sign * given_up)
 
 
 def _excess(
@@ -79,26 +79,53 @@ def _excess(
     return largest(jnp.where(raises, beyond, 0))
 
 
-def _inverses(matrix: Float[Array, "4 4"]) -> Float[Array, "16 4 4"]:
-    """Least-squares inverses of A for all sixteen sets of nonzero unknowns; the last one is the inverse of A.
+def _inverses(wrenches: Float[Array, "4 4"]) -> list[Float[Array, "8 4"]]:
+    """Rows of the least-squares inverses of A for every set of rotors; they depend only on the vehicle.
 
-    They depend only on the vehicle.
+    A row is the squared speed of one rotor per demand, along the part of its wrench that the others do not produce:
+    the orthogonalization of Gram and Schmidt.
+
+    Args:
+        wrenches: columns of A, the wrench of each rotor.
+
+    Returns:
+        For each rotor its row with every set of the other rotors: the first without any, the last with all of them,
+        which is a row of the inverse of A. Set k has the rotors whose bits are set, the highest bit first.
     """
 
-    def solve_on(active):
-        part = matrix * active[None]
-        normal = part.T @ part + jnp.diag(1.0 - active)
-        return jnp.linalg.solve(normal, part.T)
+    @functools.cache
+    def alone(rotor: int, others: tuple[int, ...]) -> Array:
+        """Part of a rotor's wrench that is orthogonal to those of others."""
+        if not others:
+            return wrenches[rotor]
+        own, last = alone(rotor, others[:-1]), alone(others[-1], others[:-1])
+        return own - dot(own, last) / dot(last, last) * last
 
-    return jax.vmap(solve_on)(jnp.asarray(_ACTIVE_SETS, matrix.dtype))
+    def row(rotor: int, k: int) -> Array:
+        part = alone(rotor, tuple(j for bit, j in zip((4, 2, 1), _OTHERS[rotor], strict=True) if k & bit))
+        return part / dot(part, part)
+
+    return [jnp.stack([row(rotor, k) for k in range(8)]) for rotor in range(4)]
 
 
-def _non_negative_least_squares(
-    matrix: Float[Array, "4 4"], inverses: Float[Array, "16 4 4"], target: Float[Array, "4"]
-) -> Float[Array, "4"]:
-    """Minimizer x >= 0 of |A x - b| for a regular A: the best non-negative candidate of sixteen."""
-    candidates = jnp.swapaxes(inverses, 0, 1) @ target  # (4, 16)
-    misses = (matrix[None] @ inverses - jnp.eye(4, dtype=matrix.dtype)[None]) @ jax.lax.stop_gradient(target)
-    residuals = jnp.sum(misses**2, axis=-1)
-    feasible = jnp.all(candidates >= 0, axis=0)
-    return candidates[:, jnp.argmin(jnp.where(feasible, residuals, jnp.inf))]
+def _non_negative_least_squares(inverses: list[Float[Array, "8 4"]], target: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Minimizer x >= 0 of |A x - b| for a regular A.
+
+    The rotors are added one by one, for every set of later rotors: a new rotor turns if its square is positive together
+    with the rotors that turn without it. The minimizer is unique, because the columns of A are independent.
+    """
+    squares: list[Array] = []  # of the rotors so far, with an axis of length 2 for each later one: at rest or turning
+    for rows in inverses:
+        own = jnp.reshape(rows @ target, (2, 2, 2))  # by the earlier rotors, then by the later ones
+        turns = _choose(own, [x[0] > 0 for x in squares]) > 0
+        squares = [_choose(x, [turns]) for x in squares]
+        squares.append(_choose(own, [x > 0 for x in squares]))
+    return jnp.maximum(jnp.stack(squares), 0)
+
+
+def _choose(values: Float[Array, "..."], turning: list[Bool[Array, "..."]]) -> Float[Array, "..."]:
+    """Entries of the first axes for rotors at rest (0) or turning (1)."""
+    for turns in turning:
+        rest, turn = values
+        values = jnp.where(jnp.broadcast_to(turns, rest.shape), turn, rest)
+    return values

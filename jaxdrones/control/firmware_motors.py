@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -89,12 +88,13 @@ def mix(
         mixer: share of each motor in the torques; by default the firmware's for a Crazyflie in X configuration.
     """
     shares = jnp.array(_MIXER) if mixer is None else mixer
-    return thrust + jax.vmap(vector.dot, (0, None))(shares, torque)
+    return jnp.stack([thrust + vector.dot(share, torque) for share in vector.components(shares)])
 
 
 def within_range(commands: Float[Array, "4"]) -> Float[Array, "4"]:
     """Commands limited to 0 .. 65535; if one is too high, all are lowered, so thrust is reduced before torque."""
-    return jnp.maximum(commands - jnp.maximum(largest(commands) - FULL, 0), 0)
+    excess = jnp.maximum(largest(commands) - FULL, 0)
+    return jnp.stack([jnp.maximum(command - excess, 0) for command in vector.components(commands)])
 
 
 def duty_cycles(

@@ -175,5 +175,5 @@ def attitude_loop(
 
 def rotor_speeds(params: Params, thrust: Float[Array, ""], torque: Float[Array, "3"]) -> Float[Array, "4"]:
     """Rotor speeds (RPM) for a thrust per rotor and a torque (PWM), limited to the Crazyflie's PWM and to `max_rpm`."""
-    pwm = jnp.clip(thrust + jax.vmap(vector.dot, (0, None))(mixer(params), torque), *_PWM_RANGE)
-    return jnp.minimum(_PWM_TO_RPM * pwm + _PWM_OFFSET, params.max_rpm)
+    pwm = [jnp.clip(thrust + vector.dot(share, torque), *_PWM_RANGE) for share in vector.components(mixer(params))]
+    return jnp.minimum(_PWM_TO_RPM * jnp.stack(pwm) + _PWM_OFFSET, params.max_rpm)

@@ -113,5 +113,6 @@ def _angles_of(force: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def _wrap_yaw(rpy: Float[Array, "3"]) -> Float[Array, "3"]:
-    yaw = rpy[2]
-    return rpy.at[2].add(2 * jnp.pi * ((yaw < -jnp.pi).astype(yaw.dtype) - (yaw > jnp.pi).astype(yaw.dtype)))
+    roll, pitch, yaw = vector.components(rpy)
+    turn = jnp.where(yaw < -jnp.pi, 1, jnp.where(yaw > jnp.pi, -1, 0))
+    return jnp.stack([roll, pitch, yaw + 2 * jnp.pi * turn])

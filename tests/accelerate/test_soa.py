@@ -10,6 +10,7 @@ from helpers import flying, tape
 
 import jaxdrones as jd
 from jaxdrones.accelerate import compiler
+from jaxdrones.accelerate.fitting import can_be_a_kernel
 from jaxdrones.accelerate.soa import vmap_for_kernel
 
 rng = np.random.default_rng(0)
@@ -69,6 +70,21 @@ def test_a_loop_gives_what_vmap_gives(name):
 def test_a_gradient_through_a_loop_gives_what_vmap_gives(name):
     gradient = jax.grad(lambda x, pushes: jnp.sum(looped(BODIES[name])(x, pushes)[0] ** 2), (0, 1))
     assert_same(vmap_apart(gradient)(start, pushes), jax.vmap(gradient, -1, -1)(start, pushes))
+
+
+@pytest.mark.parametrize(
+    "axes", ["ij,jk->ik", "ij,i->j", "i,i->", "i,j->ij", "bij,bj->bi", "bij,bkj->bki", "ijk,kjl->il"]
+)
+def test_products_of_small_arrays_give_what_vmap_gives(axes):
+    sizes, (*inputs, _) = dict(zip("bijkl", (2, 3, 4, 2, 3), strict=True)), axes.replace("->", ",").split(",")
+    arrays = [rng.normal(size=(*map(sizes.get, names), 5)) for names in inputs]
+    product = functools.partial(jnp.einsum, axes)
+    assert can_be_a_kernel(jax.make_jaxpr(product)(*(x[..., 0] for x in arrays)).jaxpr)
+    assert_same(vmap_apart(product)(*arrays), jax.vmap(product, -1, -1)(*arrays))
+
+
+def test_products_of_large_matrices_are_left_to_a_library():
+    assert not can_be_a_kernel(jax.make_jaxpr(jnp.dot)(jnp.zeros((7, 7)), jnp.zeros(7)).jaxpr)
 
 
 def test_random_numbers_are_those_of_vmap():

@@ -102,6 +102,38 @@ def test_what_rotors_without_a_limit_cannot_is_missed_by_the_least_squares(vehic
         assert np.all(miss(np.maximum(squares + size * step, 0)) >= miss(squares) - 1e-12)
 
 
+def test_the_least_squares_hold_wherever_the_rotors_are():
+    """Also without the symmetries of a vehicle, for which some sets of rotors have equal solutions."""
+    rng = np.random.default_rng(7)
+    params = jaxdrones.load_params("cf2x")
+    thrust, torque = wild_wrenches(params, seed=8)
+    for _ in range(5):
+        moved = params.replace(rotor_pos=params.rotor_pos + 0.6 * params.arm * rng.uniform(-1, 1, (4, 3)))
+        squares = np.asarray(allocate_all(golden_data.unlimited(moved), thrust, torque)) ** 2
+        matrix, target = least_squares_problem(moved, thrust, torque)
+        for x, b in zip(squares, target, strict=True):
+            unit = np.max(np.abs(b))
+            expected, _ = scipy.optimize.nnls(matrix, b / unit)
+            np.testing.assert_allclose(x / unit, expected, rtol=0, atol=1e-12 * np.linalg.cond(matrix) ** 2)
+
+
+@pytest.mark.float32
+def test_a_rotor_that_hardly_turns_is_not_stopped_by_rounding():
+    """The demand of an infeasible wrench, with squares of 1e-2 to 1e-6 of the largest on the border of standing still.
+
+    A comparison of residuals, which are flat around their minimum, would be off by the root of the rounding.
+    """
+    params = golden_data.unlimited(jaxdrones.load_params("cf2x"))
+    matrix, _ = least_squares_problem(params, np.zeros(1), np.zeros((1, 3)))
+    small = np.logspace(-2, -6, N)
+    squares = np.stack([np.ones(N), small, np.zeros(N), np.zeros(N)], axis=-1)
+    slopes = np.array([0, 0, 0.3, 0.4])  # of the misfit in the squares of the rotors at rest
+    target = squares @ matrix.T - np.linalg.solve(matrix.T, slopes)
+    thrust, torque = wrenches_of_targets(params, 1e8 * target)
+    found = np.asarray(allocate_all(params, thrust, torque)) ** 2 / 1e8
+    np.testing.assert_allclose(found, squares, rtol=0, atol=2e-6)
+
+
 @pytest.mark.parametrize("vehicle", VEHICLES)
 def test_no_rotor_is_asked_for_more_than_its_highest_speed(vehicle):
     """However large the wrench, up to a thousand times the largest, and whatever the drone weighs."""
@@ -256,6 +288,12 @@ def wild_wrenches(params, seed):
     thrust = params.max_thrust * rng.uniform(-0.1, 1, N)
     limits = np.array([params.max_xy_torque, params.max_xy_torque, params.max_z_torque])
     return thrust, jnp.array(rng.uniform(-1, 1, (N, 3)) * limits)
+
+
+def wrenches_of_targets(params, target):
+    """Thrust and torque with b, the inverse of `least_squares_problem`."""
+    scale = np.array([params.kf, params.kf * params.arm, params.kf * params.arm, params.km])
+    return jnp.asarray(scale[0] * target[:, 0]), jnp.asarray(scale[1:] * target[:, 1:])
 
 
 def least_squares_problem(params, thrust, torque):

@@ -14,6 +14,7 @@ from helpers import VEHICLES, assert_close, assert_finite, flying, jit_unoptimiz
 from jax.flatten_util import ravel_pytree
 
 from jaxdrones import rotation
+from jaxdrones.accelerate.fitting import can_be_a_kernel
 from jaxdrones.control import firmware_pid, for_team, geometric, mellinger, mrac, pid, rates, simple_pid, velocity
 from jaxdrones.control.setpoint import Setpoint
 
@@ -117,6 +118,18 @@ def test_values_and_gradients_are_finite_where_directions_are_lost(loop):
     gradients, rpm = differentiate(loop.control, (loop.gains(), team, state, target), for_team(loop.init(), N))
     assert_finite(rpm)
     assert_finite(gradients)
+
+
+@pytest.mark.parametrize("loop", [loop for loop in EVERY_CONTROLLER if loop not in MRAC], ids=repr)
+def test_a_call_and_its_gradient_can_be_a_single_kernel(loop):
+    """Without one, `over_worlds` takes many times as long. The matrices of `mrac` are too large."""
+    params, memory, state, target = map(one, in_flight(loop))
+
+    def squares(params, state, target):
+        return jnp.sum(loop.control(loop.gains(), params, memory, state, target, dt=DT)[1] ** 2)
+
+    for function in squares, jax.grad(squares, (0, 1, 2)):
+        assert can_be_a_kernel(jax.make_jaxpr(function)(params, state, target).jaxpr)
 
 
 @pytest.mark.slow

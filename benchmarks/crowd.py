@@ -1,8 +1,8 @@
 """How many drones of a crowd reach their goals without touching, with a policy that was trained with eight?
 
 One drone per cubic meter; starts and goals are random. `safe`: the drone never came closer to another one than two
-collision radii, also between control steps; `reached`: it was within 10 cm of its goal in the end; `success`: both, with
-a 95 % interval that counts the drones of a world as far as they are independent.
+collision radii, also between control steps; `reached`: it was within 10 cm of its goal in the end; `success`: both,
+with a 95 % interval that counts the drones of a world as far as they are independent.
 
 Policies: `bptt`, the preset; `blind`, the same without a view of the others; `ppo`, the same network by PPO in the time
 that `bptt` took.

@@ -14,7 +14,8 @@ from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_c
 from jaxdrones.dynamics.inflow import inflow_thrust
 from jaxdrones.dynamics.integrators import euler, implicit_midpoint, midpoint, rk4, semi_implicit_euler
 from jaxdrones.dynamics.interaction import downwash, downwash_2021
-from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.model import Model, PointMass
+from jaxdrones.dynamics.payload import Payload, cable, cable_tension, payload, with_payload
 from jaxdrones.dynamics.power import Battery, battery, battery_current, battery_voltage, charge_at, lithium_polymer
 from jaxdrones.dynamics.propulsion import (
     Motors,
@@ -49,6 +50,8 @@ __all__ = [
     "NeighborGrid",
     "Pair",
     "Params",
+    "Payload",
+    "PointMass",
     "Scene",
     "Sensor",
     "State",
@@ -58,6 +61,8 @@ __all__ = [
     "battery",
     "battery_current",
     "battery_voltage",
+    "cable",
+    "cable_tension",
     "charge_at",
     "clock",
     "crazyflie_motors",
@@ -89,6 +94,7 @@ __all__ = [
     "midpoint",
     "obstacle_contact",
     "over_worlds",
+    "payload",
     "pwm_of_thrust",
     "pwm_rotors",
     "quadratic_drag",
@@ -102,4 +108,5 @@ __all__ = [
     "stack",
     "supply_voltage",
     "vector",
+    "with_payload",
 ]

@@ -54,7 +54,7 @@ _DRONE_FRICTION = 0.25  # coefficient: 0.5 times 0.5
 _ROUNDING = 1e-4  # m: smooths the distance of coincident points
 
 
-@declare(Needs(contact="ground", ground_only=True))
+@declare(Needs(contact="ground", ground_only=True, largest_step=LARGEST_STEP))
 def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
     """Normal force and friction of the ground, the plane z = 0, on a drone.
 
@@ -91,7 +91,7 @@ def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
     return Wrench(rotation.rotate_inverse(state.quat, force), rotation.rotate_inverse(state.quat, torque))
 
 
-@declare(Needs(contact="obstacles"))
+@declare(Needs(contact="obstacles", largest_step=LARGEST_STEP))
 def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     """Normal force and friction of the obstacles of a scene on a drone, by the law of the ground.
 
@@ -152,7 +152,7 @@ def contact_radius(params: Params) -> Float[Array, ""]:
     return safe_sqrt(ring**2 + params.collision_offset**2) + radius
 
 
-@declare(Needs(contact="drones"))
+@declare(Needs(contact="drones", largest_step=LARGEST_STEP))
 def drone_contact(params: Params, state: State, other: Params, other_state: State) -> Wrench:
     """Normal force and friction of another drone on a drone; the other drone gets the opposite.
 

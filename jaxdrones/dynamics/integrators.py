@@ -5,11 +5,13 @@ it is normalized, or rotated by the exponential of a rotation vector.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.dynamics.model import PointMass
 from jaxdrones.state import State
 
 Derivative = Callable[[State], State]
@@ -32,7 +34,7 @@ def semi_implicit_euler(derivative: Derivative, state: State, dt: float) -> Stat
     state = _normalized(state)  # the exponential map keeps the length only up to rounding
     after = _add(state, dt, derivative(state))
     pos, quat = state.pos + dt * after.vel, jax.vmap(_turn)(state.quat, dt * after.omega)
-    return after.replace(pos=pos, quat=quat)
+    return after.replace(pos=pos, quat=quat, aux=_moved(state.aux, after.aux, dt))
 
 
 def midpoint(derivative: Derivative, state: State, dt: float) -> State:
@@ -63,6 +65,25 @@ def implicit_midpoint(derivative: Derivative, state: State, dt: float) -> State:
 
     rate, _ = jax.lax.scan(iterate, derivative(state), length=_MIDPOINT_ITERATIONS)
     return _normalized(_add(state, dt, rate))
+
+
+def models_after(aux: dict[str, Any], rate: dict[str, Any], dt: float) -> dict[str, Any]:
+    """States of models after a semi-implicit Euler step.
+
+    Args:
+        aux: states of the models, by name.
+        rate: their time derivatives.
+        dt: time step, s.
+    """
+    return _moved(aux, jax.tree.map(lambda x, k: x + dt * k, aux, rate), dt)
+
+
+def _moved(before: dict[str, Any], after: dict[str, Any], dt: float) -> dict[str, Any]:
+    """States of models after an explicit Euler step, with point masses moved by their new velocity."""
+    return {
+        name: x.replace(pos=before[name].pos + dt * x.vel) if isinstance(x, PointMass) else x
+        for name, x in after.items()
+    }
 
 
 def _add(state: State, dt: float, rate: State) -> State:

@@ -9,23 +9,38 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arguments, check_callable, short_repr
+from jaxdrones.checks import bind, check_arguments, check_callable, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
+
+
+class PointMass(PyTreeNode):
+    """Point mass as the state of a model, or its time derivative: velocity and acceleration.
+
+    Semi-implicit Euler moves it with its new velocity, like a drone.
+    """
+
+    pos: Array
+    """(3,) position, m, world."""
+    vel: Array
+    """(3,) velocity, m/s, world."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Model:
     """Differential equation integrated with the rigid body; its state is `state.aux[name]`.
 
-    Every integrator treats it at its own order; Bullet takes explicit Euler steps.
+    Every integrator treats it at its own order; Bullet takes explicit Euler steps, and semi-implicit ones of a
+    `PointMass`.
     """
 
     name: str
     """Key of `State.aux`."""
-    init: Callable[[Params], Any]
-    """`init(params)`: initial state, a pytree of floating-point arrays."""
+    init: Callable[..., Any]
+    """`init(params)`: initial state, a pytree of floating-point arrays. A parameter named `state` receives that of the
+    drone."""
     rate: Callable[[Params, State, Float[Array, "4"]], Any]
     """`rate(params, state, command)`: time derivative of the state, a pytree of the same type; `command` is the
     commanded rotor speeds, RPM, before any limit."""
@@ -38,11 +53,16 @@ class Model:
         for field, arguments in ("init", ("params",)), ("rate", ("params", "state", "command")):
             function = getattr(self, field)
             check_callable(f"{field} of the model {self.name!r}", function, f"a function of ({', '.join(arguments)})")
+            function = bind(function, state=None) if field == "init" else function
             check_arguments(f"{field} of the model {self.name!r}", function, arguments)
 
-    def start(self, params: Params) -> Any:
-        """Initial state of a team, every array with a leading drone axis."""
-        return self.init(params) if self.of_team else jax.vmap(self.init)(params)
+    def start(self, params: Params, state: State) -> Any:
+        """Initial state of a team in a state without models, every array with a leading drone axis."""
+
+        def init(params: Params, state: State) -> Any:
+            return bind(self.init, state=state)(params)
+
+        return init(params, state) if self.of_team else jax.vmap(init)(params, state)
 
     def team_rate(self, params: Params, state: State, command: Float[Array, "n 4"]) -> Any:
         """Time derivative of the state of a team.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -17,10 +18,12 @@ class Needs:
     contact: str = ""
     """Kind of contact: `ground`, `obstacles` or `drones`; empty for other effects.
 
-    Bullet rejects contact effects, as it resolves contacts itself. The explicit backend checks that its physics step is
-    short enough, computes contact with obstacles only near one, and stops fast drones at their surfaces."""
+    Bullet rejects contact effects, as it resolves contacts itself. The explicit backend computes contact with obstacles
+    only near one, and stops fast drones at their surfaces."""
     ground_only: bool = False
     """Whether the effect uses only the ground of a scene."""
+    largest_step: float = math.inf
+    """Longest physics step with which the effect is stable, s; the explicit backend rejects longer ones."""
 
 
 def declare(needs: Needs) -> Callable[[Function], Function]:

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.shared import recomputed
 from jaxdrones.arguments import Count, Seconds, checked
-from jaxdrones.dynamics.contact import LARGEST_STEP
 from jaxdrones.dynamics.integrators import Integrator, semi_implicit_euler
 from jaxdrones.dynamics.model import Model
+from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rigid_body import newton_euler, quat_rate
 from jaxdrones.dynamics.rotors import instant_rotors, limited
 from jaxdrones.engine.clearance import NearObstacles
@@ -132,18 +132,26 @@ def make_step(
 
     Raises:
         ValueError: `dt` or `substeps` not positive, an argument that is not a function or a model, a scene with
-            obstacles without an effect that uses it, or contact with `dt` above 1/240 s, where it is unstable.
+            obstacles without an effect that uses it, or `dt` above that with which an effect is stable: 1/240 s for
+            contact, 1/100 s for `cable`.
     """
     physics = Physics(effects, pairs, team_effects, models, rotors, neighbors)
     check_functions("integrator", [integrator])
-    contacts = physics.contacts("ground", "obstacles", "drones")
-    if contacts and dt > LARGEST_STEP * (1 + 1e-6):
-        times = math.ceil(dt / LARGEST_STEP - 1e-6)
+    _check_stable(physics, dt, substeps)
+    return ExplicitStep(physics, integrator, dt, substeps, scene)
+
+
+def _check_stable(physics: Physics, dt: float, substeps: int) -> None:
+    """Raise for a physics step with which an effect is unstable."""
+    functions = (*physics.effects, *physics.pairs, *physics.team_effects)
+    largest = min((needs_of(f).largest_step for f in functions), default=math.inf)
+    if dt > largest * (1 + 1e-6):
+        stiff = describe([f for f in functions if needs_of(f).largest_step == largest])
+        times = math.ceil(dt / largest - 1e-6)
         raise UserError(
-            f"dt is {dt:.4g} s and {describe(contacts)} is stable up to 1/240 s; give dt={dt / times:.4g} and "
+            f"dt is {dt:.4g} s and {stiff} is stable up to 1/{1 / largest:.0f} s; give dt={dt / times:.4g} and "
             f"substeps={times * substeps}"
         )
-    return ExplicitStep(physics, integrator, dt, substeps, scene)
 
 
 class ExplicitStep(Step):

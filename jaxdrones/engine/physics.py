@@ -108,7 +108,7 @@ class Physics:
 
     def init(self, params: Params, state: State) -> State:
         """State of a team, with missing model states initialized."""
-        fresh = {model.name: model.start(params) for model in self.models if model.name not in state.aux}
+        fresh = {model.name: model.start(params, state) for model in self.models if model.name not in state.aux}
         return state.replace(aux=state.aux | fresh)
 
     def loads(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jaxdrones import rotation
 from jaxdrones.checks import UNIT_LENGTH
+from jaxdrones.dynamics.integrators import models_after
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.team import Layout, columns
@@ -96,7 +97,7 @@ def make_loads(physics: Physics, dt: float) -> Callable[..., jax.Array]:
         torque, omega = in_world(state.quat, acting.wrench.torque), in_world(state.quat, state.omega)
         rpm = acting.state.rpm + dt * acting.rpm_rate
         aux_rate = jax.tree.map(jnp.zeros_like, state.aux) | acting.aux_rate
-        following = jax.tree.map(lambda x, rate: x + dt * rate, state.aux, aux_rate)
+        following = models_after(state.aux, aux_rate, dt)
         flags = jnp.stack([near(params, state.pos, scene.ground), suspect(team)], axis=-1)
         return jnp.concatenate([force, torque, omega, flags, rpm, *columns(following, len(team))], axis=-1)
 

@@ -61,7 +61,7 @@ def make(
     camera: Camera | None = None,
     realistic: Annotated[bool | str, functools.partial(check_switch, others=("any",))] = False,
     effects: Sequence[str | Callable] | None = None,
-    pairs: Sequence[str | Callable] = (),
+    pairs: Sequence[str | Callable] | None = None,
     team_effects: Sequence[TeamEffect] = (),
     models: Sequence[Model] = (),
     rotors: str | None = None,
@@ -90,7 +90,7 @@ def make(
         realistic: defaults with lagging rotors, drag, a random delay, sensor noise and random parameters; `any` draws a
             vehicle of 20 g to 3 kg for every episode in place of random parameters.
         effects: names of `EFFECTS` or functions.
-        pairs: names of `PAIRS` or functions.
+        pairs: names of `PAIRS` or functions; by default the task's.
         team_effects: functions `(params, state) -> Wrench` of the whole team.
         models: additional differential equations, such as a battery.
         rotors: `instant` or `lagging`.
@@ -131,7 +131,7 @@ def make(
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
     if disturbance is not None:
         effects = [*effects, external_force]
-    pairs = _all_named("pairs", pairs, PAIRS, others=EFFECTS)
+    pairs = _all_named("pairs", task.pairs if pairs is None else pairs, PAIRS, others=EFFECTS)
     lagging = inspect.unwrap(cast(Callable, rotors)) is inspect.unwrap(lagging_rotors)  # also inside `failing`
     action = _action(task.action if action is None else action, nominal, lagging, dt)
     sensors = check_sensors(sensors, dt)

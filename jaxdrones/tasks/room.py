@@ -18,7 +18,7 @@ from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
-from jaxdrones.tasks import shaping
+from jaxdrones.tasks import crossing, shaping
 from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World
@@ -31,8 +31,6 @@ _SPACING = 1.0  # m between neighboring places on the ring
 _CLEARANCE = 0.6  # m between a pillar and a place
 _SIGHT = 2.0  # m, at which the observed vector to the nearest surface is clipped
 _ARRIVED = 0.2  # m
-_SPEED = 1.5  # m/s, to the goal
-_SLOW_WITHIN = 1.0  # m of the goal
 
 
 _METRICS = {
@@ -85,11 +83,6 @@ def room(
         """Goal: the place of another drone at the start."""
         return Setpoint.at(variables["goal"])
 
-    def velocity(task: Task, world: World) -> Float[Array, " n"]:
-        """Magnitude of the velocity error over the speed of flight."""
-        desired = shaping.velocity_to_target(task, world, _SPEED, _SLOW_WITHIN)
-        return shaping.length(world.drones.vel - desired, 0.1 * _SPEED) / _SPEED
-
     return Task(
         name="room",
         summary="exchange places in a room with pillars without touching",
@@ -97,22 +90,14 @@ def room(
         duration=duration,
         start=start,
         target=target,
-        rewards={
-            "alive": (2.0, shaping.alive),
-            "position": (-0.5, shaping.position),
-            "velocity": (-1.0, velocity),
-            "clearance": (-2.0, shaping.clearance),
-            "crowding": (-5.0, shaping.crowding),
-            "omega": (-0.02, shaping.body_rates),
-            "action_change": (-0.02, shaping.action_change),
-            "touched": (-10.0, _METRICS["touched"]),
-        },
+        rewards=crossing.REWARDS | {"clearance": (-4.0, shaping.clearance), "touched": (-10.0, _METRICS["touched"])},
         terminations={"touched": shaping.flag("touched", "A drone touches the room, a pillar or another drone.")}
         | out_of_control(size, center=(0, 0, HEIGHT)),
         advance=_advance,
         metrics=_METRICS,
         success=_arrived_untouched,
-        observations={
+        observations=crossing.GOAL
+        | {
             "nearest_surface": ObservationTerm(
                 _observe_nearest_surface, _SIGHT, entries=quantities("nearest surface, from the drone", "m", "world")
             )
@@ -122,15 +107,7 @@ def room(
         scene=scene if pillars else build_room((size, size, ROOM_HEIGHT)),
         obstacles_terminate=True,
         action="thrust_and_rates",
-        observation=(
-            "position_error",
-            "rotation_matrix",
-            "velocity",
-            "omega",
-            "nearest_surface",
-            "neighbors",
-            "last_action",
-        ),
+        observation=(*crossing.OBSERVATION[:-1], "nearest_surface", crossing.OBSERVATION[-1]),
     )
 
 

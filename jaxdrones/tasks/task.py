@@ -164,6 +164,8 @@ class Task:
     """Names of the default images."""
     contact: Annotated[tuple[str, ...], choices("contact", CONTACTS, "'ground'")] = ()
     """Contact forces of the explicit backend: `ground`, `drones`, `obstacles` (unless `obstacles_terminate`)."""
+    pairs: tuple[str, ...] = ()
+    """Names of the default pair effects."""
     action: str = "rpm"
     """Name of the default action type."""
     observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")

@@ -90,9 +90,10 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("forest", "shac"): _FOREST | dict(updates=600, horizon=50, critic_hidden_sizes=(128, 64)),
     ("forest", "ppo"): _SLOW_PPO
     | dict(updates=600, worlds=256, horizon=64, hidden_sizes=(128, 64), critic_hidden_sizes=(128, 64), gae_lambda=0.95),
-    ("room", "bptt"): dict(updates=300, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
+    ("room", "bptt"): _CROSSING | dict(worlds=64),
     ("crowd", "bptt"): _CROSSING,
     ("swap-goals", "bptt"): _CROSSING,
+    ("wake", "bptt"): _CROSSING | dict(updates=200, worlds=64),
     ("follow", "bptt"): dict(updates=200, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
     ("hover-2021", "bptt"): _ONE_D,
     ("hover-2021", "ppo"): _ONE_D_PPO,
@@ -120,7 +121,7 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "swap-goals": dict(substeps=2),
 }
 """Options of the environment in training, where they differ from those in flight."""
-_DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo", "swap-goals": "ppo"}
+_DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo"}
 
 
 def default_algorithm(task: str) -> str:

@@ -31,7 +31,8 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.worlds, options.repeats = 16, 1
 
-    swarm = dict(drones=8, pairs=("downwash",))
+    swarm = dict(drones=8, pairs=("downwash",), control_hz=100, action="rpm")
+    swarm |= dict(observation=("position_error", "rotation_matrix", "velocity_error", "omega", "neighbors"))
     rows = {
         "hover, in jit: env-steps/s": in_jit(make("hover"), options),
         "hover, realistic, in jit: env-steps/s": in_jit(make("hover", realistic=True), options),

@@ -54,7 +54,7 @@ def measure(recipe: Recipe, options) -> tuple[list[dict], dict]:
     algorithm, config = learner(recipe.algorithm), recipe.config
     env, practice = recipe.env(), recipe.env(practice=True)
     start, start_cpu = time.perf_counter(), time.process_time()
-    program = compilation.jit(lambda key: algorithm.train(key, practice, config), config)
+    program = compilation.jit(lambda key: algorithm.train(key, practice, config), practice, config)
     train = program.lower(jax.random.key(0)).compile()
     spent = {"compile s": time.perf_counter() - start, "compile CPU s": time.process_time() - start_cpu}
 

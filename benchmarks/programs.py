@@ -83,7 +83,7 @@ def update(algorithm: str) -> Program:
         trained_by = learner(algorithm)
         env, config = presets.preset("hover", algorithm)
         state = jax.jit(lambda key: trained_by.init(key, env, config))(jax.random.key(0))
-        compiling = functools.partial(compilation.jit, config=config)
+        compiling = functools.partial(compilation.jit, env=env, config=config)
         return Made(functools.partial(trained_by.update, env, config), (state,), compiling)
 
     return Program(f"the first update of hover by {algorithm}, with the settings of its preset", UPDATE, 1, make_it)

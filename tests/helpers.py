@@ -27,7 +27,7 @@ CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name !=
 
 def jit_unoptimized(function, **arguments):
     """`jax.jit` in a third of the time for large programs that run a few times and whose law is not about compiling."""
-    options = training_options(differentiated=True) | {"xla_backend_optimization_level": 0}
+    options = training_options(large_arrays=False) | {"xla_backend_optimization_level": 0}
     return jax.jit(function, compiler_options=options, **arguments)
 
 

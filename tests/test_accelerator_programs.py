@@ -71,7 +71,7 @@ def test_a_step_for_a_cpu_holds_what_the_other_tests_look_for():
 
 def test_no_compiler_option_is_for_an_accelerator(accelerator):
     assert compiler.kernel_options() == {}
-    assert compiler.training_options(differentiated=True) == compiler.training_options(differentiated=False) == {}
+    assert compiler.training_options(large_arrays=True) == compiler.training_options(large_arrays=False) == {}
 
 
 def test_the_plant_and_its_gradient_hold_nothing_for_cpus(accelerator):
@@ -104,7 +104,7 @@ def test_an_environment_step_holds_nothing_for_cpus(accelerator):
 def test_an_update_of_a_learner_holds_nothing_for_cpus(algorithm, accelerator):
     trained_by = learner(algorithm)
     env, config = presets.preset("hover", algorithm)
-    update = compilation.jit(functools.partial(trained_by.update, env, config), config)
+    update = compilation.jit(functools.partial(trained_by.update, env, config), env, config)
     state = jax.eval_shape(lambda key: trained_by.init(key, env, config), jax.random.key(0))
     assert not found(lowered(update, state))
 

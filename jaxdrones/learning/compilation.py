@@ -8,11 +8,12 @@ from typing import Any
 import jax
 
 from jaxdrones.accelerate.compiler import training_options
+from jaxdrones.envs import Env
 from jaxdrones.learning.gradients import GradientConfig
 from jaxdrones.learning.settings import Config
 
 
-def jit(function: Callable, config: Config | None = None, **arguments: Any) -> Any:
+def jit(function: Callable, env: Env, config: Config | None = None, **arguments: Any) -> Any:
     """`jax.jit` with compiler options for training.
 
     The result can be called or lowered, but not inside another traced function, where JAX rejects compiler options.
@@ -20,10 +21,12 @@ def jit(function: Callable, config: Config | None = None, **arguments: Any) -> A
 
     Args:
         function: function to compile.
+        env: environment that the function simulates.
         config: settings of the learner whose updates the function makes.
         **arguments: further arguments of `jax.jit`.
     """
-    options = training_options(differentiated=config is None or isinstance(config, GradientConfig))
+    has_epochs = config is not None and not isinstance(config, GradientConfig)
+    options = training_options(large_arrays=has_epochs or env.vision is not None)
     return jax.jit(function, compiler_options=options, **arguments)
 
 

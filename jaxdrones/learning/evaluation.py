@@ -74,7 +74,7 @@ def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: int = 1000) -> Rep
     check_episodes(env, episodes)
     keys = jax.random.split(key, episodes)
     if isinstance(policy, PyTreeNode):
-        outcomes = _compiled_outcomes()(env, policy, keys)
+        outcomes = _compiled_outcomes(env)(policy, keys)
     else:
         outcomes = jax.jit(functools.partial(_outcomes, env, policy))(keys)
     return _report(env, jax.tree.map(np.asarray, outcomes))
@@ -107,7 +107,7 @@ def compile_evaluation(
         return sharding.map_worlds(outcomes, (sharding.WORLDS,), sharding.WORLDS)(keys)
 
     with jax.set_mesh(mesh):
-        program = compilation.jit(all_outcomes, in_shardings=shardings).lower(leaves, keys).compile()
+        program = compilation.jit(all_outcomes, env, in_shardings=shardings).lower(leaves, keys).compile()
 
     def report(policy: AnyPolicy, key: jax.Array) -> Report:
         outcomes = program(*jax.device_put((jax.tree.leaves(policy), split(key)), shardings))
@@ -122,9 +122,9 @@ def check_episodes(env: Env, episodes: int) -> None:
     check_memory(f"an evaluation of {episodes:,} episodes", episodes * env.drones * _EPISODE_BYTES, "give fewer")
 
 
-@functools.cache
-def _compiled_outcomes() -> Callable:
-    return compilation.jit(_outcomes, static_argnums=0)
+@functools.lru_cache(maxsize=8)
+def _compiled_outcomes(env: Env) -> Callable:
+    return compilation.jit(functools.partial(_outcomes, env), env)
 
 
 def _outcomes(env: Env, policy: AnyPolicy, keys: jax.Array) -> dict:

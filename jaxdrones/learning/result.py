@@ -156,8 +156,8 @@ def _programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple[
 
 @functools.lru_cache(maxsize=8)
 def _cached_programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple:
-    start = compilation.jit(lambda key: init(key, env, config))
-    return start, compilation.jit(functools.partial(advance, update, env, config), config)
+    start = compilation.jit(lambda key: init(key, env, config), env)
+    return start, compilation.jit(functools.partial(advance, update, env, config), env, config)
 
 
 def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result:

@@ -54,7 +54,7 @@ class Trainer:
         """Compile the programs, the updates beside the others."""
         start = time.perf_counter()
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
-        init = compilation.jit(self._init, in_shardings=same, out_shardings=state)
+        init = compilation.jit(self._init, self.practice_env, in_shardings=same, out_shardings=state)
         with ThreadPoolExecutor(1) as beside:
             with jax.set_mesh(self.mesh):
                 updates = beside.submit(self._traced.lower().compile)
@@ -86,7 +86,7 @@ class Trainer:
         count = jnp.zeros((), jnp.int32)
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
         shardings = {"in_shardings": (state, same, same), "out_shardings": (state, same)}
-        updates = compilation.jit(self._updates, self.recipe.config, **shardings)
+        updates = compilation.jit(self._updates, self.practice_env, self.recipe.config, **shardings)
         with jax.set_mesh(self.mesh):
             return updates.trace(self.shapes, count, count)
 

@@ -13,7 +13,7 @@ from jaxdrones.control import Setpoint
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.envs import Action
 from jaxdrones.envs.vision import Vision
-from jaxdrones.learning import checkpoint, evaluate, ppo
+from jaxdrones.learning import bptt, checkpoint, compilation, evaluate, evaluation, ppo, result, shac
 from jaxdrones.learning.layers import IMAGE_CHANNELS
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import map_state_vector
@@ -192,6 +192,18 @@ def test_a_compiled_program_sees_what_is_seen_without_one(team):
     for i in range(3):
         alone = team.physics.camera(team.params, jax.tree.map(lambda x, i=i: np.asarray(x[i]), drones))
         jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a[i], b), together, alone)
+
+
+@pytest.mark.parametrize("task", ["forest", "hover"])
+@pytest.mark.parametrize("learner", [bptt, shac, ppo])
+def test_programs_with_images_are_compiled_for_large_arrays(task, learner, monkeypatch):
+    """With the options for small arrays, updates and evaluations of the forest take several times as long."""
+    env, chosen = jd.make(task), []
+    monkeypatch.setattr(compilation, "training_options", lambda large_arrays: chosen.append(large_arrays) or {})
+    result._cached_programs.__wrapped__(learner.init, learner.update, env, learner.Config())
+    evaluation._compiled_outcomes.__wrapped__(env)
+    sees = task == "forest"
+    assert chosen == [sees, sees or learner is ppo, sees]  # the start, the updates, an evaluation
 
 
 @pytest.mark.needs("pybullet")

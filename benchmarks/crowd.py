@@ -59,7 +59,7 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
 
 
 def train(options: argparse.Namespace) -> tuple[jd.learning.networks.Policy, dict]:
-    """Policy of a learner, and the seconds that it took with compiling."""
+    """Policy of a learner, and the seconds that it took, compiling included."""
     learner = LEARNERS[options.learner]
     blind = {"observation": _observation(options)} if options.learner == "blind" else {}
     env, config = preset("crowd", learner.__name__.rpartition(".")[2], practice=True, **blind)
@@ -68,9 +68,10 @@ def train(options: argparse.Namespace) -> tuple[jd.learning.networks.Policy, dic
     key = jax.random.key(options.seed)
     if learner is ppo and not options.quick:
         config = dataclasses.replace(config, updates=_updates_in(options.seconds, env, config))
-    start = time.perf_counter()
+    start, start_cpu = time.perf_counter(), time.process_time()
     result = jax.block_until_ready(learner.train(key, env, config))
-    return result.policy, {"updates": config.updates, "train s": round(time.perf_counter() - start, 1)}
+    spent = {"train s": time.perf_counter() - start, "train CPU s": time.process_time() - start_cpu}
+    return result.policy, {"updates": config.updates} | {name: round(x, 1) for name, x in spent.items()}
 
 
 def _updates_in(seconds: float, env: jd.envs.Env, config: ppo.Config) -> int:

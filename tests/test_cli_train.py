@@ -1,16 +1,19 @@
 """Training at the shell: what it writes, how it stops, how it goes on."""
 
+import argparse
 import contextlib
 import csv
 import io
 import json
 import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
 from jaxdrones.cli import main
+from jaxdrones.cli.policies import team_of_run
 from jaxdrones.cli.report import percent, success
 from jaxdrones.learning import checkpoint, loggers
 from jaxdrones.learning.evaluation import wilson_interval
@@ -331,7 +334,7 @@ def test_a_sweep_of_a_file_trains_a_run_for_each_value(tmp_path, capsys):
         (["train", "hover", "--output", "file"], "choose another --output"),
         (["eval", "nowhere"], "no checkpoint at nowhere/best"),
         (["fly", "--policy", "nowhere"], "no checkpoint at nowhere/best"),
-        (["fly", "--policy", "nowhere", "--drones", "3"], "drones 3 is given beside --policy"),
+        (["fly", "--policy", "nowhere", "--vehicle", "hb"], "vehicle hb is given beside --policy"),
         (["fly", "--policy", "nowhere", "--backend", "gazebo"], "unknown backend 'gazebo'"),
     ],
 )
@@ -444,3 +447,28 @@ def test_a_policy_is_filmed(trained, tmp_path, capsys):
     assert main([*arguments, "--output", str(tmp_path)]) == 0
     assert film.stat().st_size > 1000
     assert "no success: return" in capsys.readouterr().out
+
+
+def test_drones_beside_a_run_are_the_size_of_the_team_and_beside_a_policy_of_a_file_an_option():
+    settings = {"drones": 4, "density": 2.0}
+    run = argparse.Namespace(policy=Path("runs/crowd"), drones=4)
+    assert team_of_run(run, settings) == {"drones": 4} and settings == {"density": 2.0}
+    own = argparse.Namespace(policy=Path("mine.py:policy"), drones=4)
+    assert team_of_run(own, {"drones": 4}) == {} == team_of_run(argparse.Namespace(policy=run.policy, drones=None), {})
+
+
+@pytest.mark.slow
+def test_a_policy_of_a_run_flies_teams_of_other_sizes_unless_each_drone_has_its_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = ["--set", "updates=1", "--set", "worlds=2", "--set", "horizon=2", "--no-figure"]
+    assert main(["train", "crowd", "--drones", "2", *small]) == 0
+    capsys.readouterr()
+    assert main(["eval", "runs/crowd", "--drones", "5", "--episodes", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["evaluation"]["episodes"] == 2
+    assert main(["fly", "--policy", "runs/crowd", "--drones", "3", "--no-figure"]) == 0
+    with np.load("runs/crowd/flight/log.npz") as log:
+        assert log["pos"].shape[1] == 3
+    assert main(["train", "flock", *small]) == 0
+    capsys.readouterr()
+    assert main(["eval", "runs/flock", "--drones", "3", "--episodes", "2"]) == 2
+    assert "has a network for each of 2 drones; give as many, not 3" in capsys.readouterr().err

@@ -7,7 +7,7 @@ from typing import Any
 from jaxdrones.arguments import choice, number, whole
 from jaxdrones.cli.common import DIVERGED, check_options, folder, print_error
 from jaxdrones.cli.options import add_backend, add_drones, add_json, add_set, add_vehicle
-from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.policies import is_user_policy, open_policy, team_of_run
 from jaxdrones.cli.report import as_json, described, evaluation_table, percent
 from jaxdrones.cli.settings import add_realistic, asked_settings
 from jaxdrones.errors import UserError
@@ -34,10 +34,10 @@ def add(commands) -> None:
     own = parser.add_argument_group("your own policy", "only with file.py:name")
     evaluation = parser.add_argument_group("evaluation")
     own.add_argument("--task", metavar="TASK", help="task to fly, as for `jaxdrones train`")
-    add_drones(own)
     add_vehicle(own)
     add_realistic(own)
     add_set(own, "option of the environment (action, observation, ...)")
+    add_drones(evaluation)
     add_backend(evaluation)
     evaluation.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
     evaluation.add_argument("--seed", type=int, default=0, metavar="K", help="seed of starts and noise (0)")
@@ -59,7 +59,9 @@ def _evaluate(options: argparse.Namespace) -> int:
     passing = number(name="fail-below", above=0, at_most=1)
     backend, episodes = choice("backend", BACKENDS), whole(limit=LARGEST_COUNT)
     check_options(options, episodes=episodes, seed=check_seed, fail_below=passing, backend=backend)
-    run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
+    settings = asked_settings(options)
+    team = team_of_run(options, settings)
+    run = open_policy(options.policy, options.task, options.realistic, settings, options.last)
     about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed, "backend": options.backend}
     if is_user_policy(options.policy):
         recipe, make_policy = run.recipe(), run.policy
@@ -72,7 +74,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         about |= {"policy": name, "update": update}
     title += f", on the {options.backend} backend" * (options.backend != "explicit")
     key = jax.random.key(_FIRST_SEED + options.seed)
-    with recipe.env(backend=options.backend) as env:
+    with recipe.env(backend=options.backend, **team) as env:
         report = report_as_dict(evaluate(env, make_policy(env), key, options.episodes))
     if options.fail_below is not None and report["success"] is None:
         raise UserError(f"--fail-below {options.fail_below} is given, and the task has no criterion of success")

@@ -13,7 +13,7 @@ from jaxdrones.cli.common import check_options, check_writable, folder, print_er
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_json, add_no_figure, add_output, add_set
-from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.policies import is_user_policy, open_policy, team_of_run
 from jaxdrones.cli.report import as_json, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
 from jaxdrones.errors import UserError
@@ -119,7 +119,7 @@ def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Non
             raise UserError("--realistic is given without --policy file.py:name; leave it out, or give both")
         return
     own = is_user_policy(options.policy)
-    names = ["flight", *([] if own else ["drones", "vehicle"]), *_OF_EXAMPLES]
+    names = ["flight", *([] if own else ["vehicle"]), *_OF_EXAMPLES]
     for name in names:
         if getattr(options, name) != parser.get_default(name):
             what = "the task" if own else "the run"
@@ -159,7 +159,8 @@ def _fly_policy(options: argparse.Namespace) -> int:
     output = options.output or (
         run_folder(str(options.policy)) if is_user_policy(options.policy) else options.policy / "flight"
     )
-    with recipe.env(backend=options.backend) as env, progress() as report:
+    team = team_of_run(options, {})
+    with recipe.env(backend=options.backend, **team) as env, progress() as report:
         policy = run.policy(env=env)
         _check_files(options, output)
         title = f"{recipe.task}: {env.task.summary} ({recipe.algorithm}, {options.backend})"
@@ -174,7 +175,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
         options.backend,
         seed,
         vehicle,
-        recipe.options,
+        recipe.options | team,
     )
     record = to_record(episode, conditions)
     files = _write(record, options, output, title, plots.POLICY_PANELS)

@@ -1,5 +1,6 @@
 """Policies on the command line: of a run of `jaxdrones train`, or of a user's file."""
 
+import argparse
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,14 @@ from jaxdrones.user_code import is_reference
 def is_user_policy(policy: Path) -> bool:
     """Whether this is a policy of a user's file, `file.py:name`, not the folder of a run."""
     return is_reference(str(policy))
+
+
+def team_of_run(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, Any]:
+    """Options of `jaxdrones.make` for --drones beside a run: the size of the team. They are removed from `settings`."""
+    if is_user_policy(options.policy) or options.drones is None:
+        return {}
+    settings.pop("drones", None)
+    return {"drones": options.drones}
 
 
 def open_policy(

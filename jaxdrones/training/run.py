@@ -130,6 +130,11 @@ class Run:
         if env is not None:
             sizes = (policy.obs_stats.mean.size, policy.network.output_size)
             self.check_sizes(name, env, sizes, (env.observation_size, env.action_size))
+            networks = len(jax.tree.leaves(policy.params)[0])
+            if policy.per_agent and networks != env.drones:
+                raise UserError(
+                    f"{self.folder / name} has a network for each of {networks} drones; give as many, not {env.drones}"
+                )
         return policy
 
     def check_sizes(self, name: str, env: Env, sizes: tuple[int, int], expected: tuple[int, int]) -> None:

@@ -105,6 +105,7 @@ TRAININGS = {
         f"hover by bptt, realistic, any vehicle: ... {TRAINED}", TRAINING
     ),
     "train forest": Short(f"forest by bptt ... {TRAINED}", TRAINING),
+    "train sling": Short(f"sling by bptt ... {TRAINED}", TRAINING),
     "train recovery --set recurrent_size=32": Short(f"recovery by bptt ... {TRAINED}", TRAINING),
     "train hover --resume": Short(TRAINED),
     "train hover --resume --budget 100": Short("updates: 102, 2 of them made ... " + TRAINED.split(" ... ", 1)[1]),

@@ -9,7 +9,19 @@ from typing import Any
 from jaxdrones import user_code
 from jaxdrones.checks import UnexpectedKeyword, check_callable, check_choice, check_keyword, hint, short_repr
 from jaxdrones.errors import UserError
-from jaxdrones.tasks import crowd, follow, forest, gates, gym_pybullet_drones, hover, room, swap, tracking, wake
+from jaxdrones.tasks import (
+    crowd,
+    follow,
+    forest,
+    gates,
+    gym_pybullet_drones,
+    hover,
+    payload,
+    room,
+    swap,
+    tracking,
+    wake,
+)
 from jaxdrones.tasks.task import Task
 
 TASKS: dict[str, Callable[..., Task]] = {
@@ -24,6 +36,8 @@ TASKS: dict[str, Callable[..., Task]] = {
     "swap-goals": swap.swap_goals,
     "crowd": crowd.crowd,
     "wake": wake.wake,
+    "sling": payload.sling,
+    "transport": payload.transport,
     "hover-2021": gym_pybullet_drones.hover,
     "takeoff": gym_pybullet_drones.takeoff,
     "fly-through-gate": gym_pybullet_drones.fly_through_gate,

@@ -126,9 +126,10 @@ def make(
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
     check_finite("vehicle", nominal)
     check_params(nominal)
-    nominal = nominal_params(randomize, nominal)
+    nominal = task.equip(nominal_params(randomize, nominal))
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
+    effects = [*effects, *task.effects]
     if disturbance is not None:
         effects = [*effects, external_force]
     pairs = _all_named("pairs", task.pairs if pairs is None else pairs, PAIRS, others=EFFECTS)
@@ -136,7 +137,7 @@ def make(
     action = _action(task.action if action is None else action, nominal, lagging, dt)
     sensors = check_sensors(sensors, dt)
     physics: dict[str, Any] = dict(
-        effects=effects, pairs=pairs, team_effects=team_effects, models=models, rotors=rotors
+        effects=effects, pairs=pairs, team_effects=team_effects, models=(*models, *task.models), rotors=rotors
     )
     physics |= dict(dt=dt / substeps, substeps=substeps)
     scene = task.scene if scene is None else scene

@@ -17,6 +17,7 @@ from jaxdrones import rotation, vector
 from jaxdrones.arguments import Count, Hertz, NonNegativeInt, Seconds, Switch, checked, choice, choices, number, whole
 from jaxdrones.checks import bind, check_arguments, check_choice, check_number, check_sequence, check_whole, short_repr
 from jaxdrones.control import Setpoint
+from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -24,6 +25,7 @@ from jaxdrones.quantity import Quantity
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
+from jaxdrones.wrench import Wrench
 
 
 class World(PyTreeNode):
@@ -69,6 +71,8 @@ class World(PyTreeNode):
 
 Entries = tuple[Quantity, ...] | Callable[[int, tuple[Quantity, ...]], tuple[Quantity, ...]]
 """Quantities, or a function (number of drones, quantities of an action) -> quantities."""
+Effect = Callable[..., Wrench]
+"""Effect on one drone, `(params, state) -> Wrench`."""
 CONTACTS = ("ground", "drones", "obstacles")
 IMAGES = ("rgb", "depth", "segmentation")
 Drones = Annotated[int, whole("number of drones of {function}")]  # argument of a task
@@ -150,6 +154,12 @@ class Task:
     """Observation terms of this task by name."""
     randomize: tuple[Callable[[jax.Array, Params], Params], ...] = ()
     """Randomizations of the task: (key, params) of one drone -> its parameters in an episode."""
+    effects: tuple[Effect, ...] = ()
+    """Effects of the task's physics, in addition to those of `jaxdrones.make`."""
+    models: tuple[Model, ...] = ()
+    """Models of the task's physics, in addition to those of `jaxdrones.make`."""
+    equip: Callable[[Params], Params] = lambda params: params
+    """(parameters of the team) -> the same with constants of the task's models, such as a load."""
     control_hz: Hertz = 100.0
     """Default control steps per second."""
     substeps: Count = 5
@@ -180,6 +190,8 @@ class Task:
                 raise UserError(f"{name} of the task is {short_repr(x)}; give a {what}")
         check_whole(f"number of drones of {self.name}", self.drones)
         self._check_functions()
+        check_sequence("effects", self.effects, "jaxdrones.cable")
+        check_sequence("models", self.models, "jaxdrones.payload()")
         for name in check_sequence("success_terminations", self.success_terminations, "'reached'"):
             check_choice("success termination", name, self.terminations)
         check_sequence("observation", self.observation, "'position_error'")
@@ -190,6 +202,7 @@ class Task:
     def _check_functions(self) -> None:
         """Raise unless the task's functions take the right number of arguments."""
         _check_function("start", bind(self.start, scene=None, progress=1.0), ("key", "params"))
+        _check_function("equip", self.equip, ("params",))
         _check_function("target", self.target, ("variables", "time"))
         _check_function("advance", self.advance, _OF_A_WORLD)
         _check_function("success", self.advance if self.success is None else self.success, ("metrics", "dt"))

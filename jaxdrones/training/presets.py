@@ -77,6 +77,21 @@ _CROSSING = dict(
 )
 """Two seconds of flight of teams, in which drones meet and avoid each other."""
 
+_PAYLOAD = dict(
+    updates=300,
+    worlds=32,
+    horizon=100,
+    hidden_sizes=(64, 64),
+    obs_stats_freeze=0,
+    gradient="decay",
+    gradient_decay=0.95,
+    learning_rate=3e-3,
+    adam_b2=0.99,
+    max_grad_norm=0.5,
+    restart_fraction=0.3,
+)
+"""Two seconds of flight with a load, about one and a half periods of its swing."""
+
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     # The exact gradient fails for 1 of 10 seeds; that of a rigid body costs two thirds, and learns as well.
     ("hover", "bptt"): dict(gradient="surrogate", learning_rate=1.5e-2, restart_fraction=0.3),
@@ -94,6 +109,8 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("crowd", "bptt"): _CROSSING,
     ("swap-goals", "bptt"): _CROSSING,
     ("wake", "bptt"): _CROSSING | dict(updates=200, worlds=64),
+    ("sling", "bptt"): _PAYLOAD,
+    ("transport", "bptt"): _PAYLOAD,
     ("follow", "bptt"): dict(updates=200, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
     ("hover-2021", "bptt"): _ONE_D,
     ("hover-2021", "ppo"): _ONE_D_PPO,
@@ -119,6 +136,8 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "gates": dict(random_start=True),
     "crowd": dict(random_box=True, substeps=2),
     "swap-goals": dict(substeps=2),
+    "sling": dict(substeps=2),
+    "transport": dict(substeps=2),
 }
 """Options of the environment in training, where they differ from those in flight."""
 _DEFAULT_ALGORITHMS: dict[str, str] = {"gates": "ppo"}

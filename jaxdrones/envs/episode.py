@@ -137,8 +137,10 @@ def outcome(
         for conditions in (task.terminations, task.truncations)
     )
     terminated = task.shared(jnp.any, _any_of(terminations, jnp.zeros_like(active)))
-    truncated = task.shared(jnp.any, _any_of(truncations, active & (world.step >= env.steps)))
-    world = world.replace(active=active & ~(terminated | truncated))
+    cut = task.shared(jnp.any, _any_of(truncations, jnp.zeros_like(active)))
+    truncated = cut | active & (world.step >= env.steps)
+    if task.ends == "drone":  # a step after the time limit is like any other
+        world = world.replace(active=active & ~(terminated | cut))
     info = dict(rewards=rewards, metrics=task.measure(world), terminations=terminations, truncations=truncations)
     info |= dict(active=active, terminated=terminated, truncated=truncated)
     obs = _noisy_observation(env, key, world)

@@ -28,6 +28,12 @@ _NUMBERS = (
 )
 
 
+_ENDS = {
+    "team": "the episode ends for all drones when a termination or truncation holds for one",
+    "drone": "a termination or truncation ends the episode of that drone, which leaves the world; the others fly on",
+}
+
+
 @dataclasses.dataclass(frozen=True)
 class Entry:
     """One entry of the observation or action of a drone."""
@@ -56,7 +62,7 @@ class Explanation:
     """Description of an environment; its text is a table."""
 
     task: dict[str, str]
-    """Name, summary, team, time, start, target and success."""
+    """Name, summary, team, time, start, target, success, and whose episode a termination ends."""
     observation: tuple[Entry, ...]
     images: dict[str, str]
     """Images of one drone by name."""
@@ -88,8 +94,8 @@ class Explanation:
             *([f"Images of each drone\n{_pairs(self.images)}"] if self.images else []),
             f"Action: {_count(self.action)} of each drone\n{entries_table(self.action)}",
             f"Reward of each drone in each control step: the sum of weight times term\n{_parts(self.rewards)}",
-            f"Terminations: the episode ends if one holds for one drone\n{_parts(self.terminations)}",
-            f"Truncations: the episode is cut short\n{_parts(self.truncations)}",
+            f"Terminations\n{_parts(self.terminations)}",
+            f"Truncations\n{_parts(self.truncations)}",
             f"Metrics of each drone\n{_parts(self.metrics)}",
             f"Physics\n{_pairs(self.physics)}",
             f"Vehicle\n{_pairs(self.vehicle)}",
@@ -125,6 +131,7 @@ def explain(env: Env) -> Explanation:
             "start": description(task.start),
             "target": description(task.target),
             "success": description(task.success) if task.success else "no criterion",
+            "ends": _ENDS[task.ends],
         },
         observation=tuple(_observed(env, action)),
         images={

@@ -44,7 +44,7 @@ class World(PyTreeNode):
     step: Array
     """() number of control steps since the start."""
     active: Array
-    """(n,) whether the episode of each drone goes on; see `Task.ends`."""
+    """(n,) whether each drone is still in the world, always with `Task.ends` of `team`."""
     dt: float = flax.struct.field(pytree_node=False)
     """Control period, s."""
     scene: Scene = flax.struct.field(default_factory=Scene)

@@ -92,6 +92,17 @@ _PAYLOAD = dict(
 )
 """Two seconds of flight with a load, about one and a half periods of its swing."""
 
+_CROSSING_PPO = _SLOW_PPO | dict(
+    updates=600,
+    worlds=64,
+    horizon=64,
+    hidden_sizes=(64, 64),
+    critic_hidden_sizes=(64, 64),
+    obs_stats_freeze=0,
+    gae_lambda=0.95,
+    final_std=0.05,
+)
+
 _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     # The exact gradient fails for 1 of 10 seeds; that of a rigid body costs two thirds, and learns as well.
     ("hover", "bptt"): dict(gradient="surrogate", learning_rate=1.5e-2, restart_fraction=0.3),
@@ -107,7 +118,9 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     | dict(updates=600, worlds=256, horizon=64, hidden_sizes=(128, 64), critic_hidden_sizes=(128, 64), gae_lambda=0.95),
     ("room", "bptt"): _CROSSING | dict(worlds=64),
     ("crowd", "bptt"): _CROSSING,
+    ("crowd", "ppo"): _CROSSING_PPO,
     ("swap-goals", "bptt"): _CROSSING,
+    ("swap-goals", "ppo"): _CROSSING_PPO,
     ("wake", "bptt"): _CROSSING | dict(updates=200, worlds=64),
     ("sling", "bptt"): _PAYLOAD,
     ("transport", "bptt"): _PAYLOAD,

@@ -84,7 +84,7 @@ def test_the_others_fly_on_and_the_team_ends_with_the_last():
     assert 0 < last < STEPS - 1 and ended.sum() == 1
     np.testing.assert_array_equal([info["active"] for info in infos], [[k <= last, True] for k in range(STEPS)])
     np.testing.assert_array_equal(rewards, [[k <= last, True] for k in range(STEPS)])
-    np.testing.assert_array_equal([world.active for world in worlds], [[k < last, k < STEPS - 1] for k in range(STEPS)])
+    np.testing.assert_array_equal([world.active for world in worlds], [[k < last, True] for k in range(STEPS)])
     assert not any(terminated) and [bool(x) for x in truncated] == [False] * (STEPS - 1) + [True]
     assert not infos[-1]["truncated"][0] and infos[-1]["truncated"][1]
     both = flown(column(), [-1.0, -1.0])
@@ -98,6 +98,16 @@ def test_by_default_the_end_of_a_drone_is_that_of_its_team():
     first = int(np.argmax(terminated))
     np.testing.assert_array_equal(info[first]["terminations"]["fell"], [True, False])
     np.testing.assert_array_equal(info[first]["terminated"], [True, True])
+
+
+@pytest.mark.parametrize("ends", ["team", "drone"])
+def test_who_flies_on_after_the_time_limit_can_still_fail(ends):
+    """As brax does, whose episodes have a length of their own."""
+    env = column(ends=ends, terminations={"late": lambda task, world: (world.step > STEPS + 1) & jnp.ones(2, bool)})
+    answers = flown(env, [0.0, 0.0], STEPS + 2)
+    assert [bool(x[2]) for x in answers] == [False] * (STEPS + 1) + [ends == "team"]
+    assert all(np.all(x[4]["terminated"]) == (k == STEPS + 1) for k, x in enumerate(answers))
+    assert [bool(x[3]) for x in answers] == [False] * (STEPS - 1) + [True] * 3
 
 
 @pytest.mark.parametrize("backend", ["explicit", pytest.param("bullet", marks=pytest.mark.slow)])

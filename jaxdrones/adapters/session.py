@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -13,7 +12,6 @@ from jax.typing import ArrayLike
 from jaxdrones.adapters import pictures
 from jaxdrones.arguments import checked, choice
 from jaxdrones.checks import UnexpectedKeyword
-from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import AutoReset, Env, make
 from jaxdrones.tasks.task import Task, World
 
@@ -29,12 +27,10 @@ class Session:
         self.world: World | None = None
         self.running = False
         """Whether an episode is in progress."""
-        on_host = isinstance(env.physics, HostStep)  # the environment itself compiles the code around such a step
-        self._compiled: Callable[..., Any] = _partial if on_host else Env.compiled
 
     def reset(self, seed: int) -> Any:
         """Start an episode; return the observation."""
-        self._key, self.world, obs = self._compiled(self.env, begin)(np.uint32(seed % SEEDS))
+        self._key, self.world, obs = self.env.compiled(begin)(np.uint32(seed % SEEDS))
         self.running = True
         return _numpy(obs)
 
@@ -47,7 +43,7 @@ class Session:
         Returns:
             Observation, reward (n,), terminated, truncated and info of the environment.
         """
-        self.world, outcome = self._compiled(self.env, _advance)(self._key, self.world, action)
+        self.world, outcome = self.env.compiled(_advance)(self._key, self.world, action)
         obs, reward, terminated, truncated, info = _numpy(outcome)
         terminated, truncated = bool(terminated), bool(truncated)
         self.running = not (terminated or truncated)
@@ -113,10 +109,6 @@ def begin(env: Env | AutoReset, seed: ArrayLike) -> tuple[jax.Array, Any, Any]:
 def _advance(env: Env, key: jax.Array, world: World, action: np.ndarray) -> tuple[World, Any]:
     obs, world, *rest = env.step(jax.random.fold_in(key, world.step), world, action)
     return world, (obs, *rest)
-
-
-def _partial(env: Env, function: Callable) -> Callable:
-    return functools.partial(function, env)
 
 
 def _numpy(tree: Any) -> Any:

@@ -7,7 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from jaxdrones.adapters.gymnasium import GymnasiumEnv
+from jaxdrones.adapters.gymnasium import GymnasiumEnv, VectorEnv
 from jaxdrones.envs import make
 
 pytestmark = pytest.mark.float32
@@ -50,3 +50,25 @@ def test_environments_fly_in_spawned_processes():
         assert obs in envs.observation_space
     finally:
         envs.close()
+
+
+@pytest.mark.slow
+@pytest.mark.needs("pybullet")
+def test_worlds_of_bullet_fly_in_processes_as_in_one():
+    options = dict(backend="bullet", duration=0.05)
+    make_one = functools.partial(GymnasiumEnv, "hover", **options)
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    apart = gymnasium.vector.AsyncVectorEnv([make_one] * 2, context="spawn", autoreset_mode=mode)
+    together = VectorEnv("hover", 2, **options)
+    try:
+        assert apart.single_observation_space == together.single_observation_space
+        found, expected = apart.reset(seed=3)[0], together.reset(seed=3)[0]
+        actions = np.random.default_rng(0).uniform(-0.1, 0.1, (4, *apart.action_space.shape)).astype(np.float32)
+        for action in actions:
+            np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+            (found, *outcome), (expected, *others) = apart.step(action)[:4], together.step(action)[:4]
+            for x, y in zip(outcome, others, strict=True):
+                np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
+    finally:
+        apart.close()
+        together.close()

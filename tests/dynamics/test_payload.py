@@ -330,3 +330,33 @@ def test_a_missing_load_or_missing_constants_are_named():
         without(params, jd.State.at_rest([[0.0, 0, 1]]), jnp.zeros((1, 4)))
     with pytest.raises(ValueError, match=r"params\.aux lacks 'payload'.*with_payload"):
         make_step().init(team(1), jd.State.at_rest([[0.0, 0, 1]]))
+
+
+UDAAN = [
+    [0.092455, 0.024299, 0.005309, -0.096222, 0.052004, -0.456896],
+    [-0.058245, 0.013141, 0.008244, 0.055325, -0.001809, -0.478458],
+    [-0.427473, -0.231506, -0.03152, -0.231139, -0.083952, -0.467043],
+    [-1.304922, -0.838683, -0.159275, -1.317921, -0.765084, -0.653657],
+]
+"""Positions of drone and load, m, after 0.5, 1, 1.5 and 2 s by udaan 1.3.0: `QuadrotorCsPayloadBase._zoh`, equations
+of a rigid cable (Sreenath, Lee and Kumar 2013), extrapolated from Euler steps of 0.1 and 0.05 ms, 0.22 mm apart."""
+
+
+@pytest.mark.parametrize("stretch", [1e-2, 1e-3])
+def test_a_flight_converges_to_that_of_udaan_as_the_cable_stretches_less(stretch):
+    """Thrust for drone and load, small torques, a swing of 0.5 rad; the difference is twice the stretch of 0.5 m."""
+    inertia = np.array([1.4e-5, 1.4e-5, 2.17e-5])
+
+    def push(params, state):
+        return jd.Wrench(jnp.array([0, 0, 0.035 * 9.8]), jnp.array([2e-6, -3e-6, 1e-6]))
+
+    down = np.array([np.sin(0.5), 0, -np.cos(0.5)])
+    vel = 0.5 * np.cross(np.cross(down, [0, 0.6, 0]), down)
+    with jax.enable_x64(True):
+        drone = team(1).replace(mass=jnp.array([0.027]), inertia=jnp.array([inertia]), gravity=jnp.array([9.8]))
+        params = jd.with_payload(drone, 0.008, 0.5, stretch=stretch, damping_ratio=0.2)
+        step = jd.make_step(effects=(push, jd.cable), models=(jd.payload(),), integrator=jd.rk4, dt=1 / 1000)
+        start = step.init(params, jd.State.at_rest([[0.0, 0, 0]]))
+        _, states = flown(step, params, with_load(start, 0.5 * (1 + stretch) * down[None], vel[None]), 2.0)
+    flight = np.concatenate([states.pos[499::500, 0], states.aux["payload"].pos[499::500, 0]], axis=1)
+    np.testing.assert_allclose(flight, UDAAN, atol=2.1 * stretch * 0.5)

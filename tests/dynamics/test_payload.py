@@ -360,3 +360,13 @@ def test_a_flight_converges_to_that_of_udaan_as_the_cable_stretches_less(stretch
         _, states = flown(step, params, with_load(start, 0.5 * (1 + stretch) * down[None], vel[None]), 2.0)
     flight = np.concatenate([states.pos[499::500, 0], states.aux["payload"].pos[499::500, 0]], axis=1)
     np.testing.assert_allclose(flight, UDAAN, atol=2.1 * stretch * 0.5)
+
+
+def test_the_damping_resists_the_motion_of_the_anchor_by_the_rotation_of_the_drone():
+    """The anchor moves up at 0.2 m/s as the drone turns, so the cable stretches at that rate."""
+    params = jd.with_payload(team(1), MASS, 0.5, anchor=(0.1, 0, 0))
+    own = jax.tree.map(lambda x: float(x[0]), params.aux["payload"].replace(anchor=jnp.zeros(1)))
+    load = jd.PointMass(jnp.array([[0.1, 0, -(0.5 + own.onset)]]), jnp.zeros((1, 3)))
+    state = jd.State.at_rest([[0.0, 0, 0]]).replace(omega=jnp.array([[0, -2.0, 0]]), aux={"payload": load})
+    tension = jax.vmap(jd.cable_tension)(params, state)
+    np.testing.assert_allclose(tension, own.stiffness * own.onset + 0.2 * own.damping, rtol=1e-3)

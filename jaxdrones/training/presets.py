@@ -69,27 +69,15 @@ _CROSSING = dict(
     hidden_sizes=(64, 64),
     obs_stats_freeze=0,  # with normalized velocities and rates 81 % of a crowd succeed, without 99 %
     gradient="decay",
-    gradient_decay=0.94,
-    learning_rate=3e-3,
+    gradient_decay=0.92,  # with 0.94 and a learning rate of 3e-3 the gradients of one of four seeds grew to 1e18
+    learning_rate=2e-3,
     adam_b2=0.99,
     max_grad_norm=0.5,
     restart_fraction=0.35,
 )
 """Two seconds of flight of teams, in which drones meet and avoid each other."""
 
-_PAYLOAD = dict(
-    updates=300,
-    worlds=32,
-    horizon=100,
-    hidden_sizes=(64, 64),
-    obs_stats_freeze=0,
-    gradient="decay",
-    gradient_decay=0.95,
-    learning_rate=3e-3,
-    adam_b2=0.99,
-    max_grad_norm=0.5,
-    restart_fraction=0.3,
-)
+_PAYLOAD = _CROSSING | dict(updates=300, gradient_decay=0.95, learning_rate=3e-3, restart_fraction=0.3)
 """Two seconds of flight with a load, about one and a half periods of its swing."""
 
 _CROSSING_PPO = _SLOW_PPO | dict(
@@ -121,7 +109,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("crowd", "ppo"): _CROSSING_PPO,
     ("swap-goals", "bptt"): _CROSSING,
     ("swap-goals", "ppo"): _CROSSING_PPO,
-    ("wake", "bptt"): _CROSSING | dict(updates=200, worlds=64),
+    ("wake", "bptt"): _CROSSING | dict(updates=200, worlds=64, gradient_decay=0.94, learning_rate=3e-3),
     ("sling", "bptt"): _PAYLOAD,
     ("transport", "bptt"): _PAYLOAD,
     ("follow", "bptt"): dict(updates=200, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),

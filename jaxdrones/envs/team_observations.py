@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.arguments import Count, checked, number
 from jaxdrones.quantity import Quantity, quantities
-from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, seen_from
+from jaxdrones.tasks.pairs import CORE, closest_approach, nearby, nearest, seen_from
 from jaxdrones.tasks.task import ObservationTerm, Task, World, norm
 
 _MAX_DISTANCE = 20.0  # m: bound of the observations, and place of a drone that does not exist
@@ -62,7 +62,7 @@ def encounters(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2
         index = nearby(drones.pos, count)
         pos, vel = seen_from(drones.pos, index), seen_from(drones.vel, index)
         time, approach = closest_approach(pos, vel, _HORIZON)
-        away = jnp.sqrt(jnp.sum(pos**2, axis=-1, keepdims=True) + 1e-8)
+        away = jnp.sqrt(jnp.sum(pos**2, axis=-1, keepdims=True) + CORE**2)
         direction = pos / away * (_NEARNESS / (away + _NEAR))
         return _flat(jnp.concatenate([pos, vel, approach, time[..., None], direction], axis=-1), count)
 

@@ -17,6 +17,7 @@ depth at the edges of obstacles.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, get_args
 
@@ -26,12 +27,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from jaxdrones import vector
-from jaxdrones.arguments import BelowOne, Fraction, Scalar, Switch, choice, function
+from jaxdrones.arguments import BelowOne, Fraction, PositiveOrInfinite, Scalar, Switch, choice, function
+from jaxdrones.checks import is_concrete
 from jaxdrones.dynamics import rotors
 from jaxdrones.dynamics.rigid_body import newton_euler
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
 from jaxdrones.envs import Env
+from jaxdrones.learning.layers import expand
 from jaxdrones.learning.settings import Config
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -52,6 +55,9 @@ class GradientConfig(Config):
     """Kind of gradient: exact, decay, surrogate or point_mass; see `learning.gradients`."""
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
+    outlier_gradient: PositiveOrInfinite = math.inf
+    """Largest gradient of a world at a control step over the median of all worlds, with `gradient="decay"`; longer ones
+    are scaled down. A few chaotic worlds then cannot drown the others."""
     surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
     """Surrogate step of `gradient="surrogate"`; by default a rigid body with instant rotors."""
     image_gradient: Switch = True
@@ -73,9 +79,15 @@ def with_gradient(env: Env, config: GradientConfig) -> Env:
 
 def gradient_between_steps(config: GradientConfig) -> Callable[[Any], Any]:
     """Function of the worlds between control steps; it changes gradients, not values."""
-    if config.gradient == "decay":
-        return lambda worlds: scale_gradient(worlds, config.gradient_decay)
-    return lambda worlds: worlds
+    if config.gradient != "decay":
+        return lambda worlds: worlds
+
+    def changed(worlds: Any) -> Any:
+        if not (is_concrete(config.outlier_gradient) and math.isinf(config.outlier_gradient)):
+            worlds = limit_gradient(worlds, config.outlier_gradient)
+        return scale_gradient(worlds, config.gradient_decay)
+
+    return changed
 
 
 def scale_gradient(tree: Any, factor: Scalar) -> Any:
@@ -87,6 +99,33 @@ def scale_gradient(tree: Any, factor: Scalar) -> Any:
         return jax.lax.stop_gradient(x) + factor * (x - jax.lax.stop_gradient(x))
 
     return jax.tree.map(scale, tree)
+
+
+@jax.custom_vjp
+def limit_gradient(worlds: Any, limit: Scalar) -> Any:
+    """Identity, in which the gradient of no world is longer than `limit` times the median of all worlds.
+
+    Args:
+        worlds: pytree of arrays (w, ...).
+        limit: largest ratio.
+    """
+    return worlds
+
+
+def _limited(limit: Scalar, cotangent: Any) -> tuple[Any, None]:
+    leaves = [x for x in jax.tree.leaves(cotangent) if x.dtype != jax.dtypes.float0]
+    length = jnp.sqrt(sum(jnp.sum(x**2, axis=tuple(range(1, x.ndim))) for x in leaves))
+    longest = limit * jnp.median(length)
+    scale = jnp.where(length > longest, longest / jnp.where(length > 0, length, 1), 1)
+    scale = jnp.where(jnp.isfinite(length), scale, 0)
+
+    def scaled(x):
+        return x if x.dtype == jax.dtypes.float0 else jnp.where(expand(scale, x.ndim) > 0, expand(scale, x.ndim) * x, 0)
+
+    return jax.tree.map(scaled, cotangent), None
+
+
+limit_gradient.defvjp(lambda worlds, limit: (worlds, limit), _limited)
 
 
 def point_mass(dt: float, response: float = 0.1) -> Callable[[Params, State, Array], State]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxdrones.quantity import quantities
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
-from jaxdrones.tasks.pairs import nearby, nearest_on_the_way, seen_from
+from jaxdrones.tasks.pairs import CORE, nearby, nearest_on_the_way, seen_from
 from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, distance
 
 SPEED = 1.2  # m/s, to the goal
@@ -55,7 +55,7 @@ def _approach(task: Task, world: World) -> Float[Array, " n"]:
     """Sum over the nearest drones of the smoothed penetration of a margin that grows with the closing speed, m."""
     index = nearby(world.drones.pos, _SEEN)
     pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
-    apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + 1e-8)
+    apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + CORE**2)
     closing = jnp.maximum(-jnp.sum(pos * vel, axis=-1) / apart, 0)
     gap = apart - 2 * world.params.collision_radius[:, None]
     inside = _MARGIN + _MARGIN_TIME * closing - gap

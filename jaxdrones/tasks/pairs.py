@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+CORE = 0.05  # m; added in quadrature to distances, as directions of drones that pass through each other turn at once
 _SLOW = 0.05  # m^2/s^2, added to squared speeds
 
 

@@ -12,6 +12,7 @@ from jaxdrones.learning import bptt, collect
 from jaxdrones.learning.gradients import (
     SurrogateStep,
     gradient_between_steps,
+    limit_gradient,
     point_mass,
     scale_gradient,
     with_gradient,
@@ -132,3 +133,22 @@ def test_images_may_be_constants_for_the_gradient_and_are_the_same():
 def test_unknown_options_are_named():
     with pytest.raises(ValueError, match="surrogate"):
         bptt.Config(gradient="surogate")
+
+
+def test_the_gradient_of_a_chaotic_world_is_shortened_to_a_multiple_of_the_median_and_keeps_its_direction():
+    worlds = {"x": jnp.ones((5, 3)), "step": jnp.arange(5), "key": jax.random.split(jax.random.key(0), 5)}
+    slopes = jnp.array([1.0, 2.0, 3.0, 100.0, -50.0])[:, None] * jnp.array([[1.0, 2.0, -2.0]])
+
+    def gradient(slopes, limit):
+        def loss(worlds):
+            return jnp.sum(slopes * limit_gradient(worlds, limit)["x"])
+
+        return np.asarray(jax.grad(loss, allow_int=True)(worlds)["x"])
+
+    expected = np.array(slopes)
+    expected[3:] *= np.array([[12 / 100], [12 / 50]])  # four times the median, that of the third world
+    np.testing.assert_allclose(gradient(slopes, 4.0), expected, rtol=1e-6)
+    np.testing.assert_array_equal(gradient(slopes, 100.0), slopes)
+    np.testing.assert_array_equal(gradient(jnp.zeros((5, 3)), 4.0), np.zeros((5, 3)))
+    broken = gradient(slopes.at[3, 0].set(jnp.inf), 4.0)
+    assert np.all(broken[3] == 0) and np.all(broken[:3] == slopes[:3])

@@ -24,7 +24,7 @@ FRACTIONS = {
     *("obs_stats_freeze", "restart_fraction", "anneal_fraction", "gradient_decay"),
     *("gamma", "gae_lambda", "adam_b2", "terminal_value_warmup", "target_update_rate"),
 }
-INFINITY_MAKES_SENSE = {"obs_stats_window", "max_grad_norm"}
+INFINITY_MAKES_SENSE = {"obs_stats_window", "max_grad_norm", "outlier_gradient"}
 
 
 def numbers(learner):

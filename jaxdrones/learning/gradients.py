@@ -17,7 +17,6 @@ depth at the edges of obstacles.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, get_args
 
@@ -41,6 +40,7 @@ from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.wrench import Wrench
 
+_UNLIMITED = 1e9  # times the median; JSON has no infinity
 GradientName = Literal["exact", "decay", "surrogate", "point_mass"]
 
 
@@ -55,7 +55,7 @@ class GradientConfig(Config):
     """Kind of gradient: exact, decay, surrogate or point_mass; see `learning.gradients`."""
     gradient_decay: Fraction = 0.98
     """Factor on the gradient per control step with `gradient="decay"`."""
-    outlier_gradient: PositiveOrInfinite = math.inf
+    outlier_gradient: PositiveOrInfinite = _UNLIMITED
     """Largest gradient of a world at a control step over the median of all worlds, with `gradient="decay"`; longer ones
     are scaled down. A few chaotic worlds then cannot drown the others."""
     surrogate: Annotated[Step | None, function("jaxdrones.make_step()")] = None
@@ -83,7 +83,7 @@ def gradient_between_steps(config: GradientConfig) -> Callable[[Any], Any]:
         return lambda worlds: worlds
 
     def changed(worlds: Any) -> Any:
-        if not (is_concrete(config.outlier_gradient) and math.isinf(config.outlier_gradient)):
+        if not (is_concrete(config.outlier_gradient) and config.outlier_gradient >= _UNLIMITED):
             worlds = limit_gradient(worlds, config.outlier_gradient)
         return scale_gradient(worlds, config.gradient_decay)
 

@@ -130,7 +130,7 @@ def test_every_stream_of_an_environment_sees_a_key_that_no_other_sees(monkeypatc
     monkeypatch.setattr("jaxdrones.envs.randomize.draw", draw)
     env = make(dataclasses.replace(plain, start=start), noise=noise, disturbance=disturbance)
     begin = env.begin
-    object.__setattr__(env, "begin", lambda key: (tell("reset", key), begin(key))[1])
+    object.__setattr__(env, "begin", lambda key, *progress: (tell("reset", key), begin(key, *progress))[1])
     _, episode = AutoReset(env).reset(KEY)
     episode = episode.replace(world=episode.world.replace(step=env.steps - 1))
     AutoReset(env).step(KEY, episode, jnp.zeros((1, 4)))
@@ -196,7 +196,7 @@ def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(ke
         return Policy.init(jax.random.key(0), env, (2,))
 
     with monkeypatch.context() as patched:
-        patched.setattr(learner, "Policy", type("Policy", (), {"init": staticmethod(init)}))
+        patched.setattr("jaxdrones.learning.result.Policy", type("Policy", (), {"init": staticmethod(init)}))
         state = learner.init(KEY, env, config)
     jax.jit(lambda state: learner.update(env, config, state))(state)
     for purpose in (selection.SELECTION_STREAM, selection.REPORT_STREAM):

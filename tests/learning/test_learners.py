@@ -47,7 +47,7 @@ TOY = {
         dict(updates=300, worlds=64, horizon=10, terminal_value_warmup=0.3, gamma=0.99, learning_rate=5e-3),
         1.05,
     ),
-    "ppo": (ppo, dict(updates=150, worlds=128, horizon=25, gamma=0.95, gae_lambda=0.95, min_std=0.02), 1.15),
+    "ppo": (ppo, dict(updates=300, worlds=128, horizon=25, gamma=0.95, gae_lambda=0.95, min_std=0.02), 1.15),
 }
 
 

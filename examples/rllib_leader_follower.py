@@ -157,7 +157,8 @@ def simulate(env, horizon, key, policy, log_std, worlds):
     obs, final_obs = map(policy.obs_stats.normalize, (x.obs, x.final_obs))
     mean = policy(x.obs)
     steps = {"obs": centralized_input(obs, x.action), "final": centralized_input(final_obs, final_actions)}
-    steps |= {"actions": x.action, "rewards": x.reward, "terminated": x.terminated, "truncated": x.truncated}
+    steps |= {"actions": x.action, "rewards": x.reward}
+    steps |= {"terminated": x.terminated[..., 0], "truncated": x.truncated[..., 0]}  # all drones end at once
     inputs = jnp.concatenate([mean, jnp.broadcast_to(log_std, mean.shape)], axis=-1)
     return worlds, x.obs, steps | {"action_dist_inputs": inputs, "action_logp": x.extras}
 

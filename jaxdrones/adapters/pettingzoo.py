@@ -84,9 +84,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         if not self._session.running:
             raise UserError("step is called before reset or after the end of an episode; call reset")
         drones = {agent: i for i, agent in enumerate(self.possible_agents) if agent in self.agents}
-        idle = np.zeros(self.env.action_size, np.float32)
-        actions = {agent: idle for agent in self.possible_agents if agent not in drones} | actions
-        obs, reward, _, _, info = self._session.step(self._layout.gather(actions))
+        obs, reward, _, _, info = self._session.step(self._layout.gather_present(actions, drones))
         observed = self._observed(obs)
         ended = info["terminated"] | info["truncated"]
         self.agents = [agent for agent, i in drones.items() if not ended[i]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -78,6 +78,17 @@ class Layout:
         rows = [_check(action[name], f"action of {name}", (*batch, self.size), "") for name in self.names]
         stack = np.stack if isinstance(rows[0], np.ndarray) else jnp.stack
         return stack(rows, axis=len(batch))
+
+    def gather_present(self, actions: Any, present: Collection[str]) -> Any:
+        """`gather` for the agents that are still in the world; actions of the others are zero.
+
+        Raises:
+            ValueError: as for `gather`.
+        """
+        if isinstance(actions, Mapping):
+            left = [name for name in self.names if name not in present]
+            actions = dict.fromkeys(left, np.zeros(self.size, np.float32)) | dict(actions)
+        return self.gather(actions)
 
     @property
     def _agents(self) -> str:

@@ -27,7 +27,7 @@ def adjacency(task: Task, world: World, radius: float = 10.0) -> Array:
 def neighbors(count: Count) -> ObservationTerm:
     """Observation term of the nearest drones, nearest first: relative position (m) and velocity (m/s), world axes.
 
-    In smaller teams the remaining rows are a drone at rest in 35 m.
+    In smaller teams the remaining rows are those of a drone 35 m away with the same velocity.
     """
 
     def observe(task: Task, world: World) -> Array:

@@ -1,13 +1,15 @@
-"""Flight of every drone of a team to its goal without touching another one: what `crowd` and `swap-goals` share."""
+"""Flight of every drone of a team to its goal without touching another one: shared by `crowd`, `swap-goals`, `room`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.control import Setpoint
 from jaxdrones.quantity import quantities
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
@@ -20,6 +22,27 @@ _SIGHT = 2.0  # m, length at which the observed vector to the goal is clipped
 _ARRIVED = 0.1  # m
 _MARGIN, _MARGIN_TIME, _SOFTNESS = 0.14, 0.3, 0.04  # m, s, m: gap below which the reward falls
 _SEEN = 8  # nearest drones that count
+
+
+def task(**own: Any) -> Task:
+    """Task whose drones fly to the variable `goal`; the arguments are the remaining ones of `Task`."""
+    return Task(
+        target=target,
+        rewards=REWARDS,
+        advance=advance,
+        metrics={"safe": _safe, "reached": _reached},
+        success=_arrived_untouched,
+        observations=GOAL,
+        control_hz=50.0,
+        action="thrust_and_rates",
+        observation=OBSERVATION,
+        **own,
+    )
+
+
+def target(variables: dict[str, Array], t: Array) -> Setpoint:
+    """Goal."""
+    return Setpoint.at(variables["goal"])
 
 
 def variables(state: State, goal: Float[Array, "n 3"]) -> dict[str, Array]:
@@ -35,7 +58,7 @@ def advance(task: Task, world: World) -> dict[str, Array]:
     return variables | {"pos": pos, "touched": variables["touched"] | touching}
 
 
-def arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
+def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
     """Whether a drone was within 10 cm of its goal in the end and never touched another one."""
     return (metrics["reached"][-1] == 1) & (metrics["safe"][-1] == 1)
 
@@ -80,6 +103,5 @@ REWARDS: dict[str, tuple[float, Term]] = {
     "omega": (-0.02, shaping.body_rates),
     "action_change": (-0.02, shaping.action_change),
 }
-METRICS: dict[str, Term] = {"safe": _safe, "reached": _reached}
 GOAL = {"goal": ObservationTerm(_goal, _SIGHT, entries=quantities("goal, from the drone, up to 2 m", "m", "world"))}
 OBSERVATION = ("goal", "rotation_matrix", "velocity", "omega", "encounters")

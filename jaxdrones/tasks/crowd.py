@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import Switch, checked, number
-from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import crossing
@@ -58,27 +57,14 @@ def crowd(
         state = thrown(start_key, params, place, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)
         return state, crossing.variables(state, goal)
 
-    def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """Goal."""
-        return Setpoint.at(variables["goal"])
-
-    return Task(
+    return crossing.task(
         name="crowd",
         summary="cross a box full of drones without touching",
         drones=drones,
         duration=duration,
         start=start,
-        target=target,
-        rewards=crossing.REWARDS,
         terminations=out_of_control(longest + 4.0, center=(0, 0, FLOOR + side / 2)),
         ends="drone",
-        advance=crossing.advance,
-        metrics=crossing.METRICS,
-        success=crossing.arrived_untouched,
-        observations=crossing.GOAL,
-        control_hz=50.0,
-        action="thrust_and_rates",
-        observation=crossing.OBSERVATION,
     )
 
 

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, number, whole
 from jaxdrones.checks import check_number
-from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
@@ -79,17 +78,13 @@ def room(
             "touched": goal[:, 0] < -jnp.inf,
         }
 
-    def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """Goal: the place of another drone at the start."""
-        return Setpoint.at(variables["goal"])
-
     return Task(
         name="room",
         summary="exchange places in a room with pillars without touching",
         drones=drones,
         duration=duration,
         start=start,
-        target=target,
+        target=crossing.target,
         rewards=crossing.REWARDS | {"clearance": (-4.0, shaping.clearance), "touched": (-10.0, _METRICS["touched"])},
         terminations={"touched": shaping.flag("touched", "A drone touches the room, a pillar or another drone.")}
         | out_of_control(size, center=(0, 0, HEIGHT)),

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones.arguments import Seconds, checked
-from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import crossing
@@ -41,24 +40,11 @@ def swap_goals(drones: Team = 8, duration: Seconds | None = None) -> Task:
         goal = jnp.roll(ring, jax.random.randint(order_key, (), 1, drones), axis=0)
         return state, crossing.variables(state, goal)
 
-    def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """Goal: the place of another drone at the start."""
-        return Setpoint.at(variables["goal"])
-
-    return Task(
+    return crossing.task(
         name="swap-goals",
         summary="a swarm exchanges places without touching",
         drones=drones,
         duration=_SETTLING + 2 * radius / crossing.SPEED if duration is None else duration,
         start=start,
-        target=target,
-        rewards=crossing.REWARDS,
         terminations=out_of_control(2 * radius + 4.0),
-        advance=crossing.advance,
-        metrics=crossing.METRICS,
-        success=crossing.arrived_untouched,
-        observations=crossing.GOAL,
-        control_hz=50.0,
-        action="thrust_and_rates",
-        observation=crossing.OBSERVATION,
     )

@@ -50,6 +50,8 @@ def test_mistakes_are_named(env_of):
     env.reset(seed=0)
     with pytest.raises(ValueError, match="action is for drone_0; give a dict with one each for drone_0, drone_1"):
         env.step({"drone_0": np.zeros(4)})
+    with pytest.raises(ValueError, match="give a dict with one each for drone_0, drone_1"):
+        env.step([np.zeros(4), np.zeros(4)])
     with pytest.raises(ValueError, match=r"action of drone_1 has shape \(3,\); expected \(4,\)"):
         env.step({"drone_0": np.zeros(4), "drone_1": np.zeros(3)})
     with pytest.raises(ValueError, match="action of drone_1 is not finite"):

@@ -4,30 +4,36 @@ One drone per cubic meter; starts and goals are random. `safe`: the drone never 
 collision radii, also between control steps; `reached`: it was within 10 cm of its goal in the end; `success`: both,
 with a 95 % interval that counts the drones of a world as far as they are independent.
 
-Policies: `bptt`, the preset; `blind`, the same without a view of the others; `ppo`, the same network by PPO in the time
-that `bptt` took.
+Policies: `bptt`, the preset; `stopped`, the same with the other drones constant in the derivative of observation and
+reward; `blind`, the same without a view of the others; `ppo`, the same network by PPO in the time that `bptt` took; and
+`cbf` and `velocity-obstacles`, which do not learn (crowd_baselines.py).
 """
 
 import argparse
 import dataclasses
 import time
+from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
 import jaxdrones as jd
+from benchmarks import crowd_baselines
 from benchmarks.common import success_rate
 from jaxdrones.envs.observations import encounters
 from jaxdrones.learning import bptt, checkpoint, evaluate, ppo
 from jaxdrones.tasks.crossing import OBSERVATION
+from jaxdrones.tasks.task import Task, World
 from jaxdrones.training.presets import preset
 
 WORLDS = {8: 256, 16: 128, 32: 64, 64: 32, 128: 20, 256: 20, 512: 20}
-LEARNERS = {"bptt": bptt, "blind": bptt, "ppo": ppo}
+LEARNERS = {"bptt": bptt, "stopped": bptt, "blind": bptt, "ppo": ppo}
+BASELINES = {"cbf": crowd_baselines.cbf, "velocity-obstacles": crowd_baselines.velocity_obstacles}
 TIMED = 3  # updates that tell how many PPO makes in a given time
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--learner", choices=LEARNERS, default="bptt")
+    parser.add_argument("--learner", choices=[*LEARNERS, *BASELINES], default="bptt")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=250.0, help="of the training by ppo, without compiling")
     parser.add_argument("--drones", type=int, nargs="+", default=list(WORLDS))
@@ -43,6 +49,8 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         options.drones, options.seconds = [2, 4], 0.0
     if options.policy:
         policy, spent = checkpoint.load(options.policy), {}
+    elif options.learner in BASELINES:
+        policy, spent = None, {}
     else:
         policy, spent = train(options)
     if options.save:
@@ -61,8 +69,9 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
 def train(options: argparse.Namespace) -> tuple[jd.learning.networks.Policy, dict]:
     """Policy of a learner, and the seconds that it took, compiling included."""
     learner = LEARNERS[options.learner]
-    blind = {"observation": _observation(options)} if options.learner == "blind" else {}
-    env, config = preset("crowd", learner.__name__.rpartition(".")[2], practice=True, **blind)
+    env, config = preset("crowd", learner.__name__.rpartition(".")[2], practice=True, observation=_observation(options))
+    if options.learner == "stopped":
+        env = _others_constant(env)
     if options.quick:
         config = dataclasses.replace(config, updates=2, worlds=8, horizon=4)
     key = jax.random.key(options.seed)
@@ -83,12 +92,33 @@ def _updates_in(seconds: float, env: jd.envs.Env, config: ppo.Config) -> int:
     return max(1, round(seconds * TIMED / (time.perf_counter() - start)))
 
 
-def fly(policy: jd.learning.networks.Policy, drones: int, options: argparse.Namespace) -> dict:
+def _others_constant(env: jd.envs.Env) -> jd.envs.Env:
+    """Environment with the other drones constant in the derivatives of a drone's observation and reward."""
+
+    def constant(term: Callable) -> Callable:
+        def of_team(task: Task, world: World) -> jax.Array:
+            def of_drone(i: jax.Array) -> jax.Array:
+                drones = jax.tree.map(lambda x: jax.lax.stop_gradient(x).at[i].set(x[i]), world.drones)
+                return term(task, world.replace(drones=drones))[i]
+
+            return jax.vmap(of_drone)(jnp.arange(env.drones))
+
+        return of_team
+
+    task, seen = env.task, env.terms[-1]
+    approach = task.rewards["approach"]
+    rewards = task.rewards | {"approach": (approach[0], constant(approach[1]))}
+    terms = (*env.terms[:-1], dataclasses.replace(seen, observe=constant(seen.observe)))
+    return dataclasses.replace(env, task=dataclasses.replace(task, rewards=rewards), terms=terms)
+
+
+def fly(policy: jd.learning.networks.Policy | None, drones: int, options: argparse.Namespace) -> dict:
     """Rates of success of a team of this size."""
     made = dict(density=options.density, patience=options.patience, observation=_observation(options))
     env = jd.make("crowd", drones=drones, pairs=("downwash",) if options.downwash else (), **made)
     worlds = 2 if options.quick else WORLDS.get(drones, 20)
     start = time.perf_counter()
+    policy = policy or crowd_baselines.policy(BASELINES[options.learner], env)
     report = evaluate(env, policy, jax.random.key(1_000_000), worlds)
     return {
         "drones": drones,

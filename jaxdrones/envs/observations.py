@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
-from jaxdrones.envs.team_observations import adjacency, encounters, neighbors
+from jaxdrones.envs.surroundings import adjacency, encounters, neighbors, obstacles
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.quantity import Quantity, quantities
@@ -261,5 +261,6 @@ OBSERVATIONS: dict[str, ObservationTerm] = {
     "last_actions_2x": last_actions(15),
     "neighbors": neighbors(2),
     "encounters": encounters(8),
+    "obstacles": obstacles(4),
     "preview": preview(0.1, 0.2, 0.3),
 }

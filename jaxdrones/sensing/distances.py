@@ -73,13 +73,26 @@ def distance_of(kinds: list[Any], ground: bool, point: Point) -> Number:
 
 def nearest_of(kinds: list[Any], ground: bool, point: Point) -> Surface:
     """The nearest surface of some solids; arguments as for `distance_of`."""
-    surfaces = [Surface(jnp.full((), jnp.inf, point.dtype), jnp.full_like(point, jnp.inf), jnp.zeros_like(point))]
+    surfaces = [_no_surface(point)]
     if ground:
-        height = point[2]
-        up = along_z(jnp.ones_like(height))
-        surfaces.append(Surface(height, point - along_z(height), up))
+        surfaces.append(_nearest_on_ground(point))
     surfaces += [_nearest_of_kind(kind, point) for kind in kinds]
     return functools.reduce(_nearer, surfaces)
+
+
+def nearest_few_of(kinds: list[Any], ground: bool, point: Point, count: int) -> Surface:
+    """The nearest surfaces of each of the `count` nearest solids, nearest first; other arguments as for `distance_of`.
+
+    Returns:
+        Surfaces with a leading axis of length `count`; there is none in the last ones of a smaller scene.
+    """
+    missing = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), _no_surface(point))
+    surfaces = [missing] + [jax.vmap(_surface, in_axes=(0, None))(kind, point) for kind in kinds]
+    if ground:
+        surfaces.append(jax.tree.map(lambda x: x[None], _nearest_on_ground(point)))
+    every = jax.tree.map(lambda *x: jnp.concatenate(x), *surfaces)
+    index = jax.lax.top_k(-jax.lax.stop_gradient(every.distance), count)[1]
+    return jax.tree.map(lambda x: x[index], every)
 
 
 def touched_of(kinds: list[Any], points: Float[Array, "m 3"], within: Number) -> Surface:
@@ -112,6 +125,15 @@ def _distances(kind: Obstacle, point: Point) -> Array:
 def _distance_of_kind(kind: Any, point: Point) -> Number:
     obstacle = _nearest_obstacle(kind, point)
     return jnp.where(obstacle.active, obstacle.distance(obstacle.to_local(point)), jnp.inf)
+
+
+def _no_surface(point: Point) -> Surface:
+    return Surface(jnp.full((), jnp.inf, point.dtype), jnp.full_like(point, jnp.inf), jnp.zeros_like(point))
+
+
+def _nearest_on_ground(point: Point) -> Surface:
+    height = point[2]
+    return Surface(height, point - along_z(height), along_z(jnp.ones_like(height)))
 
 
 def _nearest_of_kind(kind: Any, point: Point) -> Surface:

@@ -26,7 +26,7 @@ from jaxdrones.checks import (
 )
 from jaxdrones.errors import UserError
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.sensing.distances import Surface, as_floats, distance_of, merged, nearest_of, touched_of
+from jaxdrones.sensing.distances import Surface, as_floats, distance_of, merged, nearest_few_of, nearest_of, touched_of
 from jaxdrones.sensing.files import File, Mesh, Urdf
 from jaxdrones.sensing.geometry import Number
 from jaxdrones.sensing.shapes import LENGTHS, Box, Capsule, Cylinder, Obstacle, Sphere, single
@@ -143,6 +143,24 @@ class Scene(PyTreeNode, kw_only=True):
         """
         point = self._point(point)
         return nearest_of(self.shapes(point.dtype), self.ground, point)
+
+    def nearest_few(self, point: ArrayLike, count: int) -> Surface:
+        """Nearest surfaces of each of the `count` nearest obstacles, the ground among them; the nearest first.
+
+        It is differentiable in the point and in the scene.
+
+        Args:
+            point: (3,) m, world; for many points use `jax.vmap`.
+            count: number of surfaces; see `Surface` for those beyond the number of obstacles.
+
+        Returns:
+            Surfaces with a leading axis of length `count`.
+
+        Raises:
+            ValueError: a wrong shape, or a mesh or URDF file in the scene.
+        """
+        point = self._point(point)
+        return nearest_few_of(self.shapes(point.dtype), self.ground, point, count)
 
     def touched(self, points: Float[Array, "m 3"], within: Number) -> Surface:
         """Nearest obstacle surface for each of several points of one body.

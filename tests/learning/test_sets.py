@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from jaxdrones import envs
-from jaxdrones.envs.observations import encounters, neighbors
+from jaxdrones.envs.observations import encounters, neighbors, obstacles
 from jaxdrones.learning import bptt, checkpoint
 from jaxdrones.learning.layers import SetEncoder, split_sets
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import RunningStatistics
+from jaxdrones.sensing import Cylinder, Scene, Sphere
+from jaxdrones.tasks.pairs import nearest
 
 KEY = jax.random.key(0)
 REACH = 1.2
@@ -86,9 +88,10 @@ def test_the_statistics_of_a_policy_without_sets_are_kept():
     np.testing.assert_array_equal(policy.with_obs_stats(stats).obs_stats.mean, stats.mean)
 
 
-def observed(term, pos, vel):
+def observed(term, pos, vel, scene=None):
     env = envs.make("crowd", drones=len(pos))
     _, world = env.reset(KEY)
+    world = world if scene is None else world.replace(scene=scene)
     world = world.replace(drones=world.drones.replace(pos=jnp.asarray(pos), vel=jnp.asarray(vel)))
     return np.asarray(term.observe(env.task, world))
 
@@ -111,6 +114,33 @@ def test_encounters_are_those_of_the_nearest_drones_at_constant_velocity(count):
             assert np.linalg.norm(row[6:9]) < away.min() + 0.03  # a small term keeps slow drones smooth
             np.testing.assert_allclose(row[6:9], row[:3] + row[9] * row[3:6], atol=1e-12)
             np.testing.assert_allclose(np.cross(row[10:], row[:3]), 0, atol=1e-9)
+
+
+def test_an_obstacle_is_seen_like_a_drone_that_rests_at_its_nearest_point():
+    scene = Scene.of(Sphere(pos=(2.0, 0, 1), radius=0.5), Cylinder(pos=(0, 3.0, 1), radius=1.0, height=2.0))
+    pos, vel = np.array([[0.0, 0, 1], [0, 0, 1.7]]), np.array([[1.0, 0, 0], [0, 0, 0.5]])
+    rows = observed(obstacles(4), pos, vel, scene).reshape(2, 4, 13)
+    np.testing.assert_allclose(rows[0, :3, :3], [[0, 0, -1], [1.5, 0, 0], [0, 2, 0]], atol=1e-12)
+    np.testing.assert_allclose(rows[0, :3, 3:6], np.tile(-vel[0], (3, 1)), atol=1e-12)
+    assert np.all(np.linalg.norm(rows[:, 3, :3], axis=-1) == 20)
+    others = np.concatenate([pos[:1], pos[:1] + rows[0, :3, :3]])
+    seen = observed(encounters(3), others, np.concatenate([vel[:1], np.zeros((3, 3))])).reshape(4, 3, 13)
+    order = np.argsort(np.linalg.norm(seen[0, :, :3], axis=1))
+    np.testing.assert_allclose(rows[0, :3], seen[0][order], atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [9, 64, 65])
+def test_the_nearest_drones_are_found_in_their_order(n, dtype):
+    pos = np.random.default_rng(n).uniform(0, 4, (n, 3)).astype(dtype)
+    pos[3] = pos[5]  # two at one place see each other first
+    found = np.asarray(nearest(jnp.asarray(pos), 8))
+    away = np.linalg.norm(pos[None] - pos[:, None], axis=-1)
+    assert found[3, 0] == 5 and found[5, 0] == 3 and np.all(found != np.arange(n)[:, None])
+    assert all(len(set(row)) == 8 for row in found.tolist())
+    np.fill_diagonal(away, np.inf)
+    expected = np.sort(away, axis=1)[:, :8]
+    np.testing.assert_allclose(np.take_along_axis(away, found, axis=1), expected, rtol=1e-4)
 
 
 def test_a_missing_neighbor_is_far_away():

@@ -122,6 +122,19 @@ def test_the_nearest_surface_is_a_distance_away_along_its_normal():
 
 
 @pytest.mark.slow
+def test_the_nearest_few_surfaces_are_those_of_the_nearest_obstacles_and_the_ground():
+    scene, count = SCENE.replace(spheres=SCENE.spheres.replace(active=np.array([True, False, True]))), 16
+    alone = [Scene.of(obstacle, ground=False) for obstacle in scene.obstacles if obstacle.active] + [Scene()]
+    each = [surfaces(one, POINTS[:40]) for one in alone]
+    order = np.argsort([one.distance for one in each], axis=0)
+    found = jit_unoptimized(jax.vmap(Scene.nearest_few, (None, 0, None)), static_argnums=2)(scene, POINTS[:40], count)
+    for name in ("distance", "point", "normal"):
+        expected = np.stack([getattr(one, name) for one in each])[order, np.arange(40)]
+        np.testing.assert_allclose(np.swapaxes(getattr(found, name), 0, 1)[: len(alone)], expected, atol=1e-12)
+    assert np.all(found.distance[:, len(alone) :] == jnp.inf) and found.distance.shape == (40, count)
+
+
+@pytest.mark.slow
 def test_normals_have_unit_length_and_finite_gradients_also_at_centers_and_on_faces_and_edges():
     places = np.array([(0, 0, 2), (1, 0, 2), (1, 2, 2), (1, 2, 2.5), (0.5, 0, 2), (0, 0, 3), (0.5, 0, 3), (0, 0, 3.5)])
     scenes = [Scene.of(solid, ground=False) for solid in SOLIDS]

@@ -1,4 +1,4 @@
-"""Observations of the other drones of a team."""
+"""Observations of the other drones of a team and of obstacles."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 from jaxdrones.arguments import Count, checked, number
 from jaxdrones.quantity import Quantity, quantities
 from jaxdrones.tasks.pairs import CORE, closest_approach, nearby, nearest, seen_from
-from jaxdrones.tasks.task import ObservationTerm, Task, World, norm
+from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, norm
 
-_MAX_DISTANCE = 20.0  # m: bound of the observations, and place of a drone that does not exist
+_MAX_DISTANCE = 20.0  # m: bound of the observations, and place of a drone or obstacle that does not exist
 _HORIZON = 1.5  # s: latest closest approach
+_RANKS = {0: "", 1: "second-", 2: "third-"}
 _NEAR, _NEARNESS = 0.1, 0.3  # m: direction of a drone, scaled by nearness
 
 
@@ -38,7 +39,7 @@ def neighbors(count: Count) -> ObservationTerm:
         return _flat(rows, count)
 
     entries: list[Quantity] = []
-    for which in _names(count):
+    for which in _names(count, "drone"):
         entries += quantities(f"position of the {which}", "m", "world")
         entries += quantities(f"velocity of the {which}", "m/s", "world")
     return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=f"neighbors({count})")
@@ -60,25 +61,59 @@ def encounters(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2
         """Position, velocity and closest approach of the nearest drones, relative to the drone."""
         drones = world.drones
         index = nearby(drones.pos, count)
-        pos, vel = seen_from(drones.pos, index), seen_from(drones.vel, index)
-        time, approach = closest_approach(pos, vel, _HORIZON)
-        away = jnp.sqrt(jnp.sum(pos**2, axis=-1, keepdims=True) + CORE**2)
-        direction = pos / away * (_NEARNESS / (away + _NEAR))
-        return _flat(jnp.concatenate([pos, vel, approach, time[..., None], direction], axis=-1), count)
+        return _flat(_meetings(seen_from(drones.pos, index), seen_from(drones.vel, index)), count)
 
+    return _set(observe, count, reach, "encounters", "drone")
+
+
+@checked
+def obstacles(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2) -> ObservationTerm:
+    """Observation term of the nearest obstacles as a set, with the rows of `encounters`.
+
+    An obstacle is represented by its nearest point, at rest; the ground is one of them.
+
+    Args:
+        count: number of obstacles; in scenes with fewer the remaining rows are beyond `reach`.
+        reach: distance at which an obstacle is out of sight, m.
+    """
+
+    def observe(task: Task, world: World) -> Array:
+        """Position, velocity and closest approach of the nearest obstacles, relative to the drone."""
+
+        def seen(pos: Float[Array, "3"]) -> Float[Array, "k 3"]:
+            surface = world.scene.nearest_few(pos, count)
+            is_there = jnp.isfinite(surface.distance)[:, None]
+            return jnp.where(is_there, surface.point - pos[None], jnp.array([[_MAX_DISTANCE, 0, 0]], pos.dtype))
+
+        pos = jax.vmap(seen)(world.drones.pos)
+        return _flat(_meetings(pos, jnp.broadcast_to(-world.drones.vel[:, None], pos.shape)), count)
+
+    return _set(observe, count, reach, "obstacles", "obstacle")
+
+
+def _meetings(pos: Float[Array, "n k 3"], vel: Float[Array, "n k 3"]) -> Float[Array, "n k 13"]:
+    """Position (m), velocity (m/s), closest approach (m), its time (s), direction by nearness of relative motions."""
+    time, approach = closest_approach(pos, vel, _HORIZON)
+    away = jnp.sqrt(jnp.sum(pos**2, axis=-1, keepdims=True) + CORE**2)
+    direction = pos / away * (_NEARNESS / (away + _NEAR))
+    return jnp.concatenate([pos, vel, approach, time[..., None], direction], axis=-1)
+
+
+def _set(observe: Term, count: int, reach: float, name: str, what: str) -> ObservationTerm:
+    """Observation term with the rows of `_meetings`."""
     entries: list[Quantity] = []
-    for which in _names(count):
+    for which in _names(count, what):
         entries += quantities(f"position of the {which}", "m", "world")
         entries += quantities(f"velocity of the {which}", "m/s", "world")
         entries += quantities(f"closest approach of the {which}", "m", "world")
         entries += [Quantity(f"time to the closest approach of the {which}", "s")]
         entries += quantities(f"direction of the {which}, by nearness", "-", "world")
-    name = f"encounters({count}, {reach:g})"
+    name = f"{name}({count}, {reach:g})"
     return ObservationTerm(observe, _MAX_DISTANCE, entries=tuple(entries), name=name, rows=count, reach=reach)
 
 
-def _names(count: int) -> list[str]:
-    return [f"{i + 1}-th nearest drone" if i else "nearest drone" for i in range(count)]
+def _names(count: int, what: str) -> list[str]:
+    return [f"{_RANKS.get(i, f'{i + 1}th-')}nearest {what}" for i in range(count)]
 
 
 def _flat(rows: Float[Array, "n k f"], count: int) -> Float[Array, "n d"]:

@@ -1,4 +1,4 @@
-"""Flight of every drone of a team to its goal without touching another one: shared by `crowd`, `swap-goals`, `room`."""
+"""Flight of every drone of a team to its goal without touching anything: shared by `crowd`, `swap-goals`, `room`."""
 
 from __future__ import annotations
 
@@ -24,18 +24,21 @@ _MARGIN, _MARGIN_TIME, _SOFTNESS = 0.14, 0.3, 0.04  # m, s, m: gap below which t
 _SEEN = 8  # nearest drones that count
 
 
-def task(**own: Any) -> Task:
-    """Task whose drones fly to the variable `goal`; the arguments are the remaining ones of `Task`."""
+def task(obstacles: bool = False, **own: Any) -> Task:
+    """Task whose drones fly to the variable `goal`; `own` are the remaining arguments of `Task`.
+
+    With `obstacles` the drones observe those of the scene and keep clear of them.
+    """
     return Task(
         target=target,
-        rewards=REWARDS,
+        rewards=REWARDS_AMONG_OBSTACLES if obstacles else REWARDS,
         advance=advance,
         metrics={"safe": _safe, "reached": _reached},
         success=_arrived_untouched,
         observations=GOAL,
         control_hz=50.0,
         action="thrust_and_rates",
-        observation=OBSERVATION,
+        observation=OBSERVATION_AMONG_OBSTACLES if obstacles else OBSERVATION,
         **own,
     )
 
@@ -51,15 +54,21 @@ def variables(state: State, goal: Float[Array, "n 3"]) -> dict[str, Array]:
 
 
 def advance(task: Task, world: World) -> dict[str, Array]:
-    """Task variables after a step; two drones touch when they come closer than two collision radii on the way."""
+    """Task variables after a step.
+
+    Two drones touch when they come closer than two collision radii on the way, a drone and an obstacle when the center
+    of the drone is within a collision radius of it at a control step.
+    """
     variables, pos = world.variables, world.drones.pos
     closest = nearest_on_the_way(variables["pos"], pos, nearby(pos, _SEEN))
     touching = closest < 2 * world.params.collision_radius
+    if world.scene.has_obstacles:
+        touching |= shaping.gap(world) < 0
     return variables | {"pos": pos, "touched": variables["touched"] | touching}
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:
-    """Whether a drone was within 10 cm of its goal in the end and never touched another one."""
+    """Whether a drone was within 10 cm of its goal in the end and never touched anything."""
     return (metrics["reached"][-1] == 1) & (metrics["safe"][-1] == 1)
 
 
@@ -86,7 +95,7 @@ def _approach(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def _safe(task: Task, world: World) -> Float[Array, " n"]:
-    """One if the drone has touched no other one."""
+    """One if the drone has touched no other one, and no obstacle."""
     return 1 - world.variables["touched"].astype(world.drones.pos.dtype)
 
 
@@ -103,5 +112,7 @@ REWARDS: dict[str, tuple[float, Term]] = {
     "omega": (-0.02, shaping.body_rates),
     "action_change": (-0.02, shaping.action_change),
 }
+REWARDS_AMONG_OBSTACLES = REWARDS | {"clearance": (-8.0, shaping.clearance(_MARGIN_TIME))}
 GOAL = {"goal": ObservationTerm(_goal, _SIGHT, entries=quantities("goal, from the drone, up to 2 m", "m", "world"))}
 OBSERVATION = ("goal", "rotation_matrix", "velocity", "omega", "encounters")
+OBSERVATION_AMONG_OBSTACLES = (*OBSERVATION[:-1], "obstacles", OBSERVATION[-1])

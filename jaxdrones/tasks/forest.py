@@ -166,7 +166,7 @@ def forest(
             "alive": (1.0, shaping.alive),
             "velocity": (-1.0, velocity),
             "progress": (0.5, progress),
-            "clearance": (-2.0, shaping.clearance),
+            "clearance": (-2.0, shaping.clearance()),
             "height": (-0.3, _height),
             "heading": (-0.2, heading),
             "omega": (-0.02, shaping.body_rates),

@@ -8,19 +8,18 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jaxdrones.arguments import checked, number, whole
 from jaxdrones.checks import check_number
 from jaxdrones.params import Params
-from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
 from jaxdrones.tasks import crossing, shaping
 from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World
+from jaxdrones.tasks.task import Drones, Task, World
 from jaxdrones.tasks.touching import touches
 
 HEIGHT = 1.5  # m, of starts and goals
@@ -28,7 +27,6 @@ ROOM_HEIGHT = 3.0  # m
 _BESIDE = 1.0  # m between the places and the walls
 _SPACING = 1.0  # m between neighboring places on the ring
 _CLEARANCE = 0.6  # m between a pillar and a place
-_SIGHT = 2.0  # m, at which the observed vector to the nearest surface is clipped
 _ARRIVED = 0.2  # m
 
 
@@ -85,24 +83,19 @@ def room(
         duration=duration,
         start=start,
         target=crossing.target,
-        rewards=crossing.REWARDS | {"clearance": (-4.0, shaping.clearance), "touched": (-10.0, _METRICS["touched"])},
+        rewards=crossing.REWARDS_AMONG_OBSTACLES | {"touched": (-10.0, _METRICS["touched"])},
         terminations={"touched": shaping.flag("touched", "A drone touches the room, a pillar or another drone.")}
         | out_of_control(size, center=(0, 0, HEIGHT)),
         advance=_advance,
         metrics=_METRICS,
         success=_arrived_untouched,
-        observations=crossing.GOAL
-        | {
-            "nearest_surface": ObservationTerm(
-                _observe_nearest_surface, _SIGHT, entries=quantities("nearest surface, from the drone", "m", "world")
-            )
-        },
+        observations=crossing.GOAL,
         control_hz=50.0,
         substeps=2,
         scene=scene if pillars else build_room((size, size, ROOM_HEIGHT)),
         obstacles_terminate=True,
         action="thrust_and_rates",
-        observation=(*crossing.OBSERVATION[:-1], "nearest_surface", crossing.OBSERVATION[-1]),
+        observation=crossing.OBSERVATION_AMONG_OBSTACLES,
     )
 
 
@@ -114,11 +107,6 @@ def _advance(task: Task, world: World) -> dict[str, Array]:
         "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
         "touched": variables["touched"] | found.ground | found.drones | found.scene,
     }
-
-
-def _observe_nearest_surface(task: Task, world: World) -> Float[Array, "n 3"]:
-    """Vector from the drone to the nearest surface, m, world axes."""
-    return jax.vmap(lambda pos: world.scene.nearest(pos).point - pos)(world.drones.pos)
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:

@@ -14,7 +14,6 @@ _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
 _CROWDED = 0.4  # m, distance of the nearest drone below which the reward falls
 _MARGIN = 0.2  # m between a drone and an obstacle beside it
-_MARGIN_TIME = 0.1  # s: growth of the margin with the closing speed
 _SOFTNESS = 0.1  # m, over which the margin begins
 
 
@@ -49,20 +48,28 @@ def gap(world: World) -> Float[Array, " n"]:
     return jax.vmap(world.scene.distance)(world.drones.pos) - world.params.collision_radius
 
 
-def clearance(task: Task, world: World) -> Float[Array, " n"]:
-    """Smoothed penetration of the margin around obstacles and ground, m.
+def clearance(margin_time: float = 0.1) -> Term:
+    """Term of the smoothed penetration of the margin around obstacles and ground, m.
 
     Margin and term grow with the closing speed, as in the cost of DiffPhysDrone ("Back to Newton's laws", 2024): a
     drone needs more distance the faster it approaches an obstacle, and none beside it.
+
+    Args:
+        margin_time: growth of the margin with the closing speed, s.
     """
 
-    def of_drone(radius: Array, pos: Array, vel: Array) -> Array:
-        away, rate = jax.jvp(world.scene.distance, (pos,), (vel,))
-        closing = jnp.maximum(-rate, 0)
-        inside = _MARGIN + _MARGIN_TIME * closing - (away - radius)
-        return (1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS)
+    def term(task: Task, world: World) -> Float[Array, " n"]:
+        """Smoothed penetration of the margin around obstacles and ground, m; it grows with the closing speed."""
 
-    return jax.vmap(of_drone)(world.params.collision_radius, world.drones.pos, world.drones.vel)
+        def of_drone(radius: Array, pos: Array, vel: Array) -> Array:
+            away, rate = jax.jvp(world.scene.distance, (pos,), (vel,))
+            closing = jnp.maximum(-rate, 0)
+            inside = _MARGIN + margin_time * closing - (away - radius)
+            return (1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS)
+
+        return jax.vmap(of_drone)(world.params.collision_radius, world.drones.pos, world.drones.vel)
+
+    return term
 
 
 def velocity_to_target(task: Task, world: World, speed: float, slow_within: float) -> Float[Array, "n 3"]:

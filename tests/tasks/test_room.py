@@ -51,15 +51,6 @@ def test_touching_is_of_walls_pillars_the_ground_and_each_other():
     np.testing.assert_array_equal(moved_to(a, pillar, c)["touched"], [False, True, False])
 
 
-@pytest.mark.slow
-def test_the_nearest_surface_is_a_vector_to_the_wall():
-    world = first_world()
-    beside = jnp.array([2.9, -2.0, 1.5])
-    world = world.replace(drones=world.drones.replace(pos=world.drones.pos.at[0].set(beside)))
-    term = jit_unoptimized(lambda world: TASK.observations["nearest_surface"].observe(TASK, world))(world)
-    np.testing.assert_allclose(term[0], [0.1, 0, 0], atol=1e-6)
-
-
 def test_success_is_arriving_within_20_cm_without_touching():
     errors = jnp.array([[1.0, 1.0, 1.0], [0.1, 0.3, 0.1]])  # time, drones
     touched = jnp.array([[0.0, 0, 0], [0, 0, 1]])

@@ -109,6 +109,7 @@ REWARDS: dict[str, tuple[float, Term]] = {
     "position": (-1.0, shaping.position),
     "velocity": (-0.5, _velocity),
     "approach": (-8.0, _approach),
+    "heading": (-0.2, shaping.heading),  # policies that let it drift lost control on flights longer than in training
     "omega": (-0.02, shaping.body_rates),
     "action_change": (-0.02, shaping.action_change),
 }

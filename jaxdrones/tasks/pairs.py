@@ -28,7 +28,7 @@ def nearest(pos: Float[Array, "n 3"], count: int) -> Int[Array, "n k"]:
         following = jnp.min(jnp.where(packed > last[None], packed, none), axis=0)
         return following, following
 
-    found = jax.lax.scan(next_nearest, jnp.full(n, -1, integer), length=min(count, n - 1))[1]
+    found = jax.lax.scan(next_nearest, jnp.full(n, -1, integer), length=min(count, n - 1), unroll=True)[1]
     return (found & bits).T
 
 

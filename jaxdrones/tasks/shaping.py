@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones import rotation
 from jaxdrones.quantity import described
 from jaxdrones.tasks.task import Condition, Task, Term, World, norm, square
 
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
 _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
+_STEEP = 0.1  # length of the nose's level part below which there is no heading
 _CROWDED = 0.4  # m, distance of the nearest drone below which the reward falls
 _MARGIN = 0.2  # m between a drone and an obstacle beside it
 _SOFTNESS = 0.1  # m, over which the margin begins
@@ -41,6 +43,16 @@ def velocity(task: Task, world: World) -> Float[Array, " n"]:
 def body_rates(task: Task, world: World) -> Float[Array, " n"]:
     """Magnitude of the body rates, rad/s; quadratic where they are small."""
     return length(world.drones.omega, _SLOW_TURN)
+
+
+def heading(task: Task, world: World) -> Float[Array, " n"]:
+    """One minus the cosine of the heading."""
+
+    def of_drone(quat: Array) -> Array:
+        east, north, _ = rotation.axes(quat)[0]
+        return 1 - east / jnp.sqrt(east**2 + north**2 + _STEEP**2)
+
+    return jax.vmap(of_drone)(world.drones.quat)
 
 
 def gap(world: World) -> Float[Array, " n"]:

@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdrones import rotation
 from jaxdrones.envs import make
+from jaxdrones.tasks import shaping
 from jaxdrones.tasks.crowd import FLOOR
 from jaxdrones.tasks.pairs import closest_approach, nearby, nearest, nearest_on_the_way, seen_from
 
@@ -36,6 +38,34 @@ def test_random_boxes_are_narrow_or_long():
     sides = np.ptp(places, axis=1)
     assert sides.min() > 0.3 and 1.0 < np.median(sides) < 2.0
     assert 0.2 < np.mean(sides.max(axis=1) > 2.2) < 0.5 and sides.max() < 4
+
+
+@pytest.mark.float32
+def test_among_balls_starts_and_goals_are_free_and_a_ball_touches():
+    env = make("crowd", drones=8, obstacles=1.0)
+    _, worlds = jax.vmap(env.reset)(KEYS)
+    radius = float(env.params.collision_radius[0])
+    balls = np.asarray(worlds.scene.spheres.pos)
+    assert balls.shape == (20, 8, 3) and np.all(np.abs(balls - [0, 0, FLOOR + 1]) <= 1)
+    for places in (worlds.drones.pos, worlds.variables["goal"]):
+        away = np.linalg.norm(places[:, :, None] - balls[:, None], axis=-1)
+        assert np.min(away - worlds.scene.spheres.radius[:, None]) > radius + 0.25 - 1e-5
+    world = jax.tree.map(lambda x: x[0], worlds)
+    surface = balls[0, 0] + jnp.array([0, 0, world.scene.spheres.radius[0]])
+    for gap, touched in ((0.9, True), (1.1, False)):
+        pos = world.drones.pos.at[2].set(surface + jnp.array([0, 0, gap * radius]))
+        after = world.replace(drones=world.drones.replace(pos=pos), variables=world.variables | {"pos": pos})
+        expected = np.arange(8) == 2 if touched else np.zeros(8, bool)
+        np.testing.assert_array_equal(env.task.advance(env.task, after)["touched"], expected)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.5, np.pi, -2.0])
+def test_the_heading_costs_one_minus_its_cosine_also_of_a_tilted_drone(heading):
+    env = make("crowd", drones=2)
+    _, world = env.reset(KEYS[0])
+    quat = jnp.stack([rotation.from_rpy(jnp.array([r, p, heading])) for r, p in ((0.0, 0.0), (0.3, 0.5))])
+    world = world.replace(drones=world.drones.replace(quat=quat))
+    np.testing.assert_allclose(shaping.heading(env.task, world), 1 - np.cos(heading), atol=0.015)
 
 
 def test_drones_that_pass_between_two_control_steps_have_touched():

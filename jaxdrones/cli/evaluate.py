@@ -21,7 +21,7 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "eval",
         help="evaluate a trained policy over many episodes",
-        description="Fly many episodes with the best policy of a run, or with your own policy (file.py:name). Print "
+        description="Fly many episodes with the best policy of a run, your own policy (file.py:name), or raptor. Print "
         "the success rate with its 95 % interval over distinct episodes, errors, and ends of episodes.",
         allow_abbrev=False,
     )
@@ -29,9 +29,9 @@ def add(commands) -> None:
         "policy",
         type=folder,
         metavar="RUN",
-        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed",
+        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed; or raptor",
     )
-    own = parser.add_argument_group("your own policy", "only with file.py:name")
+    own = parser.add_argument_group("your own policy", "only with file.py:name or raptor")
     evaluation = parser.add_argument_group("evaluation")
     own.add_argument("--task", metavar="TASK", help="task to fly, as for `jaxdrones train`")
     add_vehicle(own)

@@ -1,4 +1,4 @@
-"""Policies on the command line: of a run of `jaxdrones train`, or of a user's file."""
+"""Policies on the command line: of a run of `jaxdrones train`, of a user's file, or published ones."""
 
 import argparse
 import sys
@@ -10,8 +10,10 @@ from jaxdrones.user_code import is_reference
 
 
 def is_user_policy(policy: Path) -> bool:
-    """Whether this is a policy of a user's file, `file.py:name`, not the folder of a run."""
-    return is_reference(str(policy))
+    """Whether this is a policy of a user's file, `file.py:name`, or a published one, not the folder of a run."""
+    from jaxdrones.learning.published import POLICIES
+
+    return is_reference(str(policy)) or (str(policy) in POLICIES and not policy.exists())
 
 
 def team_of_run(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, Any]:
@@ -25,11 +27,11 @@ def team_of_run(options: argparse.Namespace, settings: dict[str, Any]) -> dict[s
 def open_policy(
     policy: Path, task: str | None, realistic: bool | str, options: dict[str, Any], last: bool = False
 ) -> Any:
-    """Open the run in a folder, or the policy of a user's file, with a common interface.
+    """Open the run in a folder, the policy of a user's file, or a published one, with a common interface.
 
     Args:
-        policy: folder of a run, or `file.py:name`.
-        task: task for the policy of a file; `None` for a run.
+        policy: folder of a run, `file.py:name`, or the name of a published policy.
+        task: task for the policy of a file or a published one; `None` for a run.
         realistic: as in `jaxdrones.make`; false for a run.
         options: options of `jaxdrones.make`; empty for a run.
         last: whether to open the newest policy of a run, not the best.

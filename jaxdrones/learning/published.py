@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
-from jaxdrones.errors import UserError
+from jaxdrones.errors import UserError, install
 from jaxdrones.learning.networks import RecurrentPolicy
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -92,8 +92,10 @@ def _gru(w: dict[str, Array], hidden: Float[Array, " h"], x: Float[Array, " d"])
 
 def _weights() -> dict[str, Array]:
     """Weights of the package foundation-policy."""
-    from foundation_policy import Raptor as Published
-
+    try:
+        from foundation_policy import Raptor as Published
+    except ImportError:
+        raise ImportError(f"foundation-policy is not installed; {install('raptor')}") from None
     dense, gru, out = Published().layers
     parts = {
         "in": dense.weights,

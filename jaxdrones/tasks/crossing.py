@@ -20,7 +20,9 @@ SPEED = 1.2  # m/s, to the goal
 _SLOW_WITHIN = 0.8  # m of the goal
 _SIGHT = 2.0  # m, length at which the observed vector to the goal is clipped
 _ARRIVED = 0.1  # m
-_MARGIN, _MARGIN_TIME, _SOFTNESS = 0.14, 0.3, 0.04  # m, s, m: gap below which the reward falls
+_MARGIN, _SOFTNESS = 0.08, 0.04  # m: gap below which the reward falls for drones at rest, and its softness
+_PASSING_TIME, _MARGIN_TIME = 0.06, 0.3  # s: growth of that gap with the relative and with the closing speed
+_SLOW = 0.1  # m/s, added to the relative speed in quadrature
 _SEEN = 8  # nearest drones that count
 
 
@@ -84,13 +86,14 @@ def _velocity(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def _approach(task: Task, world: World) -> Float[Array, " n"]:
-    """Sum over the nearest drones of the smoothed penetration of a margin that grows with the closing speed, m."""
+    """Sum over the nearest drones of the smoothed penetration of a margin that grows with relative and closing speed, m."""
     index = nearby(world.drones.pos, _SEEN)
     pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
     apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + CORE**2)
     closing = jnp.maximum(-jnp.sum(pos * vel, axis=-1) / apart, 0)
     gap = apart - 2 * world.params.collision_radius[:, None]
-    inside = _MARGIN + _MARGIN_TIME * closing - gap
+    speed = jnp.sqrt(jnp.sum(vel**2, axis=-1) + _SLOW**2)
+    inside = _MARGIN + _PASSING_TIME * speed + _MARGIN_TIME * closing - gap
     return jnp.sum((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS), axis=-1)
 
 

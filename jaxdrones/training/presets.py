@@ -136,7 +136,7 @@ _BY_DEFAULT: dict[str, tuple[str, ...]] = {"hover": ("shac",), "landing": ("bptt
 """Tasks and learners that work with default settings."""
 _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "gates": dict(random_start=True),
-    "crowd": dict(random_box=True, substeps=2),
+    "crowd": dict(random_box=True, density=1.5, substeps=2),
     "swap-goals": dict(substeps=2),
     "sling": dict(substeps=2),
     "transport": dict(substeps=2),

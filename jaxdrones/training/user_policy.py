@@ -1,4 +1,4 @@
-"""Policies from users' files."""
+"""Policies from users' files, and published ones."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from jaxdrones.envs import Env, make
 from jaxdrones.envs.functions import check_policy
 from jaxdrones.errors import UserError
 from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
+from jaxdrones.learning.published import POLICIES, make_policy
 
 
 @dataclasses.dataclass(frozen=True)
 class UserPolicy:
-    """Policy of a user's file and its task, with the interface of `Run` and `Recipe`."""
+    """Policy of a user's file, or a published one, and its task, with the interface of `Run` and `Recipe`."""
 
     reference: str
-    """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a recurrent policy."""
+    """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a recurrent policy; or the name of a
+    published policy."""
     task: str
     """A name of `jaxdrones.envs.TASKS`, or `file.py:function`."""
     realistic: bool | str
@@ -50,6 +52,8 @@ class UserPolicy:
         Raises:
             ValueError: a file that cannot be read or executed, or a name that is not a policy.
         """
+        if self.reference in POLICIES:
+            return make_policy(self.reference, env)
         policy = user_code.load(self.reference)
         sizes = (env.drones, env.observation_size), (env.drones, env.action_size)
         recurrent = isinstance(policy, RecurrentPolicy)

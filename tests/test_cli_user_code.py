@@ -36,6 +36,7 @@ MORE = {  # command of a page -> what makes it short
     "train hover --vehicle mine.urdf --resume --budget 50": RESUMED,
     "eval my_policy.py:policy --task hover --set action=position --set reach=0.5 --set tilt=20": "--episodes 4",
     "fly --policy my_policy.py:policy --task hover --set action=position --backend bullet": "--no-figure",
+    "eval raptor --task hover --vehicle x500 --set rotors=lagging": "--episodes 4",
 }
 
 
@@ -63,7 +64,9 @@ def test_every_command_of_the_pages_is_tried():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [*PAGES[:2], pytest.param(PAGES[2], marks=pytest.mark.needs("pybullet"))])
+@pytest.mark.parametrize(
+    "page", [*PAGES[:2], pytest.param(PAGES[2], marks=pytest.mark.needs("pybullet", "foundation_policy"))]
+)
 def test_the_commands_of_a_page_run_also_where_the_files_are_gone(page, here, capsys):
     for command in commands(page):
         if "--policy runs" in command or command.startswith("eval runs"):

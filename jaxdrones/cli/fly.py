@@ -65,7 +65,7 @@ def add(commands) -> None:
         metavar="RUN",
         help="in place of FLIGHT: a folder of `jaxdrones train`, or file.py:name, whose code is executed; or raptor",
     )
-    policy.add_argument("--task", metavar="TASK", help="with file.py:name or raptor: task to fly, as for `jaxdrones train`")
+    policy.add_argument("--task", metavar="TASK", help="with file.py:name or raptor: task, as for `jaxdrones train`")
     add_realistic(policy, "with file.py:name: ")
     add_set(policy, "with file.py:name: option of the environment (action, observation, ...)")
     add_backend(bullet)

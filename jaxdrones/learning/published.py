@@ -54,7 +54,7 @@ class Raptor(PyTreeNode):
             )
         params = jax.tree.map(lambda x: x[0], env.params)
         turn, order = _placed(params)
-        return cls(_weights(), jnp.asarray(turn), order, params.hover_rpm / params.max_rpm)
+        return cls(_weights(), jnp.asarray(turn, jnp.float32), order, params.hover_rpm / params.max_rpm)
 
     def initial_hidden_state(self, batch: tuple[int, ...]) -> tuple[Array, Array]:
         """Hidden state of the GRU, and the last action."""
@@ -72,7 +72,7 @@ class Raptor(PyTreeNode):
     def _act(self, hidden: Float[Array, " h"], last: Float[Array, "4"], obs: Float[Array, " d"]) -> tuple[Array, ...]:
         """Hidden state, action in the order of RAPTOR's rotors, and action of one drone."""
         w = self.weights
-        away, matrix, vel, omega = jnp.split(obs[:18], (3, 12, 15))
+        away, matrix, vel, omega = jnp.split(obs[:18].astype(hidden.dtype), (3, 12, 15))
         turned = (matrix.reshape(3, 3) @ self.turn.T).reshape(9)
         seen = jnp.concatenate([-away, turned, -vel, self.turn @ omega, last])
         x = jax.nn.relu(w["in"] @ seen + w["in_bias"])

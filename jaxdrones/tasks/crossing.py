@@ -86,7 +86,7 @@ def _velocity(task: Task, world: World) -> Float[Array, " n"]:
 
 
 def _approach(task: Task, world: World) -> Float[Array, " n"]:
-    """Sum over the nearest drones of the smoothed penetration of a margin that grows with relative and closing speed, m."""
+    """Sum over the nearest drones of the smoothed penetration of a margin that grows with the relative motion, m."""
     index = nearby(world.drones.pos, _SEEN)
     pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
     apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + CORE**2)

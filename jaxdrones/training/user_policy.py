@@ -21,8 +21,8 @@ class UserPolicy:
     """Policy of a user's file, or a published one, and its task, with the interface of `Run` and `Recipe`."""
 
     reference: str
-    """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a recurrent policy; or the name of a
-    published policy."""
+    """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a recurrent policy; or a name of
+    `jaxdrones.learning.published.POLICIES`."""
     task: str
     """A name of `jaxdrones.envs.TASKS`, or `file.py:function`."""
     realistic: bool | str

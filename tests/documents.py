@@ -20,6 +20,7 @@ _NEEDS = {  # words in a block -> the library without which it does not run
     r"\bpettingzoo\b": "pettingzoo",
     r"\bbrax\b": "brax",
     r"\btwin\b|\bmpc\b": "casadi",
+    r"\braptor\b": "foundation_policy",
     r"\bsb3\b": "stable_baselines3",
     r"\brllib\b": "ray",
 }

@@ -107,6 +107,31 @@ def test_the_camera_of_a_film_sees_what_it_was_aimed_at(record, tmp_path):
     np.testing.assert_allclose(seen, lens.project(record.pos[shot.rows[4]])[0], atol=1)
 
 
+def test_on_board_the_camera_looks_along_the_nose_and_does_not_see_its_own_drone(record, tmp_path):
+    row, drone, (width, height) = 60, 2, (1280, 720)
+    forward, left, up = np.asarray(jd.rotation.axes(jnp.asarray(record.quat[row, drone])))
+    camera = "jaxdrones.player.stage.camera"
+    with browser.open_tab() as tab:
+        tab.open(show(record).save(tmp_path / "flight.html"), width, height)
+        tab.run(f"jaxdrones.player.panel.set('drone', {drone})")
+        tab.run("jaxdrones.player.panel.setMode('board')")
+        for _ in range(2):  # also of the second picture of one moment
+            tab.run(f"jaxdrones.positionsAt({record.t[row]})")
+            eye = np.array(tab.run(f"{camera}.position.toArray()"))
+            arm = float(jnp.linalg.norm(record.params.rotor_pos[drone, 0]))
+            assert np.linalg.norm(eye - record.pos[row, drone]) < arm
+            point = eye + 2 * forward + 0.3 * left + 0.2 * up
+            seen = tab.run(f"jaxdrones.player.stage.project({camera}.position.clone().set(...{point.tolist()}))")
+            shape = tab.run("[jaxdrones.player.stage.canvas.clientWidth, jaxdrones.player.stage.canvas.clientHeight]")
+            focal = shape[1] / 2 / np.tan(np.radians(75) / 2)
+            expected = np.array(shape) / 2 - focal * np.array([0.15, 0.1])
+            np.testing.assert_allclose(seen, expected, atol=0.5)
+        drawn = tab.run(
+            "jaxdrones.player.fleet.slots[0].map(({ mesh, place }) => (mesh.matrices ?? mesh.instanceMatrix.array)[16 * place])"
+        )
+        assert [x != 0 for x in drawn] == [i != drone for i in range(4)]
+
+
 def test_keys_play_pause_step_and_choose(tab):
     tab.run("jaxdrones.positionsAt(0.5)")
     tab.press("ArrowRight")

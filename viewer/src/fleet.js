@@ -58,8 +58,11 @@ export class Fleet {
     return mesh;
   }
 
-  /** Place all drones as they are at a time, `passed` seconds after the last; `layout` says where each world is drawn. */
-  place(time, passed, layout) {
+  /**
+   * Place all drones as they are at a time, `passed` seconds after the last; `layout` says where each world is drawn.
+   * The drone `aboard` carries the camera, which does not see it: { world, drone }, or null.
+   */
+  place(time, passed, layout, aboard) {
     const { p, q } = scratch, { camera, canvas } = this.stage, size = new Vector3().setScalar(this.scale), matrix = new Matrix4();
     const pixels = (this.stage.detail * canvas.clientHeight) / 2 / Math.tan((camera.fov * Math.PI) / 360); // of 1 m at 1 m
     this.layout = layout;
@@ -73,7 +76,8 @@ export class Fleet {
         p.add(offset);
         const kind = world.vehicle[i], near = (this.scale * this.arms[kind] * pixels) / p.distanceTo(camera.position);
         const mesh = this.shapes[kind][ghost ? 1 : 0][LEVELS.findIndex((level) => !(near < level.pixels))], place = mesh.count++;
-        mesh.setMatrixAt(place, there && Number.isFinite(q.w) ? matrix.compose(p, q, size) : NOWHERE);
+        const seen = there && Number.isFinite(q.w) && !(aboard && aboard.world === w && aboard.drone === i);
+        mesh.setMatrixAt(place, seen ? matrix.compose(p, q, size) : NOWHERE);
         mesh.setColorAt(place, this.colors[w][i]);
         const spin = world.kinds[i].rotor_spin, turned = mesh.geometry.attributes.spin?.array;
         for (let k = 0; k < 4 && turned; k++) {

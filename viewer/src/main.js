@@ -240,8 +240,8 @@ class Player {
   draw(passed) {
     const { panel, stage, time } = this, shown = panel.shown;
     if (this.pose(scratch.p, scratch.q)) stage.track(scratch.p, scratch.q, panel.size * this.arm);
-    stage.orbit.update();
-    this.fleet.place(time, passed, this.layout);
+    if (panel.mode !== "board") stage.orbit.update(); // which turns the camera to its own target
+    this.fleet.place(time, passed, this.layout, panel.mode === "board" ? panel : null);
     this.trails.forEach((trail, w) => trail.show(time, panel.trail, this.layout[w], stage));
     this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], panel.size));
     stage.render();

@@ -126,9 +126,8 @@ def test_on_board_the_camera_looks_along_the_nose_and_does_not_see_its_own_drone
             focal = shape[1] / 2 / np.tan(np.radians(75) / 2)
             expected = np.array(shape) / 2 - focal * np.array([0.15, 0.1])
             np.testing.assert_allclose(seen, expected, atol=0.5)
-        drawn = tab.run(
-            "jaxdrones.player.fleet.slots[0].map(({ mesh, place }) => (mesh.matrices ?? mesh.instanceMatrix.array)[16 * place])"
-        )
+        scale = "(mesh.matrices ?? mesh.instanceMatrix.array)[16 * place]"
+        drawn = tab.run(f"jaxdrones.player.fleet.slots[0].map(({{ mesh, place }}) => {scale})")
         assert [x != 0 for x in drawn] == [i != drone for i in range(4)]
 
 

@@ -10,6 +10,7 @@ import pytest
 from helpers import mostly_slow
 
 from jaxdrones.cli import main
+from jaxdrones.cli.report import summary, table
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.fly import fly
 from jaxdrones.training import algorithms
@@ -27,6 +28,14 @@ def test_fly_prints_a_table_and_writes_log_and_figure(tmp_path, capsys):
     log = np.load(tmp_path / "log.npz")
     assert log["pos"].shape == (30, 2, 3) and log["rpm"].shape == (30, 2, 4)
     assert json.loads(str(log["conditions"]))["control_hz"] == 120
+
+
+def test_many_drones_are_three_rows():
+    rows = [{"drone": f"drone {i}", "rms_error_m": float(i), "settled_after_s": None if i else 2.0} for i in range(5)]
+    lowest, median, highest = summary(rows)
+    assert lowest == {"drone": "lowest", "rms_error_m": 0.0, "settled_after_s": 2.0}
+    assert (median["rms_error_m"], highest["rms_error_m"], highest["drone"]) == (2.0, 4.0, "highest")
+    assert "-" in table(summary([row | {"settled_after_s": None} for row in rows]))
 
 
 @pytest.mark.slow

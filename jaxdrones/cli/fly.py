@@ -14,7 +14,7 @@ from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_o
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_json, add_no_figure, add_output, add_set
 from jaxdrones.cli.policies import is_user_policy, open_policy, team_of_run
-from jaxdrones.cli.report import as_json, table
+from jaxdrones.cli.report import as_json, summary, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
@@ -217,7 +217,7 @@ def _report(
         print(as_json(about | {"results": rows, "diverged": diverged, "files": list(map(str, files))}))
     else:
         print(record.conditions)
-        print(table(rows))
+        print(table(rows if len(rows) <= plots.MOST_NAMED else summary(rows)))
         print(results.definitions(record, after))
         if end is not None:
             how = {True: "success", False: "no success", None: "done"}[end["success"]]

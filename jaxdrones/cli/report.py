@@ -4,6 +4,8 @@ import json
 import math
 from typing import Any
 
+import numpy as np
+
 from jaxdrones.training.presets import realism
 
 _COLUMNS = {  # result: (heading, format)
@@ -41,6 +43,18 @@ def _finite(x):
     if isinstance(x, list | tuple):
         return [_finite(value) for value in x]
     return None if isinstance(x, float) and not math.isfinite(x) else x
+
+
+def summary(results: list[dict]) -> list[dict]:
+    """Lowest, median and highest value of every column of the results of many drones."""
+    quantiles = {"lowest": 0.0, "median": 0.5, "highest": 1.0}
+
+    def of_drones(name: str, share: float) -> float | None:
+        known = [row[name] for row in results if row[name] is not None]
+        return float(np.quantile(known, share)) if known else None
+
+    names = [name for name in results[0] if name != "drone"]
+    return [{"drone": which} | {name: of_drones(name, share) for name in names} for which, share in quantiles.items()]
 
 
 def table(results: list[dict]) -> str:

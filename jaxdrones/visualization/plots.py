@@ -33,7 +33,9 @@ PANELS = {
 ERROR = {"error": ("error", 0, "error (m)")}
 POLICY_PANELS = ("x", "rpm0", "y", "rpm1", "z", "rpm2", "vz", "rpm3", "error", "yaw")
 _SMALLEST = {"pos": 0.02, "vel": 0.02, "rpy": 0.02, "omega": 0.05, "rpm": 200.0, "error": 0.01}  # ranges of axes
-_MOST_NAMED = 12  # drones in a legend
+MOST_NAMED = 12  # drones with a line or a row each; more of them are summarized
+_BANDS = ((0.0, 1.0, 0.15), (0.05, 0.95, 0.3))  # lower and upper quantile, opacity
+_BAND = colors(1)[0]
 _WIDTH, _PATHS, _ROW = 13.0, 5.4, 1.6  # in
 
 
@@ -88,9 +90,12 @@ def _draw_signal(axis: Any, record: FlightLog, name: str, tints: Sequence[str]) 
     signal = np.asarray(getattr(record, array), float)[..., column]
     targets = {"pos": record.target_pos, "vel": record.target_vel}
     command = np.asarray(targets[array], float)[..., column] if array in targets else np.full_like(signal, np.nan)
-    for i, tint in enumerate(tints):
-        axis.plot(record.t, command[:, i], color=tint, **style.TARGET)
-        axis.plot(record.t, signal[:, i], color=tint)
+    if len(tints) > MOST_NAMED:
+        _draw_bands(axis, record.t, signal)
+    else:
+        for i, tint in enumerate(tints):
+            axis.plot(record.t, command[:, i], color=tint, **style.TARGET)
+            axis.plot(record.t, signal[:, i], color=tint)
     low, high = style.limits(np.concatenate([signal, command], axis=1), _SMALLEST[array])
     axis.set_ylim(low, high)
     axis.set_ylabel(label)
@@ -103,6 +108,14 @@ def _draw_signal(axis: Any, record: FlightLog, name: str, tints: Sequence[str]) 
         axis.text(0.995, 0.97, text, transform=axis.transAxes, ha="right", va="top", fontsize=11.5, bbox=box)
 
 
+def _draw_bands(axis: Any, t: np.ndarray, signal: np.ndarray) -> None:
+    """Draw the median of a signal (time, drones) over bands of its quantiles."""
+    for low, high, opacity in _BANDS:
+        edges = np.nanquantile(signal, (low, high), axis=1)
+        axis.fill_between(t, *edges, color=_BAND, alpha=opacity, linewidth=0)
+    axis.plot(t, np.nanmedian(signal, axis=1), color=_BAND)
+
+
 def _range(values: np.ndarray) -> str:
     """Range of values as text."""
     ends = [f"{x:,.0f}" if 1e3 <= abs(x) < 1e6 else f"{x:.2g}" for x in (values.min(), values.max())]
@@ -112,8 +125,14 @@ def _range(values: np.ndarray) -> str:
 def _handles(record: FlightLog, tints: Sequence[str]) -> list[Any]:
     """Legend: drones, dashed lines, start and end."""
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
+    if len(tints) > MOST_NAMED:
+        bands = [Patch(color=_BAND, alpha=a, label=f"{100 * (b - c):.0f} % of them") for c, b, a in _BANDS[::-1]]
+        return [
+            Line2D([], [], color=_BAND, label=f"median of {len(tints)} drones"),
+            *bands,
+            *paths.legend_handles(record),
+        ]
     named = [Line2D([], [], color=tint, label=drone) for tint, drone in zip(tints, record.labels, strict=True)]
-    if len(named) > _MOST_NAMED:
-        named = [*named[:_MOST_NAMED], Line2D([], [], linestyle="none", label=f"and {len(named) - _MOST_NAMED} more")]
     return named + paths.legend_handles(record)

@@ -65,12 +65,19 @@ def test_a_panel_holds_nearly_all_samples_and_says_what_it_leaves_out(record, tm
     assert [text.get_text() for text in axis.texts] == ["outside: 30,000, first at 0.01 s"]
 
 
-def test_a_team_of_many_drones_has_a_short_legend(record, tmp_path, figures):
+def test_a_team_of_many_drones_is_a_median_with_bands(record, tmp_path, figures):
     many = {name: np.repeat(getattr(record, name), 15, axis=1) for name in ("pos", "quat", "vel", "omega", "rpm")}
     many |= {name: np.repeat(getattr(record, name), 15, axis=1) for name in ("target_pos", "target_vel")}
+    many["pos"] = many["pos"] + np.arange(30)[None, :, None]
     crowd = dataclasses.replace(record, **many, labels=tuple(f"drone {i}" for i in range(30)))
     plots.save_flight(crowd, tmp_path / "flight.png", "a title", ("z",))
-    assert "and 18 more" in [text.get_text() for text in figures[0].legends[0].get_texts()]
+    named = [text.get_text() for text in figures[0].legends[0].get_texts()]
+    assert named[:3] == ["median of 30 drones", "90 % of them", "100 % of them"]
+    axis, height = figures[0].axes[-1], crowd.pos[..., 2]
+    np.testing.assert_allclose(axis.lines[0].get_ydata(), np.median(height, axis=1), rtol=1e-6)
+    edges = [band.get_paths()[0].vertices[:, 1] for band in axis.collections]
+    assert edges[0].max() == pytest.approx(height.max()) and edges[0].min() == pytest.approx(height.min())
+    assert height.min() < edges[1].min() < edges[1].max() < height.max()
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from jaxdrones.training.run import Run
 SPACING = 0.8  # m between neighboring drones
 HEIGHT = 2.0  # m, of the starts; the word begins one meter above
 SETTLING = 6.0  # s beyond a straight flight
+EVERY = 5  # control steps between two rows of the page
 
 
 def letters(word: str, count: int) -> np.ndarray:
@@ -85,6 +86,12 @@ def fly(policy: AnyPolicy, text: str, drones: int, seed: int = 0) -> EpisodeLog:
     return fly_episode(jd.make(word(text, drones)), policy, jax.random.key(seed))
 
 
+def thinned(flight: EpisodeLog) -> EpisodeLog:
+    """Flight with fewer rows, for a smaller page."""
+    fewer = {name: jax.tree.map(lambda x: x[::EVERY], getattr(flight, name)) for name in ("t", "drones", "target")}
+    return flight.replace(**fewer)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy", default="runs/crowd", help="run of `jaxdrones train crowd`")
@@ -96,7 +103,7 @@ def main() -> None:
     flight = fly(Run(options.policy).policy(), options.word, options.drones)
     safe, reached = (float(np.mean(flight.metrics[name][-1])) for name in ("safe", "reached"))
     print(f"{100 * safe:.2f} % touched nobody, {100 * reached:.2f} % are at their points after {flight.t[-1]:.1f} s")
-    print(f"wrote {jd.show(flight).save(options.output)}")
+    print(f"wrote {jd.show(thinned(flight)).save(options.output)}")
 
 
 if __name__ == "__main__":

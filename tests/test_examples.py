@@ -4,6 +4,8 @@ import importlib.util
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from documents import ROOT
@@ -17,6 +19,34 @@ def example(name):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.mark.needs("matplotlib")
+def test_the_points_of_a_word_keep_apart_and_leave_the_hole_of_an_a_free():
+    module = example("word")
+    points = module.letters("JAX", 150)
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(150)
+    assert points.shape == (150, 3) and apart.min() > 0.9 * module.SPACING
+    x, _, z = module.letters("A", 200).T
+    middle = np.abs(x - (x.max() + x.min()) / 2) < 0.1 * np.ptp(x)
+    gaps = np.diff(np.sort(z[middle]))
+    assert gaps.max() > 2.5 * module.SPACING  # between the bar and the top
+
+
+@pytest.mark.needs("matplotlib")
+def test_drones_take_the_points_of_a_word_and_a_page_has_fewer_rows():
+    import jaxdrones as jd
+
+    module = example("word")
+    task = module.word("X", 12)
+    env = jd.make(task)
+    _, world = env.reset(jax.random.key(0))
+    goal = np.asarray(world.variables["goal"])
+    taken, points = (np.array(sorted(x.round(3).tolist())) for x in (goal, module.letters("X", 12)))
+    np.testing.assert_allclose(taken, points, atol=2e-3)
+    flight = module.fly_episode(env, lambda obs: jnp.zeros((12, 4)), jax.random.key(0))
+    shown = module.thinned(flight)
+    assert len(shown.t) == -(-len(flight.t) // module.EVERY) and shown.drones.pos.shape == (len(shown.t), 12, 3)
 
 
 @pytest.mark.needs("torch")

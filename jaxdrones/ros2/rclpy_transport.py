@@ -13,6 +13,7 @@ try:
     import rclpy.duration
     import rclpy.executors
     import rclpy.qos
+    import rclpy.signals
 except ImportError as error:
     raise ImportError(
         "rclpy is not there; it comes with ROS 2 (source its setup.bash), or take the transport 'cyclonedds'"
@@ -32,8 +33,8 @@ class RclpyTransport:
     def __init__(self, name: str = "jaxdrones"):
         """Start rclpy if necessary, and a node of this name."""
         self._began = not rclpy.ok()
-        if self._began:
-            rclpy.init()
+        if self._began:  # without its handler of Ctrl-C, which ends the network before the flight
+            rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
         self._node = rclpy.create_node(name)
         self._executor = rclpy.executors.SingleThreadedExecutor()
         self._executor.add_node(self._node)

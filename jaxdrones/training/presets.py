@@ -106,7 +106,7 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("forest", "ppo"): _SLOW_PPO
     | dict(updates=600, worlds=256, horizon=64, hidden_sizes=(128, 64), critic_hidden_sizes=(128, 64), gae_lambda=0.95),
     ("room", "bptt"): _CROSSING | dict(worlds=64),
-    ("crowd", "bptt"): _CROSSING,
+    ("crowd", "bptt"): _CROSSING | dict(updates=900),
     ("crowd", "ppo"): _CROSSING_PPO,
     ("swap-goals", "bptt"): _CROSSING,
     ("swap-goals", "ppo"): _CROSSING_PPO,

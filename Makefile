@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fly train rllib sb3 tables test test-slow test-libraries test-rllib lint docs notebooks viewer
+.PHONY: fly train rllib sb3 tables test test-slow test-libraries test-rllib test-ros2 lint docs notebooks viewer
 
 fly: .venv/installed  ## four Crazyflies on the paper's circle
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
@@ -36,6 +36,9 @@ test-libraries: .venv-libraries/installed  ## TorchRL, skrl, tianshou, Stable-Ba
 test-rllib: .venv-rllib/installed
 	.venv-rllib/bin/pytest tests/adapters/test_rllib.py tests/test_examples.py -k rllib
 
+test-ros2: .venv-ros2/installed  ## a node in a real graph of ROS 2, with rclpy, in an environment of its own
+	.venv-ros2/bin/pytest tests/ros2/test_real_rclpy.py
+
 lint: .venv/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -67,4 +70,11 @@ viewer:  ## the page of the viewer, from its sources; needs Node.js, which nothi
 .venv-rllib/installed: pyproject.toml constraints-rllib.txt
 	$(PYTHON) -m venv .venv-rllib
 	.venv-rllib/bin/pip install --quiet -c constraints-rllib.txt -e ".[cli]" torch "ray[rllib]" beartype pytest
+	touch $@
+
+# rclpy as wheels, for CPython 3.11; elsewhere it comes with an installed ROS 2.
+.venv-ros2/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv-ros2
+	.venv-ros2/bin/pip install --quiet -c constraints.txt -e ".[cli,ros2]" beartype pytest scipy
+	.venv-ros2/bin/pip install --quiet $(addprefix ros-,rclpy==9.1.2 rmw-fastrtps-cpp==9.3.3 std-msgs sensor-msgs geometry-msgs nav-msgs std-srvs rosgraph-msgs)
 	touch $@

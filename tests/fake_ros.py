@@ -199,12 +199,13 @@ def install(monkeypatch):
     rclpy = module(
         "rclpy",
         ok=lambda: graph.running,
-        init=lambda: set_running(True),
+        init=lambda signal_handler_options: set_running(True),
         shutdown=lambda: set_running(False),
         create_node=lambda name: FakeNode(graph, name),
     )
     rclpy.duration = module("rclpy.duration", Duration=Duration)
     rclpy.executors = module("rclpy.executors", SingleThreadedExecutor=FakeExecutor)
+    rclpy.signals = module("rclpy.signals", SignalHandlerOptions=type("SignalHandlerOptions", (), {"NO": 0}))
     rclpy.qos = module("rclpy.qos", QoSProfile=QoSProfile, ReliabilityPolicy=Reliability)
     packages = defaultdict(dict)
     for name, kind in classes.items():

@@ -93,11 +93,16 @@ def test_a_killed_peer_is_missed_and_another_one_continues(tmp_path):
 
 
 def test_ctrl_c_ends_a_flight_without_a_traceback():
-    command = [sys.executable, "-m", "jaxdrones.cli", "ros2", "--transport", "rclpy", "--drones", "2"]
-    flight = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    time.sleep(12)
-    flight.send_signal(signal.SIGINT)
-    _, errors = flight.communicate(timeout=30)
+    from jaxdrones.ros2 import open_transport, topics
+
+    clock = []
+    with closing(open_transport("rclpy", "watcher")) as transport:
+        transport.subscribe(topics.CLOCK, clock.append)
+        command = [sys.executable, "-m", "jaxdrones.cli", "ros2", "--transport", "rclpy", "--drones", "2"]
+        flight = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        wait_for(lambda: transport.spin(0.1) or len(clock) > 20)
+        flight.send_signal(signal.SIGINT)
+        _, errors = flight.communicate(timeout=60)
     assert "Traceback" not in errors, errors
 
 

@@ -221,7 +221,9 @@ def _fly(
         memory = memory.replace(age=jnp.minimum(memory.age, _SLOW))  # the slow loops run at once afterwards
         attitude, thrust = rpy(state.quat), jnp.clip(setpoint.thrust, 0, motors.FULL)
     else:
-        raise UserError(f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude, Rates or PerAxis")
+        raise UserError(
+            f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude, Rates or PerAxis"
+        )
     if isinstance(setpoint, Attitude):
         attitude = degrees(setpoint.rpy)
     if isinstance(setpoint, Rates):

@@ -190,7 +190,9 @@ def test_modes_for_each_axis_give_what_the_set_points_of_all_axes_give(name):
     gains, tilted = firmware_pid.gains(), LEVEL.replace(quat=rotation.from_rpy(jnp.array([0.1, -0.2, 0.3])))
     same = [firmware_pid.init()] * 2
     for omega in jnp.array([[0.0, 0, 0], [0.3, -0.2, 0.1]]).repeat(4, axis=0):
-        steps = [firmware_pid.pwm(gains, m, tilted.replace(omega=omega), s) for m, s in zip(same, MODES[name])]
+        steps = [
+            firmware_pid.pwm(gains, m, tilted.replace(omega=omega), s) for m, s in zip(same, MODES[name], strict=True)
+        ]
         same = [memory for memory, _ in steps]
         np.testing.assert_allclose(steps[0][1].pwm, steps[1][1].pwm)
 
@@ -237,7 +239,9 @@ def test_gradients_of_duty_cycles_agree_with_differences():
 
 
 def test_other_set_points_and_propellers_are_refused():
-    with pytest.raises(ValueError, match="setpoint is a ndarray; give a Setpoint, Velocity, Attitude, Rates or PerAxis"):
+    with pytest.raises(
+        ValueError, match="setpoint is a ndarray; give a Setpoint, Velocity, Attitude, Rates or PerAxis"
+    ):
         firmware_pid.pwm(firmware_pid.gains(), firmware_pid.init(), LEVEL, np.zeros(3))
     with pytest.raises(ValueError, match=r"unknown propellers '2.2'.*known: 2.1, 2.1\+"):
         firmware_pid.gains(propellers="2.2")

@@ -22,8 +22,9 @@ def add(commands) -> None:
         "crazyflie",
         help="simulate a Crazyflie to which cflib connects",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Simulate a Crazyflie in real time, flown by the PID of its firmware. Scripts of cflib, the Python\n"
-        f"library of Bitcraze, connect to udp://127.0.0.1:PORT; those that use `uri_from_env` run unchanged after\n{_EXAMPLE}\n\n"
+        description="Simulate a Crazyflie in real time, flown by the PID of its firmware. Scripts of cflib (by Bitcraze)\n"
+        "connect to udp://127.0.0.1:PORT; those that use `uri_from_env` run unchanged after\n"
+        f"{_EXAMPLE}\n\n"
         "There are parameters, log blocks, set-points of all kinds, the high-level commander with uploaded\n"
         "trajectories, arming and emergency stops. Ctrl-C ends the flight and writes its log.",
         allow_abbrev=False,

@@ -1,0 +1,206 @@
+"""Flight of a simulated drone with Betaflight in the loop, in real time or in lockstep."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.firmware.betaflight import msp, settings
+from jaxdrones.firmware.betaflight.link import Link
+from jaxdrones.firmware.betaflight.packets import Sticks, rc_packet, state_packet
+from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
+from jaxdrones.firmware.betaflight.process import Process
+from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
+
+_LATE = 0.1  # s, lag behind the clock after which the schedule restarts
+_SILENT = 0.5  # s of real time without motors after which Betaflight is lost
+_REPLY = 0.02  # s for the motors of a step in lockstep
+_UPRIGHT = 0.9  # cosine of the tilt above which Betaflight arms
+_NOT_ARMED = "arm switch"  # reason that follows from the others
+
+
+class BetaflightLost(Exception):
+    """Betaflight that does not start, arm or come back."""
+
+
+@dataclasses.dataclass
+class Flown:
+    """Statistics of a flight."""
+
+    simulated_s: float = 0.0
+    real_s: float = 0.0
+    armed_s: float = 0.0
+    """Simulated time with motors armed."""
+    states: int = 0
+    motors: int = 0
+    """Packets of the motors."""
+    unanswered: int = 0
+    """Steps in lockstep without motors within 20 ms."""
+    late: int = 0
+    """Number of times that the flight fell behind the clock by 0.1 s."""
+    lost: int = 0
+    """Number of times that Betaflight was silent for 0.5 s."""
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated over real time."""
+        return self.simulated_s / self.real_s if self.real_s else 0.0
+
+
+def _nothing(*_: Any) -> None:
+    pass
+
+
+class Flight:
+    """Loop: physics, state to Betaflight, sticks of the pilot, motors from Betaflight."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        link: Link,
+        pilot: Pilot,
+        *,
+        process: Process | None = None,
+        lockstep: bool = False,
+        wait: float = 30.0,
+        on_row: Callable[[float, Sample, Sticks], None] = _nothing,
+        warn: Callable[[str], None] = _nothing,
+    ):
+        """Prepare a flight.
+
+        Args:
+            simulation: drone on the ground.
+            link: to Betaflight.
+            pilot: of the sticks, 100 times a second of simulated time, once it is armed.
+            process: of Betaflight, to be started again if it ends; `None` for one that others started.
+            lockstep: whether each step waits for the motors, for 20 ms at most; else the flight follows the clock.
+            wait: longest time until Betaflight is armed, at the start and after it was lost, s.
+            on_row: called with time (s), sample and sticks 100 times a second.
+            warn: function of a line of text for warnings.
+        """
+        self._simulation, self._link, self._pilot, self._process = simulation, link, pilot, process
+        self._lockstep, self._wait, self._on_row, self._warn = lockstep, wait, on_row, warn
+        self.flown = Flown()
+        self._outputs = np.zeros(4)
+        self._sticks = Sticks()
+        self._armed_at: float | None = None
+        self._booted = False  # its clock, which follows the packets, stops if they arrive while it starts
+        self._per_stick = max(round(PERIOD / simulation.dt), 1)
+        self._begin = self._due = self._heard = time.monotonic()
+
+    def run(self, duration: float | None = None) -> Flown:
+        """Arm and fly for a time with motors armed (s), by default until it is interrupted; then disarm.
+
+        Raises:
+            BetaflightLost: see `wait`.
+        """
+        self._begin = self._due = self._heard = time.monotonic()
+        try:
+            while duration is None or self.flown.armed_s < duration - 1e-9:
+                if self._armed_at is None:
+                    self._arm()
+                self._step()
+                if time.monotonic() - self._heard > _SILENT:
+                    self._lose()
+        finally:
+            self._armed_at, self._sticks = None, Sticks()
+            self._link.send_sticks(rc_packet(self._simulation.time, self._sticks))
+        return self.flown
+
+    def _lose(self) -> None:
+        """Betaflight is silent: the motors stop, and it has to be armed again."""
+        self.flown.lost += 1
+        self._warn(f"Betaflight sent no motors for {_SILENT:g} s; they stop")
+        self._armed_at, self._sticks, self._outputs, self._booted = None, Sticks(), np.zeros(4), False
+
+    def _arm(self) -> None:
+        """Wait until Betaflight is there, configure it, and arm it; the simulation runs on."""
+        end, why = time.monotonic() + self._wait, "there is no answer on its port of MSP"
+        while time.monotonic() < end:
+            if self._process is not None and self._process.ended:
+                self._warn(f"Betaflight has ended ({self._process.last_words}); it is started again")
+                self._process.restart()
+            connection = self._link.connect_msp()
+            if connection is None:
+                self._catch_up(0.05)
+                continue
+            with contextlib.closing(connection):
+                try:
+                    why = self._arm_by(msp.Client(connection, self._catch_up), end)
+                except msp.NoAnswer as error:
+                    why = str(error)
+                    self._catch_up(0.2)
+            if not why:
+                return
+        raise BetaflightLost(f"Betaflight was not armed within {self._wait:g} s: {why}")
+
+    def _arm_by(self, client: msp.Client, end: float) -> str:
+        """Configure and arm; an empty text, or why not at the time `end`."""
+        settings.configure(client, reversed_yaw=self._simulation.reversed_yaw)
+        self._booted, why = True, ""
+        while time.monotonic() < end:
+            now = settings.status(client)
+            reasons = [reason for reason in now.reasons if reason != _NOT_ARMED]
+            why = f"it reports {', '.join(reasons) or 'nothing'}"
+            x, y = self._simulation.sample.quat[:2]
+            if 1 - 2 * (x * x + y * y) < _UPRIGHT and self.flown.lost:
+                self._warn("the drone is set upright")
+                self._simulation.set_upright()
+            if now.armed and self._sticks.armed:
+                self._armed_at, self._heard = self._simulation.time, time.monotonic()
+                return ""
+            self._sticks = Sticks(armed=not reasons)
+            self._catch_up(0.05)
+        self._sticks = Sticks()
+        return why
+
+    def _catch_up(self, more: float = 0.0) -> None:
+        """Take the steps that are due, and those of a further real time (s)."""
+        end = time.monotonic() + more
+        while True:
+            if (time.monotonic() if self._lockstep else self._due) >= end:
+                break
+            self._step()
+
+    def _step(self) -> None:
+        """One step: motors, physics, state, sticks."""
+        simulation = self._simulation
+        sample = simulation.advance(self._outputs)
+        t = simulation.time
+        if self._booted:
+            self._link.send_state(state_packet(t, sample.quat, sample.omega, sample.acc))
+            self.flown.states += 1
+        if simulation.steps % self._per_stick == 0:
+            if self._armed_at is not None:
+                self._sticks = self._pilot(t - self._armed_at, sample)._replace(armed=True)
+            if self._booted:
+                self._link.send_sticks(rc_packet(t, self._sticks))
+            self._on_row(t, sample, self._sticks)
+        self._receive()
+        self._pace()
+        self.flown.armed_s += simulation.dt if self._armed_at is not None else 0.0
+        self.flown.simulated_s += simulation.dt
+        self.flown.real_s = time.monotonic() - self._begin
+
+    def _receive(self) -> None:
+        found = self._link.outputs(_REPLY if self._lockstep else 0.0)
+        if found:
+            self._outputs, self._heard = found[-1], time.monotonic()
+        self.flown.motors += len(found)
+        self.flown.unanswered += self._lockstep and not found
+
+    def _pace(self) -> None:
+        if self._lockstep:
+            return
+        self._due += self._simulation.dt
+        now = time.monotonic()
+        if now > self._due + _LATE:
+            self.flown.late += 1
+            self._due = now
+        while (left := self._due - time.monotonic()) > 0:
+            time.sleep(min(left, 0.0005))

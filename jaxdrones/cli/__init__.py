@@ -5,6 +5,7 @@ import sys
 
 from jaxdrones.cli import (
     bench,
+    betaflight,
     compare,
     completion,
     crazyflie,
@@ -62,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
         score,
         ros2,
         crazyflie,
+        betaflight,
         export,
         explain,
         names,

@@ -22,7 +22,7 @@ def add(commands) -> None:
         "crazyflie",
         help="simulate a Crazyflie to which cflib connects",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Simulate a Crazyflie in real time, flown by the PID of its firmware. Scripts of cflib (by Bitcraze)\n"
+        description="Simulate a Crazyflie in real time, flown by the PID of its firmware. Scripts of cflib\n"
         "connect to udp://127.0.0.1:PORT; those that use `uri_from_env` run unchanged after\n"
         f"{_EXAMPLE}\n\n"
         "There are parameters, log blocks, set-points of all kinds, the high-level commander with uploaded\n"

@@ -78,7 +78,8 @@ class Flight:
             link: to Betaflight.
             pilot: of the sticks, 100 times a second of simulated time, once it is armed.
             process: of Betaflight, to be started again if it ends; `None` for one that others started.
-            lockstep: whether each step waits for the motors, for 20 ms at most; else the flight follows the clock.
+            lockstep: whether each step waits for the motors, for 20 ms at most; a flight is never faster than the
+                clock.
             wait: longest time until Betaflight is armed, at the start and after it was lost, s.
             on_row: called with time (s), sample and sticks 100 times a second.
             warn: function of a line of text for warnings.
@@ -91,7 +92,7 @@ class Flight:
         self._armed_at: float | None = None
         self._booted = False  # its clock, which follows the packets, stops if they arrive while it starts
         self._per_stick = max(round(PERIOD / simulation.dt), 1)
-        self._begin = self._due = self._heard = time.monotonic()
+        self._begin = self._due = self._heard = self._last = time.monotonic()
 
     def run(self, duration: float | None = None) -> Flown:
         """Arm and fly for a time with motors armed (s), by default until it is interrupted; then disarm.
@@ -99,7 +100,7 @@ class Flight:
         Raises:
             BetaflightLost: see `wait`.
         """
-        self._begin = self._due = self._heard = time.monotonic()
+        self._begin = self._due = self._heard = self._last = time.monotonic()
         try:
             while duration is None or self.flown.armed_s < duration - 1e-9:
                 if self._armed_at is None:
@@ -127,14 +128,14 @@ class Flight:
                 self._process.restart()
             connection = self._link.connect_msp()
             if connection is None:
-                self._catch_up(0.05)
+                self._run_for(0.05)
                 continue
             with contextlib.closing(connection):
                 try:
-                    why = self._arm_by(msp.Client(connection, self._catch_up), end)
+                    why = self._arm_by(msp.Client(connection, self._step), end)
                 except msp.NoAnswer as error:
                     why = str(error)
-                    self._catch_up(0.2)
+                    self._run_for(0.2)
             if not why:
                 return
         raise BetaflightLost(f"Betaflight was not armed within {self._wait:g} s: {why}")
@@ -155,16 +156,14 @@ class Flight:
                 self._armed_at, self._heard = self._simulation.time, time.monotonic()
                 return ""
             self._sticks = Sticks(armed=not reasons)
-            self._catch_up(0.05)
+            self._run_for(0.05)
         self._sticks = Sticks()
         return why
 
-    def _catch_up(self, more: float = 0.0) -> None:
-        """Take the steps that are due, and those of a further real time (s)."""
-        end = time.monotonic() + more
-        while True:
-            if (time.monotonic() if self._lockstep else self._due) >= end:
-                break
+    def _run_for(self, seconds: float) -> None:
+        """Take steps for a real time (s)."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
             self._step()
 
     def _step(self) -> None:
@@ -188,19 +187,19 @@ class Flight:
         self.flown.real_s = time.monotonic() - self._begin
 
     def _receive(self) -> None:
-        found = self._link.outputs(_REPLY if self._lockstep else 0.0)
+        waits = self._lockstep and self._booted
+        found = self._link.outputs(_REPLY if waits else 0.0)
         if found:
             self._outputs, self._heard = found[-1], time.monotonic()
         self.flown.motors += len(found)
-        self.flown.unanswered += self._lockstep and not found
+        self.flown.unanswered += waits and not found
 
     def _pace(self) -> None:
-        if self._lockstep:
-            return
-        self._due += self._simulation.dt
-        now = time.monotonic()
+        """Wait for the clock; the interval between steps that make up for a late one is at least half of a step."""
+        dt, now = self._simulation.dt, time.monotonic()
+        self._due += dt
         if now > self._due + _LATE:
-            self.flown.late += 1
+            self.flown.late += not self._lockstep
             self._due = now
-        while (left := self._due - time.monotonic()) > 0:
-            time.sleep(min(left, 0.0005))
+        time.sleep(max(self._due - now, self._last + dt / 2 - now, 0.0))
+        self._last = time.monotonic()

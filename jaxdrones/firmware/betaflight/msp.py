@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 VARIANT, VERSION = 2, 3
 RC_TUNING, STATUS, SET_RC_TUNING, SET_MODE_RANGE, SET_MIXER = 111, 150, 204, 35, 43
+FAILSAFE, SET_FAILSAFE, EEPROM_WRITE = 75, 76, 250
 _HEAD, _TO, _FROM, _ERROR = b"$M", b"<", b">", b"!"
 _TIMEOUT = 1.0  # s for an answer
 _TRIES = 3
@@ -66,15 +67,15 @@ class Decoder:
 class Client:
     """Connection to a flight controller."""
 
-    def __init__(self, connection: socket.socket, idle: Callable[[], None] = lambda: None):
+    def __init__(self, connection: socket.socket, idle: Callable[[], None] = lambda: time.sleep(0.001)):
         """Use a connection, which the caller closes.
 
         Args:
             connection: connected socket.
-            idle: called while an answer is awaited, at least every 5 ms.
+            idle: called again and again while an answer is awaited; it takes about a millisecond.
         """
         self._socket, self._idle, self._decoder = connection, idle, Decoder()
-        self._socket.settimeout(0.005)
+        self._socket.setblocking(False)
 
     def request(self, command: int, data: bytes = b"") -> bytes:
         """Answer to a request.
@@ -100,7 +101,7 @@ class Client:
     def _received(self) -> bytes:
         try:
             data = self._socket.recv(4096)
-        except TimeoutError:
+        except BlockingIOError:
             return b""
         if not data:
             raise ConnectionResetError(0, "end of the stream")

@@ -13,6 +13,7 @@ _ARM, _ANGLE = 0, 1  # permanent numbers of modes
 _ACTUAL = 3  # kind of rates: center sensitivity and maximum, in 10 degrees/s
 _RATE_LIMIT = 1998  # degrees/s
 _QUAD_X = 3
+_FAILSAFE_DELAY = 200  # 0.1 s
 _SWITCH_ON = (1700, 2100)  # us
 _STATUS = struct.Struct("<HHHIBHBB")
 FLAGS = (
@@ -61,7 +62,9 @@ class Status(NamedTuple):
 
 
 def configure(client: msp.Client, max_rate: int = MAX_RATE, reversed_yaw: bool = False) -> None:
-    """Set AUX1 to arm, AUX2 to level (else acro), linear rates, and the direction of the motors; not saved.
+    """Set AUX1 to arm, AUX2 to level (else acro), linear rates, a long failsafe and the direction of the motors.
+
+    They are saved in `eeprom.bin` in the folder of the process, which activates them.
 
     Args:
         client: connection.
@@ -76,6 +79,9 @@ def configure(client: msp.Client, max_rate: int = MAX_RATE, reversed_yaw: bool =
     rates = rc_tuning(max_rate)
     client.request(msp.SET_RC_TUNING, rates)
     client.request(msp.SET_MIXER, bytes([_QUAD_X, reversed_yaw]))
+    failsafe = client.request(msp.FAILSAFE)  # whose clock jumps if this computer is busy
+    client.request(msp.SET_FAILSAFE, bytes([_FAILSAFE_DELAY]) + failsafe[1:])
+    client.request(msp.EEPROM_WRITE)
     if client.request(msp.RC_TUNING)[: len(rates)] != rates:
         raise msp.NoAnswer("Betaflight did not take the rates; it is another version than 4.6")
 

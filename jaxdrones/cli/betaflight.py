@@ -56,7 +56,9 @@ def add(commands) -> None:
     )
     clock.add_argument("--duration", type=float, metavar="S", help="simulated time after arming, s (until Ctrl-C)")
     clock.add_argument("--physics-hz", type=int, default=1000, metavar="HZ", help="states per second (1000)")
-    clock.add_argument("--lockstep", action="store_true", help="wait for the motors after each state, at most 20 ms")
+    clock.add_argument(
+        "--real-time", action="store_true", help="follow the clock; else each state waits for the motors"
+    )
     clock.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time until it is armed, s (30)")
     add_output(files, "folder of the log (runs/betaflight)", Path("runs") / "betaflight")
     add_json(files)
@@ -88,7 +90,7 @@ def _run(options: argparse.Namespace) -> int:
             link,
             pilot,
             process=process,
-            lockstep=options.lockstep,
+            lockstep=not options.real_time,
             wait=options.wait,
             on_row=lambda t, now, sticks: recorder.add(t, *now[:5], target() if target else None),
             warn=print_warning,
@@ -101,7 +103,7 @@ def _run(options: argparse.Namespace) -> int:
             lost = str(error)
     report: dict[str, Any] = vars(flight.flown) | {"real_time_factor": round(flight.flown.real_time_factor, 3)}
     if len(recorder):
-        about = f"betaflight: {options.vehicle}{', lockstep' if options.lockstep else ''}"
+        about = f"betaflight: {options.vehicle}{', real time' if options.real_time else ''}"
         log = recorder.log(simulation.params, {"vehicle": options.vehicle, "controller": "betaflight"}, about)
         save_npz(log, file)
         settled = log.t > log.t[-1] - (flight.flown.armed_s - _TAKE_OFF)

@@ -1,4 +1,4 @@
-"""Flight of a simulated drone with Betaflight in the loop, in real time or in lockstep."""
+"""Flight of a simulated drone with Betaflight in the loop, in lockstep or in real time."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Flight:
         pilot: Pilot,
         *,
         process: Process | None = None,
-        lockstep: bool = False,
+        lockstep: bool = True,
         wait: float = 30.0,
         on_row: Callable[[float, Sample, Sticks], None] = _nothing,
         warn: Callable[[str], None] = _nothing,
@@ -78,8 +78,8 @@ class Flight:
             link: to Betaflight.
             pilot: of the sticks, 100 times a second of simulated time, once it is armed.
             process: of Betaflight, to be started again if it ends; `None` for one that others started.
-            lockstep: whether each step waits for the motors, for 20 ms at most; a flight is never faster than the
-                clock.
+            lockstep: whether each step waits for the motors, for 20 ms at most; without it a flight needs a computer that
+                is not busy. It is never faster than the clock.
             wait: longest time until Betaflight is armed, at the start and after it was lost, s.
             on_row: called with time (s), sample and sticks 100 times a second.
             warn: function of a line of text for warnings.

@@ -52,13 +52,14 @@ class Decoder:
         self._rest += data
         while (at := self._rest.find(_HEAD)) >= 0:
             head = self._rest[at:]
-            if len(head) < 6 or len(head) < 6 + head[3]:
+            answers = head[2:3] in (_FROM, _ERROR)
+            if len(head) < 3 or (answers and (len(head) < 6 or len(head) < 6 + head[3])):
                 self._rest = head
                 return
-            body, checksum = head[3 : 5 + head[3]], head[5 + head[3]]
-            if head[2:3] not in (_FROM, _ERROR) or _checksum(body) != checksum:
+            if not answers or _checksum(head[3 : 5 + head[3]]) != head[5 + head[3]]:
                 self._rest = head[2:]
                 continue
+            body = head[3 : 5 + head[3]]
             self._rest = head[6 + head[3] :]
             yield Frame(body[1], body[2:], head[2:3] == _ERROR)
         self._rest = self._rest[-1:]  # which may begin a frame

@@ -17,6 +17,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight import BetaflightLost, Flight, Flip, Hover, Link, Process, Simulation, find_program
 from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import AXES, Joystick
+from jaxdrones.firmware.betaflight.link import connect_msp
 from jaxdrones.firmware.betaflight.pilots import Pilot
 from jaxdrones.firmware.recorder import Recorder
 from jaxdrones.flights.files import save_npz
@@ -40,6 +41,7 @@ def add(commands) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("--build", action="store_true", help="download and compile Betaflight, and end")
+    parser.add_argument("--if-missing", action="store_true", help="with --build: not if it is built already")
     add_vehicle(parser, "racer")
     pilots = parser.add_argument_group("pilot")
     clock = parser.add_argument_group("clock")
@@ -68,18 +70,21 @@ def add(commands) -> None:
 def _run(options: argparse.Namespace) -> int:
     say: Callable[[str], None] = (lambda text: None) if options.json else (lambda text: print(text, flush=True))
     if options.build:
-        say(f"built {build(say)}")
+        there = options.if_missing and _is_built()
+        say(f"{find_program()} is there" if there else f"built {build(say)}")
         return 0
+    if options.if_missing:
+        raise UserError("--if-missing is given without --build; give both or none")
     _check(options)
     file = options.output / "log.npz"
     check_writable(file)
     interrupted, lost = False, None
+    running = connect_msp()
+    program = None if running else find_program()
+    if running:
+        running.close()
     with contextlib.ExitStack() as stack:
         link = stack.enter_context(Link())
-        running = link.connect_msp()
-        program = None if running else find_program()
-        if running:
-            running.close()
         simulation = Simulation(options.vehicle, options.physics_hz)
         pilot, target = _pilot(options, simulation, stack)
         say("a running Betaflight is joined" if program is None else f"{program} is started")
@@ -130,6 +135,14 @@ def _check(options: argparse.Namespace) -> None:
         raise UserError("--flip is given beside --joystick; leave it out")
     options.target = _numbers("target", options.target, 3, float)
     options.axes = _numbers("axes", options.axes, 4, int)
+
+
+def _is_built() -> bool:
+    try:
+        find_program()
+    except UserError:
+        return False
+    return True
 
 
 def _numbers(name: str, text: str, count: int, kind: Callable[[str], Any]) -> tuple[Any, ...]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.firmware.betaflight import msp, settings
-from jaxdrones.firmware.betaflight.link import Link
+from jaxdrones.firmware.betaflight.link import Link, connect_msp
 from jaxdrones.firmware.betaflight.packets import Sticks, rc_packet, state_packet
 from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
 from jaxdrones.firmware.betaflight.process import Process
@@ -78,8 +78,8 @@ class Flight:
             link: to Betaflight.
             pilot: of the sticks, 100 times a second of simulated time, once it is armed.
             process: of Betaflight, to be started again if it ends; `None` for one that others started.
-            lockstep: whether each step waits for the motors, for 20 ms at most; without it a flight needs a computer that
-                is not busy. It is never faster than the clock.
+            lockstep: whether each step waits for the motors, for 20 ms at most; without it a flight needs a computer
+                that is not busy. It is never faster than the clock.
             wait: longest time until Betaflight is armed, at the start and after it was lost, s.
             on_row: called with time (s), sample and sticks 100 times a second.
             warn: function of a line of text for warnings.
@@ -126,7 +126,7 @@ class Flight:
             if self._process is not None and self._process.ended:
                 self._warn(f"Betaflight has ended ({self._process.last_words}); it is started again")
                 self._process.restart()
-            connection = self._link.connect_msp()
+            connection = connect_msp()
             if connection is None:
                 self._run_for(0.05)
                 continue

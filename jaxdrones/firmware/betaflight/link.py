@@ -66,15 +66,16 @@ class Link:
                 found.append(outputs)
         return found
 
-    def connect_msp(self) -> socket.socket | None:
-        """Connection of MSP; `None` without a flight controller."""
-        try:
-            return socket.create_connection((HOST, MSP_PORT), timeout=1.0)
-        except OSError:
-            return None
-
     def _send(self, packet: bytes, port: int) -> None:
         try:
             self._sender.sendto(packet, (HOST, port))
         except OSError:  # nobody listens
             pass
+
+
+def connect_msp() -> socket.socket | None:
+    """Connection of MSP; `None` without a flight controller."""
+    try:
+        return socket.create_connection((HOST, MSP_PORT), timeout=1.0)
+    except OSError:
+        return None

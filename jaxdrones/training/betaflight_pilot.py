@@ -36,7 +36,7 @@ class PolicyPilot:
         Raises:
             UserError: an environment with another action type, sensors, cameras or several drones.
         """
-        if env.action.name != ACTION:
+        if env.action.name != ACTION or env.action.entries is None:
             raise UserError(
                 f"the policy acts by {env.action.name!r}, for which Betaflight has no sticks; train one with "
                 f"--set action={ACTION}"
@@ -44,6 +44,7 @@ class PolicyPilot:
         if env.vision is not None or env.sensors or env.drones != 1:
             raise UserError(f"the policy is for {env}; give one of a single drone without cameras and sensors")
         self._env, self._params = env, jax.tree.map(lambda x: x[0], env.params)
+        self._entries = env.action.entries(self._params)
         world = env.reset(jax.random.key(seed))[1]
         self._world = world.replace(params=env.params)
         self._hidden = initial_hidden_state(policy, 1)
@@ -64,8 +65,8 @@ class PolicyPilot:
         self._hidden, self._world, action, target = jax.device_get(self._decide(self._hidden, world))
         self.target = np.asarray(target)
         thrust, *omega = (
-            float(np.interp(a, (-1, 0, 1), entry.values))
-            for a, entry in zip(np.asarray(action), self._env.action.entries(self._params), strict=True)
+            float(np.interp(a, (-1, 0, 1), entry.values or (0, 0, 0)))
+            for a, entry in zip(np.asarray(action), self._entries, strict=True)
         )
         self._sticks = sticks_for(self._params, thrust, omega)
         return self._sticks

@@ -20,6 +20,9 @@ from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
 _LATE = 0.1  # s, lag behind the clock after which the schedule restarts
 _SILENT = 0.5  # s of real time without motors after which Betaflight is lost
 _REPLY = 0.02  # s for the motors of a step in lockstep
+_BOOT = 1.5  # s after its port of MSP opens; packets and settings that come earlier may stop its loop for good
+_FIRST = 5  # packets with the first time: Betaflight's clock takes its pace from two times that differ
+_STUCK = 4.0  # s after which a loop that has not begun is started again
 _UPRIGHT = 0.9  # cosine of the tilt above which Betaflight arms
 _NOT_ARMED = "arm switch"  # reason that follows from the others
 
@@ -90,7 +93,7 @@ class Flight:
         self._outputs = np.zeros(4)
         self._sticks = Sticks()
         self._armed_at: float | None = None
-        self._booted = False  # its clock, which follows the packets, stops if they arrive while it starts
+        self._booted = False  # packets are sent from then on; see _BOOT
         self._per_stick = max(round(PERIOD / simulation.dt), 1)
         self._begin = self._due = self._heard = self._last = time.monotonic()
 
@@ -135,17 +138,27 @@ class Flight:
                     why = self._arm_by(msp.Client(connection, self._step), end)
                 except msp.NoAnswer as error:
                     why = str(error)
-                    self._run_for(0.2)
             if not why:
                 return
+            self._booted = False
+            self._run_for(0.2)
         raise BetaflightLost(f"Betaflight was not armed within {self._wait:g} s: {why}")
 
     def _arm_by(self, client: msp.Client, end: float) -> str:
         """Configure and arm; an empty text, or why not at the time `end`."""
+        self._run_for(_BOOT)
         settings.configure(client, reversed_yaw=self._simulation.reversed_yaw)
+        self._start_clock()
         self._booted, why = True, ""
+        ran = time.monotonic()
         while time.monotonic() < end:
             now = settings.status(client)
+            ran = time.monotonic() if now.cycle else ran
+            if time.monotonic() > ran + _STUCK:
+                if self._process is not None:
+                    self._warn("Betaflight's loop does not run; it is started again")
+                    self._process.restart()
+                return "its loop does not run; start it again"
             reasons = [reason for reason in now.reasons if reason != _NOT_ARMED]
             why = f"it reports {', '.join(reasons) or 'nothing'}"
             x, y = self._simulation.sample.quat[:2]
@@ -159,6 +172,14 @@ class Flight:
             self._run_for(0.05)
         self._sticks = Sticks()
         return why
+
+    def _start_clock(self) -> None:
+        """Send the present state again and again, with one time: the pace of Betaflight's clock begins afterwards."""
+        for _ in range(_FIRST):
+            sample = self._simulation.sample
+            packet = state_packet(self._simulation.time, sample.quat, sample.omega, sample.acc)
+            self._link.send_state(packet)
+            time.sleep(0.001)
 
     def _run_for(self, seconds: float) -> None:
         """Take steps for a real time (s)."""

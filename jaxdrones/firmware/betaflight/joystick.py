@@ -40,7 +40,8 @@ class Joystick:
             raise UserError(
                 f"the joystick {device} cannot be opened: {error.strerror}; see ls /dev/input/js*"
             ) from None
-        self._axes, self._at = tuple(axes), {}
+        self._axes = tuple(axes)
+        self._at: dict[int, float] = {}
         self._rest = b""
 
     def __enter__(self) -> Joystick:

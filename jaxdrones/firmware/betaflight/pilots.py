@@ -92,4 +92,5 @@ class Flip:
 
 def state_of(sample: Sample) -> State:
     """State of one drone."""
-    return State(*map(np.asarray, (sample.pos, sample.quat, sample.vel, sample.omega, sample.rpm)))
+    arrays: Any = (sample.pos, sample.quat, sample.vel, sample.omega, sample.rpm)
+    return State(*arrays)

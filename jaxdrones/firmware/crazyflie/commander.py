@@ -141,7 +141,7 @@ def _decode(kind: int, values: tuple[Any, ...]) -> Target:
         return target(pos, yaw=math.radians(degrees))
     roll, pitch, yaw_rate, thrust, by_rate = values
     angles = np.deg2rad([roll, -pitch, 0])
-    which = {"rates": angles} if by_rate else {"rpy": angles}
+    which: dict[str, Any] = {"rates": angles} if by_rate else {"rpy": angles}
     return target(thrust=thrust, yaw_rate=math.radians(yaw_rate), **which)
 
 
@@ -153,5 +153,5 @@ def decompress(number: int) -> np.ndarray:
             magnitude = (number & 0x1FF) / 0x1FF / math.sqrt(2)
             quat[i] = -magnitude if number >> 9 & 1 else magnitude
             number >>= 10
-    quat[largest] = math.sqrt(max(1 - quat @ quat, 0))
+    quat[largest] = math.sqrt(max(1 - float(quat @ quat), 0.0))
     return quat

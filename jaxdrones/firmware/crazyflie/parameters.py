@@ -136,9 +136,9 @@ class Parameters:
         if data[:1] == bytes([_SET_BY_NAME]):
             group, _, rest = data[1:].partition(b"\0")
             short, _, typed = rest.partition(b"\0")
-            name = f"{group.decode('latin-1')}.{short.decode('latin-1')}"
-            known = name in self._entries and typed[:1] == bytes([self._entries[name].kind.parameter])
-            error = self._write(name, typed[1:]) if known else ENOENT
+            given = f"{group.decode('latin-1')}.{short.decode('latin-1')}"
+            known = given in self._entries and typed[:1] == bytes([self._entries[given].kind.parameter])
+            error = self._write(given, typed[1:]) if known else ENOENT
             return data[: len(data) - len(typed)] + bytes([error])
         if len(data) < 3 or data[0] not in (*_EXTENDED_TYPE, *_DEFAULT, *_PERSISTENT):
             return b""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,10 +35,10 @@ def _variables() -> dict[str, Variable]:
     number = TYPES["float"]
     found: dict[str, Variable] = {}
 
-    def add(names: str, kind: Type, read: Callable[[Readings, int], float]) -> None:
+    def add(names: str, kind: Type, read: Callable[[Readings, int], Any]) -> None:
         group, _, rest = names.partition(".")
         for i, name in enumerate(rest.split()):
-            found[f"{group}.{name}"] = Variable(kind, lambda now, i=i: read(now, i))
+            found[f"{group}.{name}"] = Variable(kind, functools.partial(_read, read, i))
 
     add("stateEstimate.x y z", number, lambda now, i: now.sample.pos[i])
     add("kalman.stateX stateY stateZ", number, lambda now, i: now.sample.pos[i])
@@ -60,9 +61,13 @@ def _variables() -> dict[str, Variable]:
     add("range.zrange", TYPES["uint16_t"], lambda now, i: 1000 * now.sample.pos[2])
     add("radio.rssi", TYPES["uint8_t"], lambda now, i: 0)
     add("supervisor.info", TYPES["uint16_t"], lambda now, i: now.status)
-    for name, bit in (("canfly", 3), ("isFlying", 4), ("isTumbled", 5), ("armed", 1)):
-        add(f"sys.{name}", TYPES["uint8_t"], lambda now, i, bit=bit: now.status >> bit & 1)
+    bits = (3, 4, 5, 1)
+    add("sys.canfly isFlying isTumbled armed", TYPES["uint8_t"], lambda now, i: now.status >> bits[i] & 1)
     return dict(sorted(found.items()))
+
+
+def _read(read: Callable[[Readings, int], Any], i: int, now: Readings) -> float:
+    return read(now, i)
 
 
 def _world_acc(sample: Sample) -> np.ndarray:

@@ -146,7 +146,7 @@ def target(
     by_pos = [pos is not None, pos is not None, pos is not None or height is not None]
     place = np.zeros(3) if pos is None else np.asarray(pos, float)
     angles = np.zeros(3) if rpy is None else np.asarray(rpy, float)
-    setpoint = PerAxis(
+    arrays: dict[str, Any] = dict(
         pos=place if height is None else np.append(place[:2], height),
         vel=np.asarray(vel, float),
         by_pos=np.array(by_pos),
@@ -157,7 +157,7 @@ def target(
         thrust=np.array(0.0 if thrust is None else thrust),
         thrust_given=np.array(thrust is not None),
     )
-    return Target(setpoint, np.array(in_heading), np.array(float(yaw_rate)), np.array(yaw is not None))
+    return Target(PerAxis(**arrays), np.array(in_heading), np.array(float(yaw_rate)), np.array(yaw is not None))
 
 
 def _advance(

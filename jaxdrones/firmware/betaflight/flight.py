@@ -19,7 +19,7 @@ from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
 
 _LATE = 0.1  # s, lag behind the clock after which the schedule restarts
 _SILENT = 0.5  # s of real time without motors after which Betaflight is lost
-_REPLY = 0.02  # s for the motors of a step in lockstep
+_REPLY = 0.01  # s for the motors of a step in lockstep, after which the state is sent again
 _BOOT = 1.5  # s after its port of MSP opens; packets and settings that come earlier may stop its loop for good
 _FIRST = 5  # packets with the first time: Betaflight's clock takes its pace from two times that differ
 _STUCK = 4.0  # s after which a loop that has not begun is started again
@@ -42,8 +42,8 @@ class Flown:
     states: int = 0
     motors: int = 0
     """Packets of the motors."""
-    unanswered: int = 0
-    """Steps in lockstep without motors within 20 ms."""
+    repeated: int = 0
+    """States in lockstep that were sent again, because no motors came within 10 ms."""
     late: int = 0
     """Number of times that the flight fell behind the clock by 0.1 s."""
     lost: int = 0
@@ -81,8 +81,8 @@ class Flight:
             link: to Betaflight.
             pilot: of the sticks, 100 times a second of simulated time, once it is armed.
             process: of Betaflight, to be started again if it ends; `None` for one that others started.
-            lockstep: whether each step waits for the motors, for 20 ms at most; without it a flight needs a computer
-                that is not busy. It is never faster than the clock.
+            lockstep: whether each step waits for the motors, and repeats its state until they come; without it a
+                flight needs a computer that is not busy. It is never faster than the clock.
             wait: longest time until Betaflight is armed, at the start and after it was lost, s.
             on_row: called with time (s), sample and sticks 100 times a second.
             warn: function of a line of text for warnings.
@@ -192,8 +192,11 @@ class Flight:
         simulation = self._simulation
         sample = simulation.advance(self._outputs)
         t = simulation.time
+        packet = state_packet(t, sample.quat, sample.omega, sample.acc)
+        if self._lockstep:
+            self._link.outputs()  # drops late answers to the last state
         if self._booted:
-            self._link.send_state(state_packet(t, sample.quat, sample.omega, sample.acc))
+            self._link.send_state(packet)
             self.flown.states += 1
         if simulation.steps % self._per_stick == 0:
             if self._armed_at is not None:
@@ -201,19 +204,23 @@ class Flight:
             if self._booted:
                 self._link.send_sticks(rc_packet(t, self._sticks))
             self._on_row(t, sample, self._sticks)
-        self._receive()
+        self._receive(packet)
         self._pace()
         self.flown.armed_s += simulation.dt if self._armed_at is not None else 0.0
         self.flown.simulated_s += simulation.dt
         self.flown.real_s = time.monotonic() - self._begin
 
-    def _receive(self) -> None:
+    def _receive(self, packet: bytes) -> None:
+        """Take the motors; in lockstep, send the state again and again until they come or Betaflight is lost."""
         waits = self._lockstep and self._booted
         found = self._link.outputs(_REPLY if waits else 0.0)
+        while waits and not found and time.monotonic() - self._heard < _SILENT:
+            self._link.send_state(packet)
+            self.flown.repeated += 1
+            found = self._link.outputs(_REPLY)
         if found:
             self._outputs, self._heard = found[-1], time.monotonic()
         self.flown.motors += len(found)
-        self.flown.unanswered += waits and not found
 
     def _pace(self) -> None:
         """Wait for the clock; the interval between steps that make up for a late one is at least half of a step."""

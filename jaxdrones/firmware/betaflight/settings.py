@@ -14,6 +14,7 @@ _ACTUAL = 3  # kind of rates: center sensitivity and maximum, in 10 degrees/s
 _RATE_LIMIT = 1998  # degrees/s
 _QUAD_X = 3
 _FAILSAFE_DELAY = 200  # 0.1 s
+_STICKS, _HOLD = 4, 1  # channels that keep their values if the receiver seems lost, for example as the clock jumped
 _SWITCH_ON = (1700, 2100)  # us
 _STATUS = struct.Struct("<HHHIBHBB")
 FLAGS = (
@@ -81,6 +82,8 @@ def configure(client: msp.Client, max_rate: int = MAX_RATE, reversed_yaw: bool =
     client.request(msp.SET_MIXER, bytes([_QUAD_X, reversed_yaw]))
     failsafe = client.request(msp.FAILSAFE)  # whose clock jumps if this computer is busy
     client.request(msp.SET_FAILSAFE, bytes([_FAILSAFE_DELAY]) + failsafe[1:])
+    for channel in range(_STICKS):
+        client.request(msp.SET_RX_FAIL, struct.pack("<BBH", channel, _HOLD, 1500))
     client.request(msp.EEPROM_WRITE)
     if client.request(msp.RC_TUNING)[: len(rates)] != rates:
         raise msp.NoAnswer("Betaflight did not take the rates; it is another version than 4.6")

@@ -20,9 +20,9 @@ from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
 _LATE = 0.1  # s, lag behind the clock after which the schedule restarts
 _SILENT = 0.5  # s of real time without motors after which Betaflight is lost
 _REPLY = 0.01  # s for the motors of a step in lockstep, after which the state is sent again
-_BOOT = 1.5  # s after its port of MSP opens; packets and settings that come earlier may stop its loop for good
+_BOOT = 1.0  # s after its port of MSP opens, until it takes settings
 _FIRST = 5  # packets with the first time: Betaflight's clock takes its pace from two times that differ
-_STUCK = 4.0  # s after which a loop that has not begun is started again
+_STUCK = 1.5  # s after which a loop that does not run is started again; about one start in ten ends so
 _UPRIGHT = 0.9  # cosine of the tilt above which Betaflight arms
 _NOT_ARMED = "arm switch"  # reason that follows from the others
 

@@ -14,7 +14,17 @@ from jaxdrones.cli.options import add_json, add_output, add_vehicle
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
-from jaxdrones.firmware.betaflight import BetaflightLost, Flight, Flip, Hover, Link, Process, Simulation, find_program
+from jaxdrones.firmware.betaflight import (
+    BetaflightLost,
+    Flight,
+    Flip,
+    Hover,
+    Link,
+    Process,
+    Simulation,
+    TakeOff,
+    find_program,
+)
 from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import AXES, Joystick
 from jaxdrones.firmware.betaflight.link import connect_msp
@@ -23,7 +33,7 @@ from jaxdrones.firmware.recorder import Recorder
 from jaxdrones.flights.files import save_npz
 
 _MAX_HZ = 8000
-_TAKE_OFF = 4.0  # s after arming from which the distance to the target counts
+_TAKE_OFF = 4.0  # s after arming from which the distance to the target counts, and a policy flies
 
 
 def add(commands) -> None:
@@ -169,10 +179,17 @@ def _pilot(
         if env.vehicle != options.vehicle:
             raise UserError(f"the policy flies {env.vehicle}, not {options.vehicle}; give --vehicle {env.vehicle}")
         policy = PolicyPilot(env, run.policy(env=env))
-        return _with_flip(options, simulation, policy), lambda: policy.target
-    hover = Hover(simulation.params, options.target)
-    hover(0.0, simulation.sample)  # compiles it
+        x, y, z = map(float, policy.target)
+        pilot = TakeOff(_hover(simulation, (x, y, z)), policy, _TAKE_OFF)  # policies were trained in the air
+        return _with_flip(options, simulation, pilot), lambda: policy.target
+    hover = _hover(simulation, options.target)
     return _with_flip(options, simulation, hover), lambda: np.array(options.target)
+
+
+def _hover(simulation: Simulation, target: tuple[float, float, float]) -> Pilot:
+    hover = Hover(simulation.params, target)
+    hover(0.0, simulation.sample)  # compiles it
+    return hover
 
 
 def _with_flip(options: argparse.Namespace, simulation: Simulation, pilot: Pilot) -> Pilot:

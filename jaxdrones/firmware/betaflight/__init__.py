@@ -3,7 +3,7 @@
 from jaxdrones.firmware.betaflight.flight import BetaflightLost, Flight, Flown
 from jaxdrones.firmware.betaflight.link import Link
 from jaxdrones.firmware.betaflight.packets import Sticks
-from jaxdrones.firmware.betaflight.pilots import Flip, Hover, Pilot, sticks_for
+from jaxdrones.firmware.betaflight.pilots import Flip, Hover, Pilot, TakeOff, sticks_for
 from jaxdrones.firmware.betaflight.process import Process, find_program
 from jaxdrones.firmware.betaflight.simulation import Simulation
 
@@ -18,6 +18,7 @@ __all__ = [
     "Process",
     "Simulation",
     "Sticks",
+    "TakeOff",
     "find_program",
     "sticks_for",
 ]

@@ -62,6 +62,22 @@ class Hover:
         return sticks_for(self.params, float(thrust) * float(self.params.mass), omega)
 
 
+@dataclasses.dataclass(frozen=True)
+class TakeOff:
+    """Take-off by one pilot, after which another one, who cannot take off, holds the sticks."""
+
+    first: Pilot
+    """Pilot until `after`."""
+    then: Pilot
+    """Pilot afterwards; his time begins then."""
+    after: float
+    """Time since arming, s."""
+
+    def __call__(self, t: float, sample: Sample) -> Sticks:
+        """Sticks at a time since arming (s)."""
+        return self.first(t, sample) if t < self.after else self.then(t - self.after, sample)
+
+
 @dataclasses.dataclass
 class Flip:
     """Flip in acro: the drone climbs, rolls once around at full stick, and continues with another pilot."""

@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: fly train rllib sb3 tables test test-slow test-libraries test-rllib test-ros2 lint docs notebooks viewer
+.PHONY: fly train rllib sb3 tables betaflight crazyflie test test-slow test-libraries test-rllib test-ros2 lint docs notebooks viewer
 
 fly: .venv/installed  ## four Crazyflies on the paper's circle
 	$(BIN)/jaxdrones fly circle --drones 4 --output runs/circle
@@ -20,6 +20,13 @@ rllib: .venv-rllib/installed  ## the paper's leader and follower by RLlib, three
 sb3: .venv-libraries/installed  ## the paper's one-dimensional hover by Stable-Baselines3, and a flight of the policy
 	.venv-libraries/bin/python examples/sb3_hover.py --output runs/hover-2021-sb3
 	.venv-libraries/bin/jaxdrones fly --policy runs/hover-2021-sb3
+
+betaflight: .venv/installed  ## build Betaflight (GPL-3.0) in the user's cache, unless it is there, and fly with it; needs gcc and make
+	$(BIN)/jaxdrones betaflight --build --if-missing
+	$(BIN)/pytest tests/firmware -k betaflight
+
+crazyflie: .venv/installed .venv-crazyflie/installed  ## install cflib (GPL-2.0) in an environment of its own, and fly the simulated Crazyflie by it
+	$(BIN)/pytest tests/firmware -k "cflib or crazyflie"
 
 tables: .venv/installed  ## the measured tables of the pages, again; on idle cores
 	$(BIN)/python -m benchmarks.tables
@@ -77,4 +84,10 @@ viewer:  ## the page of the viewer, from its sources; needs Node.js, which nothi
 	$(PYTHON) -m venv .venv-ros2
 	.venv-ros2/bin/pip install --quiet -c constraints.txt -e ".[cli,ros2]" beartype pytest scipy
 	.venv-ros2/bin/pip install --quiet $(addprefix ros-,rclpy==9.1.2 rmw-fastrtps-cpp==9.3.3 std-msgs sensor-msgs geometry-msgs nav-msgs std-srvs rosgraph-msgs)
+	touch $@
+
+# cflib pins an older packaging.
+.venv-crazyflie/installed:
+	$(PYTHON) -m venv .venv-crazyflie
+	.venv-crazyflie/bin/pip install --quiet cflib==0.1.34
 	touch $@

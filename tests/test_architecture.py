@@ -36,7 +36,7 @@ LAYERS = (  # from the bottom; the groups of a layer are peers, and none imports
     (("engine",), ("tasks",)),
     (("optimal",),),
     (("envs",), ("flights",)),
-    (("adapters",), ("learning",), ("ros2",), ("visualization",)),
+    (("adapters",), ("firmware",), ("learning",), ("ros2",), ("visualization",)),
     (("training",), ("export",)),
     (("cli",),),
     (("",),),  # the package itself, which re-exports

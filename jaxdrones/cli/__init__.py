@@ -5,8 +5,10 @@ import sys
 
 from jaxdrones.cli import (
     bench,
+    betaflight,
     compare,
     completion,
+    crazyflie,
     doctor,
     evaluate,
     explain,
@@ -51,7 +53,23 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--debug", action="store_true", help=text)
     parser.add_argument("--version", action="version", version=f"jaxdrones {machine.version('jaxdrones')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
-    for command in (fly, train, evaluate, compare, view, fit, score, ros2, export, explain, names, doctor, bench):
+    for command in (
+        fly,
+        train,
+        evaluate,
+        compare,
+        view,
+        fit,
+        score,
+        ros2,
+        crazyflie,
+        betaflight,
+        export,
+        explain,
+        names,
+        doctor,
+        bench,
+    ):
         command.add(commands)
     completion.add(commands, parser)
     for each in commands.choices.values():  # --debug may stand before the command or after it

@@ -61,7 +61,30 @@ class Rates(PyTreeNode):
     """() thrust of each motor, 16 bit; at 0 the motors stop and the integrators are reset."""
 
 
-AnySetpoint = Setpoint | Velocity | Attitude | Rates
+class PerAxis(PyTreeNode):
+    """Set-point with a mode for each axis, as in the firmware's commander: the mode is a number, not a type."""
+
+    pos: Array
+    """(3,) m, world."""
+    vel: Array
+    """(3,) m/s, world."""
+    by_pos: Array
+    """(3,) whether an axis follows `pos`, not `vel`; x and y are equal."""
+    rpy: Array
+    """(3,) roll, pitch, yaw about fixed axes, rad, right-handed; the yaw is always followed."""
+    omega: Array
+    """(3,) body rates, rad/s, right-handed; roll and pitch are used."""
+    tilt_given: Array
+    """() whether roll and pitch follow `rpy` or `omega`, not x and y."""
+    rates_given: Array
+    """() whether they follow `omega`, not `rpy`."""
+    thrust: Array
+    """() thrust of each motor, 16 bit; at 0 the motors stop and the integrators are reset."""
+    thrust_given: Array
+    """() whether `thrust` is used, and z is not followed."""
+
+
+AnySetpoint = Setpoint | Velocity | Attitude | Rates | PerAxis
 
 
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
@@ -144,7 +167,7 @@ def control(
         params: parameters of the drone.
         memory: memory after the last call.
         state: estimated state of the drone.
-        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude` or `Rates`.
+        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude`, `Rates` or `PerAxis`.
         dt: time between calls, s; 0.002 on the vehicle.
 
     Raises:
@@ -170,7 +193,7 @@ def pwm(
         gains: gains of the four loops.
         memory: memory after the last call.
         state: estimated state of the drone.
-        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude` or `Rates`.
+        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude`, `Rates` or `PerAxis`.
         battery: voltage for the battery compensation, V, filtered over 0.1 s; None disables the compensation, so that a
             duty cycle equals the command.
         dt: time between calls, s.
@@ -189,6 +212,8 @@ def _fly(
     """Memory, desired attitude (degrees), thrust and torque (16 bit)."""
     check_single(None, state, setpoint if isinstance(setpoint, Setpoint) else None)
     memory = _first_measured(gains, memory, state, dt)
+    if isinstance(setpoint, PerAxis):
+        return _fly_per_axis(gains, memory, state, setpoint, dt)
     if isinstance(setpoint, Setpoint | Velocity):
         memory = _slow_loops(gains, memory, state, setpoint, dt)
         attitude, thrust = jnp.append(memory.tilt, jnp.rad2deg(setpoint.yaw)), memory.thrust
@@ -196,16 +221,44 @@ def _fly(
         memory = memory.replace(age=jnp.minimum(memory.age, _SLOW))  # the slow loops run at once afterwards
         attitude, thrust = rpy(state.quat), jnp.clip(setpoint.thrust, 0, motors.FULL)
     else:
-        raise UserError(f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude or Rates")
+        raise UserError(
+            f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude, Rates or PerAxis"
+        )
     if isinstance(setpoint, Attitude):
         attitude = degrees(setpoint.rpy)
     if isinstance(setpoint, Rates):
         memory, target = memory.replace(rpy=attitude), degrees(setpoint.omega)
     else:
         memory, target = attitude_loop(gains, memory, state, attitude, dt)
+    return _with_torque(gains, memory, state, attitude, thrust, target, dt)
+
+
+def _with_torque(
+    gains: Gains, memory: Memory, state: State, attitude: Array, thrust: Array, target: Array, dt: float
+) -> tuple[Memory, Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
+    """Memory, desired attitude, thrust and the torque towards target rates; none while the motors are off."""
     memory, torque = rate_loop(gains, memory, state, target, dt)
     memory = jax.tree.map(lambda kept, empty: jnp.where(thrust > 0, kept, empty), memory, reset(memory))
     return memory, attitude, thrust, jnp.where(thrust > 0, torque, 0)
+
+
+def _fly_per_axis(
+    gains: Gains, memory: Memory, state: State, setpoint: PerAxis, dt: float
+) -> tuple[Memory, Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
+    """As `_fly`, with the modes of a `PerAxis`; the integrators of loops that are not used stay at zero."""
+    unused = jnp.stack([setpoint.tilt_given, setpoint.tilt_given, setpoint.thrust_given])
+    memory = _slow_loops(gains, memory, state, setpoint, dt)
+    memory = memory.replace(
+        pos_integral=jnp.where(unused | ~setpoint.by_pos, 0, memory.pos_integral),
+        vel_integral=jnp.where(unused, 0, memory.vel_integral),
+    )
+    given = degrees(setpoint.rpy)
+    attitude = jnp.append(jnp.where(setpoint.tilt_given, given[:2], memory.tilt), given[2])
+    thrust = jnp.where(setpoint.thrust_given, jnp.clip(setpoint.thrust, 0, motors.FULL), memory.thrust)
+    memory, target = attitude_loop(gains, memory, state, attitude, dt)
+    by_rates = jnp.append(jnp.repeat(setpoint.tilt_given & setpoint.rates_given, 2), False)
+    target = jnp.where(by_rates, degrees(setpoint.omega), target)
+    return _with_torque(gains, memory, state, attitude, thrust, target, dt)
 
 
 def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Memory:
@@ -216,13 +269,17 @@ def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Me
     return memory.replace(**{name: jnp.where(first, value, getattr(memory, name)) for name, value in start.items()})
 
 
-def _slow_loops(gains: Gains, memory: Memory, state: State, setpoint: Setpoint | Velocity, dt: float) -> Memory:
+def _slow_loops(
+    gains: Gains, memory: Memory, state: State, setpoint: Setpoint | Velocity | PerAxis, dt: float
+) -> Memory:
     """Memory with new tilt and thrust where the loops of position and velocity are due."""
     period = jnp.maximum(_SLOW, dt)
-    if isinstance(setpoint, Setpoint):
+    ran, vel = memory, jnp.zeros(3)
+    if isinstance(setpoint, Setpoint | PerAxis):
         ran, vel = position_loop(gains, memory, state, setpoint.pos, period)
-    else:
-        ran, vel = memory, in_heading_frame(state.quat, setpoint.vel)
+    if isinstance(setpoint, Velocity | PerAxis):
+        given = in_heading_frame(state.quat, setpoint.vel)
+        vel = jnp.where(setpoint.by_pos, vel, given) if isinstance(setpoint, PerAxis) else given
     ran, tilt, thrust = velocity_loop(gains, ran, state, vel, period)
     age = jnp.where(jnp.isinf(memory.age), 0, memory.age - period)
     ran = ran.replace(tilt=tilt, thrust=thrust, age=age)

@@ -165,6 +165,56 @@ def test_velocities_attitudes_and_rates_are_flown():
     np.testing.assert_allclose(after(firmware_pid.Rates(omega, jnp.array(36000.0)), 500).omega, omega, atol=0.05)
 
 
+def per_axis(by_pos=(True, True, True), tilt=False, rates=False, direct=False, **given):
+    flags = dict(by_pos=by_pos, tilt_given=tilt, rates_given=rates, thrust_given=direct)
+    zero = dict(pos=[0.0, 0, 0], vel=[0.0, 0, 0], rpy=[0.0, 0, 0], omega=[0.0, 0, 0], thrust=0.0)
+    return firmware_pid.PerAxis(**{name: jnp.array(x) for name, x in (zero | flags | given).items()})
+
+
+MODES = {
+    "positions": (setpoint([0.4, -0.3, 1.2], 0.5), per_axis(pos=[0.4, -0.3, 1.2], rpy=[9.0, 9, 0.5])),
+    "velocities": (
+        firmware_pid.Velocity(jnp.array([0.4, -0.3, 0.2]), jnp.array(0.5)),
+        per_axis((False,) * 3, vel=[0.4, -0.3, 0.2], rpy=[9.0, 9, 0.5]),
+    ),
+    "attitudes": (
+        firmware_pid.Attitude(jnp.array([0.2, -0.1, 0.5]), jnp.array(4e4)),
+        per_axis(tilt=True, direct=True, rpy=[0.2, -0.1, 0.5], thrust=4e4),
+    ),
+    "no thrust": (firmware_pid.Attitude(jnp.zeros(3), jnp.zeros(())), per_axis(tilt=True, direct=True)),
+}
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_modes_for_each_axis_give_what_the_set_points_of_all_axes_give(name):
+    gains, tilted = firmware_pid.gains(), LEVEL.replace(quat=rotation.from_rpy(jnp.array([0.1, -0.2, 0.3])))
+    same = [firmware_pid.init()] * 2
+    for omega in jnp.array([[0.0, 0, 0], [0.3, -0.2, 0.1]]).repeat(4, axis=0):
+        steps = [
+            firmware_pid.pwm(gains, m, tilted.replace(omega=omega), s) for m, s in zip(same, MODES[name], strict=True)
+        ]
+        same = [memory for memory, _ in steps]
+        np.testing.assert_allclose(steps[0][1].pwm, steps[1][1].pwm)
+
+
+def test_a_mode_of_one_axis_leaves_the_others_alone():
+    gains = firmware_pid.gains()
+
+    def command(**given):
+        return firmware_pid.pwm(gains, firmware_pid.init(), LEVEL, per_axis(**given))[1]
+
+    mixed = command(by_pos=(False, False, True), pos=[5.0, 5, 1.2], vel=[0.4, -0.3, 5])  # as hover set-points are
+    along, up = command(by_pos=(False,) * 3, vel=[0.4, -0.3, 0]), command(pos=[0.0, 0, 1.2])
+    np.testing.assert_allclose(mixed.attitude, along.attitude)
+    np.testing.assert_allclose(mixed.thrust, up.thrust)
+    tilted = command(tilt=True, rpy=[0.2, -0.1, 0], pos=[5.0, 5, 1.2])  # as those of attitude and height are
+    np.testing.assert_allclose(tilted.attitude, np.rad2deg([0.2, 0.1, 0]), atol=1e-6)
+    np.testing.assert_allclose(tilted.thrust, up.thrust)
+    spun = command(tilt=True, rates=True, direct=True, omega=[1.0, 2, 9], thrust=4e4)
+    rates = firmware_pid.Rates(jnp.array([1.0, 2, 0]), jnp.array(4e4))
+    np.testing.assert_allclose(spun.torque, firmware_pid.pwm(gains, firmware_pid.init(), LEVEL, rates)[1].torque)
+
+
 def test_without_thrust_the_motors_stand_still():
     memory = firmware_pid.init()
     target = firmware_pid.Rates(jnp.array([1.0, 2, 3]), jnp.array(0.0))
@@ -189,7 +239,9 @@ def test_gradients_of_duty_cycles_agree_with_differences():
 
 
 def test_other_set_points_and_propellers_are_refused():
-    with pytest.raises(ValueError, match="setpoint is a ndarray; give a Setpoint, Velocity, Attitude or Rates"):
+    with pytest.raises(
+        ValueError, match="setpoint is a ndarray; give a Setpoint, Velocity, Attitude, Rates or PerAxis"
+    ):
         firmware_pid.pwm(firmware_pid.gains(), firmware_pid.init(), LEVEL, np.zeros(3))
     with pytest.raises(ValueError, match=r"unknown propellers '2.2'.*known: 2.1, 2.1\+"):
         firmware_pid.gains(propellers="2.2")

@@ -1,0 +1,196 @@
+"""`jaxdrones betaflight`."""
+
+import argparse
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.arguments import number, whole
+from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, folder, print_error, print_warning
+from jaxdrones.cli.options import add_json, add_output, add_vehicle
+from jaxdrones.cli.policies import open_policy
+from jaxdrones.cli.report import as_json
+from jaxdrones.errors import UserError
+from jaxdrones.firmware.betaflight import (
+    BetaflightLost,
+    Flight,
+    Flip,
+    Hover,
+    Link,
+    Process,
+    Simulation,
+    TakeOff,
+    find_program,
+)
+from jaxdrones.firmware.betaflight.build import build
+from jaxdrones.firmware.betaflight.joystick import AXES, Joystick
+from jaxdrones.firmware.betaflight.link import connect_msp
+from jaxdrones.firmware.betaflight.pilots import Pilot
+from jaxdrones.firmware.recorder import Recorder
+from jaxdrones.flights.files import save_npz
+
+_MAX_HZ = 8000
+_TAKE_OFF = 4.0  # s after arming from which the distance to the target counts, and a policy flies
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "betaflight",
+        help="fly with Betaflight itself in the loop",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Simulate a drone whose motors Betaflight commands. Its own program (SITL) runs beside it\n"
+        "and exchanges packets with it on 127.0.0.1. It is started, or joined if it runs already (its port 5761\n"
+        "of MSP answers), configured and armed by MSP, and flown in acro by the sticks of a pilot: the outer loop\n"
+        "of the controller `rates`, a policy, or a joystick. Ctrl-C ends the flight and writes its log.\n\n"
+        "`jaxdrones betaflight --build` downloads the source (GPL-3.0; package `betaflight`) and compiles it once,\n"
+        "with gcc and make, into ~/.cache/jaxdrones/betaflight; BETAFLIGHT_SITL is the path of another program.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--build", action="store_true", help="download and compile Betaflight, and end")
+    parser.add_argument("--if-missing", action="store_true", help="with --build: not if it is built already")
+    add_vehicle(parser, "racer")
+    pilots = parser.add_argument_group("pilot")
+    clock = parser.add_argument_group("clock")
+    files = parser.add_argument_group("files and output")
+    pilots.add_argument("--target", default="0,0,1.5", metavar="X,Y,Z", help="position to fly to, m (0,0,1.5)")
+    pilots.add_argument("--flip", type=float, metavar="S", help="roll once around this long after arming, s")
+    pilots.add_argument("--policy", type=folder, metavar="RUN", help="fly a policy, with action=thrust_and_rates")
+    pilots.add_argument("--joystick", type=Path, metavar="DEVICE", help="fly by hand, such as /dev/input/js0")
+    pilots.add_argument(
+        "--axes",
+        default=",".join(map(str, AXES)),
+        metavar="R,P,T,Y",
+        help="axes of roll, pitch, throttle, yaw (0,1,2,3); -1 is axis 0 reversed, -2 is axis 1 reversed, ...",
+    )
+    clock.add_argument("--duration", type=float, metavar="S", help="simulated time after arming, s (until Ctrl-C)")
+    clock.add_argument("--physics-hz", type=int, default=1000, metavar="HZ", help="states per second (1000)")
+    clock.add_argument(
+        "--real-time", action="store_true", help="follow the clock; else each state waits for the motors"
+    )
+    clock.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time until it is armed, s (30)")
+    add_output(files, "folder of the log (runs/betaflight)", Path("runs") / "betaflight")
+    add_json(files)
+    parser.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    say: Callable[[str], None] = (lambda text: None) if options.json else (lambda text: print(text, flush=True))
+    if options.build:
+        there = options.if_missing and _is_built()
+        say(f"{find_program()} is there" if there else f"built {build(say)}")
+        return 0
+    if options.if_missing:
+        raise UserError("--if-missing is given without --build; give both or none")
+    _check(options)
+    file = options.output / "log.npz"
+    check_writable(file)
+    interrupted, lost = False, None
+    running = connect_msp()
+    program = None if running else find_program()
+    if running:
+        running.close()
+    with contextlib.ExitStack() as stack:
+        link = stack.enter_context(Link())
+        simulation = Simulation(options.vehicle, options.physics_hz)
+        pilot, target = _pilot(options, simulation, stack)
+        say("a running Betaflight is joined" if program is None else f"{program} is started")
+        process = None if program is None else stack.enter_context(Process(program))
+        recorder = Recorder()
+        flight = Flight(
+            simulation,
+            link,
+            pilot,
+            process=process,
+            lockstep=not options.real_time,
+            wait=options.wait,
+            on_row=lambda t, now, sticks: recorder.add(t, *now[:5], target() if target else None),
+            warn=print_warning,
+        )
+        try:
+            flight.run(options.duration)
+        except KeyboardInterrupt:
+            interrupted = True
+        except BetaflightLost as error:
+            lost = str(error)
+    report: dict[str, Any] = vars(flight.flown) | {"real_time_factor": round(flight.flown.real_time_factor, 3)}
+    if len(recorder):
+        about = f"betaflight: {options.vehicle}{', real time' if options.real_time else ''}"
+        log = recorder.log(simulation.params, {"vehicle": options.vehicle, "controller": "betaflight"}, about)
+        save_npz(log, file)
+        settled = log.t > log.t[-1] - (flight.flown.armed_s - _TAKE_OFF)
+        if log.has("target_pos") and settled.any() and options.flip is None:
+            report |= {
+                "mean_error_m": float(log.error[settled].mean()),
+                "peak_error_m": float(log.error[settled].max()),
+            }
+        say(f"wrote {file}")
+    report = {name: round(x, 4) if isinstance(x, float) else x for name, x in report.items()}
+    print(as_json(report) if options.json else ", ".join(f"{n.replace('_', ' ')} {x:g}" for n, x in report.items()))
+    if lost:
+        return print_error(lost, 1)
+    return print_error("interrupted", INTERRUPTED) if interrupted else 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    hertz = whole("rate of the physics (Hz)", limit=_MAX_HZ)
+    times = dict(duration=number("s", above=0), wait=number("s", above=0), flip=number("s", at_least=0))
+    check_options(options, physics_hz=hertz, **times)
+    if options.policy is not None and options.joystick is not None:
+        raise UserError("--policy and --joystick are given; one of them can hold the sticks")
+    if options.joystick is not None and options.flip is not None:
+        raise UserError("--flip is given beside --joystick; leave it out")
+    options.target = _numbers("target", options.target, 3, float)
+    options.axes = _numbers("axes", options.axes, 4, int)
+
+
+def _is_built() -> bool:
+    try:
+        find_program()
+    except UserError:
+        return False
+    return True
+
+
+def _numbers(name: str, text: str, count: int, kind: Callable[[str], Any]) -> tuple[Any, ...]:
+    try:
+        found = tuple(map(kind, text.split(",")))
+    except ValueError:
+        found = ()
+    if len(found) != count or not np.isfinite(found).all():
+        raise UserError(f"--{name} is {text!r}; give {count} numbers with commas between them")
+    return found
+
+
+def _pilot(
+    options: argparse.Namespace, simulation: Simulation, stack: contextlib.ExitStack
+) -> tuple[Pilot, Callable[[], np.ndarray] | None]:
+    """Pilot, and the function that returns its target position; `None` for a joystick."""
+    if options.joystick is not None:
+        return stack.enter_context(Joystick(options.joystick, options.axes)), None
+    if options.policy is not None:
+        from jaxdrones.training.betaflight_pilot import PolicyPilot
+
+        run = open_policy(options.policy, None, False, {})
+        env = stack.enter_context(run.recipe().env(drones=1))
+        if env.vehicle != options.vehicle:
+            raise UserError(f"the policy flies {env.vehicle}, not {options.vehicle}; give --vehicle {env.vehicle}")
+        policy = PolicyPilot(env, run.policy(env=env))
+        x, y, z = map(float, policy.target)
+        pilot = TakeOff(_hover(simulation, (x, y, z)), policy, _TAKE_OFF)  # policies were trained in the air
+        return _with_flip(options, simulation, pilot), lambda: policy.target
+    hover = _hover(simulation, options.target)
+    return _with_flip(options, simulation, hover), lambda: np.array(options.target)
+
+
+def _hover(simulation: Simulation, target: tuple[float, float, float]) -> Pilot:
+    hover = Hover(simulation.params, target)
+    hover(0.0, simulation.sample)  # compiles it
+    return hover
+
+
+def _with_flip(options: argparse.Namespace, simulation: Simulation, pilot: Pilot) -> Pilot:
+    return pilot if options.flip is None else Flip(simulation.params, pilot, options.flip)

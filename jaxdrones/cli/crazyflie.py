@@ -1,0 +1,70 @@
+"""`jaxdrones crazyflie`."""
+
+import argparse
+from pathlib import Path
+
+from jaxdrones.arguments import number, whole
+from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, print_error
+from jaxdrones.cli.options import add_json, add_output, add_vehicle
+from jaxdrones.cli.report import as_json
+from jaxdrones.firmware.crazyflie import Crazyflie, Server, Vehicle
+from jaxdrones.firmware.crazyflie.server import PORT
+from jaxdrones.firmware.recorder import Recorder
+from jaxdrones.flights.files import save_npz
+
+_MAX_PORT = 65535
+_EXAMPLE = "export CFLIB_URI=udp://127.0.0.1:19850"
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "crazyflie",
+        help="simulate a Crazyflie to which cflib connects",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Simulate a Crazyflie in real time, flown by the PID of its firmware. Scripts of cflib\n"
+        "connect to udp://127.0.0.1:PORT; those that use `uri_from_env` run unchanged after\n"
+        f"{_EXAMPLE}\n\n"
+        "There are parameters, log blocks, set-points of all kinds, the high-level commander with uploaded\n"
+        "trajectories, arming and emergency stops. Ctrl-C ends the flight and writes its log.",
+        allow_abbrev=False,
+    )
+    add_vehicle(parser, "cf2x")
+    parser.add_argument("--port", type=int, default=PORT, metavar="PORT", help=f"UDP port, on 127.0.0.1 ({PORT})")
+    parser.add_argument("--duration", type=float, metavar="S", help="simulated time, s (until Ctrl-C)")
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="real-time factor (1); scripts keep their own clock"
+    )
+    add_output(parser, "folder of the log (runs/crazyflie)", Path("runs") / "crazyflie")
+    add_json(parser)
+    parser.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    check_options(options, port=whole("port", limit=_MAX_PORT), duration=number("s", above=0), speed=number(above=0))
+    file = options.output / "log.npz"
+    check_writable(file)
+    recorder, interrupted = Recorder(), False
+    vehicle = Vehicle(options.vehicle)
+    with Server(Crazyflie(vehicle), options.port) as server:
+        if not options.json:
+            print(f"a Crazyflie ({options.vehicle}) is at udp://127.0.0.1:{server.port}; Ctrl-C ends it", flush=True)
+        try:
+            server.run(
+                options.duration,
+                options.speed,
+                lambda t, now, target: recorder.add(t, now.pos, now.quat, now.vel, now.omega, now.rpm),
+            )
+        except KeyboardInterrupt:
+            interrupted = True
+    report = vars(server.flown) | {"real_time_factor": round(server.flown.real_time_factor, 3), "files": []}
+    if len(recorder):
+        conditions = {"vehicle": options.vehicle, "controller": "firmware_pid"}
+        save_npz(recorder.log(vehicle.params, conditions, f"crazyflie: {options.vehicle}, flown by cflib"), file)
+        report["files"] = [str(file)]
+    if options.json:
+        print(as_json(report))
+    else:
+        print(", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in report.items() if name != "files"))
+        print("wrote " + ", ".join(report["files"]) if report["files"] else "nothing was flown")
+    return print_error("interrupted", INTERRUPTED) if interrupted else 0

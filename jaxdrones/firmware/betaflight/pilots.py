@@ -1,0 +1,112 @@
+"""Pilots: from the state of the drone to the sticks."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxdrones.control import Setpoint, rates
+from jaxdrones.firmware.betaflight.packets import Sticks
+from jaxdrones.firmware.betaflight.settings import MAX_RATE
+from jaxdrones.firmware.betaflight.simulation import Sample
+from jaxdrones.params import Params
+from jaxdrones.state import State
+
+Pilot = Callable[[float, Sample], Sticks]
+"""(time since arming in s, sample) -> sticks, 100 times a second."""
+PERIOD = 0.01
+"""Time between positions of the sticks, s."""
+_IDLE = 0.055  # output of a motor at no throttle; Betaflight's default
+_MIN_CHECK = 0.05  # stick up to which the throttle is zero
+
+
+def sticks_for(params: Params, thrust: float, omega: ArrayLike, max_rate: float = MAX_RATE) -> Sticks:
+    """Sticks for a collective thrust and body rates.
+
+    Args:
+        params: of the drone.
+        thrust: total thrust of the rotors, N.
+        omega: (3,) rad/s, body, x forward, y left, z up.
+        max_rate: rate at the end of a stick, degrees/s.
+    """
+    output = math.sqrt(max(thrust, 0.0) / (4 * float(params.kf))) / float(params.max_rpm)
+    share = min(max((output - _IDLE) / (1 - _IDLE), 0.0), 1.0)
+    roll, pitch, yaw = np.rad2deg(np.asarray(omega, float)) / max_rate
+    return Sticks(float(roll), float(pitch), _MIN_CHECK + (1 - _MIN_CHECK) * share, float(-yaw))
+
+
+@jax.jit
+def _command(params: Params, state: State, setpoint: Setpoint) -> Any:
+    return rates.command(rates.gains(), params, state, setpoint)
+
+
+@dataclasses.dataclass(frozen=True)
+class Hover:
+    """Outer loop of the controller `rates`: it flies to a position and stays there; Betaflight controls the rates."""
+
+    params: Params
+    """Parameters of the drone."""
+    target: tuple[float, float, float] = (0.0, 0.0, 1.5)
+    """m, world."""
+
+    def __call__(self, t: float, sample: Sample) -> Sticks:
+        """Sticks at a time since arming (s)."""
+        setpoint = Setpoint.at(np.array(self.target))
+        thrust, omega = jax.device_get(_command(self.params, state_of(sample), setpoint))
+        return sticks_for(self.params, float(thrust) * float(self.params.mass), omega)
+
+
+@dataclasses.dataclass(frozen=True)
+class TakeOff:
+    """Take-off by one pilot, after which another one, who cannot take off, holds the sticks."""
+
+    first: Pilot
+    """Pilot until `after`."""
+    then: Pilot
+    """Pilot afterwards; his time begins then."""
+    after: float
+    """Time since arming, s."""
+
+    def __call__(self, t: float, sample: Sample) -> Sticks:
+        """Sticks at a time since arming (s)."""
+        return self.first(t, sample) if t < self.after else self.then(t - self.after, sample)
+
+
+@dataclasses.dataclass
+class Flip:
+    """Flip in acro: the drone climbs, rolls once around at full stick, and continues with another pilot."""
+
+    params: Params
+    """Parameters of the drone."""
+    then: Pilot
+    """Pilot before and after."""
+    at: float
+    """Time since arming, s."""
+    _angle: float = 0.0
+    _last: float | None = None
+
+    _CLIMB = 0.35  # s
+    _SHARE = 0.75  # share of the turn at full stick
+
+    def __call__(self, t: float, sample: Sample) -> Sticks:
+        """Sticks at a time since arming (s)."""
+        weight = float(self.params.weight)
+        if t < self.at or self._angle >= self._SHARE * 2 * math.pi:
+            return self.then(t, sample)
+        if t < self.at + self._CLIMB:
+            return sticks_for(self.params, 2 * weight, np.zeros(3))
+        self._angle += 0.0 if self._last is None else (t - self._last) * float(sample.omega[0])
+        self._last = t
+        return sticks_for(self.params, 0.3 * weight, np.zeros(3))._replace(roll=1.0)
+
+
+def state_of(sample: Sample) -> State:
+    """State of one drone."""
+    arrays: Any = (sample.pos, sample.quat, sample.vel, sample.omega, sample.rpm)
+    return State(*arrays)

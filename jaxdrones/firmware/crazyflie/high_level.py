@@ -1,0 +1,178 @@
+"""High-level commander: take-off, landing, positions and trajectories, flown by set-points of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxdrones.firmware.crazyflie.packet import ENOENT, ENOEXEC
+from jaxdrones.firmware.crazyflie.planner import Goal, Trajectory, go_to, unpack
+from jaxdrones.firmware.crazyflie.vehicle import Target, motors_off, target
+
+MEMORY_BYTES = 4096
+"""Size of the memory of trajectories."""
+_ALL_GROUPS = 0
+_IN_MEMORY, _POLYNOMIALS = 1, 0
+_LEAST_DURATION = 0.01  # s
+
+_FORMATS = {  # command -> name and format of its data
+    0: ("set_group_mask", "B"),
+    1: ("takeoff_legacy", "Bff"),
+    2: ("land_legacy", "Bff"),
+    3: ("stop", "B"),
+    4: ("go_to", "B?fffff"),
+    5: ("start_trajectory_legacy", "B??Bf"),
+    6: ("define_trajectory", "BBBIB"),
+    7: ("takeoff", "Bff?f"),
+    8: ("land", "Bff?f"),
+    9: ("takeoff_with_velocity", "Bf?f?f"),
+    10: ("land_with_velocity", "Bf?f?f"),
+    12: ("go_to_2", "B??fffff"),
+    13: ("start_trajectory", "B???Bf"),
+}
+
+
+@dataclasses.dataclass
+class HighLevel:
+    """Planner of trajectories."""
+
+    memory: bytearray = dataclasses.field(default_factory=lambda: bytearray(MEMORY_BYTES))
+    """Memory of trajectories."""
+    trajectory: Trajectory | None = None
+    """Trajectory in flight or finished, whose last point is held; `None` with motors off."""
+    _landing: bool = False
+    _group: int = 0
+    _defined: dict[int, tuple[int, int]] = dataclasses.field(default_factory=dict)
+
+    def command(self, data: bytes, t: float, now: Goal) -> bytes:
+        """Execute a command at time t (s); the answer has its error number.
+
+        Args:
+            data: payload of the packet.
+            t: time, s.
+            now: state of the vehicle, at rest.
+        """
+        name, form = _FORMATS.get(data[0] if data else -1, ("", ""))
+        if not name or len(data) != 1 + struct.calcsize("<" + form):
+            return data[:3].ljust(3, b"\0") + bytes([ENOEXEC])
+        values: tuple[Any, ...] = struct.unpack("<" + form, data[1:])
+        group = name != "define_trajectory" and name != "set_group_mask"
+        error = 0
+        if not all(math.isfinite(x) for x in values):
+            error = ENOEXEC
+        elif not group or values[0] == _ALL_GROUPS or values[0] & self._group:
+            start = now if self.trajectory is None else self.trajectory.at(t)
+            execute: Callable[..., int] = getattr(self, f"_{name}")
+            error = execute(t, start, *(values[1:] if group else values))
+        return data[:3].ljust(3, b"\0") + bytes([error])
+
+    def off(self) -> None:
+        """Drop the trajectory."""
+        self.trajectory, self._landing = None, False
+
+    def target(self, t: float) -> Target:
+        """Set-point at time t (s); motors are off without a trajectory and after a landing."""
+        if self.trajectory is not None and self._landing and self.trajectory.finished(t):
+            self.off()
+        if self.trajectory is None:
+            return motors_off()
+        goal = self.trajectory.at(t)
+        return target(goal.pos, goal.vel, yaw=goal.yaw)
+
+    def finished(self, t: float) -> bool:
+        """Whether no trajectory is in flight at time t (s)."""
+        return self.trajectory is None or self.trajectory.finished(t)
+
+    def _set_group_mask(self, t: float, start: Goal, mask: int) -> int:
+        self._group = mask
+        return 0
+
+    def _fly(self, t: float, start: Goal, pos: Any, yaw: float, duration: float, linear: bool = False) -> int:
+        self._landing = False
+        self.trajectory = go_to(start, np.asarray(pos), yaw, max(duration, _LEAST_DURATION), t, linear)
+        return 0
+
+    def _takeoff(self, t: float, start: Goal, height: float, yaw: float, keep_yaw: bool, duration: float) -> int:
+        return self._fly(t, start, np.append(start.pos[:2], height), start.yaw if keep_yaw else yaw, duration)
+
+    def _land(self, *arguments: Any) -> int:
+        self._takeoff(*arguments)
+        self._landing = True
+        return 0
+
+    def _takeoff_legacy(self, t: float, start: Goal, height: float, duration: float) -> int:
+        return self._takeoff(t, start, height, 0.0, False, duration)
+
+    def _land_legacy(self, t: float, start: Goal, height: float, duration: float) -> int:
+        return self._land(t, start, height, 0.0, False, duration)
+
+    def _takeoff_with_velocity(
+        self, t: float, start: Goal, height: float, relative: bool, yaw: float, keep_yaw: bool, velocity: float
+    ) -> int:
+        height = start.pos[2] + height if relative else height
+        return self._takeoff(t, start, height, yaw, keep_yaw, _duration(height - start.pos[2], velocity))
+
+    def _land_with_velocity(
+        self, t: float, start: Goal, height: float, relative: bool, yaw: float, keep_yaw: bool, velocity: float
+    ) -> int:
+        height = start.pos[2] - height if relative else height
+        return self._land(t, start, height, yaw, keep_yaw, _duration(height - start.pos[2], velocity))
+
+    def _stop(self, t: float, start: Goal) -> int:
+        self.off()
+        return 0
+
+    def _go_to(
+        self, t: float, start: Goal, relative: bool, x: float, y: float, z: float, yaw: float, duration: float
+    ) -> int:
+        return self._go_to_2(t, start, relative, False, x, y, z, yaw, duration)
+
+    def _go_to_2(
+        self,
+        t: float,
+        start: Goal,
+        relative: bool,
+        linear: bool,
+        x: float,
+        y: float,
+        z: float,
+        yaw: float,
+        duration: float,
+    ) -> int:
+        pos = np.array([x, y, z]) + (start.pos if relative else 0)
+        return self._fly(t, start, pos, yaw + (start.yaw if relative else 0), duration, linear)
+
+    def _define_trajectory(self, t: float, start: Goal, number: int, place: int, kind: int, offset: int, n: int) -> int:
+        if place != _IN_MEMORY or kind != _POLYNOMIALS:
+            return ENOEXEC
+        self._defined[number] = offset, n
+        return 0
+
+    def _start_trajectory_legacy(
+        self, t: float, start: Goal, relative: bool, backwards: bool, number: int, scale: float
+    ) -> int:
+        return self._start_trajectory(t, start, relative, False, backwards, number, scale)
+
+    def _start_trajectory(
+        self, t: float, start: Goal, relative: bool, relative_yaw: bool, backwards: bool, number: int, scale: float
+    ) -> int:
+        if number not in self._defined or scale <= 0:
+            return ENOENT
+        pieces = unpack(bytes(self.memory), *self._defined[number])
+        if pieces is None:
+            return ENOENT
+        plain = Trajectory(pieces, t, scale, backwards)
+        turn = start.yaw - plain.at(t).yaw if relative_yaw else 0.0
+        turned = dataclasses.replace(plain, turn=turn)
+        shift = start.pos - turned.at(t).pos if relative else np.zeros(3)
+        self.trajectory, self._landing = dataclasses.replace(turned, shift=shift), False
+        return 0
+
+
+def _duration(way: float, velocity: float) -> float:
+    return abs(way) / velocity if velocity > 0 else _LEAST_DURATION

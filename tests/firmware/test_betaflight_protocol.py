@@ -1,0 +1,153 @@
+"""Packets and MSP: bytes as Betaflight's C structures have them, and signs as its axes have them."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from jaxdrones import load_params
+from jaxdrones.errors import UserError
+from jaxdrones.firmware.betaflight import Simulation, Sticks, msp, settings, sticks_for
+from jaxdrones.firmware.betaflight.packets import motor_order, motor_outputs, rc_packet, state_packet
+
+LEVEL = np.array([0.0, 0, 0, 1])
+
+
+def state(**given):
+    start = dict(t=1.5, quat=LEVEL, omega=np.zeros(3), specific_force=np.zeros(3))
+    return struct.unpack("<18d", state_packet(**(start | given)))
+
+
+def test_a_state_packet_is_18_doubles_with_the_time_first_and_the_pressure_last():
+    packet = state()
+    assert packet[0] == 1.5 and packet[17] == 101325.0 and packet[11:17] == (0.0,) * 6
+
+
+def test_rates_are_those_about_forward_right_and_down():
+    assert state(omega=np.array([1.0, 2, 3]))[1:4] == (1.0, -2.0, -3.0)
+
+
+def test_the_specific_force_is_sent_with_the_opposite_sign():
+    assert state(specific_force=np.array([1.0, 2, 9.8]))[4:7] == (-1.0, -2.0, -9.8)
+
+
+def test_the_scalar_of_a_quaternion_comes_first():
+    assert state(quat=np.array([0.1, 0.2, 0.3, 0.9]))[7:11] == (0.9, 0.1, 0.2, 0.3)
+
+
+def channels(**sticks):
+    packet = struct.unpack("<d16H", rc_packet(2.0, Sticks(**sticks)))
+    assert packet[0] == 2.0
+    return packet[1:]
+
+
+def test_sticks_are_in_the_order_roll_pitch_throttle_yaw_and_switches():
+    assert channels() == (1500, 1500, 1000, 1500, *[1000] * 12)
+    assert channels(roll=0.2, pitch=-0.4, throttle=0.3, yaw=1.0)[:4] == (1600, 1300, 1300, 2000)
+    assert channels(armed=True)[4:6] == (2000, 1000) and channels(angle=True)[4:6] == (1000, 2000)
+
+
+def test_sticks_end_at_their_ends_and_numbers_that_are_none_are_the_center():
+    assert channels(roll=9.0, pitch=-9.0, throttle=2.0, yaw=float("nan"))[:4] == (2000, 1000, 2000, 1500)
+    assert channels(throttle=float("nan"))[2] == 1000
+
+
+def motors(*pulses, count=4):
+    return struct.pack("<H2x16f", count, *pulses, *[0.0] * (16 - len(pulses)))
+
+
+def test_motor_outputs_are_the_share_of_the_pulse_above_1_ms():
+    np.testing.assert_allclose(motor_outputs(motors(1000, 1250, 2000, 1055)), [0, 0.25, 1, 0.055], atol=1e-7)
+    np.testing.assert_array_equal(motor_outputs(motors(0, 900, 2500, 1500)), [0, 0, 1, 0.5])
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [b"", b"\0", motors(1500)[:-1], motors(1500) + b"\0", motors(1, 2, 3, 4, count=3), motors(float("nan"), 1, 1, 1)],
+    ids=["empty", "short", "a byte less", "a byte more", "three motors", "nan"],
+)
+def test_other_datagrams_are_no_motors(datagram):
+    assert motor_outputs(datagram) is None
+
+
+def test_motors_are_numbered_from_the_rear_right_one_on():
+    places = {"rear right": (-1, -1), "front right": (1, -1), "rear left": (-1, 1), "front left": (1, 1)}
+    for shuffled in ([0, 1, 2, 3], [3, 1, 0, 2]):
+        pos = np.array([[*list(places.values())[i], 0.0] for i in shuffled])
+        np.testing.assert_array_equal(motor_order(pos), shuffled)
+
+
+def test_a_plus_and_rotors_that_turn_alike_are_refused(monkeypatch):
+    with pytest.raises(UserError, match="cf2p has rotors on its axes; Betaflight's mixer is for an X"):
+        Simulation("cf2p")
+    racer = load_params("racer")
+    monkeypatch.setattr(
+        "jaxdrones.firmware.betaflight.simulation.load_params", lambda name: racer.replace(rotor_spin=np.ones(4))
+    )
+    with pytest.raises(UserError, match="neighbors must turn oppositely"):
+        Simulation("racer")
+
+
+def test_sticks_for_rates_push_the_way_the_drone_turns():
+    racer = load_params("racer")
+    hover = sticks_for(racer, float(racer.weight), np.zeros(3))
+    assert (hover.roll, hover.pitch, abs(hover.yaw)) == (0, 0, 0) and 0.05 < hover.throttle < 1
+    right_down, nose_down, to_the_left = (sticks_for(racer, 1.0, np.deg2rad(350) * axis) for axis in np.eye(3))
+    np.testing.assert_allclose([right_down.roll, nose_down.pitch, to_the_left.yaw], [0.5, 0.5, -0.5])
+
+
+def test_the_throttle_gives_the_thrust_that_is_asked_for():
+    """By Betaflight's formulas: a dead band of 50 us, then motors from idle, 5.5 %, to full speed."""
+    racer = load_params("racer")
+    for share in (0.1, 0.5, 1.0):
+        thrust = share * float(racer.max_thrust)
+        throttle = (1000 * sticks_for(racer, thrust, np.zeros(3)).throttle - 50) / 950
+        rpm = (0.055 + 0.945 * throttle) * float(racer.max_rpm)
+        np.testing.assert_allclose(4 * float(racer.kf) * rpm**2, thrust, rtol=1e-6)
+    assert sticks_for(racer, 1e9, np.zeros(3)).throttle == 1.0
+    assert sticks_for(racer, -1.0, np.zeros(3)).throttle == 0.05
+
+
+def test_a_request_of_msp_has_the_bytes_of_its_specification():
+    assert msp.encode(204, b"\x01\x02") == b"$M<\x02\xcc\x01\x02" + bytes([0x02 ^ 0xCC ^ 0x01 ^ 0x02])
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 1000])
+def test_answers_are_found_in_any_pieces_and_between_other_bytes(size):
+    rng = np.random.default_rng(size)
+    frames = [msp.Frame(int(rng.integers(256)), rng.bytes(int(rng.integers(255)))) for _ in range(20)]
+    noise = [b"", b"$", b"$M", b"#\r\n", b"$M>\x05\x01ab", b"$$M"]
+    stream = b"".join(noise[i % 4] + msp.encode(f.command, f.data, b">") for i, f in enumerate(frames))
+    decoder, found = msp.Decoder(), []
+    for at in range(0, len(stream), size):
+        found += decoder.feed(stream[at : at + size])
+    assert found == frames
+
+
+def test_a_wrong_checksum_is_no_answer_and_a_refusal_is_one_that_says_so():
+    good = msp.encode(101, b"abc", b">")
+    decoder = msp.Decoder()
+    assert list(decoder.feed(good[:-1] + bytes([good[-1] ^ 1]))) == []
+    assert list(decoder.feed(good)) == [msp.Frame(101, b"abc")]
+    assert list(decoder.feed(msp.encode(101, b"", b"!"))) == [msp.Frame(101, b"", failed=True)]
+
+
+STATUS = struct.pack("<HHHIBHBB", 125, 0, 35, 1, 0, 12, 4, 0)
+
+
+def test_the_status_tells_whether_it_is_armed_and_why_not():
+    now = settings.parse_status(STATUS + b"\x00" + struct.pack("<BI", 29, 1 << 7 | 1 << 12) + b"\0" * 4)
+    assert now == settings.Status(True, 125, ("throttle", "calibrating"))
+    more = settings.parse_status(STATUS + b"\x02ab" + struct.pack("<BI", 29, 1 << 28))
+    assert more.reasons == ("arm switch",)
+
+
+@pytest.mark.parametrize("data", [b"", STATUS, STATUS + b"\x0f", STATUS + b"\0\x1d\0\0"])
+def test_a_status_of_another_version_is_a_lack_of_an_answer(data):
+    with pytest.raises(msp.NoAnswer, match="another version"):
+        settings.parse_status(data)
+
+
+def test_switches_act_above_1700_us():
+    slot, mode, channel, first, last = settings.mode_range(1, 1, 1)
+    assert (slot, mode, channel, 900 + 25 * first, 900 + 25 * last) == (1, 1, 1, 1700, 2100)

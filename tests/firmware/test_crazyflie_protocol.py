@@ -1,0 +1,306 @@
+"""Ports of the simulated Crazyflie, packet by packet; test_cflib.py has the real client."""
+
+import math
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxdrones.control import firmware_pid
+from jaxdrones.firmware.crazyflie.commander import LEVEL_AFTER, OFF_AFTER, Commander, decompress
+from jaxdrones.firmware.crazyflie.high_level import HighLevel
+from jaxdrones.firmware.crazyflie.log import TOC, Log
+from jaxdrones.firmware.crazyflie.packet import E2BIG, EEXIST, ENOENT, MAX_DATA, Packet, decode, encode
+from jaxdrones.firmware.crazyflie.parameters import GAINS, Parameters
+from jaxdrones.firmware.crazyflie.planner import Goal, go_to
+from jaxdrones.firmware.crazyflie.supervisor import Supervisor
+from jaxdrones.firmware.crazyflie.toc import TYPES, Toc
+from jaxdrones.firmware.crazyflie.variables import VARIABLES, Readings
+from jaxdrones.firmware.crazyflie.vehicle import Sample, motors_off
+
+SAMPLE = Sample(
+    pos=np.array([1.0, 2, 3]),
+    quat=np.array([0.0, 0, 0, 1]),
+    vel=np.array([4.0, 5, 6]),
+    omega=np.deg2rad([7.0, 8, 9]),
+    rpm=np.ones(4),
+    acc=np.array([0.0, 0, 9.8]),
+    rpy=np.array([10.0, 11, 12]),
+    motors=np.array([1e4, 2e4, 3e4, 4e4]),
+)
+
+
+def test_a_packet_is_what_it_was_after_the_wire():
+    for port in range(16):
+        for channel in range(4):
+            packet = Packet(port, channel, bytes(range(MAX_DATA)))
+            assert decode(encode(packet)) == packet
+    assert encode(Packet(5, 2, b"")) == b"\x5e"  # the port in the upper four bits, the channel in the lowest two
+
+
+@pytest.mark.parametrize("datagram", [b"", b"\x5c" + bytes(MAX_DATA + 1), bytes(2000)])
+def test_other_datagrams_are_no_packets(datagram):
+    assert decode(datagram) is None
+
+
+def test_every_name_fits_into_a_packet():
+    toc = Parameters(firmware_pid.gains()).toc
+    for table in (toc, TOC):
+        for i in range(len(table.names)):
+            assert len(table.answer(struct.pack("<BH", 2, i))) <= MAX_DATA
+
+
+def test_a_table_is_described_by_its_size_and_its_checksum():
+    answers = [Toc({"a.b": 1, "a.c": kind}).answer(b"\3") for kind in (1, 1, 2)]
+    assert struct.unpack("<BHI", answers[0])[:2] == (3, 2)
+    assert answers[0] == answers[1] != answers[2]
+    assert Toc({"a.b": 7}).answer(struct.pack("<BH", 2, 0)) == b"\2\0\0\7a\0b\0"
+    assert Toc({"a.b": 7}).answer(struct.pack("<BH", 2, 1)) == bytes([2, ENOENT])
+
+
+def test_numbers_are_limited_to_their_type():
+    assert TYPES["uint8_t"].pack(300.7) == b"\xff" and TYPES["int8_t"].pack(-300) == b"\x80"
+    assert TYPES["uint16_t"].pack(0x1234) == b"\x34\x12"
+    assert TYPES["int16_t"].pack(math.nan) == b"\0\0" and TYPES["uint32_t"].pack(math.inf) == b"\xff" * 4
+    assert TYPES["FP16"].unpack(TYPES["FP16"].pack(1e9)) == 65504.0
+
+
+def parameter(parameters, name):
+    return struct.pack("<H", parameters.toc.names.index(name))
+
+
+def test_a_gain_that_is_set_acts_and_no_other():
+    changed = []
+    gains = firmware_pid.gains()
+    parameters = Parameters(gains, changed.append)
+    for name, (field, i) in GAINS.items():
+        number = parameter(parameters, name)
+        assert struct.unpack("<f", parameters.answer(1, number)[3:])[0] == pytest.approx(
+            float(getattr(gains, field)[i])
+        )
+        assert parameters.answer(2, number + struct.pack("<f", 7.5)) == number + struct.pack("<f", 7.5)
+        assert getattr(changed[-1], field)[i] == 7.5
+    assert all(np.all(np.asarray(getattr(changed[-1], field)[i]) == 7.5) for field, i in GAINS.values())
+    first = Parameters(gains, changed.append)
+    first.answer(2, parameter(first, "pid_rate.pitch_kp") + struct.pack("<f", 1.0))
+    np.testing.assert_array_equal(changed[-1].rate_p, [gains.rate_p[0], 1.0, gains.rate_p[2]])
+    np.testing.assert_array_equal(changed[-1].pos_p, gains.pos_p)
+
+
+def test_wrong_writes_change_nothing():
+    parameters = Parameters(firmware_pid.gains())
+    before = dict(parameters.values)
+    gain, deck = parameter(parameters, "pid_rate.roll_kp"), parameter(parameters, "deck.bcFlow2")
+    for data in (gain + b"\0", gain + struct.pack("<f", math.nan), deck + b"\0", b"\xff\xff\0", b"\1", b""):
+        parameters.answer(2, data)
+    assert parameters.values == before
+    assert parameters.answer(1, b"\xff\xff") == b"\xff\xff" + bytes([ENOENT])
+
+
+def test_a_parameter_is_set_by_its_name_and_its_default_is_told():
+    parameters = Parameters(firmware_pid.gains())
+    name = b"pid_rate\0roll_kp\0"
+    assert parameters.answer(3, b"\0" + name + b"\6" + struct.pack("<f", 3.0)) == b"\0" + name + b"\0"
+    assert parameters["pid_rate.roll_kp"] == 3.0
+    number = parameter(parameters, "pid_rate.roll_kp")
+    assert parameters.answer(3, b"\x08" + number) == b"\x08" + number + b"\0" + struct.pack("<f", 250.0)
+    assert parameters.answer(3, b"\7" + number) == b"\7" + number + bytes([ENOENT])  # no extended type
+
+
+def variable(name, kind):
+    return struct.pack("<BH", TYPES[kind].log, TOC.names.index(name))
+
+
+def test_a_block_is_sent_at_its_period_with_its_variables_in_order():
+    log, now = Log(), Readings(SAMPLE, motors_off(), 1 << 4)
+    made = variable("stateEstimate.y", "float") + variable("motor.m3", "uint32_t")
+    assert log.answer(1, b"\6\5" + made) == b"\6\5\0"
+    assert log.answer(1, b"\7\5" + variable("sys.isFlying", "uint8_t")) == b"\7\5\0"
+    assert [*log.rows(2, now)] == []
+    assert log.answer(1, b"\3\5\2") == b"\3\5\0"  # every 20 ms
+    packets = {row: [p for p in log.rows(row, now)] for row in range(1, 7)}
+    assert [row for row, sent in packets.items() if sent] == [2, 4, 6]
+    assert packets[4][0] == Packet(5, 2, b"\5" + b"\x28\0\0" + struct.pack("<fIB", 2.0, 30000, 1))
+    assert log.answer(1, b"\4\5") == b"\4\5\0" and [*log.rows(8, now)] == []
+
+
+def test_mistakes_with_blocks_have_error_numbers():
+    log = Log()
+    one = variable("stateEstimate.x", "float")
+    assert log.answer(1, b"\6\1" + one)[2] == 0
+    assert log.answer(1, b"\6\1" + one)[2] == EEXIST
+    assert log.answer(1, b"\6\2" + 7 * one)[2] == E2BIG
+    assert log.answer(1, b"\3\2\1")[2] == ENOENT and log.answer(1, b"\6\3\7\xff\xff")[2] == ENOENT
+    assert log.answer(1, b"\5") == b"\5\0\0" and log.answer(1, b"\3\1\1")[2] == ENOENT  # all blocks are gone
+    assert log.answer(1, b"") == b""
+
+
+def test_logged_angles_and_rates_are_degrees_and_accelerations_multiples_of_gravity():
+    now = Readings(SAMPLE, motors_off(), 0)
+    read = {name: variable.read(now) for name, variable in VARIABLES.items()}
+    assert [read[f"gyro.{axis}"] for axis in "xyz"] == pytest.approx([7, 8, 9])
+    assert [read[f"stabilizer.{axis}"] for axis in ("roll", "pitch", "yaw")] == [10, 11, 12]
+    assert (read["acc.z"], read["stateEstimate.az"]) == pytest.approx((1, 0))
+    assert [read[f"stateEstimate.v{axis}"] for axis in "xyz"] == [4, 5, 6]
+
+
+def make_commander():
+    return Commander(Parameters(firmware_pid.gains()), HighLevel())
+
+
+def generic(kind, *values, form="ffff"):
+    commander = make_commander()
+    commander.generic(0, struct.pack("<B" + form, kind, *values), 0.0)
+    return commander.target(0.0)
+
+
+def test_hover_set_points_go_along_the_heading_and_hold_the_height():
+    found = generic(10, 0.1, 0.2, 90.0, 0.5)
+    assert found.in_heading and not found.yaw_given and found.yaw_rate == pytest.approx(math.pi / 2)  # to the left
+    np.testing.assert_allclose(found.setpoint.vel, [0.1, 0.2, 0])
+    assert found.setpoint.by_pos.tolist() == [False, False, True] and found.setpoint.pos[2] == 0.5
+    assert generic(5, 0.1, 0.2, 90.0, 0.5).yaw_rate == pytest.approx(-math.pi / 2)  # legacy: clockwise
+
+
+def test_velocities_and_positions_are_in_the_world():
+    vel = generic(8, 0.1, 0.2, 0.3, -90.0)
+    assert not vel.in_heading and vel.yaw_rate == pytest.approx(-math.pi / 2) and not vel.setpoint.by_pos.any()
+    np.testing.assert_allclose(vel.setpoint.vel, [0.1, 0.2, 0.3])
+    pos = generic(7, 1.0, 2.0, 3.0, 90.0)
+    assert pos.yaw_given and pos.setpoint.rpy[2] == pytest.approx(math.pi / 2) and pos.setpoint.by_pos.all()
+    np.testing.assert_allclose(pos.setpoint.pos, [1, 2, 3])
+
+
+def test_a_pitch_on_the_wire_is_positive_nose_up():
+    for found in (
+        generic(9, 10.0, 20.0, 0.0, 0.5),
+        generic(4, 10.0, 20.0, 0.0, 0.5),
+        generic(11, 10.0, 20.0, 0.0, 30000, 0, form="fffHB"),
+    ):
+        np.testing.assert_allclose(np.rad2deg(found.setpoint.rpy[:2]), [10, -20])
+        assert found.setpoint.tilt_given
+    rates = generic(11, 10.0, 20.0, 30.0, 30000, 1, form="fffHB").setpoint
+    np.testing.assert_allclose(np.rad2deg(rates.omega[:2]), [10, -20])
+    assert rates.rates_given and rates.thrust == 30000
+
+
+def compress(quat):
+    """Bits of a quaternion, from the description in the firmware."""
+    largest = int(np.argmax(np.abs(quat)))
+    quat = quat * np.sign(quat[largest])
+    bits = largest
+    for i in range(4):
+        if i != largest:
+            bits = bits << 10 | int(quat[i] < 0) << 9 | round(511 * abs(quat[i]) * math.sqrt(2))
+    return bits
+
+
+def test_a_full_state_has_a_position_in_mm_and_its_heading_in_a_compressed_attitude():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        quat = rng.normal(size=4)
+        quat /= np.linalg.norm(quat)
+        assert abs(decompress(compress(quat)) @ quat) > 1 - 1e-5
+    quat = np.array([0, 0, math.sin(0.4), math.cos(0.4)])
+    found = generic(6, 1000, -2000, 500, *[0] * 6, compress(quat), 0, 0, 0, form="hhhhhhhhhIhhh")
+    np.testing.assert_allclose(found.setpoint.pos, [1, -2, 0.5])
+    assert found.setpoint.rpy[2] == pytest.approx(0.8, abs=2e-3)
+
+
+def rpyt(commander, roll=0.0, pitch=0.0, yaw=0.0, thrust=0, t=0.0):
+    commander.rpyt(struct.pack("<fffH", roll, pitch, yaw, thrust), t)
+    return commander.target(t)
+
+
+def test_thrust_is_locked_until_it_was_zero_and_its_yaw_rate_is_clockwise():
+    commander = make_commander()
+    assert rpyt(commander, thrust=30000).setpoint.thrust == 0
+    rpyt(commander)
+    found = rpyt(commander, roll=10, pitch=20, yaw=90, thrust=65000)
+    assert found.setpoint.thrust == 60000 and found.yaw_rate == pytest.approx(-math.pi / 2)
+    np.testing.assert_allclose(np.rad2deg(found.setpoint.rpy[:2]), [10, -20])
+
+
+def test_without_set_points_the_vehicle_levels_and_then_stops():
+    commander = make_commander()
+    commander.generic(0, struct.pack("<Bffff", 10, 0.5, 0.0, 90.0, 0.4), 0.0)
+    assert commander.target(LEVEL_AFTER - 0.01).setpoint.vel[0] == 0.5
+    level = commander.target(LEVEL_AFTER + 0.01)
+    assert level.setpoint.tilt_given and not level.setpoint.rpy[:2].any() and level.yaw_rate == 0
+    assert level.setpoint.by_pos[2] and level.setpoint.pos[2] == pytest.approx(0.4)
+    off = commander.target(OFF_AFTER + 0.01)
+    assert off.setpoint.thrust_given and off.setpoint.thrust == 0
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x0a", b"\x0a" + bytes(15), b"\xc8" + bytes(16), b"\x08" + struct.pack("<4f", *[math.nan] * 4)]
+)
+def test_invalid_set_points_are_ignored(data):
+    commander = make_commander()
+    commander.generic(0, data, 0.0)
+    commander.rpyt(data, 0.0)
+    assert commander.target(0.0).setpoint.thrust_given
+
+
+def plan(commander, kind, form, *values, t=0.0):
+    return commander.plan(struct.pack("<BB" + form, kind, 0, *values), t, SAMPLE._replace(pos=np.zeros(3)))
+
+
+def test_a_stream_ends_a_plan_and_a_plan_waits_for_the_end_of_a_stream():
+    commander = make_commander()
+    plan(commander, 7, "ff?f", 1.0, 0.0, False, 2.0)
+    assert commander.target(3.0).setpoint.pos[2] == pytest.approx(1.0)
+    commander.generic(0, struct.pack("<Bffff", 7, 0, 0, 0.3, 0), 3.0)
+    assert commander.high_level.trajectory is None and commander.target(3.0).setpoint.pos[2] == pytest.approx(0.3)
+    plan(commander, 7, "ff?f", 1.0, 0.0, False, 2.0, t=3.1)  # while the stream is valid
+    assert commander.target(3.1).setpoint.pos[2] == pytest.approx(0.3)
+    commander.generic(1, struct.pack("<BI", 0, 0), 3.2)
+    plan(commander, 7, "ff?f", 1.0, 0.0, False, 2.0, t=3.3)
+    assert commander.target(5.4).setpoint.pos[2] == pytest.approx(1.0)
+
+
+def test_after_a_landing_the_motors_stop():
+    commander = make_commander()
+    plan(commander, 7, "ff?f", 1.0, 0.0, False, 2.0)
+    plan(commander, 8, "ff?f", 0.0, 0.0, False, 2.0, t=3.0)
+    assert not commander.target(4.9).setpoint.thrust_given
+    assert commander.target(5.1).setpoint.thrust_given
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\7", b"\7" + bytes(30), b"\x0b" + bytes(24), b"\7\0" + struct.pack("<ff?f", *[math.nan] * 2, 0, 1)]
+)
+def test_invalid_plans_are_answered_with_an_error(data):
+    commander = make_commander()
+    assert commander.plan(data, 0.0, SAMPLE)[3] and commander.high_level.trajectory is None
+
+
+def test_a_trajectory_begins_and_ends_as_it_should_and_turns_the_shorter_way():
+    start = Goal(np.array([1.0, 0, 0]), np.array([0.3, 0, 0]), np.array([0, 0.2, 0]), 3.0, 0.1)
+    way = go_to(start, np.array([2.0, 3, 4]), -3.0, 2.5, begin=10.0)
+    for name in ("pos", "vel", "acc", "yaw", "yaw_rate"):
+        np.testing.assert_allclose(getattr(way.at(10.0), name), getattr(start, name), atol=1e-9)
+    end = way.at(12.5)
+    np.testing.assert_allclose(end.pos, [2, 3, 4])
+    assert not end.vel.any() and not end.acc.any() and end.yaw == pytest.approx(2 * math.pi - 3)
+    t, h = 11.2, 1e-4
+    np.testing.assert_allclose((way.at(t + h).pos - way.at(t - h).pos) / (2 * h), way.at(t).vel, rtol=1e-6)
+    np.testing.assert_allclose((way.at(t + h).vel - way.at(t - h).vel) / (2 * h), way.at(t).acc, rtol=1e-6)
+
+
+def test_the_vehicle_tumbles_locks_and_recovers():
+    upside_down = SimpleNamespace(quat=np.array([1.0, 0, 0, 0]), motors=np.zeros(4))
+    supervisor = Supervisor()
+    for k in range(150):
+        supervisor.watch(upside_down, 0.01 * k, 0.01)
+    assert supervisor.tumbled and not supervisor.can_fly
+    assert supervisor.answer(1, b"\2", 2.0, 0)[0] == 0x82 and supervisor.can_fly and supervisor.recovery_asked
+    assert supervisor.answer(1, b"\1\0", 2.0, 0) == bytes([0x81, 1, 0]) and not supervisor.can_fly
+    supervisor.answer(1, b"\1\1", 2.0, 0)
+    supervisor.answer(1, b"\4", 2.0, 0)
+    level = SimpleNamespace(quat=np.array([0.0, 0, 0, 1]), motors=np.zeros(4))
+    supervisor.watch(level, 2.9, 0.01)
+    assert supervisor.can_fly
+    supervisor.watch(level, 3.1, 0.01)  # the watchdog was not repeated
+    assert supervisor.locked and not supervisor.can_fly

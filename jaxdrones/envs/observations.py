@@ -261,5 +261,6 @@ OBSERVATIONS: dict[str, ObservationTerm] = {
     "last_actions_2x": last_actions(15),
     "neighbors": neighbors(2),
     "encounters": encounters(8),
+    "opponents": encounters(3),
     "preview": preview(0.1, 0.2, 0.3),
 }

@@ -1,0 +1,96 @@
+"""Centerline of a race track: a smooth curve from the start through the gates, and coordinates along and beside it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.tasks.racetrack import direction
+
+_POINTS = 12  # of a segment between two gates
+_SECTION = 3  # segments that a drone can be near: to the gate before the next one, to the next one, to the one after
+_WIDTH = 0.12  # m, standard deviation of the weights of the points near a place
+
+_U = np.arange(_POINTS) / _POINTS
+_HERMITE = np.stack(  # of the ends and of the derivatives there
+    [2 * _U**3 - 3 * _U**2 + 1, 3 * _U**2 - 2 * _U**3, _U**3 - 2 * _U**2 + _U, _U**3 - _U**2], axis=-1
+)
+
+
+class Centerline(PyTreeNode):
+    """Points of p segments: segment i ends at the i-th gate after the start; laps repeat."""
+
+    pos: Float[Array, "p k 3"]
+    """Positions, m."""
+    along: Float[Array, "p k"]
+    """Distance from the start along the curve, m."""
+    speed: Float[Array, "p k"]
+    """Speed of a point mass with limited acceleration that starts at rest, m/s."""
+
+    def near(self, index: Int[Array, ""]) -> Centerline:
+        """Section (p k, ...) near a drone before gate `index`; constant in derivatives."""
+        segments = jnp.maximum(index - 1, 0) + jnp.arange(_SECTION)
+        return jax.tree.map(
+            lambda x: jax.lax.stop_gradient(x[segments]).reshape(_SECTION * _POINTS, *x.shape[2:]), self
+        )
+
+
+def centerline(gates: Float[Array, "g 4"], start: Float[Array, "4"], count: int, acc: Float[Array, ""]) -> Centerline:
+    """Centerline from the start through gates.
+
+    A segment is a cubic curve in the crossing directions of both gates; between gates on a circle nearly an arc.
+
+    Args:
+        gates: x, y, z (m) and heading (rad) of the gates of one lap.
+        start: x, y, z and heading at the start.
+        count: number of segments.
+        acc: largest acceleration along the curve and across it, m/s^2.
+    """
+    end = gates[np.arange(count) % len(gates)]
+    begin = jnp.concatenate([start[None], end[:-1]])
+    ways = jnp.stack([direction(begin), direction(end)], axis=1)
+    cos_half = jnp.sqrt(jnp.maximum(1 + jnp.sum(ways[:, 0] * ways[:, 1], axis=-1), 0) / 2)
+    length = 2 / (1 + cos_half) * jnp.linalg.norm(end[:, :3] - begin[:, :3], axis=-1)
+    knots = jnp.concatenate([begin[:, None, :3], end[:, None, :3], length[:, None, None] * ways], axis=1)
+    pos = jnp.asarray(_HERMITE, gates.dtype)[None] @ knots
+    line = pos.reshape(-1, 3)
+    steps = jnp.linalg.norm(line[1:] - line[:-1], axis=-1)
+    along = jnp.concatenate([jnp.zeros(1, line.dtype), jnp.cumsum(steps)])
+    return Centerline(pos, along.reshape(count, _POINTS), _speeds(line, steps, acc).reshape(count, _POINTS))
+
+
+def foot(section: Centerline, pos: Float[Array, "3"]) -> Float[Array, " p"]:
+    """Weights of the points of a section whose mean is the point nearest to a position (m), smooth in the position."""
+    return jax.nn.softmax(-jnp.sum((section.pos - pos) ** 2, axis=-1) / (2 * _WIDTH**2))
+
+
+def at(section: Centerline, along: Float[Array, ""]) -> Float[Array, " p"]:
+    """Weights of the points of a section whose mean is the point at a coordinate along the curve, m."""
+    return jax.nn.softmax(-((section.along - along) ** 2) / (2 * _WIDTH**2))
+
+
+def tangent(section: Centerline, weights: Float[Array, " p"]) -> Float[Array, "3"]:
+    """Unit tangent at the mean of weighted points of a section."""
+    ahead = section.pos[1:] - section.pos[:-1]
+    mean = weights[:-1] @ ahead + weights[-1] * ahead[-1]
+    return mean / jnp.sqrt(jnp.sum(mean**2) + 1e-12)
+
+
+def _speeds(line: Float[Array, "m 3"], steps: Float[Array, " l"], acc: Array) -> Float[Array, " m"]:
+    """Largest speeds at points of a curve, at rest in the first one, m/s."""
+    ways = (line[1:] - line[:-1]) / steps[:, None]
+    bend = jnp.linalg.norm(ways[1:] - ways[:-1], axis=-1) / ((steps[1:] + steps[:-1]) / 2)
+    bend = jnp.concatenate([bend[:1], bend, bend[-1:]])
+    square = acc / jnp.maximum(bend, 0.1)
+
+    def limited(before: Array, limit: tuple[Array, Array]) -> tuple[Array, Array]:
+        now = jnp.minimum(limit[0], before + 2 * acc * limit[1])
+        return now, now
+
+    forward = jax.lax.scan(limited, jnp.zeros_like(acc), (square[1:], steps))[1]
+    end = forward[-1]
+    backward = jax.lax.scan(limited, end, (forward[:-1][::-1], steps[1:][::-1]))[1][::-1]
+    return jnp.sqrt(jnp.concatenate([jnp.zeros_like(square[:1]), backward, end[None]]))

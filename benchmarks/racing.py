@@ -53,8 +53,8 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     ]
     for row in rows:
         lines.append(
-            f"{row['policy']:9} | {row['seed']:4} | {row['drones']:6} | {_percent(row['completed'])} |"
-            f" {_percent(row['collided'])} | {row['lap'][0]:.3f} +- {row['lap'][1]:.3f} |"
+            f"{row['policy']:9} | {row['seed']:4} | {row['drones']:6} | {percent(row['completed'])} |"
+            f" {percent(row['collided'])} | {row['lap'][0]:.3f} +- {row['lap'][1]:.3f} |"
             f" {row['overtakes'][0]:.2f} +- {row['overtakes'][1]:.2f} | {row['seconds']:.0f}"
         )
     about = {name: getattr(options, name) for name in ("drones", "level", "races", "updates")}
@@ -127,5 +127,6 @@ def _mean(x) -> tuple[float, float]:
     return (x.mean(), 1.96 * x.std(ddof=1) / np.sqrt(len(x))) if len(x) > 1 else (np.nan, np.nan)
 
 
-def _percent(rate: tuple[float, float, float]) -> str:
+def percent(rate: tuple[float, float, float]) -> str:
+    """A rate and its interval, %."""
     return f"{100 * rate[0]:5.1f} [{100 * rate[1]:.1f}, {100 * rate[2]:.1f}]"

@@ -21,7 +21,7 @@ _HERMITE = np.stack(  # of the ends and of the derivatives there
 
 
 class Centerline(PyTreeNode):
-    """Points of p segments: segment i ends at the i-th gate after the start; laps repeat."""
+    """Points of p segments; segment i ends at gate i."""
 
     pos: Float[Array, "p k 3"]
     """Positions, m."""
@@ -38,23 +38,21 @@ class Centerline(PyTreeNode):
         )
 
 
-def centerline(gates: Float[Array, "g 4"], start: Float[Array, "4"], count: int, acc: Float[Array, ""]) -> Centerline:
+def centerline(gates: Float[Array, "g 4"], start: Float[Array, "4"], acc: Float[Array, ""]) -> Centerline:
     """Centerline from the start through gates.
 
     A segment is a cubic curve in the crossing directions of both gates; between gates on a circle nearly an arc.
 
     Args:
-        gates: x, y, z (m) and heading (rad) of the gates of one lap.
+        gates: x, y, z (m) and heading (rad) of all gates in order.
         start: x, y, z and heading at the start.
-        count: number of segments.
         acc: largest acceleration along the curve and across it, m/s^2.
     """
-    end = gates[np.arange(count) % len(gates)]
-    begin = jnp.concatenate([start[None], end[:-1]])
-    ways = jnp.stack([direction(begin), direction(end)], axis=1)
+    begin, count = jnp.concatenate([start[None], gates[:-1]]), len(gates)
+    ways = jnp.stack([direction(begin), direction(gates)], axis=1)
     cos_half = jnp.sqrt(jnp.maximum(1 + jnp.sum(ways[:, 0] * ways[:, 1], axis=-1), 0) / 2)
-    length = 2 / (1 + cos_half) * jnp.linalg.norm(end[:, :3] - begin[:, :3], axis=-1)
-    knots = jnp.concatenate([begin[:, None, :3], end[:, None, :3], length[:, None, None] * ways], axis=1)
+    length = 2 / (1 + cos_half) * jnp.linalg.norm(gates[:, :3] - begin[:, :3], axis=-1)
+    knots = jnp.concatenate([begin[:, None, :3], gates[:, None, :3], length[:, None, None] * ways], axis=1)
     pos = jnp.asarray(_HERMITE, gates.dtype)[None] @ knots
     line = pos.reshape(-1, 3)
     steps = jnp.linalg.norm(line[1:] - line[:-1], axis=-1)

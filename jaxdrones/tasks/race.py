@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdrones.arguments import NonNegativeInt, Switch, checked, number, whole
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.quantity import described
+from jaxdrones.quantity import described, quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.tasks import centerline, crossing, racetrack, shaping
@@ -26,15 +26,22 @@ from jaxdrones.tasks.touching import touches
 _GRID, _SPREAD = 0.4, 0.05  # m between starts along y, and half width of random displacements
 _LAP_SECONDS = 8.0  # s of an episode per lap
 _LEAD = 0.2  # m along the track; a drone with a smaller lead is beside the other one
-_CORRIDOR = 0.35  # m beside the centerline without a penalty
+_FINISH = 1.5  # m, between the last gate and the points behind it
 _WIDE = 2.0  # m, edge of the opening that counts without contact
 _FAR = 100.0  # m, between drones that left the race
 _MARGIN, _SOFTNESS = 0.04, 0.02  # m: gap to an obstacle below which the reward falls
 _FLYING = 0.8  # share of the random starts in flight
 _BEHIND = 0.1, 0.3  # share of a segment between drones that start in flight
-_ACC = 12.0  # m/s^2 along and across the centerline
 _MIN_SPEED, _RETURN = 0.5, 3.0  # m/s, and 1/s: of the desired velocity
 _PREVIEW = (0.3, 0.7, 1.2)  # m, of the observed points of the centerline
+_LINE_ENTRIES = (
+    *quantities("desired velocity along the centerline", "m/s", "world"),
+    *(
+        entry
+        for x in _PREVIEW
+        for entry in quantities(f"point of the centerline {x:g} m ahead, from the drone", "m", "world")
+    ),
+)
 
 
 @checked
@@ -44,6 +51,7 @@ def race(
     laps: Annotated[int, whole("laps", 1)] = 1,
     random_start: Switch = False,
     contact: Switch = True,
+    acceleration: Annotated[float, number("m/s^2", above=0)] = 12.0,
 ) -> Task:
     """Drones race through four gates; they fly in each other's downwash, and touch.
 
@@ -55,10 +63,11 @@ def race(
         level: 0 nominal; 1 random inertia; 2 gates and poles displaced too; 3 random tracks without poles. The policy
             does not observe the poles.
         laps: number of laps of four gates.
-        random_start: for training: start in flight at a random place of the first lap with probability 0.8, one behind
+        random_start: for training: start in flight at a random place of the track with probability 0.8, one behind
             the other, else on the ground at the start.
         contact: whether ground and drones push a drone, gates and poles end its race, and only the opening of a gate
             counts. Training goes without: it needs fewer physics steps, and drones learn from whole flights.
+        acceleration: largest acceleration of the observed desired velocity, along the centerline and across it, m/s^2.
     """
     scene, total = racetrack.scene_of(level), laps * len(GATES)
 
@@ -70,22 +79,21 @@ def race(
         origin = jnp.asarray([*START, standing_height(params)[0], 0], dtype)
         ahead = gates[0, :2] - origin[:2]
         origin = origin.at[3].set(jnp.arctan2(ahead[1], ahead[0]))
-        line = centerline.centerline(gates, origin, total + 2, jnp.asarray(_ACC, dtype))
+        course = _course(gates, laps)
+        line = centerline.centerline(course, origin, jnp.asarray(acceleration, dtype))
         state, index = _grid(grid_key, params, origin), jnp.zeros(n, jnp.int32)
         if random_start:
-            flying, place = _in_flight(flight_key, params, line)
+            flying, place = _in_flight(flight_key, params, line, total)
             flies = jax.random.bernoulli(flying_key, _FLYING)
             state, index = jax.tree.map(lambda x, y: jnp.where(flies, x, y), (flying, place), (state, index))
         zero = jnp.zeros(n, dtype)
         return state, {
-            "gates": gates,
+            "gates": course,
             "line": line,
             "index": index,
             "before": index,
             "pos": state.pos,
-            "along": zero,
             "progress": zero,
-            "aside": zero,
             "hit": jnp.zeros(n, bool),
             "touched": jnp.zeros(n, bool),
             "lead": jnp.zeros((n, n), jnp.int32),
@@ -102,15 +110,13 @@ def race(
         variables, pos, active = world.variables, world.drones.pos, world.active
         before, index = variables["pos"], variables["index"]
         racing = active & (index < total)
-        earlier, along, foot = jax.vmap(_step_along)(_near(variables), before, pos)
+        earlier, along = jax.vmap(_step_along)(_near(variables), before, pos)
         lead, overtakes = _order(variables["lead"], along, racing)
         return variables | {
             "index": index + (racing & racetrack.passes(_gate(variables), before, pos, OPENING if contact else _WIDE)),
             "before": index,
             "pos": pos,
-            "along": jnp.where(racing, along, variables["along"]),
             "progress": jnp.where(racing, along - earlier, 0),
-            "aside": norm(pos - foot),
             "hit": touches(world, before, world.scene.replace(ground=False)).scene,
             "touched": variables["touched"] | _touching(world, before),
             "lead": lead,
@@ -143,7 +149,6 @@ def race(
             "velocity": (-1.0, _velocity),
             "passed": (2.0, _passed),
             "crashed": (-10.0, described(crashed.__doc__, _as_number(crashed))),
-            "aside": (-4.0, _aside),
             "clearance": (-10.0, _clearance),
             "approach": (-4.0, crossing.REWARDS["approach"][1]),
             "omega": (-0.01, shaping.body_rates),
@@ -165,7 +170,7 @@ def race(
         randomize=racetrack.randomization_of(level),
         observations={
             "gates": ObservationTerm(_observe_gates, 20.0, entries=racetrack.GATE_ENTRIES),
-            "line": ObservationTerm(_observe_line, 20.0),
+            "line": ObservationTerm(_observe_line, 20.0, entries=_LINE_ENTRIES),
         },
         scene=scene,
         obstacles_terminate=True,
@@ -186,13 +191,13 @@ def _grid(key: jax.Array, params: Params, start: Float[Array, "4"]) -> State:
     return hovering(params, pos.at[:, :2].add(jax.random.uniform(spread_key, (n, 2), dtype, -_SPREAD, _SPREAD)))
 
 
-def _in_flight(key: jax.Array, params: Params, line: centerline.Centerline) -> tuple[State, Array]:
+def _in_flight(key: jax.Array, params: Params, line: centerline.Centerline, total: int) -> tuple[State, Array]:
     """One behind the other near a random place of the centerline, in random order; and the next gate of each."""
     place_key, gap_key, order_key, speed_key, throw_key = jax.random.split(key, 5)
     n, dtype = len(params.mass), line.along.dtype
     gaps = jax.random.uniform(gap_key, (n,), dtype, *_BEHIND)
     behind = jnp.cumsum(gaps)[jax.random.permutation(order_key, n)]
-    place = jnp.maximum(jax.random.uniform(place_key, (), dtype, 0, len(GATES) + 1) - behind, 0.5 - 0.1 * behind)
+    place = jnp.maximum(jax.random.uniform(place_key, (), dtype, 0, total) - behind, 0.5 - 0.1 * behind)
     index = place.astype(jnp.int32)
     points = line.pos[index]
     share = (place - index) * (points.shape[1] - 1)
@@ -204,9 +209,16 @@ def _in_flight(key: jax.Array, params: Params, line: centerline.Centerline) -> t
     return state.replace(vel=state.vel + speed * (b - a) / norm(b - a)[:, None]), index
 
 
+def _course(gates: Float[Array, "g 4"], laps: int) -> Float[Array, "p 4"]:
+    """Gates of all laps in order, and two more straight behind the last one, towards which drones finish."""
+    ahead = jnp.concatenate([racetrack.direction(gates[-1]), jnp.zeros(1, gates.dtype)])
+    behind = [gates[-1:] + (k * _FINISH * ahead)[None] for k in (1, 2)]
+    return jnp.concatenate([*[gates] * laps, *behind])
+
+
 def _gate(variables: dict[str, Array], later: int = 0) -> Float[Array, "n 4"]:
-    """Next gate of every drone, or the one `later` gates ahead; laps repeat."""
-    return variables["gates"][(variables["index"] + later) % len(GATES)]
+    """Next gate of every drone, or the one `later` gates ahead."""
+    return variables["gates"][jnp.minimum(variables["index"] + later, len(variables["gates"]) - 1)]
 
 
 def _near(variables: dict[str, Array]) -> centerline.Centerline:
@@ -214,10 +226,10 @@ def _near(variables: dict[str, Array]) -> centerline.Centerline:
     return jax.vmap(variables["line"].near)(variables["index"])
 
 
-def _step_along(section: centerline.Centerline, before: Array, pos: Array) -> tuple[Array, Array, Array]:
-    """Coordinates along the centerline before and after a step, m, and the nearest point after it."""
-    weights = centerline.foot(section, pos)
-    return centerline.foot(section, before) @ section.along, weights @ section.along, weights @ section.pos
+def _step_along(section: centerline.Centerline, before: Array, pos: Array) -> tuple[Array, Array]:
+    """Coordinates along the centerline before and after a step, m."""
+    earlier, now = (centerline.foot(section, x) @ section.along for x in (before, pos))
+    return earlier, now
 
 
 def _desired_velocity(world: World) -> Float[Array, "n 3"]:
@@ -272,11 +284,6 @@ def _passed(task: Task, world: World) -> Float[Array, " n"]:
 
 def _as_number(condition):
     return lambda task, world: condition(task, world).astype(world.drones.pos.dtype)
-
-
-def _aside(task: Task, world: World) -> Float[Array, " n"]:
-    """Distance from the corridor of 0.35 m about the centerline, m."""
-    return jnp.maximum(world.variables["aside"] - _CORRIDOR, 0)
 
 
 def _clearance(task: Task, world: World) -> Float[Array, " n"]:

@@ -156,7 +156,7 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "gates": dict(random_start=True),
     "crowd": dict(random_box=True, substeps=2),
     "swap-goals": dict(substeps=2),
-    "race": dict(laps=2, random_start=True, contact=False, substeps=2),
+    "race": dict(random_start=True, contact=False, substeps=2),
     "sling": dict(substeps=2),
     "transport": dict(substeps=2),
 }

@@ -20,6 +20,7 @@ from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import bptt, collect, result
 from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import state_vector
 from jaxdrones.learning.settings import check_config
 
 
@@ -81,12 +82,20 @@ def against(past: Policy, policy: Policy) -> collect.Act:
     """
 
     def act(policy: Policy, past: Policy, noise: Any, hidden_state: Any, obs: collect.Obs) -> tuple[Any, Array, Any]:
+        count = len(jax.tree.leaves(past)[0])
+
         def of_others(x: Array) -> Array:
-            return x[:, 1:].reshape(len(jax.tree.leaves(past)[0]), -1, *x[:, 1:].shape[1:])
+            return x[:, 1:].reshape(count, len(x) // count, *x[:, 1:].shape[1:])
 
         own = policy(jax.tree.map(lambda x: x[:, :1], obs))
+        if state_vector(obs).shape[1] == 1:
+            return hidden_state, own, None
         others = jax.vmap(lambda policy, obs: policy(obs))(past, jax.tree.map(of_others, obs))
-        return hidden_state, jnp.concatenate([own, others.reshape(len(own), -1, own.shape[-1])], axis=1), None
+        return (
+            hidden_state,
+            jnp.concatenate([own, others.reshape(len(own), others.shape[2], own.shape[-1])], axis=1),
+            None,
+        )
 
     return jax.tree_util.Partial(act, policy, jax.lax.stop_gradient(past))
 

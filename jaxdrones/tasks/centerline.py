@@ -11,7 +11,7 @@ from jaxdrones.pytree import PyTreeNode
 from jaxdrones.tasks.racetrack import direction
 
 _POINTS = 12  # of a segment between two gates
-_SECTION = 3  # segments that a drone can be near: to the gate before the next one, to the next one, to the one after
+_BEFORE, _BEHIND = 4, 8  # points of the segments before and behind that are near a drone
 _WIDTH = 0.12  # m, standard deviation of the weights of the points near a place
 
 _U = np.arange(_POINTS) / _POINTS
@@ -23,19 +23,26 @@ _HERMITE = np.stack(  # of the ends and of the derivatives there
 class Centerline(PyTreeNode):
     """Points of p segments; segment i ends at gate i."""
 
-    pos: Float[Array, "p k 3"]
+    pos: Float[Array, "*p k 3"]
     """Positions, m."""
-    along: Float[Array, "p k"]
+    along: Float[Array, "*p k"]
     """Distance from the start along the curve, m."""
-    speed: Float[Array, "p k"]
+    speed: Float[Array, "*p k"]
     """Speed of a point mass with limited acceleration that starts at rest, m/s."""
 
     def near(self, index: Int[Array, ""]) -> Centerline:
-        """Section (p k, ...) near a drone before gate `index`; constant in derivatives."""
-        segments = jnp.maximum(index - 1, 0) + jnp.arange(_SECTION)
-        return jax.tree.map(
-            lambda x: jax.lax.stop_gradient(x[segments]).reshape(_SECTION * _POINTS, *x.shape[2:]), self
-        )
+        """Points (k, ...) from shortly before to shortly behind the segment to gate `index`, constant in derivatives.
+
+        Other parts of the track may cross this one and do not count.
+        """
+        first = jnp.maximum(index * _POINTS - _BEFORE, 0)
+        count = _BEFORE + _POINTS + _BEHIND
+
+        def section(x: Array) -> Array:
+            points = jax.lax.stop_gradient(x).reshape(-1, *x.shape[2:])
+            return jax.lax.dynamic_slice_in_dim(points, first, count)
+
+        return jax.tree.map(section, self)
 
 
 def centerline(gates: Float[Array, "g 4"], start: Float[Array, "4"], acc: Float[Array, ""]) -> Centerline:
@@ -62,7 +69,7 @@ def centerline(gates: Float[Array, "g 4"], start: Float[Array, "4"], acc: Float[
 
 def foot(section: Centerline, pos: Float[Array, "3"]) -> Float[Array, " p"]:
     """Weights of the points of a section whose mean is the point nearest to a position (m), smooth in the position."""
-    return jax.nn.softmax(-jnp.sum((section.pos - pos) ** 2, axis=-1) / (2 * _WIDTH**2))
+    return jax.nn.softmax(-jnp.sum((section.pos - pos[None]) ** 2, axis=-1) / (2 * _WIDTH**2))
 
 
 def at(section: Centerline, along: Float[Array, ""]) -> Float[Array, " p"]:

@@ -29,7 +29,7 @@ _LEAD = 0.2  # m along the track; a drone with a smaller lead is beside the othe
 _FINISH = 1.5  # m, between the last gate and the points behind it
 _WIDE = 1.0  # m, edge of the opening that counts without contact
 _FAR = 100.0  # m, between drones that left the race
-_MARGIN, _SOFTNESS = 0.04, 0.02  # m: gap to an obstacle below which the reward falls
+_MARGIN, _SOFTNESS = 0.06, 0.03  # m: gap to an obstacle below which the reward falls
 _FLYING = 0.8  # share of the random starts in flight
 _BEHIND = 0.1, 0.3  # share of a segment between drones that start in flight
 _MIN_SPEED, _RETURN = 0.5, 3.0  # m/s, and 1/s: of the desired velocity
@@ -149,7 +149,7 @@ def race(
             "velocity": (-1.0, _velocity),
             "passed": (2.0, _passed),
             "crashed": (-10.0, described(crashed.__doc__, _as_number(crashed))),
-            "clearance": (-10.0, _clearance),
+            "clearance": (-30.0, _clearance),
             "approach": (-4.0, crossing.REWARDS["approach"][1]),
             "omega": (-0.01, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
@@ -287,7 +287,7 @@ def _as_number(condition):
 
 
 def _clearance(task: Task, world: World) -> Float[Array, " n"]:
-    """Smoothed penetration of a margin of 4 cm about gates and poles, m."""
+    """Smoothed penetration of a margin of 6 cm about gates and poles, m."""
     obstacles = world.scene.replace(ground=False)
     gap = jax.vmap(obstacles.distance)(world.drones.pos) - world.params.collision_radius
     return _SOFTNESS * jax.nn.softplus((_MARGIN - gap) / _SOFTNESS)

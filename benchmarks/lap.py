@@ -47,10 +47,15 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         name: fastest(GATES, start, thrust, float(params.gravity[0]), half, options.nodes)
         for name, half in halves.items()
     }
+    train, config = preset("race", "bptt", practice=True, **changes)
+    config = dataclasses.replace(config, updates=options.updates or config.updates)
     rows = []
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         begin = time.perf_counter()
-        policy = checkpoint.load(options.policy) if options.policy else trained(seed, options)
+        if options.policy:
+            policy = checkpoint.load(options.policy)
+        else:
+            policy = jax.block_until_ready(bptt.train(jax.random.key(seed), train, config)).policy
         row = {"seed": seed, "seconds": time.perf_counter() - begin}
         rows.append(row | racing.summary(racing.fly(env, policy, options.laps)))
     lines = ["bound     | s"]
@@ -63,14 +68,6 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
             f" {ratios} | {row['seconds']:.0f}"
         )
     return {"about": changes | {"nodes": options.nodes}, "bounds": bounds, "rows": rows}, lines
-
-
-def trained(seed: int, options: argparse.Namespace) -> jd.learning.networks.Policy:
-    """Policy for level 0."""
-    env, config = preset("race", "bptt", practice=True, **OPTIONS, acceleration=options.acceleration)
-    if options.updates:
-        config = dataclasses.replace(config, updates=options.updates)
-    return jax.block_until_ready(bptt.train(jax.random.key(seed), env, config)).policy
 
 
 def fastest(gates: np.ndarray, start: np.ndarray, thrust: float, gravity: float, half: float, nodes: int) -> float:

@@ -4,19 +4,22 @@ Two drones (`--drones`) race on random tracks in each other's downwash and with 
 Policies: `alone`, trained with one drone; `self-play`, with the present policy on all drones; `league`, against past
 policies of the same training. `completed`: drones that passed all gates; `collided`: races in which two drones touched,
 also between control steps; `lap`: time of the drones that completed; `overtakes` per race. The 95 % intervals are over
-distinct races. `none` in the last column of a policy trained alone is its lap without opponents.
+distinct races. Every policy also flies the same tracks alone.
 """
 
 import argparse
 import dataclasses
+import functools
+import sys
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
-from jaxdrones.learning import bptt, checkpoint, league
+from jaxdrones.learning import Policy, bptt, checkpoint, league
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.training.presets import preset
 
@@ -43,11 +46,17 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     single = jd.make("race", drones=1, level=options.level)
     rows = []
     for name in options.policies:
+        train = trainer(name, options)
         for seed in range(options.first_seed, options.first_seed + options.seeds):
-            policy, spent = trained(name, seed, options)
-            about = {"policy": name, "seed": seed, "seconds": spent}
+            path = f"{options.load or options.save}-{name}-{seed}"
+            start = time.perf_counter()
+            policy = checkpoint.load(path) if options.load else train(seed)
+            about = {"policy": name, "seed": seed, "seconds": time.perf_counter() - start}
+            if options.save:
+                checkpoint.save(path, policy)
             for env in (races, single):
                 rows.append(about | {"drones": env.drones} | summary(fly(env, policy, options.races)))
+                print(rows[-1], file=sys.stderr)
     lines = [
         "policy    | seed | drones | completed [95 %] | races with a collision [95 %] | lap s | overtakes | train s"
     ]
@@ -61,33 +70,26 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     return {"about": about, "rows": rows}, lines
 
 
-def trained(name: str, seed: int, options: argparse.Namespace) -> tuple[jd.learning.networks.Policy, float]:
-    """Policy by name, and the seconds of its training, compiling included."""
-    path = f"{name}-{seed}"
-    if options.load:
-        return checkpoint.load(f"{options.load}-{path}"), 0.0
+def trainer(name: str, options: argparse.Namespace) -> Callable[[int], Policy]:
+    """Function that trains a policy with a seed, compiled once."""
     learner, drones = POLICIES[name]
-    env, config = preset(
-        "race",
-        learner.__name__.rpartition(".")[2],
-        practice=True,
-        drones=drones or options.drones,
-        level=options.level,
-    )
+    algorithm = learner.__name__.rpartition(".")[2]
+    env, config = preset("race", algorithm, practice=True, drones=drones or options.drones, level=options.level)
     if options.updates:
         config = dataclasses.replace(config, updates=options.updates)
-    start = time.perf_counter()
-    policy = jax.block_until_ready(learner.train(jax.random.key(seed), env, config)).policy
-    spent = time.perf_counter() - start
-    if options.save:
-        checkpoint.save(f"{options.save}-{path}", policy)
-    return policy, spent
+    return lambda seed: jax.block_until_ready(learner.train(jax.random.key(seed), env, config)).policy
 
 
-def fly(env: jd.envs.Env, policy: jd.learning.networks.Policy, races: int) -> dict[str, np.ndarray]:
+def fly(env: jd.envs.Env, policy: Policy, races: int) -> dict[str, np.ndarray]:
     """Metrics (races, n) at the end of each drone's race, and whether it passed all gates."""
+    return jax.tree.map(np.asarray, _races(env)(policy, jax.random.split(jax.random.key(1_000_000), races)))
 
-    def race(key: jax.Array) -> dict[str, jax.Array]:
+
+@functools.lru_cache
+def _races(env: jd.envs.Env) -> Callable:
+    """Compiled races: (policy, keys) -> metrics."""
+
+    def race(policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
         reset_key, step_key = jax.random.split(key)
         obs, world = env.reset(reset_key)
         zero = jnp.zeros(env.drones)
@@ -103,8 +105,7 @@ def fly(env: jd.envs.Env, policy: jd.learning.networks.Policy, races: int) -> di
 
         return jax.lax.scan(control_step, (obs, world, last), jax.random.split(step_key, env.steps))[0][2]
 
-    keys = jax.random.split(jax.random.key(1_000_000), races)
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(race))(keys))
+    return jax.jit(jax.vmap(race, (None, 0)))
 
 
 def summary(outcome: dict[str, np.ndarray]) -> dict:

@@ -23,12 +23,12 @@ _HERMITE = np.stack(  # of the ends and of the derivatives there
 class Centerline(PyTreeNode):
     """Points of p segments; segment i ends at gate i."""
 
-    pos: Float[Array, "*p k 3"]
-    """Positions, m."""
-    along: Float[Array, "*p k"]
-    """Distance from the start along the curve, m."""
-    speed: Float[Array, "*p k"]
-    """Speed of a point mass with limited acceleration that starts at rest, m/s."""
+    pos: Array
+    """(p, k, 3) positions, m."""
+    along: Array
+    """(p, k) distance from the start along the curve, m."""
+    speed: Array
+    """(p, k) speed of a point mass with limited acceleration that starts at rest, m/s."""
 
     def near(self, index: Int[Array, ""]) -> Centerline:
         """Points (k, ...) from shortly before to shortly behind the segment to gate `index`, constant in derivatives.

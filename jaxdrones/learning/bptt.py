@@ -40,7 +40,12 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> resul
     return result.TrainState(jnp.zeros((), jnp.int32), key, policy, opt_state, worlds)
 
 
-def update(
+def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.TrainState, dict[str, Array]]:
+    """Simulate a trajectory of all worlds and take one gradient step on its rewards."""
+    return gradient_step(env, config, state)
+
+
+def gradient_step(
     env: Env,
     config: Config,
     state: S,
@@ -54,7 +59,7 @@ def update(
         env: environment.
         config: settings.
         state: training state.
-        act: actions of a team by the policy.
+        act: actions of all drones by the policy.
         learning: drones whose rewards count.
     """
     key, start_key, restart_key, collect_key = jax.random.split(state.key, 4)

@@ -1,7 +1,8 @@
 """Does self-play teach drones to race without collisions, and what does it cost in lap time?
 
 Two drones (`--drones`) race on random tracks in each other's downwash and with contact, all flown by one policy.
-Policies: `alone`, trained with one drone; `self-play`, with the present policy on all drones; `league`, against past
+Policies: `alone`, trained with one drone; `blind`, the same but opponents are out of sight also in the races, as in
+training; `self-play`, with the present policy on all drones; `league`, against past
 policies of the same training. `completed`: drones that passed all gates; `collided`: races in which two drones touched,
 also between control steps; `lap`: time of the drones that completed; `overtakes` per race. The 95 % intervals are over
 distinct races. Every policy also flies the same tracks alone.
@@ -19,11 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
+from jaxdrones.envs.observations import encounters
 from jaxdrones.learning import Policy, bptt, checkpoint, league
 from jaxdrones.learning.evaluation import wilson_interval
+from jaxdrones.tasks.race import OBSERVATION
 from jaxdrones.training.presets import preset
 
-POLICIES = {"alone": (bptt, 1), "self-play": (bptt, 0), "league": (league, 0)}
+POLICIES = {"alone": (bptt, 1), "blind": (bptt, 1), "self-play": (bptt, 0), "league": (league, 0)}
 """Learner, and number of drones in training; 0 for that of the races."""
 
 
@@ -42,19 +45,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.seeds, options.races, options.updates = 1, 4, 2
-    races = jd.make("race", drones=options.drones, level=options.level)
-    single = jd.make("race", drones=1, level=options.level)
     rows = []
     for name in options.policies:
+        seen = {"observation": (*OBSERVATION[:-1], encounters(3, reach=1e-3))} if name == "blind" else {}
+        flown = [jd.make("race", drones=drones, level=options.level, **seen) for drones in (options.drones, 1)]
         train = trainer(name, options)
         for seed in range(options.first_seed, options.first_seed + options.seeds):
-            path = f"{options.load or options.save}-{name}-{seed}"
+            path = f"{options.load or options.save}-{'alone' if name == 'blind' else name}-{seed}"
             start = time.perf_counter()
             policy = checkpoint.load(path) if options.load else train(seed)
             about = {"policy": name, "seed": seed, "seconds": time.perf_counter() - start}
             if options.save:
                 checkpoint.save(path, policy)
-            for env in (races, single):
+            for env in flown:
                 rows.append(about | {"drones": env.drones} | summary(fly(env, policy, options.races)))
                 print(rows[-1], file=sys.stderr)
     lines = [

@@ -176,7 +176,7 @@ def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_
 def test_racing_reports_teams_and_single_drones_of_every_policy():
     rows = quick("racing")["rows"]
     assert [(row["policy"], row["drones"]) for row in rows] == [
-        (name, drones) for name in ("alone", "self-play", "league") for drones in (2, 1)
+        (name, drones) for name in ("alone", "blind", "self-play", "league") for drones in (2, 1)
     ]
     assert all(row["collided"][0] == 0 for row in rows if row["drones"] == 1)
 

@@ -43,6 +43,8 @@ _LINE_ENTRIES = (
     ),
 )
 
+OBSERVATION = ("line", "gates", "rotation_matrix", "velocity", "omega", "opponents")
+
 
 @checked
 def race(
@@ -178,7 +180,7 @@ def race(
         pairs=("downwash",),
         control_hz=50.0,
         action="thrust_and_rates",
-        observation=("line", "gates", "rotation_matrix", "velocity", "omega", "opponents"),
+        observation=OBSERVATION,
     )
 
 

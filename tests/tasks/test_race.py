@@ -102,14 +102,12 @@ def test_the_centerline_passes_the_gates_in_order_and_in_their_direction():
 
 
 def test_the_centerline_between_gates_on_a_circle_is_nearly_the_circle():
-    angle = np.arange(8) * np.pi / 4
-    gates = np.stack([np.cos(angle), np.sin(angle), np.ones(8), angle + np.pi / 2], axis=-1)
-    line = centerline.centerline(
-        jnp.asarray(gates), jnp.asarray([*np.array([1, -1]) / np.sqrt(2), 1, np.pi / 4]), jnp.asarray(4.0)
-    )
-    np.testing.assert_allclose(np.linalg.norm(line.pos[..., :2], axis=-1), 1, atol=0.01)
-    np.testing.assert_allclose(line.along[4, 0], np.pi, rtol=0.01)
-    np.testing.assert_allclose(line.speed[2:], 2.0, rtol=0.1)  # v^2 / r is the largest acceleration
+    angle = np.arange(4) * np.pi / 2
+    gates = np.stack([np.cos(angle), np.sin(angle), np.ones(4), angle + np.pi / 2], axis=-1)
+    line = centerline.centerline(jnp.asarray(gates), jnp.asarray([0.0, -1, 1, 0]), jnp.asarray(4.0))
+    np.testing.assert_allclose(np.linalg.norm(line.pos[..., :2], axis=-1), 1, atol=2e-3)
+    np.testing.assert_allclose(line.along[3, 0], 1.5 * np.pi, rtol=5e-3)
+    np.testing.assert_allclose(line.speed[2:], 2.0, rtol=0.03)  # v^2 / r is the largest acceleration
 
 
 def test_speeds_of_the_centerline_begin_at_rest_and_keep_the_limit_of_the_acceleration():

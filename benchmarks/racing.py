@@ -1,11 +1,10 @@
 """Does self-play teach drones to race without collisions, and what does it cost in lap time?
 
 Two drones (`--drones`) race on random tracks in each other's downwash and with contact, all flown by one policy.
-Policies: `alone`, trained with one drone; `blind`, the same but opponents are out of sight also in the races, as in
-training; `self-play`, with the present policy on all drones; `league`, against past
-policies of the same training. `completed`: drones that passed all gates; `collided`: races in which two drones touched,
-also between control steps; `lap`: time of the drones that completed; `overtakes` per race. The 95 % intervals are over
-distinct races. Every policy also flies the same tracks alone.
+Policies: `alone`, trained with one drone; `blind`, the same with opponents out of sight also in the races; `self-play`,
+with the present policy on all drones; `league`, against past policies of the same training. `completed`: drones that
+passed all gates; `collided`: races in which two drones touched, also between control steps; `lap`: time of the drones
+that completed; `overtakes` per race. The 95 % intervals are over distinct races. Every policy also flies alone.
 """
 
 import argparse
@@ -20,14 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones as jd
-from jaxdrones.envs.observations import encounters
 from jaxdrones.learning import Policy, bptt, checkpoint, league
 from jaxdrones.learning.evaluation import wilson_interval
-from jaxdrones.tasks.race import OBSERVATION
 from jaxdrones.training.presets import preset
 
 POLICIES = {"alone": (bptt, 1), "blind": (bptt, 1), "self-play": (bptt, 0), "league": (league, 0)}
 """Learner, and number of drones in training; 0 for that of the races."""
+
+_OUT_OF_SIGHT = 1e-3  # m, at which rows of opponents have no effect
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,17 +44,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.quick:
         options.seeds, options.races, options.updates = 1, 4, 2
+    flown = [jd.make("race", drones=drones, level=options.level) for drones in (options.drones, 1)]
     rows = []
     for name in options.policies:
-        seen = {"observation": (*OBSERVATION[:-1], encounters(3, reach=1e-3))} if name == "blind" else {}
-        flown = [jd.make("race", drones=drones, level=options.level, **seen) for drones in (options.drones, 1)]
         train = trainer(name, options)
         for seed in range(options.first_seed, options.first_seed + options.seeds):
             path = f"{options.load or options.save}-{'alone' if name == 'blind' else name}-{seed}"
             start = time.perf_counter()
             policy = checkpoint.load(path) if options.load else train(seed)
+            if name == "blind":
+                policy = blinded(policy)
             about = {"policy": name, "seed": seed, "seconds": time.perf_counter() - start}
-            if options.save:
+            if options.save and name != "blind":
                 checkpoint.save(path, policy)
             for env in flown:
                 rows.append(about | {"drones": env.drones} | summary(fly(env, policy, options.races)))
@@ -81,6 +81,12 @@ def trainer(name: str, options: argparse.Namespace) -> Callable[[int], Policy]:
     if options.updates:
         config = dataclasses.replace(config, updates=options.updates)
     return lambda seed: jax.block_until_ready(learner.train(jax.random.key(seed), env, config)).policy
+
+
+def blinded(policy: Policy) -> Policy:
+    """The same policy with opponents out of sight."""
+    sets = tuple((*columns, _OUT_OF_SIGHT) for *columns, _ in policy.network.sets)
+    return policy.replace(network=policy.network.clone(sets=sets))
 
 
 def fly(env: jd.envs.Env, policy: Policy, races: int) -> dict[str, np.ndarray]:
@@ -118,8 +124,8 @@ def summary(outcome: dict[str, np.ndarray]) -> dict:
     collided = outcome["touched"].any(axis=1)
     laps = [lap[done].mean() for lap, done in zip(outcome["lap_time"], outcome["completed"], strict=True) if any(done)]
     return {
-        "completed": (completed.mean(), *wilson_interval(completed.sum(), races)),
-        "collided": (collided.mean(), *wilson_interval(collided.sum(), races)),
+        "completed": (float(completed.mean()), *wilson_interval(completed.sum(), races)),
+        "collided": (float(collided.mean()), *wilson_interval(collided.sum(), races)),
         "lap": _mean(laps),
         "overtakes": _mean(outcome["overtakes"].sum(axis=1)),
     }
@@ -128,7 +134,7 @@ def summary(outcome: dict[str, np.ndarray]) -> dict:
 def _mean(x) -> tuple[float, float]:
     """Mean and half of its 95 % interval."""
     x = np.asarray(x, float)
-    return (x.mean(), 1.96 * x.std(ddof=1) / np.sqrt(len(x))) if len(x) > 1 else (np.nan, np.nan)
+    return (float(x.mean()), float(1.96 * x.std(ddof=1) / np.sqrt(len(x)))) if len(x) > 1 else (np.nan, np.nan)
 
 
 def percent(rate: tuple[float, float, float]) -> str:

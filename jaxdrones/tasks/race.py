@@ -43,8 +43,6 @@ _LINE_ENTRIES = (
     ),
 )
 
-OBSERVATION = ("line", "gates", "rotation_matrix", "velocity", "omega", "opponents")
-
 
 @checked
 def race(
@@ -180,7 +178,7 @@ def race(
         pairs=("downwash",),
         control_hz=50.0,
         action="thrust_and_rates",
-        observation=OBSERVATION,
+        observation=("line", "gates", "rotation_matrix", "velocity", "omega", "opponents"),
     )
 
 

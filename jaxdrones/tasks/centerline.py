@@ -12,6 +12,7 @@ from jaxdrones.tasks.racetrack import direction
 
 _POINTS = 12  # of a segment between two gates
 _BEFORE, _BEHIND = 4, 8  # points of the segments before and behind that are near a drone
+_FAR = 10.0  # m, from which on all points are alike
 _WIDTH = 0.12  # m, standard deviation of the weights of the points near a place
 
 _U = np.arange(_POINTS) / _POINTS
@@ -70,7 +71,8 @@ def centerline(gates: Float[Array, "g 4"], start: Float[Array, "4"], acc: Float[
 
 def foot(section: Centerline, pos: Float[Array, "3"]) -> Float[Array, " p"]:
     """Weights of the points of a section whose mean is the point nearest to a position (m), smooth in the position."""
-    return jax.nn.softmax(-jnp.sum((section.pos - pos[None]) ** 2, axis=-1) / (2 * _WIDTH**2))
+    away = jnp.minimum(jnp.sum((section.pos - pos[None]) ** 2, axis=-1), _FAR**2)  # finite for drones that left
+    return jax.nn.softmax(-away / (2 * _WIDTH**2))
 
 
 def at(section: Centerline, along: Float[Array, ""]) -> Float[Array, " p"]:

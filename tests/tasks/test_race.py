@@ -138,3 +138,17 @@ def test_drones_start_on_the_ground_in_random_order_or_one_behind_the_other():
     assert abs(flying.mean() - 0.8) < 0.12
     index = np.asarray(worlds.variables["index"])[flying]
     assert index.max() == 3 and index.min() == 0 and np.ptp(index, axis=1).max() <= 1
+
+
+@pytest.mark.float32
+def test_observations_and_their_gradients_are_finite_for_a_drone_that_left_the_world():
+    env = make("race", drones=2)
+    _, world = env.reset(jax.random.key(0))
+    term = env.task.observations["line"].observe
+
+    def observed(pos):
+        return term(env.task, world.replace(drones=world.drones.replace(pos=pos)))
+
+    pos = world.drones.pos.at[1].set(jnp.array([1e4, 0.0, 1e4]))
+    obs, gradient = jax.jit(lambda pos: (observed(pos), jax.grad(lambda pos: jnp.sum(observed(pos)))(pos)))(pos)
+    assert np.all(np.isfinite(obs)) and np.all(np.isfinite(gradient))

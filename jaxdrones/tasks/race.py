@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -71,7 +71,7 @@ def race(
     """
     scene, total = racetrack.scene_of(level), laps * len(GATES)
 
-    def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
+    def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Any]]:
         """On the ground on a line across the track, or in flight one behind the other."""
         grid_key, flight_key, flying_key = jax.random.split(key, 3)
         n, dtype = len(params.mass), params.mass.dtype
@@ -105,7 +105,7 @@ def race(
         """Center of the next gate."""
         return Setpoint.at(_gate(variables)[:, :3])
 
-    def advance(task: Task, world: World) -> dict[str, Array]:
+    def advance(task: Task, world: World) -> dict[str, Any]:
         """Gates passed, progress, contacts and order of the drones after a step."""
         variables, pos, active = world.variables, world.drones.pos, world.active
         before, index = variables["pos"], variables["index"]
@@ -148,7 +148,7 @@ def race(
             "progress": (10.0, shaping.variable("progress", "Way along the centerline in the last step, m.")),
             "velocity": (-1.0, _velocity),
             "passed": (2.0, _passed),
-            "crashed": (-10.0, described(crashed.__doc__, _as_number(crashed))),
+            "crashed": (-10.0, described("A drone crashes.", _as_number(crashed))),
             "clearance": (-30.0, _clearance),
             "approach": (-4.0, crossing.REWARDS["approach"][1]),
             "omega": (-0.01, shaping.body_rates),
@@ -216,12 +216,12 @@ def _course(gates: Float[Array, "g 4"], laps: int) -> Float[Array, "p 4"]:
     return jnp.concatenate([*[gates] * laps, *behind])
 
 
-def _gate(variables: dict[str, Array], later: int = 0) -> Float[Array, "n 4"]:
+def _gate(variables: dict[str, Any], later: int = 0) -> Float[Array, "n 4"]:
     """Next gate of every drone, or the one `later` gates ahead."""
     return variables["gates"][jnp.minimum(variables["index"] + later, len(variables["gates"]) - 1)]
 
 
-def _near(variables: dict[str, Array]) -> centerline.Centerline:
+def _near(variables: dict[str, Any]) -> centerline.Centerline:
     """Section of the centerline near every drone."""
     return jax.vmap(variables["line"].near)(variables["index"])
 

@@ -49,8 +49,8 @@ def test_only_the_first_drone_learns_and_the_oldest_past_policy_is_replaced():
     assert_close(kept[1], halfway.params, 1e-12)
 
     def lost(task, world):
-        """A large reward for what the second drone does."""
-        return 1e3 * world.drones.vel[:, 2] * (jnp.arange(2) == 1)
+        """A large reward of the second drone for what the first one does."""
+        return 1e3 * world.drones.vel[0, 2] * (jnp.arange(2) == 1)
 
     rewards = dict(env.task.rewards) | {"lost": (1.0, lost)}
     other = dataclasses.replace(env, task=dataclasses.replace(env.task, rewards=rewards))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxdrones as jd
-from benchmarks import accelerator, published
+from benchmarks import accelerator, lap, published
 from benchmarks.__main__ import NAMES
 from benchmarks.common import success_rate
 from jaxdrones.visualization.browser import find_browser
@@ -170,6 +170,32 @@ def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_
     for row in result["rows"]:
         assert row["value"] > 0 and all(figure["ratio"] > 0 and figure["source"] for figure in row.get("published", ()))
     assert result["rows"][0]["failed"] == []
+
+
+@pytest.mark.slow
+def test_racing_reports_teams_and_single_drones_of_every_policy():
+    rows = quick("racing")["rows"]
+    assert [(row["policy"], row["drones"]) for row in rows] == [
+        (name, drones) for name in ("alone", "blind", "self-play", "league") for drones in (2, 1)
+    ]
+    assert all(row["collided"][0] == 0 for row in rows if row["drones"] == 1)
+
+
+@pytest.mark.needs("casadi")
+@pytest.mark.slow
+def test_the_less_of_a_gate_a_lap_may_use_the_longer_it_takes():
+    bounds = quick("lap")["bounds"]
+    assert 1 < bounds["openings"] < bounds["drone"] < bounds["centers"] < 2.5
+
+
+@pytest.mark.needs("casadi")
+def test_the_fastest_flight_to_a_gate_straight_ahead_is_that_of_a_constant_acceleration():
+    """From rest, without gravity, and with a weight that the thrust carries beside the acceleration."""
+    gate = np.array([[2.0, 0.0, 1.0, 0.0]])
+    start = np.array([0.0, 0.0, 1.0])
+    for thrust, gravity, acc in ((10.0, 0.0, 10.0), (5.0, 3.0, 4.0)):
+        time = lap.fastest(gate, start, thrust, gravity, 1e-6, 20)
+        np.testing.assert_allclose(time, np.sqrt(2 * 2.0 / acc), rtol=2e-3)
 
 
 def test_accelerator_names_tests_that_exist():

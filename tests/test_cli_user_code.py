@@ -160,7 +160,7 @@ def test_a_training_without_known_settings_says_so_before_it_starts(task, warned
 def test_settings_are_known_for_what_the_tables_name():
     known = {task for task in TASKS if settings_known(task, default_algorithm(task))}
     assert {"hover", "landing", "tracking", "recovery", "gates", "forest", "follow", "flock"} <= known
-    assert {"crowd", "swap-goals", "wake"} <= known and not {"room", "takeoff"} & known
+    assert {"crowd", "swap-goals", "wake", "race"} <= known and not {"room", "takeoff"} & known
     assert settings_known("hover", "ppo") and settings_known("hover", "shac") and not settings_known("landing", "ppo")
 
 

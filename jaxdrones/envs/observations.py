@@ -262,5 +262,6 @@ OBSERVATIONS: dict[str, ObservationTerm] = {
     "neighbors": neighbors(2),
     "encounters": encounters(8),
     "obstacles": obstacles(4),
+    "opponents": encounters(3),
     "preview": preview(0.1, 0.2, 0.3),
 }

@@ -1,6 +1,6 @@
 """Learners by gradients of the simulation or by policy gradients, and evaluation."""
 
-from jaxdrones.learning import bptt, loggers, ppo, shac
+from jaxdrones.learning import bptt, league, loggers, ppo, shac
 from jaxdrones.learning.evaluation import Report, evaluate
 from jaxdrones.learning.networks import OwnNetwork, Policy, RecurrentPolicy
 from jaxdrones.learning.result import Diverged, Result
@@ -14,6 +14,7 @@ __all__ = [
     "Result",
     "bptt",
     "evaluate",
+    "league",
     "loggers",
     "ppo",
     "shac",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,11 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import collect, result
 from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps, with_gradient
 from jaxdrones.learning.metrics import measure
+from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards
 from jaxdrones.learning.settings import check_config
+
+S = TypeVar("S", bound=result.TrainState)
 
 
 @checked
@@ -39,6 +42,26 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> resul
 
 def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.TrainState, dict[str, Array]]:
     """Simulate a trajectory of all worlds and take one gradient step on its rewards."""
+    return gradient_step(env, config, state)
+
+
+def gradient_step(
+    env: Env,
+    config: Config,
+    state: S,
+    *,
+    act: Callable[[Policy], collect.Act] = collect.deterministic,
+    learning: slice = slice(None),
+) -> tuple[S, dict[str, Array]]:
+    """Simulate a trajectory of all worlds and take one gradient step on its rewards.
+
+    Args:
+        env: environment.
+        config: settings.
+        state: training state.
+        act: actions of all drones by the policy.
+        learning: drones whose rewards count.
+    """
     key, start_key, restart_key, collect_key = jax.random.split(state.key, 4)
     progress = collect.progress_of(env, config, state.step)
     starts = collect.draw_starts(start_key, env, config.worlds, progress)
@@ -47,9 +70,15 @@ def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.T
     between_steps = gradient_between_steps(config)
 
     def loss(params):
-        act = collect.deterministic(state.policy.replace(params=params))
-        after, trajectory = collect.collect(collect_key, env, act, worlds, config.horizon, between_steps=between_steps)
-        return -jnp.mean(discounted_rewards(trajectory, config.gamma)), (after, trajectory)
+        after, trajectory = collect.collect(
+            collect_key,
+            env,
+            act(state.policy.replace(params=params)),
+            worlds,
+            config.horizon,
+            between_steps=between_steps,
+        )
+        return -jnp.mean(discounted_rewards(trajectory, config.gamma)[..., learning]), (after, trajectory)
 
     (_, (worlds, trajectory)), gradient = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     step, opt_state = _optimizer(config).update(gradient, state.opt_state)
@@ -58,7 +87,8 @@ def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.T
     norm = optax.tree.norm(gradient)
     metrics = {"gradient_norm": norm, "nonfinite_gradients": result.count_nonfinite(norm)}
     worlds, measured = measure(env, config, state.step, worlds, trajectory)
-    return result.TrainState(state.step + 1, key, policy, opt_state, worlds), metrics | measured
+    state = state.replace(step=state.step + 1, key=key, policy=policy, opt_state=opt_state, worlds=worlds)
+    return state, metrics | measured
 
 
 def train(

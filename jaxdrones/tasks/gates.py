@@ -2,58 +2,33 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from typing import Annotated
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
-from numpy.typing import ArrayLike
 
 from jaxdrones.arguments import NonNegativeInt, Switch, checked, number
-from jaxdrones.checks import short_repr
 from jaxdrones.control import Setpoint
-from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described, quantities
-from jaxdrones.sensing import BEAMS, Cylinder, Scene, gate, track
+from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-from jaxdrones.tasks import shaping
+from jaxdrones.tasks import racetrack, shaping
 from jaxdrones.tasks.conditions import out_of_control
+from jaxdrones.tasks.racetrack import ARENA, FRAME, GATES, MIDDLE, OPENING, POLES, START
 from jaxdrones.tasks.starts import hovering, standing_height
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 from jaxdrones.tasks.touching import touches
-from jaxdrones.vector import atan2
 
-# x, y, z (m) and crossing heading (rad) of each gate, in this order
-GATES = np.array([(0.5, 0.25, 0.7, -0.78), (1.05, 0.75, 1.2, 2.35), (-1.0, -0.25, 0.7, 3.14), (0.0, -0.75, 1.2, 0.0)])
-POLES = np.array([(0.0, 0.75), (1.0, 0.25), (-1.5, -0.25), (-0.5, -0.75)])  # x, y, m
-START = np.array([-1.5, 0.75])
-OPENING, FRAME = 0.40, 0.16  # m, edge of the square hole and width of the beams around it
-POLE_RADIUS, POLE_HEIGHT = 0.015, 1.52  # m
-LEVELS = (0, 1, 2, 3)
+__all__ = ("FRAME", "GATES", "OPENING", "POLES", "START", "gates")
+
 _START_SPACING = 0.5  # m in y between drones at the start
 _MAX_SPREAD = 0.15  # m, so that drones stay apart at the start
-_ARENA = 3.0  # m from the middle of the track along every axis: bounds of the arena
 _MAX_DRONES = 5  # so that all drones start inside the arena
-
-_GATE_RANGE = np.array([0.15, 0.15, 0.1, 0.2])  # m, m, m, rad: level 2 moves gates by U(-range, range)
-_POLE_RANGE = 0.15  # m
-_NOWHERE = 100.0  # m: outside the arena
 _SIGHT = 3.0  # m, at which the observed positions of poles are clipped
-_INERTIA_RANGE = 0.2  # share: level 1 on
 
-
-_GATE_ENTRIES = tuple(
-    entry
-    for gate in ("next gate", "gate after it")
-    for entry in (
-        *quantities(f"center of the {gate}, from the drone", "m", "world"),
-        *quantities(f"direction through the {gate}", "-", "world"),
-    )
-)
 _POLE_ENTRIES = tuple(
     entry for i in range(len(POLES)) for entry in quantities(f"pole {i}, from the drone", "m", "world", "xy")
 )
@@ -80,14 +55,13 @@ def gates(
             at the start of the track.
         start_spread: on the ground, drones start within +-start_spread of the start along x and y, m; at most 0.15.
     """
-    if level not in LEVELS:
-        raise UserError(f"level is {short_repr(level)}; give one of {', '.join(map(str, LEVELS))}")
+    scene = racetrack.scene_of(level)
 
     def start(key: jax.Array, params: Params, scene: Scene) -> tuple[State, dict[str, Array]]:
         """On the ground at the start of the track, or in the air in front of a random gate."""
         gate_key, place_key, spread_key = jax.random.split(key, 3)
         n, dtype = len(params.mass), params.mass.dtype
-        variables = {"gates": _gates_of(scene, dtype), "poles": _poles_of(scene, dtype)}
+        variables = {"gates": racetrack.gates_of(scene, dtype), "poles": racetrack.poles_of(scene, dtype)}
         x, y = START
         pos = jnp.stack(
             [jnp.full(n, x, dtype), y + _START_SPACING * jnp.arange(n, dtype=dtype), standing_height(params)], axis=-1
@@ -99,7 +73,8 @@ def gates(
             place = jax.random.randint(gate_key, (n,), -1, len(GATES))
             index = jnp.maximum(place, 0)
             ahead = variables["gates"][index]
-            before = ahead[:, :3] - 0.7 * _normal(ahead) + jax.random.uniform(place_key, (n, 3), dtype, -0.3, 0.3)
+            spread = jax.random.uniform(place_key, (n, 3), dtype, -0.3, 0.3)
+            before = ahead[:, :3] - 0.7 * racetrack.direction(ahead) + spread
             pos = jnp.where(place[:, None] < 0, pos, before)
         lap = {
             "index": index,
@@ -145,7 +120,7 @@ def gates(
             "omega": (-0.002, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
         },
-        terminations={"finished": finished, "crashed": crashed} | out_of_control(_ARENA, center=(0, 0, 1)),
+        terminations={"finished": finished, "crashed": crashed} | out_of_control(ARENA, center=MIDDLE),
         advance=_advance,
         metrics={
             "gates": shaping.variable("index", "Number of gates passed so far."),
@@ -153,12 +128,12 @@ def gates(
         },
         success=_finished,
         success_terminations=("finished",),
-        randomize=() if level == 0 else (_random_inertia,),
+        randomize=racetrack.randomization_of(level),
         observations={
-            "gates": ObservationTerm(_observe_gates, 20.0, entries=_GATE_ENTRIES),
+            "gates": ObservationTerm(_observe_gates, 20.0, entries=racetrack.GATE_ENTRIES),
             "poles": ObservationTerm(_observe_poles, _SIGHT, entries=_POLE_ENTRIES),
         },
-        scene=_scene(level) if level < 2 else functools.partial(_scene, level),
+        scene=scene,
         obstacles_terminate=True,
         contact=("ground",),
         observation=("position", "gates", "poles", "rotation_matrix", "velocity", "omega", "last_action"),
@@ -173,18 +148,11 @@ def _finished(metrics: Mapping[str, Array], dt: float) -> Array:
 def _advance(task: Task, world: World) -> dict[str, Array]:
     """Update passed gates and collisions on the straight line from the last position to this one."""
     variables, pos = world.variables, world.drones.pos
-    ahead = _gate(variables)
-    before, after = _in_gate(ahead, variables["pos"]), _in_gate(ahead, pos)
-    crosses = (before[:, 0] < 0) & (after[:, 0] >= 0)
-    share = -before[:, 0] / jnp.where(crosses, after[:, 0] - before[:, 0], 1)
-    _, y, z = jnp.abs(before + share[:, None] * (after - before)).T
-    passes = crosses & (y < OPENING / 2) & (z < OPENING / 2)
-
     index = variables["index"]
     racing = index < len(GATES)
     target = task.target_now(world).pos  # before the gate is passed
     return variables | {
-        "index": index + (racing & passes),
+        "index": index + (racing & racetrack.passes(_gate(variables), variables["pos"], pos)),
         "before": index,
         "hit": touches(world, variables["pos"], world.scene.replace(ground=False)).scene,
         "pos": pos,
@@ -193,87 +161,15 @@ def _advance(task: Task, world: World) -> dict[str, Array]:
     }
 
 
-def _scene(level: int, key: jax.Array | None = None) -> Scene:
-    """Gates and poles of a level, random in levels 2 and 3."""
-    if key is None:
-        return _solids(GATES, POLES)
-    gate_key, pole_key = jax.random.split(key)
-    u = jax.random.uniform(gate_key, GATES.shape, minval=-1, maxval=1)
-    if level == 3:
-        return _solids(_random_track(u))
-    moved = jax.random.uniform(pole_key, POLES.shape, minval=-_POLE_RANGE, maxval=_POLE_RANGE)
-    return _solids(jnp.asarray(GATES) + jnp.asarray(_GATE_RANGE)[None] * u, jnp.asarray(POLES) + moved)
-
-
-def _random_track(u: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """Track of four gates from random numbers in [-1, 1]."""
-    quarter = jnp.array([(1, 0), (0, 1), (-1, 0), (0, -1)], u.dtype)  # one gate in each, so that they stay apart
-    place = quarter * jnp.array([[1.3, 0.9]]) + 0.25 * u[:, :2]
-    heading = jnp.arctan2(quarter[:, 0], -quarter[:, 1]) + 0.6 * u[:, 3]  # counterclockwise, 34 degrees off
-    return jnp.concatenate([place, 0.95 + 0.25 * u[:, 2:3], heading[:, None]], axis=-1)
-
-
-def _solids(gates: ArrayLike, poles: ArrayLike | None = None) -> Scene:
-    """Scene of gates (4, 4) and poles (k, 2)."""
-    if poles is None:
-        return track(gates, OPENING, FRAME)
-    gates, poles = jnp.asarray(gates, float), jnp.asarray(poles, float)
-    pos = jnp.concatenate([poles, jnp.full((len(poles), 1), POLE_HEIGHT / 2)], axis=-1)
-    beams = jax.vmap(lambda pose: gate(pose[:3], pose[3], OPENING, FRAME))(gates)
-    return Scene.of(beams, Cylinder(pos=pos, radius=POLE_RADIUS, height=POLE_HEIGHT))
-
-
-def _gates_of(scene: Scene, dtype) -> Float[Array, "4 4"]:
-    """Gates of a scene: x, y, z of the centers (m) and headings (rad)."""
-    beams = BEAMS * len(GATES)
-    if scene.boxes is None or len(scene.boxes.pos) < beams:
-        found = 0 if scene.boxes is None else len(scene.boxes.pos)
-        raise UserError(
-            f"the task gates needs a scene whose first {beams} boxes are the beams of its {len(GATES)} gates; this one "
-            f"has {found} boxes; give one of jaxdrones.sensing.track"
-        )
-    pos, quat = (
-        jnp.asarray(x[:beams], dtype).reshape(len(GATES), BEAMS, -1) for x in (scene.boxes.pos, scene.boxes.quat)
-    )
-    heading = 2 * atan2(quat[:, 0, 2], quat[:, 0, 3])
-    return jnp.concatenate([jnp.mean(pos, axis=1), heading[:, None]], axis=-1)
-
-
-def _poles_of(scene: Scene, dtype) -> Float[Array, "4 2"]:
-    """X and y of the first four cylinders of a scene, m; missing ones are far away."""
-    pos = jnp.zeros((0, 2)) if scene.cylinders is None else scene.cylinders.pos[: len(POLES), :2]
-    missing = len(POLES) - len(pos)
-    return jnp.pad(jnp.asarray(pos, dtype), ((0, missing), (0, 0)), constant_values=_NOWHERE)
-
-
-def _random_inertia(key: jax.Array, params: Params) -> Params:
-    """Every moment of inertia times a random factor near one."""
-    factor = jax.random.uniform(key, params.inertia.shape, params.inertia.dtype, 1 - _INERTIA_RANGE, 1 + _INERTIA_RANGE)
-    return params.replace(inertia=params.inertia * factor)
-
-
-def _gate(variables: dict[str, Array], later: int = 0) -> Float[Array, "n 4"]:
-    """Next gate of every drone, or the one `later` gates ahead, at most the last one."""
-    return variables["gates"][jnp.minimum(variables["index"] + later, len(GATES) - 1)]
-
-
-def _normal(gate: Float[Array, "n 4"]) -> Float[Array, "n 3"]:
-    """Crossing direction of a gate."""
-    yaw = gate[:, 3]
-    return jnp.stack([jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw)], axis=-1)
-
-
-def _in_gate(gate: Float[Array, "n 4"], pos: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Positions in the axes of a gate: through it, to its left, up; m."""
-    dx, dy, dz = (pos - gate[:, :3]).T
-    cos, sin = jnp.cos(gate[:, 3]), jnp.sin(gate[:, 3])
-    return jnp.stack([cos * dx + sin * dy, cos * dy - sin * dx, dz], axis=-1)
+def _gate(variables: dict[str, Array]) -> Float[Array, "n 4"]:
+    """Next gate of every drone."""
+    return racetrack.gates_ahead(variables["gates"], variables["index"])[:, 0]
 
 
 def _observe_gates(task: Task, world: World) -> Float[Array, "n 12"]:
     """Center relative to the drone (m) and direction of the next gate and of the one after it, world axes."""
-    ahead = [_gate(world.variables, later) for later in (0, 1)]
-    return jnp.concatenate([x for gate in ahead for x in (gate[:, :3] - world.drones.pos, _normal(gate))], axis=-1)
+    ahead = racetrack.gates_ahead(world.variables["gates"], world.variables["index"])
+    return racetrack.seen_gates(ahead, world.drones.pos)
 
 
 def _observe_poles(task: Task, world: World) -> Float[Array, "n 8"]:

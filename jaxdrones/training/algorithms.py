@@ -15,6 +15,7 @@ from jaxdrones.envs import Env
 
 ALGORITHMS = {
     "bptt": "jaxdrones.learning.bptt",
+    "league": "jaxdrones.learning.league",
     "ppo": "jaxdrones.learning.ppo",
     "shac": "jaxdrones.learning.shac",
 }

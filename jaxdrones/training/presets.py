@@ -78,6 +78,22 @@ _CROSSING = dict(
 )
 """Two seconds of flight of teams, in which drones meet and avoid each other."""
 
+_RACE = dict(
+    updates=400,
+    worlds=64,
+    horizon=60,
+    hidden_sizes=(64, 64),
+    obs_stats_freeze=0.15,
+    gradient="decay",
+    gradient_decay=0.94,
+    outlier_gradient=10.0,
+    learning_rate=5e-3,
+    adam_b2=0.99,
+    max_grad_norm=1.0,
+    restart_fraction=0.35,
+)
+"""One second of flight, in which a drone passes a gate."""
+
 _PAYLOAD = _CROSSING | dict(updates=300, gradient_decay=0.95, learning_rate=3e-3, restart_fraction=0.3)
 """Two seconds of flight with a load, about one and a half periods of its swing."""
 
@@ -111,6 +127,8 @@ _CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
     ("swap-goals", "bptt"): _CROSSING,
     ("swap-goals", "ppo"): _CROSSING_PPO,
     ("wake", "bptt"): _CROSSING | dict(updates=200, worlds=64, gradient_decay=0.94, learning_rate=3e-3),
+    ("race", "bptt"): _RACE,
+    ("race", "league"): _RACE,
     ("sling", "bptt"): _PAYLOAD,
     ("transport", "bptt"): _PAYLOAD,
     ("follow", "bptt"): dict(updates=200, worlds=64, horizon=50, gradient="decay", learning_rate=1e-2),
@@ -138,6 +156,7 @@ _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
     "gates": dict(random_start=True),
     "crowd": dict(random_box=True, density=1.5, substeps=2),
     "swap-goals": dict(substeps=2),
+    "race": dict(random_start=True, contact=False, substeps=2),
     "sling": dict(substeps=2),
     "transport": dict(substeps=2),
 }

@@ -1,0 +1,115 @@
+"""Backpropagation through time against past policies: self-play in a league (as in AlphaStar, Vinyals et al. 2019).
+
+The first drone of every team learns; the others are flown by past policies of the same training, whose parameters are
+part of the training state. So a whole training is one compiled program.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdrones.arguments import Count, checked
+from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
+from jaxdrones.learning import bptt, collect, result
+from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.normalize import state_vector
+from jaxdrones.learning.settings import check_config
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Config(bptt.Config):
+    """Settings; numbers that are not shapes may be traced, so that `vmap` trains with many values at once."""
+
+    past_policies: Count = 4
+    """Number of past policies; each flies the opponents in an equal share of the worlds."""
+    snapshot_interval: Count = 50
+    """Updates after which the oldest past policy is replaced by the present one."""
+
+    def __post_init__(self):
+        if self.worlds % self.past_policies:
+            raise UserError(f"worlds is {self.worlds}; give a multiple of past_policies, {self.past_policies}")
+        if self.per_agent or self.recurrent_size:
+            raise UserError("a league has one policy for all drones, without a hidden state; remove per_agent and GRU")
+
+
+class TrainState(result.TrainState):
+    """Complete state of a training."""
+
+    past: Policy
+    """Past policies, (k, ...)."""
+
+
+def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> TrainState:
+    """State before the first update; all past policies are the initial one.
+
+    Raises:
+        ValueError: a network with a hidden state.
+    """
+    state = bptt.init(key, env, config, network)
+    if state.policy.is_recurrent:
+        raise UserError("network is recurrent; give a league one without a hidden state")
+    past = jax.tree.map(lambda x: jnp.broadcast_to(x, (config.past_policies, *jnp.shape(x))), state.policy)
+    return TrainState(past=past, **vars(state))
+
+
+def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
+    """Take a gradient step on the rewards of the first drones, and possibly keep the policy."""
+    act = functools.partial(against, state.past)
+    state, metrics = bptt.gradient_step(env, config, state, act=act, learning=slice(1))
+    taken = state.step % config.snapshot_interval == 0
+    slot = jnp.arange(config.past_policies) == state.step // config.snapshot_interval % config.past_policies
+
+    def kept(past: Array, new: Array) -> Array:
+        return jnp.where((taken & slot).reshape(-1, *[1] * new.ndim), new[None], past)
+
+    return state.replace(past=jax.tree.map(kept, state.past, state.policy)), metrics
+
+
+def against(past: Policy, policy: Policy) -> collect.Act:
+    """Actions of the first drones by a policy, and of the others by past policies.
+
+    Args:
+        past: (k, ...) policies; each flies in one of k equal groups of worlds.
+        policy: the policy that learns.
+    """
+
+    def act(policy: Policy, past: Policy, noise: Any, hidden_state: Any, obs: collect.Obs) -> tuple[Any, Array, Any]:
+        count = len(jax.tree.leaves(past)[0])
+
+        def of_others(x: Array) -> Array:
+            return x[:, 1:].reshape(count, len(x) // count, *x[:, 1:].shape[1:])
+
+        own = policy(jax.tree.map(lambda x: x[:, :1], obs))
+        if state_vector(obs).shape[1] == 1:
+            return hidden_state, own, None
+        others = jax.vmap(lambda policy, obs: policy(obs))(past, jax.tree.map(of_others, obs))
+        return (
+            hidden_state,
+            jnp.concatenate([own, others.reshape(len(own), others.shape[2], own.shape[-1])], axis=1),
+            None,
+        )
+
+    return jax.tree_util.Partial(act, policy, jax.lax.stop_gradient(past))
+
+
+def train(
+    key: jax.Array,
+    env: Env,
+    config: Config,
+    *,
+    network: Any = None,
+    callback: result.Callback | Sequence[result.Callback] = (),
+    state: TrainState | None = None,
+) -> result.Result:
+    """Make all updates; see `learning.result.run_training`."""
+    check_config(config, Config)
+    return result.run_training(init, update, key, env, config, network=network, callback=callback, state=state)

@@ -1,0 +1,64 @@
+"""The league: who flies whom, who learns, and when a policy is kept."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_close
+
+import jaxdrones as jd
+from jaxdrones.learning import bptt, league
+
+SMALL = dict(updates=4, worlds=4, horizon=3, hidden_sizes=(8,))
+CONFIG = league.Config(**SMALL, past_policies=2, snapshot_interval=2)
+KEY = jax.random.key(0)
+
+
+def scaled(policy, factor):
+    return policy.replace(params=jax.tree.map(lambda x: factor * x, policy.params))
+
+
+def test_the_first_drones_are_flown_by_the_policy_and_the_others_by_the_past_policies_of_their_worlds():
+    env = jd.make("hover", drones=3)
+    policy = league.init(KEY, env, CONFIG).policy
+    past = jax.tree.map(lambda *x: jnp.stack(x), scaled(policy, 2.0), scaled(policy, -3.0))
+    obs = jax.random.normal(KEY, (4, 3, env.observation_size))
+    _, action, _ = league.against(past, policy)(None, None, obs)
+    np.testing.assert_allclose(action[:, 0], policy(obs)[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(action[:2, 1:], scaled(policy, 2.0)(obs)[:2, 1:], rtol=1e-6)
+    np.testing.assert_allclose(action[2:, 1:], scaled(policy, -3.0)(obs)[2:, 1:], rtol=1e-6)
+
+
+def test_a_league_of_single_drones_learns_what_bptt_learns():
+    env = jd.make("hover")
+    expected = bptt.train(KEY, env, bptt.Config(**SMALL))
+    found = league.train(KEY, env, CONFIG)
+    assert_close(found.policy.params, expected.policy.params, 1e-6)
+
+
+def test_only_the_first_drone_learns_and_the_oldest_past_policy_is_replaced():
+    env = jd.make("hover", drones=2)
+    start = league.init(KEY, env, CONFIG)
+    result = league.train(KEY, env, CONFIG)
+    assert jax.tree.all(jax.tree.map(lambda x, first: x.shape == (2, *first.shape), start.past, start.policy))
+    kept = [jax.tree.map(lambda x, i=i: x[i], result.train_state.past.params) for i in range(2)]
+    assert_close(kept[0], result.policy.params, 1e-12)  # kept after update 4, in the place of the first
+    halfway = league.train(KEY, env, CONFIG, callback=lambda update, metrics, state: update == 2).policy
+    assert_close(kept[1], halfway.params, 1e-12)
+
+    def lost(task, world):
+        """A large reward of the second drone for what the first one does."""
+        return 1e3 * world.drones.vel[0, 2] * (jnp.arange(2) == 1)
+
+    rewards = dict(env.task.rewards) | {"lost": (1.0, lost)}
+    other = dataclasses.replace(env, task=dataclasses.replace(env.task, rewards=rewards))
+    assert_close(league.train(KEY, other, CONFIG).policy.params, result.policy.params, 1e-12)
+
+
+def test_worlds_that_past_policies_cannot_share_are_a_mistake():
+    with pytest.raises(ValueError, match="worlds is 5; give a multiple of past_policies, 2"):
+        league.Config(**SMALL | {"worlds": 5}, past_policies=2)
+    with pytest.raises(ValueError, match="one policy for all drones"):
+        league.Config(**SMALL, past_policies=2, per_agent=True)

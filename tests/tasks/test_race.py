@@ -1,0 +1,154 @@
+"""Races: order and overtakes, contact between control steps, progress, and flights without contact."""
+
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import jit_unoptimized
+
+from jaxdrones.envs import make
+from jaxdrones.tasks import centerline
+from jaxdrones.tasks.race import _order
+from jaxdrones.tasks.racetrack import GATES, OPENING, direction, passes
+
+START = np.array([-1.5, 0.75, 0.0, -0.2])
+LINE = functools.cache(
+    lambda: centerline.centerline(jnp.asarray(np.tile(GATES, (2, 1))), jnp.asarray(START), jnp.asarray(12.0))
+)
+ENV = functools.cache(lambda drones=2, **options: make("race", drones=drones, level=0, **options))
+RACING = jnp.ones(2, bool)
+
+
+@functools.cache
+def start(drones=2):
+    return jit_unoptimized(ENV(drones).reset)(jax.random.key(0))[1]
+
+
+@functools.cache
+def advance(drones=2, **options):
+    env = ENV(drones, **options)
+    return jit_unoptimized(lambda world: env.task.advance(env.task, world))
+
+
+def after(before, pos, index=0, active=None, **options):
+    """Variables after a step of two drones between these positions."""
+    world = start()
+    variables = world.variables | {"pos": jnp.asarray(before), "index": jnp.full(2, index)}
+    drones = world.drones.replace(pos=jnp.asarray(pos))
+    active = world.active if active is None else jnp.asarray(active)
+    return advance(**options)(world.replace(drones=drones, variables=variables, active=active))
+
+
+def overtakes(leads, racing=RACING):
+    """Overtakes of two drones over a history of leads of the first, m."""
+    lead, total = jnp.zeros((2, 2), jnp.int32), jnp.zeros(2)
+    for x in leads:
+        lead, new = _order(lead, jnp.array([5.0 + x, 5.0]), racing)
+        total += new
+    return total.tolist()
+
+
+@pytest.mark.parametrize(
+    ("leads", "counts"),
+    [
+        ([-0.5, 0.5], [1, 0]),
+        ([0.5, -0.5], [0, 1]),
+        ([-0.5, -0.1, 0.1, -0.1, 0.1, 0.3, 0.5, 0.9], [1, 0]),
+        ([-0.5, 0.5, -0.5, 0.5], [2, 1]),
+        ([-0.5, 0.1, -0.5], [0, 0]),
+        ([0.0, 0.1, 0.5], [0, 0]),
+    ],
+)
+def test_an_overtake_counts_once_for_the_drone_that_went_from_clearly_behind_to_clearly_ahead(leads, counts):
+    assert overtakes(leads) == counts
+
+
+def test_a_drone_that_left_the_race_is_not_overtaken():
+    assert overtakes([-0.5]) == overtakes([-0.5, 0.5], jnp.array([True, False])) == [0, 0]
+
+
+def test_drones_that_pass_through_each_other_between_two_control_steps_have_touched():
+    radius = float(ENV().params.collision_radius[0])
+    for gap, touched in ((1.9, True), (2.1, False)):
+        aside = gap * radius
+        left, right = [[0.0, 1.5, 1.0], [0.4, 1.5 + aside, 1.0]], [[0.4, 1.5, 1.0], [0.0, 1.5 + aside, 1.0]]
+        np.testing.assert_array_equal(after(left, right)["touched"], [touched] * 2)
+        np.testing.assert_array_equal(after(left, right, active=[True, False])["touched"], [False] * 2)
+
+
+def test_a_flight_along_the_centerline_makes_progress_of_its_length_and_back_none():
+    line = LINE()
+    way = np.asarray(line.pos[1]), np.asarray(line.pos[2])  # to the second gate, and to the third
+    length = float(line.along[2, 0] - line.along[1, 3])
+    steps = np.concatenate([way[0][3:], way[1][:1]])
+    gained = sum(float(after([a, a], [b, a], index=1)["progress"][0]) for a, b in itertools.pairwise(steps))
+    np.testing.assert_allclose(gained, length, rtol=0.04)  # means over 12 cm of a bend
+    back = after([steps[3], steps[3]], [steps[2], steps[3]], index=1)
+    assert back["progress"][0] < -0.05 and back["progress"][1] == 0
+
+
+def test_the_centerline_passes_the_gates_in_order_and_in_their_direction():
+    line = np.asarray(LINE().pos)
+    for i in range(5):
+        gate = GATES[i % 4]
+        np.testing.assert_allclose(line[i + 1, 0], gate[:3], atol=1e-6)
+        before, beyond = line[i, -1], line[i + 1, 1]
+        heading = (beyond - before) / np.linalg.norm(beyond - before)
+        assert heading @ np.asarray(direction(jnp.asarray(gate))) > 0.8
+        assert passes(jnp.asarray(gate)[None], jnp.asarray(before)[None], jnp.asarray(beyond)[None])[0]
+
+
+def test_the_centerline_between_gates_on_a_circle_is_nearly_the_circle():
+    angle = np.arange(4) * np.pi / 2
+    gates = np.stack([np.cos(angle), np.sin(angle), np.ones(4), angle + np.pi / 2], axis=-1)
+    line = centerline.centerline(jnp.asarray(gates), jnp.asarray([0.0, -1, 1, 0]), jnp.asarray(4.0))
+    np.testing.assert_allclose(np.linalg.norm(line.pos[..., :2], axis=-1), 1, atol=2e-3)
+    np.testing.assert_allclose(line.along[3, 0], 1.5 * np.pi, rtol=5e-3)
+    np.testing.assert_allclose(line.speed[2:], 2.0, rtol=0.03)  # v^2 / r is the largest acceleration
+
+
+def test_speeds_of_the_centerline_begin_at_rest_and_keep_the_limit_of_the_acceleration():
+    along, square = np.asarray(LINE().along).ravel(), np.asarray(LINE().speed).ravel() ** 2
+    assert square[0] == 0
+    assert np.all(np.abs(np.diff(square)) <= 2 * 12.0 * np.diff(along) * (1 + 1e-9))
+
+
+def test_without_contact_a_gate_counts_also_beside_its_opening_and_its_frame_ends_nothing():
+    gate = GATES[0]
+    left = np.array([-np.sin(gate[3]), np.cos(gate[3]), 0.0])
+    place = gate[:3] + (OPENING / 2 + 0.08) * left  # in the frame
+    ahead = 0.1 * np.asarray(direction(jnp.asarray(gate)))
+    step = [place - ahead] * 2, [place + ahead, place - ahead]
+    np.testing.assert_array_equal(after(*step)["index"], [0, 0])
+    np.testing.assert_array_equal(after(*step, contact=False)["index"], [1, 0])
+    assert after(*step)["hit"][0] and "crashed" not in ENV(contact=False).task.terminations
+
+
+def test_drones_start_on_the_ground_in_random_order_or_one_behind_the_other():
+    keys = jax.random.split(jax.random.key(0), 200)
+    grid = np.asarray(jit_unoptimized(jax.vmap(make("race", drones=3).reset))(keys)[1].drones.pos)
+    first = np.argmin(grid[..., 1], axis=1)
+    np.testing.assert_allclose(np.bincount(first) / len(keys), 1 / 3, atol=0.12)  # 3.6 standard deviations
+    env = make("race", drones=3, random_start=True, contact=False)
+    worlds = jit_unoptimized(jax.vmap(env.reset))(keys)[1]
+    flying = np.asarray(worlds.drones.pos[:, 0, 2] > 0.1)
+    assert abs(flying.mean() - 0.8) < 0.12
+    index = np.asarray(worlds.variables["index"])[flying]
+    assert index.max() == 3 and index.min() == 0 and np.ptp(index, axis=1).max() <= 1
+
+
+@pytest.mark.float32
+def test_observations_and_their_gradients_are_finite_for_a_drone_that_left_the_world():
+    env = make("race", drones=2)
+    _, world = env.reset(jax.random.key(0))
+    term = env.task.observations["line"].observe
+
+    def observed(pos):
+        return term(env.task, world.replace(drones=world.drones.replace(pos=pos)))
+
+    pos = world.drones.pos.at[1].set(jnp.array([1e4, 0.0, 1e4]))
+    obs, gradient = jax.jit(lambda pos: (observed(pos), jax.grad(lambda pos: jnp.sum(observed(pos)))(pos)))(pos)
+    assert np.all(np.isfinite(obs)) and np.all(np.isfinite(gradient))

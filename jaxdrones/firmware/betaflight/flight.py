@@ -147,7 +147,15 @@ class Flight:
     def _arm_by(self, client: msp.Client, end: float) -> str:
         """Configure and arm; an empty text, or why not at the time `end`."""
         self._run_for(_BOOT)
-        settings.configure(client, reversed_yaw=self._simulation.reversed_yaw)
+        for _ in range(_FIRST):  # disarms a Betaflight whose simulator was killed, which takes no settings while armed
+            self._link.send_sticks(rc_packet(self._simulation.time, Sticks()))
+            self._run_for(0.02)
+        again = settings.configure(client, 1 / self._simulation.dt, reversed_yaw=self._simulation.reversed_yaw)
+        if again and self._process is not None:
+            self._process.restart()
+            return "it is started again with its settings"
+        if again:
+            self._warn("the joined Betaflight takes the rate of its loop when it is started again; it flies without")
         self._start_clock()
         self._booted, why = True, ""
         ran = time.monotonic()

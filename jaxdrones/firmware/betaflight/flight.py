@@ -18,7 +18,7 @@ from jaxdrones.firmware.betaflight.process import Process
 from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
 
 _LATE = 0.1  # s, lag behind the clock after which the schedule restarts
-_SILENT = 0.5  # s of real time without motors after which Betaflight is lost
+_SILENT, _SILENT_IN_LOCKSTEP = 0.5, 3.0  # s of real time without motors after which Betaflight is lost
 _REPLY = 0.01  # s for the motors of a step in lockstep, after which the state is sent again
 _BOOT = 1.0  # s after its port of MSP opens, until it takes settings
 _FIRST = 5  # packets with the first time: Betaflight's clock takes its pace from two times that differ
@@ -47,7 +47,7 @@ class Flown:
     late: int = 0
     """Number of times that the flight fell behind the clock by 0.1 s."""
     lost: int = 0
-    """Number of times that Betaflight was silent for 0.5 s."""
+    """Number of times that Betaflight was silent for 0.5 s, or 3 s in lockstep."""
 
     @property
     def real_time_factor(self) -> float:
@@ -89,6 +89,7 @@ class Flight:
         """
         self._simulation, self._link, self._pilot, self._process = simulation, link, pilot, process
         self._lockstep, self._wait, self._on_row, self._warn = lockstep, wait, on_row, warn
+        self._silent = _SILENT_IN_LOCKSTEP if lockstep else _SILENT
         self.flown = Flown()
         self._outputs = np.zeros(4)
         self._sticks = Sticks()
@@ -109,7 +110,7 @@ class Flight:
                 if self._armed_at is None:
                     self._arm()
                 self._step()
-                if time.monotonic() - self._heard > _SILENT:
+                if time.monotonic() - self._heard > self._silent:
                     self._lose()
         finally:
             self._armed_at, self._sticks = None, Sticks()
@@ -119,7 +120,7 @@ class Flight:
     def _lose(self) -> None:
         """Betaflight is silent: the motors stop, and it has to be armed again."""
         self.flown.lost += 1
-        self._warn(f"Betaflight sent no motors for {_SILENT:g} s; they stop")
+        self._warn(f"Betaflight sent no motors for {self._silent:g} s; they stop")
         self._armed_at, self._sticks, self._outputs, self._booted = None, Sticks(), np.zeros(4), False
 
     def _arm(self) -> None:
@@ -222,7 +223,7 @@ class Flight:
         """Take the motors; in lockstep, send the state again and again until they come or Betaflight is lost."""
         waits = self._lockstep and self._booted
         found = self._link.outputs(_REPLY if waits else 0.0)
-        while waits and not found and time.monotonic() - self._heard < _SILENT:
+        while waits and not found and time.monotonic() - self._heard < self._silent:
             self._link.send_state(packet)
             self.flown.repeated += 1
             found = self._link.outputs(_REPLY)

@@ -63,7 +63,7 @@ def fly(link, seconds, pilot=lambda hover: hover, act=lambda t, process: None, *
 
     with Process(PROGRAM) as process:
         flight = Flight(
-            simulation, link, pilot(hover), process=process, on_row=on_row, warn=warnings.append, wait=60, **options
+            simulation, link, pilot(hover), process=process, on_row=on_row, warn=warnings.append, wait=120, **options
         )
         flight.run(seconds)
     return Trial(flight, rows, warnings)

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import threading
+import time
 from pathlib import Path
 
 import jax
@@ -88,8 +89,8 @@ def test_log_blocks_come_at_their_rates(flying):
     for rows, period in zip(flying.client("log")["rows"], (20, 100), strict=True):
         t, z, acc, voltage = np.array(rows).T
         np.testing.assert_array_equal(np.diff(t), period)  # of simulated time, without a gap
-        assert abs(len(t) - 3000 / period) <= 0.2 * 3000 / period + 2
-        np.testing.assert_allclose(acc, 1, atol=0.02)  # it settles on the ground
+        assert abs(len(t) - 3000 / period) <= 0.3 * 3000 / period + 2
+        assert np.median(acc) == pytest.approx(1, abs=2e-3)
         assert (voltage == 4000).all() and np.ptp(z) < 1e-3
 
 
@@ -125,6 +126,7 @@ def test_the_example_of_cflib_runs_unchanged(flying, tmp_path):
     if not example.is_file():
         pytest.skip(f"this cflib has no example {example}")
     ran([str(example)], tmp_path, CFLIB_URI=flying.uri)
+    time.sleep(1)  # it falls from the height at which the script stops the motors
     pos = flying.pos
     assert abs(pos[:, 0].max() - 0.8) < 0.1 and abs(pos[:, 2].max() - 0.8) < 0.1
     assert pos[-1, 2] < 0.05

@@ -18,7 +18,7 @@ from jaxdrones.firmware.betaflight.process import Process
 from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
 
 _LATE = 0.1  # s, lag behind the clock after which the schedule restarts
-_SILENT = 0.5  # s of real time without motors after which Betaflight is lost
+_SILENT, _SILENT_IN_LOCKSTEP = 0.5, 3.0  # s of real time without motors after which Betaflight is lost
 _REPLY = 0.01  # s for the motors of a step in lockstep, after which the state is sent again
 _BOOT = 1.0  # s after its port of MSP opens, until it takes settings
 _FIRST = 5  # packets with the first time: Betaflight's clock takes its pace from two times that differ
@@ -47,7 +47,7 @@ class Flown:
     late: int = 0
     """Number of times that the flight fell behind the clock by 0.1 s."""
     lost: int = 0
-    """Number of times that Betaflight was silent for 0.5 s."""
+    """Number of times that Betaflight was silent for 0.5 s, or 3 s in lockstep."""
 
     @property
     def real_time_factor(self) -> float:
@@ -89,6 +89,7 @@ class Flight:
         """
         self._simulation, self._link, self._pilot, self._process = simulation, link, pilot, process
         self._lockstep, self._wait, self._on_row, self._warn = lockstep, wait, on_row, warn
+        self._silent = _SILENT_IN_LOCKSTEP if lockstep else _SILENT
         self.flown = Flown()
         self._outputs = np.zeros(4)
         self._sticks = Sticks()
@@ -109,7 +110,7 @@ class Flight:
                 if self._armed_at is None:
                     self._arm()
                 self._step()
-                if time.monotonic() - self._heard > _SILENT:
+                if time.monotonic() - self._heard > self._silent:
                     self._lose()
         finally:
             self._armed_at, self._sticks = None, Sticks()
@@ -119,7 +120,7 @@ class Flight:
     def _lose(self) -> None:
         """Betaflight is silent: the motors stop, and it has to be armed again."""
         self.flown.lost += 1
-        self._warn(f"Betaflight sent no motors for {_SILENT:g} s; they stop")
+        self._warn(f"Betaflight sent no motors for {self._silent:g} s; they stop")
         self._armed_at, self._sticks, self._outputs, self._booted = None, Sticks(), np.zeros(4), False
 
     def _arm(self) -> None:
@@ -147,7 +148,15 @@ class Flight:
     def _arm_by(self, client: msp.Client, end: float) -> str:
         """Configure and arm; an empty text, or why not at the time `end`."""
         self._run_for(_BOOT)
-        settings.configure(client, reversed_yaw=self._simulation.reversed_yaw)
+        for _ in range(_FIRST):  # disarms a Betaflight whose simulator was killed, which takes no settings while armed
+            self._link.send_sticks(rc_packet(self._simulation.time, Sticks()))
+            self._run_for(0.02)
+        again = settings.configure(client, 1 / self._simulation.dt, reversed_yaw=self._simulation.reversed_yaw)
+        if again and self._process is not None:
+            self._process.restart()
+            return "it is started again with its settings"
+        if again:
+            self._warn("the joined Betaflight takes the rate of its loop when it is started again; it flies without")
         self._start_clock()
         self._booted, why = True, ""
         ran = time.monotonic()
@@ -214,7 +223,7 @@ class Flight:
         """Take the motors; in lockstep, send the state again and again until they come or Betaflight is lost."""
         waits = self._lockstep and self._booted
         found = self._link.outputs(_REPLY if waits else 0.0)
-        while waits and not found and time.monotonic() - self._heard < _SILENT:
+        while waits and not found and time.monotonic() - self._heard < self._silent:
             self._link.send_state(packet)
             self.flown.repeated += 1
             found = self._link.outputs(_REPLY)

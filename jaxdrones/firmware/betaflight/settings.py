@@ -14,6 +14,9 @@ _ACTUAL = 3  # kind of rates: center sensitivity and maximum, in 10 degrees/s
 _RATE_LIMIT = 1998  # degrees/s
 _QUAD_X = 3
 _FAILSAFE_DELAY = 200  # 0.1 s
+_GYRO_HZ, _MOST_DENOMINATOR = 8000, 16  # rate of the gyroscope; largest quotient of it and the rate of the loop
+_FIRST_LOW_PASS, _LOW_PASS, _DYNAMIC = slice(0, 1), slice(20, 24), slice(29, 33)  # cutoffs for the gyroscope, Hz
+_LOOPS = 2  # for each state; with one, the states and Betaflight's clock, which has their pace, wait for each other
 _STICKS, _HOLD = 4, 1  # channels that keep their values if the receiver seems lost, for example as the clock jumped
 _SWITCH_ON = (1700, 2100)  # us
 _STATUS = struct.Struct("<HHHIBHBB")
@@ -62,18 +65,24 @@ class Status(NamedTuple):
     """Reasons against arming, of `FLAGS`."""
 
 
-def configure(client: msp.Client, max_rate: int = MAX_RATE, reversed_yaw: bool = False) -> None:
+def configure(client: msp.Client, hz: float, max_rate: int = MAX_RATE, reversed_yaw: bool = False) -> bool:
     """Set AUX1 to arm, AUX2 to level (else acro), linear rates, a long failsafe and the direction of the motors.
 
-    They are saved in `eeprom.bin` in the folder of the process, which activates them.
+    The rate of the control loop becomes twice that of the states, and the low-pass filters of the gyroscope, which has
+    no noise, are off: on a busy computer the loop runs less often, which makes filters and derivatives slower. All
+    settings are saved in `eeprom.bin` in the folder of the process.
 
     Args:
         client: connection.
+        hz: states per second.
         max_rate: rate at the end of a stick about all axes, degrees/s.
         reversed_yaw: whether the motors turn in the opposite of Betaflight's default direction.
 
     Raises:
         msp.NoAnswer: no answer, or settings that were not taken.
+
+    Returns:
+        Whether Betaflight must be started again for the rate of its loop and its filters.
     """
     for slot, mode in enumerate((_ARM, _ANGLE)):
         client.request(msp.SET_MODE_RANGE, mode_range(slot, mode, slot))
@@ -84,9 +93,25 @@ def configure(client: msp.Client, max_rate: int = MAX_RATE, reversed_yaw: bool =
     client.request(msp.SET_FAILSAFE, bytes([_FAILSAFE_DELAY]) + failsafe[1:])
     for channel in range(_STICKS):
         client.request(msp.SET_RX_FAIL, struct.pack("<BBH", channel, _HOLD, 1500))
+    slower = _with_loop(client, hz)
     client.request(msp.EEPROM_WRITE)
     if client.request(msp.RC_TUNING)[: len(rates)] != rates:
         raise msp.NoAnswer("Betaflight did not take the rates; it is another version than 4.6")
+    return slower
+
+
+def _with_loop(client: msp.Client, hz: float) -> bool:
+    """Set the rate of the control loop and switch filters off; whether this changes something."""
+    old = client.request(msp.ADVANCED), client.request(msp.FILTERS)
+    advanced, filters = map(bytearray, old)
+    if len(advanced) < 2 or len(filters) < _DYNAMIC.stop:
+        raise msp.NoAnswer("Betaflight's settings are shorter than those of 4.6; it is another version")
+    advanced[1] = min(max(round(_GYRO_HZ / (_LOOPS * hz)), 1), _MOST_DENOMINATOR)
+    for place in (_FIRST_LOW_PASS, _LOW_PASS, _DYNAMIC):
+        filters[place] = bytes(place.stop - place.start)
+    client.request(msp.SET_ADVANCED, bytes(advanced))
+    client.request(msp.SET_FILTERS, bytes(filters))
+    return (advanced, filters) != tuple(map(bytearray, old))
 
 
 def mode_range(slot: int, mode: int, auxiliary: int) -> bytes:

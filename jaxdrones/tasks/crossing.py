@@ -62,7 +62,8 @@ def advance(task: Task, world: World) -> dict[str, Array]:
     of the drone is within a collision radius of it at a control step.
     """
     variables, pos = world.variables, world.drones.pos
-    closest = nearest_on_the_way(variables["pos"], pos, nearby(pos, _SEEN))
+    before = jnp.where(world.active[:, None], variables["pos"], pos)  # drones that left did not fly there
+    closest = nearest_on_the_way(before, pos, nearby(pos, _SEEN))
     touching = closest < 2 * world.params.collision_radius
     if world.scene.has_obstacles:
         touching |= shaping.gap(world) < 0

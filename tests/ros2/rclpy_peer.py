@@ -1,6 +1,6 @@
 """A peer of a team that knows rclpy alone: it steps a flight in lockstep and writes what it receives.
 
-    python rclpy_peer.py FILE.npz DRONES STEPS
+python rclpy_peer.py FILE.npz DRONES STEPS
 """
 
 import sys

@@ -87,6 +87,19 @@ def test_drones_that_pass_between_two_control_steps_have_touched():
         np.testing.assert_array_equal(env.task.measure(later)["safe"], [not touches, not touches, True])
 
 
+def test_a_drone_that_left_the_world_touches_nobody_on_the_way():
+    """Drones that leave are moved far along x, here past another one."""
+    env = make("crowd", drones=3)
+    _, world = env.reset(jax.random.key(0))
+    pos = jnp.array([[0.0, 0, 3], [1.0, 0, 3], [0, 3, 3]])
+    left = world.replace(
+        drones=world.drones.replace(pos=pos.at[0, 0].set(1e4)),
+        variables=world.variables | {"pos": pos},
+        active=jnp.array([False, True, True]),
+    )
+    np.testing.assert_array_equal(env.task.advance(env.task, left)["touched"], [False, False, False])
+
+
 @pytest.mark.parametrize("count", [3, 4])
 def test_the_nearest_point_of_two_ways_is_that_of_a_fine_search(count):
     rng = np.random.default_rng(0)

@@ -19,6 +19,7 @@ HELPERS = (
     "against",
     "cameras_scenes",
     "common",
+    "crowd_baselines",
     "exported",
     "programs",
     "published",

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
@@ -62,7 +63,7 @@ def randomization_of(level: int) -> tuple[Callable[[jax.Array, Params], Params],
     return () if level == 0 else (_random_inertia,)
 
 
-def gates_of(scene: Scene, dtype) -> Float[Array, "4 4"]:
+def gates_of(scene: Scene, dtype: DTypeLike) -> Float[Array, "4 4"]:
     """Gates of a scene: x, y, z of the centers (m) and headings (rad).
 
     Raises:
@@ -82,7 +83,7 @@ def gates_of(scene: Scene, dtype) -> Float[Array, "4 4"]:
     return jnp.concatenate([jnp.mean(pos, axis=1), heading[:, None]], axis=-1)
 
 
-def poles_of(scene: Scene, dtype) -> Float[Array, "4 2"]:
+def poles_of(scene: Scene, dtype: DTypeLike) -> Float[Array, "4 2"]:
     """X and y of the first four cylinders of a scene, m; missing ones are far away."""
     pos = jnp.zeros((0, 2)) if scene.cylinders is None else scene.cylinders.pos[: len(POLES), :2]
     missing = len(POLES) - len(pos)

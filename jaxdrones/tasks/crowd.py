@@ -93,7 +93,9 @@ def _random_sides(key: jax.Array, side: float) -> Float[Array, "3"]:
     return jnp.where(jnp.arange(3) == jax.random.randint(which_key, (), 0, 6), long, sides)
 
 
-def _places(key: jax.Array, n: int, middle: Array, sides: Array, scene: Scene, radius: Array) -> Float[Array, "n 3"]:
+def _places(
+    key: jax.Array, n: int, middle: np.ndarray, sides: Array, scene: Scene, radius: Array
+) -> Float[Array, "n 3"]:
     """Random places in a box, apart from each other and from obstacles where one of the tries is."""
     tries = middle[None] + jax.random.uniform(key, (n, _TRIES, 3), minval=-0.5, maxval=0.5) * sides[None, None]
     spacing = _SPACING * radius

@@ -97,7 +97,7 @@ def _places(
     key: jax.Array, n: int, middle: np.ndarray, sides: Array, scene: Scene, radius: Array
 ) -> Float[Array, "n 3"]:
     """Random places in a box, apart from each other and from obstacles where one of the tries is."""
-    tries = middle[None] + jax.random.uniform(key, (n, _TRIES, 3), minval=-0.5, maxval=0.5) * sides[None, None]
+    tries = jax.random.uniform(key, (n, _TRIES, 3), minval=-0.5, maxval=0.5) * sides[None, None] + middle[None]
     spacing = _SPACING * radius
     clear = jnp.full((n, _TRIES), jnp.inf)
     if scene.has_obstacles:

@@ -148,8 +148,6 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
 }
 _ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {("hover", "bptt"): dict(updates=1200)}
 
-_UNFINISHED = {("room", "bptt")}
-"""Best known settings, with a success rate of about one half."""
 _BY_DEFAULT: dict[str, tuple[str, ...]] = {"hover": ("shac",), "landing": ("bptt",)}
 """Tasks and learners that work with default settings."""
 _PRACTICE_OPTIONS: dict[str, dict[str, Any]] = {
@@ -210,8 +208,7 @@ def settings_known(task: str, algorithm: str, any_vehicle: bool = False) -> bool
     """Whether there are tuned settings for a learner on a task with default options."""
     if any_vehicle:
         return (task, algorithm) in _ANY_VEHICLE_CONFIGS
-    found = (task, algorithm) in _CONFIGS or algorithm in _BY_DEFAULT.get(task, ())
-    return found and (task, algorithm) not in _UNFINISHED
+    return (task, algorithm) in _CONFIGS or algorithm in _BY_DEFAULT.get(task, ())
 
 
 def _settings(task: str, algorithm: str, realistic: bool | str) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from jaxdrones.tasks.starts import thrown
 from jaxdrones.training.episode import EpisodeLog, fly_episode
 from jaxdrones.training.run import Run
 
-SPACING = 0.8  # m between neighboring drones
+SPACING = 0.5  # m between neighboring drones
 HEIGHT = 2.0  # m, of the starts; the word begins one meter above
 SETTLING = 6.0  # s beyond a straight flight
 EVERY = 5  # control steps between two rows of the page

@@ -16,8 +16,8 @@ from jaxdrones.firmware.betaflight.packets import Sticks, rc_packet, state_packe
 from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
 from jaxdrones.firmware.betaflight.process import Process
 from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
+from jaxdrones.firmware.pace import LATE, Pace
 
-_LATE = 0.1  # s, lag behind the clock after which the schedule restarts
 _SILENT, _SILENT_IN_LOCKSTEP = 0.5, 3.0  # s of real time without motors after which Betaflight is lost
 _REPLY = 0.01  # s for the motors of a step in lockstep, after which the state is sent again
 _BOOT = 1.0  # s after its port of MSP opens, until it takes settings
@@ -32,11 +32,9 @@ class BetaflightLost(Exception):
 
 
 @dataclasses.dataclass
-class Flown:
+class Flown(Pace):
     """Statistics of a flight."""
 
-    simulated_s: float = 0.0
-    real_s: float = 0.0
     armed_s: float = 0.0
     """Simulated time with motors armed."""
     states: int = 0
@@ -44,15 +42,8 @@ class Flown:
     """Packets of the motors."""
     repeated: int = 0
     """States in lockstep that were sent again, because no motors came within 10 ms."""
-    late: int = 0
-    """Number of times that the flight fell behind the clock by 0.1 s."""
     lost: int = 0
     """Number of times that Betaflight was silent for 0.5 s, or 3 s in lockstep."""
-
-    @property
-    def real_time_factor(self) -> float:
-        """Simulated over real time."""
-        return self.simulated_s / self.real_s if self.real_s else 0.0
 
 
 def _nothing(*_: Any) -> None:
@@ -235,7 +226,7 @@ class Flight:
         """Wait for the clock; the interval between steps that make up for a late one is at least half of a step."""
         dt, now = self._simulation.dt, time.monotonic()
         self._due += dt
-        if now > self._due + _LATE:
+        if now > self._due + LATE:
             self.flown.late += not self._lockstep
             self._due = now
         time.sleep(max(self._due - now, self._last + dt / 2 - now, 0.0))

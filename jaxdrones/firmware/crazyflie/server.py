@@ -13,31 +13,22 @@ from jaxdrones.errors import UserError
 from jaxdrones.firmware.crazyflie.firmware import Crazyflie
 from jaxdrones.firmware.crazyflie.packet import NULL, Packet, decode, encode
 from jaxdrones.firmware.crazyflie.vehicle import PERIOD, Sample, Target
+from jaxdrones.firmware.pace import LATE, Pace
 
 HOST = "127.0.0.1"
 PORT = 19850
 """First of the ten ports that cflib scans."""
-_LATE = 0.1  # s, lag behind the clock after which the schedule restarts
 _MOST_AT_ONCE = 200  # packets between two periods
 
 
 @dataclasses.dataclass
-class Flown:
+class Flown(Pace):
     """Statistics of a flight."""
 
-    simulated_s: float = 0.0
-    real_s: float = 0.0
     received: int = 0
     sent: int = 0
     invalid: int = 0
     """Datagrams that are no packets."""
-    late: int = 0
-    """Number of times that the flight fell behind the clock by 0.1 s."""
-
-    @property
-    def real_time_factor(self) -> float:
-        """Simulated over real time."""
-        return self.simulated_s / self.real_s if self.real_s else 0.0
 
 
 class Server:
@@ -90,7 +81,7 @@ class Server:
             on_row(self._crazyflie.time, self._crazyflie.vehicle.sample, self._crazyflie.target)
             now = time.monotonic()
             self.flown.simulated_s, self.flown.real_s = rows * PERIOD, now - begin
-            if now > due + _LATE:
+            if now > due + LATE:
                 self.flown.late += 1
                 due = now
         return self.flown

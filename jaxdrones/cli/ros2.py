@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from jaxdrones.arguments import choice, number, whole
-from jaxdrones.cli.common import check_options, folder, print_error, print_warning
+from jaxdrones.cli.common import DIVERGED, INTERRUPTED, check_options, folder, print_error, print_warning
 from jaxdrones.cli.options import add_backend, add_drones, add_json, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
@@ -97,13 +97,17 @@ def _run(options: argparse.Namespace) -> int:
                 recorder=recorder,
                 warn=print_warning,
             )
-            lost = None
+            interrupted, lost = False, None
             try:
                 node.run(options.duration)
+            except KeyboardInterrupt:
+                interrupted = True
             except PeerLost as error:
                 lost = str(error)
         _print(options, vars(node.flown) | {"simulated_s": simulation.ns / 1e9})
-    return 0 if lost is None else print_error(lost, 1)
+    if lost:
+        return print_error(lost, DIVERGED)
+    return print_error("interrupted", INTERRUPTED) if interrupted else 0
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:

@@ -113,27 +113,25 @@ def encode(message: Message, class_of: Callable[[str], Any], array: Callable[[Fi
         class_of: name of a message type -> class of the other library, with the fields as keywords.
         array: (field, tuple or bytes) -> array of the other library.
     """
+    given = {field.name: _encode(field, getattr(message, field.name), class_of, array) for field in fields(message.NAME)}
+    return class_of(message.NAME)(**given)
 
-    def encoded(field: Field) -> Any:
-        given = getattr(message, field.name)
-        if field.is_message:
-            return (
-                encode(given, class_of, array) if field.length is None else [encode(x, class_of, array) for x in given]
-            )
-        return given if field.length is None else array(field, given)
 
-    return class_of(message.NAME)(**{field.name: encoded(field) for field in fields(message.NAME)})
+def _encode(field: Field, value: Any, class_of: Callable[[str], Any], array: Callable[[Field, Any], Any]) -> Any:
+    if field.is_message:
+        one = field.length is None
+        return encode(value, class_of, array) if one else [encode(x, class_of, array) for x in value]
+    return value if field.length is None else array(field, value)
 
 
 def decode(name: str, foreign: Any) -> Message:
     """Convert an object of another library to a message of the type `name`."""
+    return message_class(name)(**{field.name: _decode(field, getattr(foreign, field.name)) for field in fields(name)})
 
-    def decoded(field: Field) -> Any:
-        given = getattr(foreign, field.name)
-        if field.is_message:
-            return decode(field.kind, given) if field.length is None else tuple(decode(field.kind, x) for x in given)
-        if field.length is None:
-            return given
-        return bytes(given) if field.kind == "uint8" else tuple(map(float, given))
 
-    return message_class(name)(**{field.name: decoded(field) for field in fields(name)})
+def _decode(field: Field, value: Any) -> Any:
+    if field.is_message:
+        return decode(field.kind, value) if field.length is None else tuple(decode(field.kind, x) for x in value)
+    if field.length is None:
+        return value
+    return bytes(value) if field.kind == "uint8" else tuple(map(float, value))

@@ -113,8 +113,8 @@ def encode(message: Message, class_of: Callable[[str], Any], array: Callable[[Fi
         class_of: name of a message type -> class of the other library, with the fields as keywords.
         array: (field, tuple or bytes) -> array of the other library.
     """
-    given = {field.name: _encode(field, getattr(message, field.name), class_of, array) for field in fields(message.NAME)}
-    return class_of(message.NAME)(**given)
+    own = fields(message.NAME)
+    return class_of(message.NAME)(**{f.name: _encode(f, getattr(message, f.name), class_of, array) for f in own})
 
 
 def _encode(field: Field, value: Any, class_of: Callable[[str], Any], array: Callable[[Field, Any], Any]) -> Any:

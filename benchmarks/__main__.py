@@ -21,6 +21,8 @@ HELPERS = (
     "common",
     "crowd_baselines",
     "exported",
+    "leaderboard_pilots",
+    "leaderboard_scenarios",
     "programs",
     "published",
     "server",

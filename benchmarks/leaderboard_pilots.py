@@ -1,0 +1,259 @@
+"""Pilots of the leaderboard: how each is obtained, on the nominal scenario alone.
+
+All are policies with the action `rpm`. A controller is tuned by a random search: the factors of its gains that succeed
+most often in flights from the starts of tuning, and of equals those with the smallest error. The optimal planners fly
+with the package's weights, which are not tuned.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import jaxdrones as jd
+from benchmarks.leaderboard_scenarios import SETPOINT, TRAINING, TUNING, Scenario, flight
+from jaxdrones.control import Setpoint, firmware_pid, geometric, mellinger, pid
+from jaxdrones.envs import Env
+from jaxdrones.learning import evaluate
+from jaxdrones.learning.published import make_policy
+from jaxdrones.optimal import ilqr, lqr, mppi, weights
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+from jaxdrones.state import State
+from jaxdrones.training.algorithms import learner
+from jaxdrones.training.presets import preset
+
+_WIDTHS = (8.0, 2.5)  # largest factor of a gain in the first and in the second half of the search
+_GAINS = {
+    pid: ("pos_p", "pos_i", "pos_d", "rpy_p", "rpy_d"),
+    firmware_pid: ("pos_p", "vel_p", "vel_i", "attitude_p", "rate_p", "rate_d"),
+    geometric: ("pos", "vel", "attitude", "rate"),
+    mellinger: ("pos_p", "pos_i", "pos_d", "attitude_p", "rate_p", "rate_d"),
+    lqr: ("pos", "attitude", "vel", "omega", "command"),
+}
+_LEARNED = ("position_error", "rotation_matrix", "velocity_error", "omega", "rotor_speed", "last_action")
+"""What learned policies observe: the same as controllers."""
+
+
+class Obtained(NamedTuple):
+    """A pilot for a scenario, and what it cost."""
+
+    policy: Any
+    seconds: float
+    """Wall-clock time of tuning or training, with compilation, s."""
+    flown: float
+    """Simulated flight in it, s."""
+    settings: str = ""
+    """What was found."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pilot:
+    """A pilot and how it flies."""
+
+    obtain: Callable[[Scenario, Pilot], Obtained]
+    """(nominal scenario, pilot) -> policy."""
+    hz: int = 100
+    """Commands per second."""
+    starts: int = 1000
+    """Scored starts, the first ones of 1,000."""
+    horizon: int = -1
+    """Control steps whose setpoints a controller observes; -1 for a policy with observations of its own."""
+    needs: str = ""
+    """Optional library."""
+    candidates: int = 48
+    """Sets of gains in the tuning."""
+    tuning_starts: int = 128
+    """Flights of each set: together as many seconds as `bptt` flies in training, within a third."""
+
+    def observation(self, scenario: Scenario) -> tuple:
+        """Observation terms in a scenario."""
+        if self.horizon >= 0:
+            return (flight(self.horizon),)
+        return (*_LEARNED, "preview") if scenario.task == "tracking" else _LEARNED
+
+    def env(self, scenario: Scenario) -> Env:
+        """Environment of a scenario as this pilot flies it."""
+        return scenario.env(self.hz, self.observation(scenario))
+
+
+class Controller(PyTreeNode):
+    """Controller as a policy of the observation `flight`."""
+
+    gains: Any
+    """Gains, or settings of an optimal controller."""
+    params: Params
+    """Nominal parameters of one drone."""
+    memory: Any
+    """Memory of one drone at the start of an episode."""
+    module: ModuleType = flax.struct.field(pytree_node=False)
+    dt: float = flax.struct.field(pytree_node=False)
+
+    def initial_hidden_state(self, batch: tuple[int, ...]) -> Any:
+        """Memory of every drone."""
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*batch, *jnp.shape(x))), self.memory)
+
+    def act(self, hidden_state: Any, obs: Float[Array, "n d"]) -> tuple[Any, Float[Array, "n 4"]]:
+        """Memory after the observations, and actions."""
+        return jax.vmap(self._act)(hidden_state, obs)
+
+    def _act(self, memory: Any, obs: Float[Array, " d"]) -> tuple[Any, Float[Array, "4"]]:
+        state, setpoints = seen(obs)
+        if not hasattr(self.gains, "horizon"):
+            setpoints = jax.tree.map(lambda x: x[0], setpoints)
+        memory, rpm = self.module.control(self.gains, self.params, memory, state, setpoints, dt=self.dt)
+        return memory, action_of(self.params, rpm)
+
+
+def seen(obs: Float[Array, " d"]) -> tuple[State, Setpoint]:
+    """State and setpoints in an observation `flight` of one drone."""
+    state = jnp.split(obs[:17], (3, 7, 10, 13))
+    pos, vel, acc, yaw, omega = jnp.split(obs[17:].reshape(-1, SETPOINT), (3, 6, 9, 10), axis=-1)
+    return State(*state), Setpoint(pos, vel, acc, yaw[:, 0], omega)
+
+
+def action_of(params: Params, rpm: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Action of the type `rpm` that commands rotor speeds."""
+    above = rpm - params.hover_rpm
+    return above / jnp.where(above > 0, params.max_rpm - params.hover_rpm, params.hover_rpm)
+
+
+def nothing(scenario: Scenario, pilot: Pilot) -> Obtained:
+    """Rotors at hover speed, whatever is observed."""
+    return Obtained(lambda obs: jnp.zeros((len(obs), 4)), 0.0, 0.0)
+
+
+def tuned(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
+    """Controller with gains, or LQR with weights, from a random search."""
+
+    def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
+        began = time.perf_counter()
+        env, names = pilot.env(scenario), _GAINS[module]
+        make = controller(module, env)
+        rng = np.random.default_rng(TUNING)
+        best, score = np.ones(len(names)), (-1.0, 0.0)
+        for width in _WIDTHS:
+            center = best
+            for i in range(pilot.candidates // len(_WIDTHS)):
+                factors = center * np.exp(rng.uniform(-1, 1, len(names)) * np.log(width)) if i else center
+                came = evaluate(env, make(factors), jax.random.key(TUNING), pilot.tuning_starts)
+                error = came.rms_error if np.isfinite(came.rms_error) else np.inf
+                if (came.success, -error) > score:
+                    best, score = factors, (came.success, -error)
+        found = ", ".join(f"{name} {factor:.2g}" for name, factor in zip(names, best, strict=True))
+        flown = pilot.candidates * pilot.tuning_starts * env.steps * env.dt
+        return Obtained(make(best), time.perf_counter() - began, flown, f"gains times {found}")
+
+    return obtain
+
+
+def controller(module: ModuleType, env: Env) -> Callable[[np.ndarray], Controller]:
+    """Function from the factors of its gains to a controller for the nominal vehicle."""
+    params = jax.tree.map(lambda x: x[0], env.params)
+    names = _GAINS[module]
+    if module is lqr:
+        state = jax.tree.map(lambda x: x[0], env.reset(jax.random.key(TUNING))[1].drones)
+        solve = jax.jit(lambda settings: lqr.init(settings, params, state))
+    nominal = module.gains(params) if module in (firmware_pid, mellinger) else getattr(module, "gains", weights)()
+
+    def make(factors: np.ndarray) -> Controller:
+        scaled = {name: getattr(nominal, name) * float(x) for name, x in zip(names, factors, strict=True)}
+        gains = nominal.replace(**scaled)
+        if module is not lqr:
+            return Controller(gains, params, module.init(), module, env.dt)
+        settings = lqr.settings(env.physics, gains)
+        return Controller(settings, params, solve(settings), lqr, env.dt)
+
+    return make
+
+
+def planner(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
+    """Optimal controller that plans at every step, with the weights of the package."""
+
+    def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
+        began = time.perf_counter()
+        env = pilot.env(scenario)
+        params = jax.tree.map(lambda x: x[0], env.params)
+        state = jax.tree.map(lambda x: x[0], env.reset(jax.random.key(TUNING))[1].drones)
+        settings = module.settings(env.physics)
+        key = (jax.random.key(TRAINING),) if module is mppi else ()
+        memory = jax.jit(module.init)(settings, params, state, *key)
+        return Obtained(Controller(settings, params, memory, module, env.dt), time.perf_counter() - began, 0.0)
+
+    return obtain
+
+
+class Mpc:
+    """MPC by CasADi, called on the host."""
+
+    def __init__(self, env: Env):
+        from jaxdrones.optimal.mpc import Mpc as Solver
+        from jaxdrones.optimal.twin import casadi_model
+
+        params = jax.tree.map(lambda x: x[0], env.params)
+        rotors = jd.lagging_rotors
+        self.solver = Solver(casadi_model(params.replace(aux={}), [jd.drag], rotors=rotors), env.dt)
+        self._read = jax.jit(lambda obs: seen(obs[0]))
+        self._action = jax.jit(lambda rpm: action_of(params, rpm)[None])
+
+    def initial_hidden_state(self, batch: tuple[int, ...]) -> None:
+        """Forget the plan of the last flight."""
+        self.solver.reset()
+
+    def act(self, hidden_state: None, obs: Array) -> tuple[None, Array]:
+        """Action of the first command of a plan."""
+        rpm = self.solver(*self._read(obs))
+        return None, self._action(jnp.asarray(rpm, jnp.float32))
+
+
+def by_casadi(scenario: Scenario, pilot: Pilot) -> Obtained:
+    """Twin and solver of MPC."""
+    began = time.perf_counter()
+    return Obtained(Mpc(pilot.env(scenario)), time.perf_counter() - began, 0.0)
+
+
+def trained(algorithm: str) -> Callable[[Scenario, Pilot], Obtained]:
+    """Policy of a learner with the preset of the task and the exact gradient, one seed."""
+
+    def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
+        began = time.perf_counter()
+        settings = scenario.settings(pilot.hz, pilot.observation(scenario)) | dict(scenario.options)
+        env, config = preset(scenario.task, algorithm, practice=True, **settings)
+        if algorithm != "ppo":  # the gradient of a rigid body, the preset of hover, does not see that rotors lag
+            config = dataclasses.replace(config, gradient="exact")
+        policy = jax.block_until_ready(learner(algorithm).train(jax.random.key(TRAINING), env, config).policy)
+        flown = config.updates * config.worlds * config.horizon * env.dt
+        return Obtained(policy, time.perf_counter() - began, flown, f"seed {TRAINING}")
+
+    return obtain
+
+
+def published(scenario: Scenario, pilot: Pilot) -> Obtained:
+    """RAPTOR as published."""
+    return Obtained(make_policy("raptor", pilot.env(scenario)), 0.0, 0.0)
+
+
+PILOTS: dict[str, Pilot] = {
+    "nothing": Pilot(nothing),
+    "pid": Pilot(tuned(pid), horizon=0),
+    "firmware-pid": Pilot(tuned(firmware_pid), hz=500, horizon=0),
+    "geometric": Pilot(tuned(geometric), horizon=0),
+    "mellinger": Pilot(tuned(mellinger), hz=500, horizon=0),
+    "lqr": Pilot(tuned(lqr), horizon=2),
+    "ilqr": Pilot(planner(ilqr), horizon=25, starts=24),
+    "mppi": Pilot(planner(mppi), horizon=24, starts=50),
+    "mpc": Pilot(by_casadi, hz=50, horizon=20, starts=10, needs="casadi"),
+    "ppo": Pilot(trained("ppo")),
+    "shac": Pilot(trained("shac")),
+    "bptt": Pilot(trained("bptt")),
+    "raptor": Pilot(published, needs="foundation_policy"),
+}

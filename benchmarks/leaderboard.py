@@ -17,7 +17,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +59,15 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         if pilot.needs and importlib.util.find_spec(pilot.needs) is None:
             print(f"{name}: {pilot.needs} is not installed", file=sys.stderr)
             continue
-        rows += fly(name, pilot, options.scenarios, options.starts or pilot.starts)
-        if options.update:
-            update(rows)
+        for row in fly(name, pilot, options.scenarios, options.starts or pilot.starts):
+            rows.append(row)
+            print(line(row), file=sys.stderr, flush=True)
+            if options.update:
+                update([row])
     return {"rows": rows}, lines(rows)
 
 
-def fly(name: str, pilot: Pilot, scenarios: Sequence[str], starts: int) -> list[Row]:
+def fly(name: str, pilot: Pilot, scenarios: Sequence[str], starts: int) -> Iterator[Row]:
     """Rows of a pilot, which is obtained once for scenarios of one nominal scenario."""
 
     @functools.cache
@@ -73,15 +75,12 @@ def fly(name: str, pilot: Pilot, scenarios: Sequence[str], starts: int) -> list[
         obtained = pilot.obtain(SCENARIOS[nominal], pilot)
         return obtained, seconds_of_command(pilot.env(SCENARIOS[nominal]), obtained.policy)
 
-    rows = []
     for scenario in scenarios:
         obtained, seconds = of(SCENARIOS[scenario].nominal or scenario)
         row = {"pilot": name, "scenario": scenario, "hz": pilot.hz, "starts": starts}
         row |= score(pilot.env(SCENARIOS[scenario]), obtained.policy, starts)
         row |= {"seconds a command": seconds, "seconds to obtain": obtained.seconds, "flown": obtained.flown}
-        rows.append(row | {"settings": obtained.settings, "about": about()})
-        print(lines(rows[-1:])[-1], file=sys.stderr, flush=True)
-    return rows
+        yield row | {"settings": obtained.settings, "about": about()}
 
 
 def score(env: Env, policy: Any, starts: int) -> Row:

@@ -50,7 +50,7 @@ class Obtained(NamedTuple):
 
     policy: Any
     seconds: float
-    """Wall-clock time of tuning or training, with compilation, s."""
+    """Processor time of tuning or training, with compilation, s."""
     flown: float
     """Simulated flight in it, s."""
     settings: str = ""
@@ -137,7 +137,7 @@ def tuned(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
     """Controller with gains, or LQR with weights, from a random search."""
 
     def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
-        began = time.perf_counter()
+        began = time.process_time()
         env, names = pilot.env(scenario), _GAINS[module]
         make = controller(module, env)
         rng = np.random.default_rng(TUNING)
@@ -152,7 +152,7 @@ def tuned(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
                     best, score = factors, (came.success, -error)
         found = ", ".join(f"{name} {factor:.2g}" for name, factor in zip(names, best, strict=True))
         flown = pilot.candidates * pilot.tuning_starts * env.steps * env.dt
-        return Obtained(make(best), time.perf_counter() - began, flown, f"gains times {found}")
+        return Obtained(make(best), time.process_time() - began, flown, f"gains times {found}")
 
     return obtain
 
@@ -184,7 +184,7 @@ def planner(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
     """
 
     def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
-        began = time.perf_counter()
+        began = time.process_time()
         env = pilot.env(scenario)
         regulator = tuned(lqr)(scenario, dataclasses.replace(pilot, horizon=2))
         params = regulator.policy.params
@@ -199,7 +199,7 @@ def planner(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
             scores[name] = (came.success, -error, policy)
         name = max(scores, key=lambda name: scores[name][:2])
         flown = regulator.flown + 2 * PLANNED_STARTS * env.steps * env.dt
-        return Obtained(scores[name][2], time.perf_counter() - began, flown, f"weights {name}")
+        return Obtained(scores[name][2], time.process_time() - began, flown, f"weights {name}")
 
     return obtain
 
@@ -229,22 +229,22 @@ class Mpc:
 
 def by_casadi(scenario: Scenario, pilot: Pilot) -> Obtained:
     """Twin and solver of MPC."""
-    began = time.perf_counter()
-    return Obtained(Mpc(pilot.env(scenario)), time.perf_counter() - began, 0.0)
+    began = time.process_time()
+    return Obtained(Mpc(pilot.env(scenario)), time.process_time() - began, 0.0)
 
 
 def trained(algorithm: str) -> Callable[[Scenario, Pilot], Obtained]:
     """Policy of a learner with the preset of the task and the exact gradient, one seed."""
 
     def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
-        began = time.perf_counter()
+        began = time.process_time()
         settings = scenario.settings(pilot.hz, pilot.observation(scenario)) | dict(scenario.options)
         env, config = preset(scenario.task, algorithm, practice=True, **settings)
         if algorithm != "ppo":  # the gradient of a rigid body, the preset of hover, does not see that rotors lag
             config = dataclasses.replace(config, gradient="exact")
         policy = jax.block_until_ready(learner(algorithm).train(jax.random.key(TRAINING), env, config).policy)
         flown = config.updates * config.worlds * config.horizon * env.dt
-        return Obtained(policy, time.perf_counter() - began, flown, f"seed {TRAINING}")
+        return Obtained(policy, time.process_time() - began, flown, f"seed {TRAINING}")
 
     return obtain
 

@@ -14,6 +14,7 @@ from jaxdrones.training.trainer import Trainer
 ELSEWHERE = {  # page -> the tests that try its commands
     "docs/export.md": "tests/export/test_page.py",
     "docs/firmware.md": "tests/firmware/test_cli_firmware.py",
+    "docs/leaderboard.md": "tests/test_leaderboard.py",
     "docs/own-policy.md": "tests/test_cli_user_code.py",
     "docs/own-task.md": "tests/test_cli_user_code.py",
     "docs/own-vehicle.md": "tests/test_cli_user_code.py",

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks import leaderboard, tables
-from benchmarks.leaderboard_pilots import PILOTS, Controller
+from benchmarks.leaderboard_pilots import PILOTS, Controller, controller
 from benchmarks.leaderboard_scenarios import SCENARIOS, SCORED, TRAINING, TUNING, broken_rotor, vehicle
+from jaxdrones.control import geometric
 
 SETTINGS = ["--quick", "--pilot", "nothing", "geometric", "--scenario", "hover"]
 
@@ -74,11 +75,7 @@ def test_a_share_is_never_rounded_up():
 def test_a_controller_commands_the_rotor_speeds_that_its_module_computes():
     env = PILOTS["geometric"].env(SCENARIOS["hover"])
     obs, world = env.reset(jax.random.key(0))
-    policy = (
-        PILOTS["geometric"]
-        .obtain(SCENARIOS["hover"], dataclasses.replace(PILOTS["geometric"], candidates=2, tuning_starts=1))
-        .policy
-    )
+    policy = controller(geometric, env)(np.ones(4))
     assert isinstance(policy, Controller)
     action = policy.act(policy.initial_hidden_state((1,)), obs)[1]
     one = jax.tree.map(lambda x: x[0], (world.drones, env.task.target_now(world)))

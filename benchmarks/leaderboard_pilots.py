@@ -23,6 +23,7 @@ import jaxdrones as jd
 from benchmarks.leaderboard_scenarios import SETPOINT, TRAINING, TUNING, Scenario, flight
 from jaxdrones.control import Setpoint, firmware_pid, geometric, mellinger, pid
 from jaxdrones.envs import Env
+from jaxdrones.envs.observations import last_actions
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.published import make_policy
 from jaxdrones.optimal import ilqr, lqr, mppi, weights
@@ -69,6 +70,8 @@ class Pilot:
     """Scored starts, the first ones of 1,000."""
     horizon: int = -1
     """Control steps whose setpoints a controller observes; -1 for a policy with observations of its own."""
+    realistic: bool = False
+    """Whether a policy is trained with drawn constants, noise and delays of 0 to 40 ms, and observes five actions."""
     needs: str = ""
     """Optional library."""
     candidates: int = 48
@@ -80,6 +83,8 @@ class Pilot:
         """Observation terms in a scenario."""
         if self.horizon >= 0:
             return (flight(self.horizon),)
+        if self.realistic:
+            return (*_LEARNED[:-1], last_actions(5))
         return (*_LEARNED, "preview") if scenario.task == "tracking" else _LEARNED
 
     def env(self, scenario: Scenario) -> Env:
@@ -239,7 +244,7 @@ def trained(algorithm: str) -> Callable[[Scenario, Pilot], Obtained]:
     def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
         began = time.process_time()
         settings = scenario.settings(pilot.hz, pilot.observation(scenario)) | dict(scenario.options)
-        env, config = preset(scenario.task, algorithm, practice=True, **settings)
+        env, config = preset(scenario.task, algorithm, pilot.realistic, practice=True, **settings)
         if algorithm != "ppo":  # the gradient of a rigid body, the preset of hover, does not see that rotors lag
             config = dataclasses.replace(config, gradient="exact")
         policy = jax.block_until_ready(learner(algorithm).train(jax.random.key(TRAINING), env, config).policy)
@@ -267,5 +272,6 @@ PILOTS: dict[str, Pilot] = {
     "ppo": Pilot(trained("ppo")),
     "shac": Pilot(trained("shac")),
     "bptt": Pilot(trained("bptt")),
+    "bptt-random": Pilot(trained("bptt"), realistic=True),
     "raptor": Pilot(published, needs="foundation_policy"),
 }

@@ -37,6 +37,11 @@ from jaxdrones.learning.networks import act, initial_hidden_state
 TIMED = 200  # commands of a timing
 SHORTEST = 0.1  # s, of calls of it
 FIGURE = tables.ROOT / "benchmarks/figures/leaderboard.png"
+DRAWN = ("hover", "rotor-70", "airframes")
+COSTS = (
+    ("seconds a command", 1e-6, "processor time of a command, us"),
+    ("seconds to obtain", 1.0, "processor time of tuning or training, s"),
+)
 Row = dict[str, Any]
 
 
@@ -209,23 +214,27 @@ def write(rows: Sequence[Row], file: Path, page: Path, figure: Path) -> None:
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Figure of success against the time of a command: the mean of the scenarios, and a line down to the worst."""
+    """Figure of success against the time of a command, and against that to obtain the pilot, where it took any.
+
+    A dot is the mean of `DRAWN`, the bar below it the worst of them; pilots that did not fly all of them are left out.
+    """
     from matplotlib.figure import Figure  # only if a figure is asked for
 
     from jaxdrones.visualization.palette import colors
 
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.add_subplot(
-        xscale="log", xlabel="processor time of a command, us", ylabel="success, %", ylim=(-3, 103)
-    )
-    pilots = [name for name in PILOTS if any(row["pilot"] == name for row in rows)]
-    for name, color in zip(pilots, colors(len(pilots)), strict=True):
-        own = [row for row in rows if row["pilot"] == name]
-        success = [100 * row["success"] for row in own]
-        x, y = 1e6 * float(np.median([row["seconds a command"] for row in own])), float(np.mean(success))
-        axes.plot([x, x], [min(success), y], color=color, linewidth=1, alpha=0.5)
-        axes.plot(x, y, "o", color=color)
-        axes.plot(x, min(success), "_", color=color)
-        axes.annotate(name, (x, y), xytext=(5, 4), textcoords="offset points", color=color)
-    axes.grid(which="major", alpha=0.2)
+    flown = {(row["pilot"], row["scenario"]): row for row in rows}
+    pilots = [name for name in PILOTS if all((name, scenario) in flown for scenario in DRAWN) and name != "nothing"]
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    for axes, (key, unit, label) in zip(figure.subplots(1, 2, sharey=True), COSTS, strict=True):
+        for name, color in zip(pilots, colors(len(pilots)), strict=True):
+            own = [flown[name, scenario] for scenario in DRAWN]
+            success, x = [100 * row["success"] for row in own], own[0][key] / unit
+            if x > 0:
+                axes.plot([x, x], [min(success), np.mean(success)], color=color, linewidth=1, alpha=0.5)
+                axes.plot(x, np.mean(success), "o", color=color)
+                axes.plot(x, min(success), "_", color=color)
+                axes.annotate(name, (x, np.mean(success)), xytext=(5, 4), textcoords="offset points", color=color)
+        axes.set(xscale="log", xlabel=label, ylim=(-3, 106))
+        axes.grid(which="major", alpha=0.2)
+    figure.axes[0].set_ylabel(f"success in {', '.join(DRAWN)}, %")
     figure.savefig(path, dpi=120)

@@ -16,6 +16,11 @@ def vehicles() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder().glob("*.urdf"))}
 
 
+def policies() -> dict[str, Path]:
+    """Bundled policies: name of the task -> folder of the run that trained it, without its training state."""
+    return {path.name: path for path in sorted((folder() / "policies").glob("*/"))}
+
+
 def flights() -> dict[str, Path]:
     """Bundled flight logs of NanoBench (BSD-3): name -> .npz."""
     return {path.stem: path for path in sorted((folder() / "flights").glob("*.npz"))}

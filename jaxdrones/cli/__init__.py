@@ -9,6 +9,7 @@ from jaxdrones.cli import (
     compare,
     completion,
     crazyflie,
+    demo,
     doctor,
     evaluate,
     explain,
@@ -54,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"jaxdrones {machine.version('jaxdrones')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
     for command in (
+        demo,
         fly,
         train,
         evaluate,

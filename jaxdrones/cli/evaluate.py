@@ -29,7 +29,8 @@ def add(commands) -> None:
         "policy",
         type=folder,
         metavar="RUN",
-        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed; or raptor",
+        help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); "
+        "file.py:name, whose code is executed; or raptor",
     )
     own = parser.add_argument_group("your own policy", "only with file.py:name or raptor")
     evaluation = parser.add_argument_group("evaluation")

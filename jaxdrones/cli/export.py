@@ -6,7 +6,7 @@ from typing import Any
 from jaxdrones.arguments import choice
 from jaxdrones.cli.common import check_options, folder, run_folder
 from jaxdrones.cli.options import add_drones, add_json, add_output, add_set, add_vehicle
-from jaxdrones.cli.policies import is_user_policy, open_policy
+from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder
 from jaxdrones.cli.report import as_json, described
 from jaxdrones.cli.settings import add_realistic, asked_settings
 
@@ -27,7 +27,8 @@ def add(commands) -> None:
         "policy",
         type=folder,
         metavar="RUN",
-        help="folder of `jaxdrones train`, for example runs/hover; or file.py:name, whose code is executed",
+        help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); or "
+        "file.py:name, whose code is executed",
     )
     parser.add_argument("--to", required=True, metavar="TARGET", help=", ".join(TARGETS))
     own = parser.add_argument_group("your own policy", "only with file.py:name")
@@ -54,7 +55,7 @@ def _export(options: argparse.Namespace) -> int:
     else:
         name = "last" if options.last else "best"
         recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
-        title, place = f"{described(recipe)}, policy of update {update}", options.policy / "export"
+        title, place = f"{described(recipe)}, policy of update {update}", output_folder(options.policy, "export")
     with recipe.env() as env:
         policy = run.policy(env) if is_user_policy(options.policy) else run.policy(name, env)
         exported = save(policy, env, options.to, options.output or place, options.name, title)

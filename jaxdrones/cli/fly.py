@@ -9,11 +9,11 @@ from typing import Any
 
 from jaxdrones.arguments import choice
 from jaxdrones.checks import check_choice
-from jaxdrones.cli.common import check_options, check_writable, folder, print_error, run_folder
+from jaxdrones.cli.common import check_options, check_writable, folder, print_error
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_json, add_no_figure, add_output, add_set
-from jaxdrones.cli.policies import is_user_policy, open_policy, team_of_run
+from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder, team_of_run
 from jaxdrones.cli.report import as_json, summary, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
 from jaxdrones.errors import UserError
@@ -63,7 +63,8 @@ def add(commands) -> None:
         "--policy",
         type=folder,
         metavar="RUN",
-        help="in place of FLIGHT: a folder of `jaxdrones train`, or file.py:name, whose code is executed; or raptor",
+        help="in place of FLIGHT: a folder of `jaxdrones train`; a task with a bundled policy (`jaxdrones list`), for "
+        "example forest; file.py:name, whose code is executed; or raptor",
     )
     policy.add_argument("--task", metavar="TASK", help="with file.py:name or raptor: task, as for `jaxdrones train`")
     add_realistic(policy, "with file.py:name: ")
@@ -156,9 +157,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
     vehicle = "any vehicle" if recipe.realistic == "any" else str(recipe.options.get("vehicle", "cf2x"))
     if options.pwm:
         check_pwm(vehicle)
-    output = options.output or (
-        run_folder(str(options.policy)) if is_user_policy(options.policy) else options.policy / "flight"
-    )
+    output = options.output or output_folder(options.policy, "flight")
     team = team_of_run(options, {})
     with recipe.env(backend=options.backend, **team) as env, progress() as report:
         policy = run.policy(env=env)

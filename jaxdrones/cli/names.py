@@ -9,6 +9,7 @@ from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
+from jaxdrones.learning.published import POLICIES
 from jaxdrones.training.algorithms import ALGORITHMS
 
 
@@ -35,6 +36,7 @@ def known_names() -> dict[str, list[str]]:
         "actions": list(ACTIONS),
         "observations": list(OBSERVATIONS),
         "algorithms": list(ALGORITHMS),
+        "policies": [*assets.policies(), *POLICIES],
     }
 
 

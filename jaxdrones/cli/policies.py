@@ -1,10 +1,12 @@
-"""Policies on the command line: of a run of `jaxdrones train`, of a user's file, or published ones."""
+"""Policies on the command line: of a run of `jaxdrones train`, of a user's file, bundled or published ones."""
 
 import argparse
 import sys
 from pathlib import Path
 from typing import Any
 
+from jaxdrones import assets
+from jaxdrones.cli.common import run_folder
 from jaxdrones.errors import UserError
 from jaxdrones.user_code import is_reference
 
@@ -14,6 +16,18 @@ def is_user_policy(policy: Path) -> bool:
     from jaxdrones.learning.published import POLICIES
 
     return is_reference(str(policy)) or (str(policy) in POLICIES and not policy.exists())
+
+
+def is_bundled(policy: Path) -> bool:
+    """Whether this is the name of a bundled policy; a folder of the same name goes first."""
+    return str(policy) in assets.policies() and not policy.exists()
+
+
+def output_folder(policy: Path, what: str) -> Path:
+    """Default folder of what is made with a policy, such as `flight`: in its run, or under runs/ by its name."""
+    if is_bundled(policy):
+        return Path("runs") / f"bundled-{policy}" / what
+    return run_folder(str(policy)) if is_user_policy(policy) else policy / what
 
 
 def team_of_run(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, Any]:
@@ -27,13 +41,13 @@ def team_of_run(options: argparse.Namespace, settings: dict[str, Any]) -> dict[s
 def open_policy(
     policy: Path, task: str | None, realistic: bool | str, options: dict[str, Any], last: bool = False
 ) -> Any:
-    """Open the run in a folder, the policy of a user's file, or a published one, with a common interface.
+    """Open the run in a folder, the policy of a user's file, a bundled or a published one, with a common interface.
 
     Args:
-        policy: folder of a run, `file.py:name`, or the name of a published policy.
-        task: task for the policy of a file or a published one; `None` for a run.
-        realistic: as in `jaxdrones.make`; false for a run.
-        options: options of `jaxdrones.make`; empty for a run.
+        policy: folder of a run, `file.py:name`, or the name of a bundled or published policy.
+        task: task for the policy of a file or a published one; `None` for a run and a bundled one.
+        realistic: as in `jaxdrones.make`; false for a run and a bundled one.
+        options: options of `jaxdrones.make`; empty for a run and a bundled one.
         last: whether to open the newest policy of a run, not the best.
 
     Raises:
@@ -50,7 +64,7 @@ def open_policy(
     for name, x in given.items():
         if x not in (None, False):
             raise UserError(f"{name} is given beside the run {policy}, which determines it; leave it out")
-    run = Run(policy)
+    run = Run(assets.policies()[str(policy)] if is_bundled(policy) else policy)
     recipe = run.sidecar_entry("last" if last else "best", "recipe")
     names = recipe.get("files", ()) if isinstance(recipe, dict) else ()
     if code := " and ".join(name for name in names if is_reference(name)):

@@ -9,13 +9,15 @@ import { drawCurve } from "./curve.js";
 import { Panel } from "./panel.js";
 import { decode } from "./payload.js";
 import { Plot, short } from "./plots.js";
+import { Plant, Simulation } from "./simulation.js";
 import { solids } from "./solids.js";
 import { Stage } from "./stage.js";
 import { Trail } from "./trails.js";
 
 const NAMED = 24; // drones in a world of which all have their names in the view
 const STILL = 200; // ms without a change after which the picture is drawn in full resolution
-const SMALLEST = 0.012; // arm over the radius of the flight from which on a drone is drawn in its true size at first
+const SMALLEST = 0.012; // arm over the radius of the flight from which on drones are drawn in their true size at first
+const SMALLEST_ALONE = 0.035; // of a single drone, which touches nobody if it is drawn larger
 const BEHIND = 0.4; // s, how far a flight that is running may be ahead of what is shown
 const ROOM = 0.2; // share of its extent that a flight that is running may grow to every side before the camera moves
 const REPAINT = 200; // ms between two paintings of the plots of a flight that is running
@@ -53,10 +55,11 @@ class Player {
   }
 
   /** Learn whether the flight is still running, or is to be shown again and again. */
-  begin({ live }) {
+  begin({ live, play }) {
     this.end = Math.max(...this.worlds.map((world) => world.end));
     this.running = Boolean(live?.running);
-    this.again = Boolean(live) && !this.running; // and again
+    this.again = Boolean(play || live) && !this.running; // and again
+    if (play) this.playing = true;
     this.live = Boolean(live);
     this.span = Math.max(this.end, live?.end ?? 0); // s, length of the time line
     this.following = this.running;
@@ -124,7 +127,8 @@ class Player {
   sizeDrones() {
     const { low, high } = bounds(this.worlds, this.surroundings), seen = armOf(this.worlds[0].kinds[0]) / (low.distanceTo(high) / 2);
     if (this.sized && this.panel.size !== this.sized) return;
-    this.sized = [1, 3].find((size) => size * seen > SMALLEST) ?? 10;
+    const smallest = this.worlds[0].n > 1 ? SMALLEST : SMALLEST_ALONE;
+    this.sized = [1, 3].find((size) => size * seen > smallest) ?? 10;
     this.panel.set("size", this.sized);
   }
 
@@ -327,6 +331,10 @@ function begin(header) {
   const player = new Player(header);
   find("status").textContent = "";
   window.jaxdrones = handles(player);
+  if (header.simulation) {
+    window.jaxdrones.simulation = new Simulation(player, header);
+    window.jaxdrones.plant = () => new Plant(header.simulation);
+  }
   document.documentElement.dataset.ready = "true";
   return player;
 }

@@ -26,7 +26,7 @@ class Page:
     @property
     def html(self) -> str:
         """HTML text of the page."""
-        return _template().replace("@TITLE@", html.escape(self.title)).replace("@PAYLOAD@", self.payload)
+        return template().replace("@TITLE@", html.escape(self.title)).replace("@PAYLOAD@", self.payload)
 
     def save(self, path: str | os.PathLike) -> Path:
         """Write the page to a file, creating its folder; return its path.
@@ -50,7 +50,8 @@ class Page:
 
 
 @functools.cache
-def _template() -> str:
+def template() -> str:
+    """HTML text of the player, with @TITLE@ and @PAYLOAD@ for the flight."""
     try:
         return _TEMPLATE.read_text(encoding="utf-8")
     except FileNotFoundError:

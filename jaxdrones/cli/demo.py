@@ -1,0 +1,70 @@
+"""`jaxdrones demo`."""
+
+import argparse
+import webbrowser
+from pathlib import Path
+
+from jaxdrones import assets
+from jaxdrones.checks import check_choice
+from jaxdrones.cli.common import check_writable, folder
+from jaxdrones.cli.options import add_json, add_output
+from jaxdrones.cli.policies import open_policy
+from jaxdrones.cli.report import as_json
+from jaxdrones.visualization.viewer.gallery import Exhibit, gallery, read_exhibits
+from jaxdrones.writing import write
+
+_FIRST = "forest"
+
+
+def add(commands) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "demo",
+        help="open a page of flights by bundled policies",
+        description="Open a page in the browser that plays recorded flights of the bundled policies: through a forest, "
+        "through gates, in a crowd, and others. One drone is simulated in the page; push it. It needs no network.",
+        epilog="`jaxdrones fly --policy forest --live` flies one of them now, `jaxdrones eval forest` evaluates it.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("flight", nargs="?", default=_FIRST, metavar="FLIGHT", help=f"flight to show first ({_FIRST})")
+    parser.add_argument(
+        "--policy",
+        type=folder,
+        metavar="RUN",
+        help="simulate the drone with this policy instead: a run of hover for one drone; needs casadi",
+    )
+    add_output(parser, "path of the page (runs/demo.html)", metavar="FILE")
+    parser.add_argument("--no-open", action="store_true", help="write the page and do not open it")
+    add_json(parser)
+    parser.set_defaults(run=_demo)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    exhibits = {exhibit.name: exhibit for exhibit in read_exhibits(assets.folder() / "demo")}
+    check_choice("flight", options.flight, exhibits)
+    if options.policy is not None:
+        own = _own(options.policy)
+        exhibits = {own.name: own} | exhibits
+        options.flight = own.name
+    output = options.output or Path("runs") / "demo.html"
+    check_writable(output)
+    first = exhibits.pop(options.flight)
+    write(output, gallery([first, *exhibits.values()]).encode())
+    if options.json:
+        print(as_json({"flights": [first.name, *exhibits], "files": [str(output)]}))
+    else:
+        print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+    if not options.no_open and not webbrowser.open(output.absolute().as_uri()):
+        print("no browser was found; open the page in one")
+    return 0
+
+
+def _own(policy: Path) -> Exhibit:
+    """Simulation with a policy of the user."""
+    from jaxdrones.export import simulation
+
+    run = open_policy(policy, None, False, {})
+    with run.recipe().env() as env:
+        page = simulation.page(run.policy(env=env), env, str(policy))
+    about = f"A drone that is simulated in this page, and flown by the policy of {policy}. Push it."
+    return Exhibit(str(policy), about, f"jaxdrones fly --policy {policy} --live", page.payload)

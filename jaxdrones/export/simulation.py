@@ -1,0 +1,180 @@
+"""Simulation of one drone in a web page: physics, controllers and a policy as JavaScript, without a server."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdrones.control import CONTROLLERS, Setpoint
+from jaxdrones.dynamics import drag, ground_contact
+from jaxdrones.dynamics.rotors import instant_rotors
+from jaxdrones.engine.explicit import make_step
+from jaxdrones.engine.step import HostStep
+from jaxdrones.envs import Env, episode
+from jaxdrones.envs.observations import observe
+from jaxdrones.errors import UserError
+from jaxdrones.export.equations import javascript
+from jaxdrones.flights.log import FlightLog
+from jaxdrones.learning.networks import Policy, initial_hidden_state
+from jaxdrones.params import Params
+from jaxdrones.rotation import rotate_inverse
+from jaxdrones.state import State
+from jaxdrones.visualization.viewer.page import Page
+from jaxdrones.visualization.viewer.payload import encode
+from jaxdrones.visualization.viewer.show import looks
+from jaxdrones.wrench import Wrench
+
+_CONTROLLERS = {"cf2": ("pid", "geometric", "mellinger"), "": ("geometric",)}
+"""Beginning of a vehicle's name -> controllers whose gains fit."""
+_HZ = 240  # rate of the controllers
+_START = 1.0  # m, height
+_SPAN = 20.0  # s of flight until the plots start anew
+
+
+@dataclasses.dataclass(frozen=True)
+class Pilot:
+    """Policy or controller in a page."""
+
+    name: str
+    """Name of its JavaScript function."""
+    period: int
+    """Physics steps from one command to the next."""
+    gains: list[float]
+    memory: list[float]
+    """Memory at the start of a flight."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulation:
+    """JavaScript of a simulation, and the numbers that it starts from.
+
+    The functions write into the array `out`: `physics(out, state, rpm, wind, mass, push)` the state after a step, and a
+    pilot, for example `pid(out, gains, memory, state, goal)`, its new memory and rotor speeds. States are position,
+    attitude, velocity, body rates and rotor speeds, in the units of `State`.
+    """
+
+    script: str
+    pilots: tuple[Pilot, ...]
+    """The policy first."""
+    state: list[float]
+    """First state."""
+    goal: list[float]
+    """Place to hover at, m, world."""
+    mass: float
+    """kg"""
+    dt: float
+    """Physics step, s."""
+
+
+def simulation(policy: Policy, env: Env) -> Simulation:
+    """Simulation of the nominal vehicle of an environment, flown by a policy or by controllers.
+
+    The physics are a rigid body with instant rotors, drag and the ground, in a wind (m/s), with any mass (kg), and an
+    external force (N, world).
+
+    Args:
+        policy: policy that flies one drone to a target and stays.
+        env: its environment.
+
+    Raises:
+        ValueError: a team, images, sensors, a delay, other rotors, or a policy with memory.
+        ImportError: without casadi (extra `casadi`).
+    """
+    _check(policy, env)
+    params = jax.tree.map(lambda x: x[0], env.params)
+    dt, zero = env.physics.dt, jnp.zeros(3)
+    start = State.at_rest(jnp.array([[0.0, 0.0, _START]]))
+    state = jax.tree.map(lambda x: x[0], start).replace(rpm=jnp.full(4, params.hover_rpm))
+    inputs: dict[str, Any] = {"state": state, "rpm": state.rpm, "wind": zero, "mass": params.mass, "push": zero}
+    parts, pilots = [javascript("physics", _physics(params, dt), **inputs)], []
+
+    def add(name: str, fly: Callable, period: int, gains: Any, memory: Any) -> None:
+        parts.append(javascript(name, fly, gains=gains, memory=memory, state=state, goal=zero))
+        pilots.append(Pilot(name, period, _numbers(gains), _numbers(memory)))
+
+    add("policy", *_policy(policy, env))
+    period = max(1, round(1 / (_HZ * dt)))
+    for name in next(names for beginning, names in _CONTROLLERS.items() if env.vehicle.startswith(beginning)):
+        controller = CONTROLLERS[name]
+        add(name, _controller(name, params, period * dt), period, controller.gains(), controller.init())
+    return Simulation(
+        "\n\n".join(parts), tuple(pilots), _numbers(state), _numbers(state.pos), float(params.mass), float(dt)
+    )
+
+
+def page(policy: Policy, env: Env, title: str) -> Page:
+    """Page in which anyone can push a drone that a policy flies; arguments and errors as for `simulation`."""
+    made = simulation(policy, env)
+    params = jax.tree.map(np.asarray, jax.device_get(env.params))
+    pos, quat, vel, omega, rpm = np.split(np.array([[made.state]]), (3, 7, 10, 13), axis=2)
+    goal, labels = np.array([[made.goal]]), (env.vehicle,)
+    record = FlightLog(np.zeros(1), pos, quat, vel, omega, rpm, target_pos=goal, params=params, labels=labels)
+    live = {"running": True, "rows": 1, "end": _SPAN}
+    about = dataclasses.asdict(made) | {"span": _SPAN}
+    return Page(title, encode([record], [title], title, layout="alone", live=live, simulation=about, **looks([record])))
+
+
+def _check(policy: Policy, env: Env) -> None:
+    reasons = {
+        "it flies a team": env.drones > 1,
+        "it observes images or sensors": bool(env.vision or env.sensors),
+        "its commands are delayed": env.delay_steps[1] > 0,
+        "it has a memory": bool(jax.tree.leaves(initial_hidden_state(policy, 1))),
+        "the backend is Bullet": isinstance(env.physics, HostStep),
+        "its rotors are not instant": env.physics.physics.rotors is not instant_rotors,
+    }
+    if found := [reason for reason, holds in reasons.items() if holds]:
+        raise UserError(f"the page cannot fly this policy: {', '.join(found)}; give the policy of hover, for example")
+
+
+def _numbers(tree: Any) -> list[float]:
+    """Entries of a tree, leaf after leaf."""
+    return [float(x) for leaf in jax.tree.leaves(tree) for x in np.ravel(leaf)]
+
+
+def _physics(params: Params, dt: float) -> Callable[..., State]:
+    def step(state: State, rpm: Array, wind: Array, mass: Array, push: Array) -> State:
+        loaded = params.replace(wind=wind, mass=mass, inertia=params.inertia * (mass / params.mass))
+
+        def pushed(params: Params, state: State) -> Wrench:
+            return Wrench.of_force(rotate_inverse(state.quat, push))
+
+        one = make_step((drag, ground_contact, pushed), dt=dt)
+        team, drones = jax.tree.map(lambda x: x[None], (loaded, state))
+        return jax.tree.map(lambda x: x[0], one(team, drones, rpm[None]))
+
+    return step
+
+
+def _controller(name: str, params: Params, dt: float) -> Callable[..., tuple[Any, Array]]:
+    def fly(gains: Any, memory: Any, state: State, goal: Float[Array, "3"]) -> tuple[Any, Array]:
+        zero = jnp.zeros(3)
+        target = Setpoint(pos=goal, vel=zero, acc=zero, yaw=jnp.zeros(()), omega=zero)
+        return CONTROLLERS[name].control(gains, params, memory, state, target, dt=dt)
+
+    return fly
+
+
+def _policy(policy: Policy, env: Env) -> tuple[Callable, int, Any, Any]:
+    """Arguments of a pilot: a policy in the world of an episode, whose target takes the place of the goal.
+
+    Its memory are the latest actions, which it may observe, and the memory of the action type.
+    """
+    _, world = env.reset(jax.random.key(0))
+    target = env.task.target_now(world).pos[0]
+
+    def fly(gains: Any, memory: Any, state: State, goal: Float[Array, "3"]) -> tuple[Any, Array]:
+        actions, of_action_type = memory
+        drones = jax.tree.map(lambda x: x[None], state)
+        drones = drones.replace(pos=(state.pos - goal + target)[None])
+        seen = world.replace(drones=drones, actions=actions, memory=of_action_type)
+        after, rpm = episode.command(env, None, seen, policy(observe(env.terms, env.task, seen)))
+        return (after.actions, after.memory), rpm[0]
+
+    return fly, env.physics.substeps, (), (world.actions, world.memory)

@@ -1,0 +1,183 @@
+"""What a page simulates is what JAX simulates."""
+
+import json
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdrones as jd
+from jaxdrones.visualization import browser
+
+pytestmark = [
+    pytest.mark.needs("casadi"),
+    pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed"),
+]
+GOAL, WIND, PUSH = [0.3, -0.2, 1.4], [1.0, 0.5, 0.0], [0.0, 0.02, 0.01]
+
+
+def in_node(text, *values):
+    """Result of a JavaScript expression of the values a, b, ... as a NumPy array."""
+    names = "abcdef"[: len(values)]
+    given = "".join(f"const {x} = {json.dumps(value)};\n" for x, value in zip(names, values, strict=True))
+    code = f"{given}console.log(JSON.stringify({text}));"
+    done = subprocess.run(["node"], input=code, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return np.array(json.loads(done.stdout))
+
+
+def test_a_function_in_javascript_has_the_values_of_jax():
+    """Arithmetic, comparisons, functions and a loop, on both sides of every branch."""
+    from jaxdrones.export.equations import javascript
+
+    def function(x, y):
+        turned = jnp.arctan2(x[0], x[1]) + jnp.sqrt(jnp.abs(x[2])) ** 1.5
+        chosen = jnp.where((x > y) & (x != 0.5), jnp.sin(x) * y, jnp.exp(-x) / (1 + y**2))
+        either = jnp.where((x < 0) | ~(y <= 1), jnp.tanh(x), jnp.maximum(x, jnp.minimum(y, 0.25)))
+        summed, _ = jax.lax.scan(lambda total, z: (total * 0.5 + jnp.cos(z), None), turned, x)
+        return {"a": chosen @ either, "b": summed, "c": jnp.floor(3 * x) + jnp.sign(y)}
+
+    text = javascript("f", function, x=jnp.zeros(3), y=jnp.zeros(3))
+    for seed in range(20):
+        x, y = np.random.default_rng(seed).normal(size=(2, 3)) * 1.5
+        found = in_node(f"(() => {{ {text}\nconst out = []; f(out, a, b); return out; }})()", x.tolist(), y.tolist())
+        expected = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(function(x, y))])
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def env():
+    return jd.make("hover", effects=(jd.drag, jd.ground_contact))
+
+
+@pytest.fixture(scope="module")
+def made(env):
+    from jaxdrones.export.simulation import simulation
+
+    with jax.enable_x64(True):
+        return simulation(jd.make_policy("hover"), env)
+
+
+def flown_by_the_environment(env, state, steps):
+    """Positions after every control step of an episode whose goal, wind and start are given."""
+    _, world = env.reset(jax.random.key(0))
+    shift = jnp.asarray([GOAL]) - env.task.target_now(world).pos
+    state = jax.tree.map(jnp.asarray, state)
+    world = world.replace(
+        drones=state.replace(pos=state.pos - shift), params=world.params.replace(wind=jnp.asarray([WIND]))
+    )
+    policy, observe = jd.make_policy("hover"), jax.jit(env.privileged_observation)
+    places = []
+    for _ in range(steps):
+        _, world, *_ = env.step(jax.random.key(0), world, policy(observe(world).obs))
+        places.append(world.drones.pos[0] + shift[0])
+    return np.array(places)
+
+
+def start_of(made):
+    numbers = np.asarray(made.state)[None]
+    pos, quat, vel, omega, rpm = np.split(numbers, (3, 7, 10, 13), axis=1)
+    return jd.State(pos=pos, quat=quat, vel=vel, omega=omega, rpm=rpm)
+
+
+def places(made, pilot, steps, wind):
+    """Positions after every command of a pilot in JavaScript."""
+    text = f"""(() => {{ {made.script}
+let {{ state, memory }} = a, rpm;
+const places = [];
+for (let k = 1; k <= {steps}; k++) {{
+  if ((k - 1) % a.period === 0) {{
+    rpm = [];
+    {pilot}(rpm, a.gains, memory, state, b);
+    memory = rpm.splice(0, rpm.length - 4);
+  }}
+  const next = [];
+  physics(next, state, rpm, c, [a.mass], [0, 0, 0]);
+  state = next;
+  if (k % a.period === 0) places.push(state.slice(0, 3));
+}}
+return places; }})()"""
+    own = next(vars(one) for one in made.pilots if one.name == pilot)
+    return in_node(text, own | {"state": made.state, "mass": made.mass}, GOAL, wind)
+
+
+def test_a_thousand_steps_in_javascript_are_those_of_the_environment(env, made):
+    found = places(made, "policy", 1000, WIND)
+    expected = flown_by_the_environment(env, start_of(made), len(found))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    assert np.linalg.norm(found[-1] - GOAL) < 0.1 < np.linalg.norm(found[0] - GOAL)
+
+
+@pytest.mark.parametrize("pilot", ["pid", "geometric", "mellinger"])
+def test_a_controller_in_the_page_flies_to_the_goal_and_stays(pilot, made):
+    """Far enough and pushed a little; all four rotors turn at the speeds that the controller of JAX commands."""
+    found = places(made, pilot, 3000, [0, 0, 0])
+    assert np.linalg.norm(found[-1] - GOAL) < 0.03
+
+    control, params = jd.control.CONTROLLERS[pilot], jd.load_params("cf2x")
+    zero = jnp.zeros(3)
+    target = jd.control.Setpoint(jnp.asarray(GOAL), zero, zero, jnp.zeros(()), zero)
+    state = jax.tree.map(lambda x: jnp.asarray(x[0]), start_of(made))
+    own = next(one for one in made.pilots if one.name == pilot)
+    dt = own.period * made.dt
+    _, rpm = control.control(control.gains(), params, control.init(), state, target, dt=dt)
+    text = (
+        f"(() => {{ {made.script}\nconst out = []; {pilot}(out, a.gains, a.memory, b, c); return out.slice(-4); }})()"
+    )
+    np.testing.assert_allclose(in_node(text, vars(own), made.state, GOAL), rpm, rtol=1e-5)
+
+
+def test_push_mass_and_weight_obey_newton(made):
+    """Falling with stopped rotors, and pushed: a = F / m - g, less a little drag."""
+    text = (
+        f"(() => {{ {made.script}\nconst out = []; physics(out, a, [0, 0, 0, 0], [0, 0, 0], [b], c); return out; }})()"
+    )
+    for share in (0.5, 2.0):
+        after = in_node(text, made.state, share * made.mass, PUSH)
+        acc = after[7:10] / made.dt
+        expected = np.array(PUSH) / (share * made.mass) - [0, 0, 9.8]
+        np.testing.assert_allclose(acc, expected, rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("task", "says"), [("swap-goals", "it flies a team"), ("forest", "it observes images"), ("hover", "not instant")]
+)
+def test_what_a_page_cannot_fly_is_refused(task, says):
+    from jaxdrones.export.simulation import simulation
+
+    options = {"rotors": "lagging"} if task == "hover" else {}
+    with pytest.raises(ValueError, match=says):
+        simulation(jd.make_policy(task), jd.make(task, **options))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")
+def test_a_drone_in_the_page_is_pushed_and_recovers(env, made, tmp_path):
+    from jaxdrones.export.simulation import page
+
+    file = page(jd.make_policy("hover"), env, "push me").save(tmp_path / "page.html")
+    with browser.open_tab() as tab:
+        tab.open(file)
+        found = tab.run(
+            "(() => { const plant = jaxdrones.plant(), places = [];"
+            f"plant.goal = {GOAL}; plant.conditions.wind = {WIND};"
+            "for (let k = 1; k <= 1000; k++) { plant.step(); if (k % 5 === 0) places.push(plant.state.slice(0, 3)); }"
+            "return places; })()"
+        )
+        expected = flown_by_the_environment(env, start_of(made), len(found))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+        tab.run("jaxdrones.simulation.kick()")
+        plant = "jaxdrones.simulation.plant"
+        away = f"Math.hypot(...{plant}.goal.map((x, i) => x - {plant}.state[i]))"
+        tab.wait(f"{away} > 0.2")
+        tab.wait(f"{away} < 0.05")
+        x, y = tab.run("jaxdrones.player.stage.project(jaxdrones.simulation.place())")
+        for event, dx in (("mousePressed", 0), ("mouseMoved", 150)):
+            tab.call("Input.dispatchMouseEvent", type=event, x=x + dx, y=y, button="left", clickCount=1)
+        tab.wait(f"{away} > 0.1")
+        tab.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 150, y=y, button="left", clickCount=1)
+        tab.wait(f"{away} < 0.05")
+        assert tab.problems == []

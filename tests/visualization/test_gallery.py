@@ -1,0 +1,72 @@
+"""`jaxdrones demo` and its page."""
+
+import json
+import re
+
+import pytest
+from documents import ROOT
+
+from jaxdrones import assets
+from jaxdrones.cli import main
+from jaxdrones.visualization import browser
+from jaxdrones.visualization.viewer.gallery import read_exhibits
+from jaxdrones.visualization.viewer.payload import decode
+
+EXHIBITS = read_exhibits(assets.folder() / "demo")
+
+
+@pytest.fixture
+def page(tmp_path, capsys):
+    file = tmp_path / "demo.html"
+    assert main(["demo", "recovery", "--no-open", "--json", "--output", str(file)]) == 0
+    assert json.loads(capsys.readouterr().out)["files"] == [str(file)]
+    return file
+
+
+def test_every_bundled_policy_has_a_flight_that_can_be_shown():
+    names = [exhibit.name for exhibit in EXHIBITS]
+    assert set(assets.policies()) - set(names) <= {"room"}  # seen from outside, a room hides what flies in it
+    for exhibit in EXHIBITS:
+        (world,) = decode(exhibit.payload)["worlds"]
+        assert len(world["pos"]) > 40 or exhibit.name == "fly it yourself"
+        assert exhibit.command.startswith("jaxdrones ")
+
+
+def test_the_page_begins_with_the_flight_that_was_asked_for(page):
+    data = json.loads(re.search(r'<script id="data" type="application/json">(.*)</script>', page.read_text())[1])
+    assert data["exhibits"][0]["name"] == "recovery"
+    assert len(data["exhibits"]) == len(EXHIBITS)
+
+
+def test_an_unknown_flight_is_named(tmp_path, capsys):
+    assert main(["demo", "forrest", "--no-open", "--output", str(tmp_path / "demo.html")]) == 2
+    assert "unknown flight 'forrest'; did you mean 'forest'?" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+@pytest.mark.needs("casadi")
+def test_the_commands_of_the_page_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    more = {"demo": "--no-open", "eval": "--episodes 4", "train": "--set worlds=8 --set horizon=4 --budget 2"}
+    text = (ROOT / "docs" / "viewer.md").read_text().split("## The demo")[1].split("\n## ")[0]
+    lines = re.findall(r"^jaxdrones .*", text, re.M)
+    for command in (part.strip() for line in lines for part in line.partition("#")[0].split("&&")):
+        arguments = command.removeprefix("jaxdrones ").removesuffix(" --live").split()
+        assert main([*arguments, *more.get(arguments[0], "").split()]) == 0
+    assert "runs/hover" in (tmp_path / "runs" / "demo.html").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")
+@pytest.mark.parametrize("width", [390, 1400])
+def test_every_flight_plays_without_a_message_and_fits(page, width):
+    with browser.open_tab() as tab:
+        tab.open(page, width, 800)
+        frame = "document.querySelector('iframe')"
+        for exhibit in EXHIBITS:
+            tab.run(f"location.hash = {exhibit.name!r}")
+            tab.wait(f"document.querySelector('[aria-current]').textContent === {exhibit.name!r}")
+            tab.wait(f"{frame}.srcdoc.includes({exhibit.payload[:200]!r})")
+        assert tab.run("document.documentElement.scrollWidth") <= width
+        assert tab.problems == []

@@ -35,6 +35,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "landing": {},
     "transport": {},
     "sling": {},
+    "room": {},
     "wake": {},
     "tracking": {},
     "hover": {},

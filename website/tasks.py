@@ -16,11 +16,11 @@ _ONE_DRONE = "Of each drone, in each control step."
 def pages(root: Path) -> dict[str, str]:
     """Path -> Markdown."""
     results = (root / "docs" / "training.md").read_text()
-    pictured = {path.stem for path in (root / "docs" / "images" / "tasks").glob("*.png")}
-    return {f"tasks/{name}.md": _page(name, name in pictured, results) for name in TASKS}
+    pictures = {path.stem: path.name for path in (root / "docs" / "images" / "tasks").iterdir()}
+    return {f"tasks/{name}.md": _page(name, pictures.get(name), results) for name in TASKS}
 
 
-def _page(name: str, pictured: bool, results: str) -> str:
+def _page(name: str, picture: str | None, results: str) -> str:
     with jd.make(name) as env:
         table = jd.explain(env)
     team = [(key, text) for key, text in table.task.items() if key not in ("name", "summary") and text]
@@ -28,7 +28,7 @@ def _page(name: str, pictured: bool, results: str) -> str:
     sections = [
         f"# {name}",
         table.task["summary"].capitalize() + ".",
-        *([f"![The start of an episode](../images/tasks/{name}.png)"] if pictured else []),
+        *([f"![{_shown(picture)}](../images/tasks/{picture})"] if picture else []),
         _table(["", ""], team),
         f"```sh\njaxdrones explain {name}\n{_training(name)}\n```",
         f"## What was measured\n\n{_measured(name, results)}",
@@ -42,6 +42,10 @@ def _page(name: str, pictured: bool, results: str) -> str:
         f"## Physics\n\n{_table(['', ''], table.physics.items())}",
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _shown(picture: str) -> str:
+    return "A flight of the bundled policy" if picture.endswith(".webp") else "The start of an episode"
 
 
 def _training(name: str) -> str:

@@ -19,7 +19,8 @@ from jaxdrones.sensing.scene import Scene
 from jaxdrones.sensing.shapes import Box, Cylinder, Obstacle, Sphere
 from jaxdrones.vector import sin_cos
 
-_WALL, _WOOD = (0.8, 0.8, 0.75, 1.0), (0.4, 0.28, 0.18, 1.0)  # red, green, blue, opacity
+_WALL = (0.8, 0.8, 0.75, 0.2)  # red, green, blue, opacity, so that the viewer shows what is inside
+_WOOD = (0.4, 0.28, 0.18, 1.0)
 _GREEN, _STONE = (0.2, 0.5, 0.2, 1.0), (0.5, 0.5, 0.55, 1.0)
 _SPHERE_RADIUS = (0.2, 0.5)  # m
 _BOX_EDGE = (0.3, 1.0)  # m

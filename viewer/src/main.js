@@ -309,6 +309,8 @@ function handles(player) {
     },
     /** Show nothing but the flight and a clock, by a camera; drones are `scale` times as large as they are, if given. */
     async film(mode, scale) {
+      player.playing = false;
+      player.stage.setSharp(true);
       document.body.classList.add("film");
       await new Promise(requestAnimationFrame);
       player.resize();

@@ -235,6 +235,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 axes.plot(x, min(success), "_", color=color)
                 axes.annotate(name, (x, np.mean(success)), xytext=(5, 4), textcoords="offset points", color=color)
         axes.set(xscale="log", xlabel=label, ylim=(-3, 106))
+        axes.xaxis.set_minor_formatter("")
         axes.grid(which="major", alpha=0.2)
     figure.axes[0].set_ylabel(f"success in {', '.join(DRAWN)}, %")
     figure.savefig(path, dpi=120)

@@ -239,14 +239,12 @@ def by_casadi(scenario: Scenario, pilot: Pilot) -> Obtained:
 
 
 def trained(algorithm: str) -> Callable[[Scenario, Pilot], Obtained]:
-    """Policy of a learner with the preset of the task and the exact gradient, one seed."""
+    """Policy of a learner with the preset of the task, one seed."""
 
     def obtain(scenario: Scenario, pilot: Pilot) -> Obtained:
         began = time.process_time()
         settings = scenario.settings(pilot.hz, pilot.observation(scenario)) | dict(scenario.options)
         env, config = preset(scenario.task, algorithm, pilot.realistic, practice=True, **settings)
-        if algorithm != "ppo":  # the gradient of a rigid body, the preset of hover, does not see that rotors lag
-            config = dataclasses.replace(config, gradient="exact")
         policy = jax.block_until_ready(learner(algorithm).train(jax.random.key(TRAINING), env, config).policy)
         flown = config.updates * config.worlds * config.horizon * env.dt
         return Obtained(policy, time.process_time() - began, flown, f"seed {TRAINING}")

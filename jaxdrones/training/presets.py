@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from jaxdrones.dynamics import instant_rotors
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.observations import last_actions
 from jaxdrones.tasks.task import Task
@@ -196,6 +197,10 @@ def preset(
     env = make(task, realistic=realistic, **options)
     if isinstance(task, str):
         config = dataclasses.replace(config, **_settings(task, algorithm, realistic))
+    if getattr(config, "gradient", None) == "surrogate" and env.physics.physics.rotors is not instant_rotors:
+        config = dataclasses.replace(
+            config, gradient="exact"
+        )  # the surrogate has instant rotors, and nothing is learned
     return env, config
 
 

@@ -100,6 +100,12 @@ def test_every_preset_makes_sense(task, algorithm):
         Recipe.of(task, algorithm, realistic)
 
 
+@pytest.mark.parametrize("rotors, gradient", [("instant", "surrogate"), ("lagging", "exact")])
+def test_the_preset_of_hover_has_no_surrogate_without_the_lag_of_the_rotors(rotors, gradient):
+    """Trained with it, not one of 1,000 starts succeeded; with the exact gradient 998 or more, three seeds."""
+    assert presets.preset("hover", "bptt", rotors=rotors)[1].gradient == gradient
+
+
 def test_arrays_of_one_number_and_numbers_of_numpy_are_numbers():
     ppo.Config(updates=np.int64(3), worlds=jnp.asarray(8), learning_rate=np.float32(1e-3), gamma=jnp.asarray(0.9))
 

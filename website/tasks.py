@@ -5,9 +5,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import jaxdrones as jd
+from jaxdrones import assets
 from jaxdrones.envs import TASKS
 from jaxdrones.envs.explanation import Entry, Part, number
 from jaxdrones.training.presets import default_algorithm, settings_known
+from jaxdrones.training.run import Run
 
 _NUMBERS = "Entries are in their unit, unless the last columns have the values at -1, 0 and 1."
 _ONE_DRONE = "Of each drone, in each control step."
@@ -30,8 +32,8 @@ def _page(name: str, picture: str | None, results: str) -> str:
         table.task["summary"].capitalize() + ".",
         *([f"![{_shown(picture)}](../images/tasks/{picture})"] if picture else []),
         _table(["", ""], team),
-        f"```sh\njaxdrones explain {name}\n{_training(name)}\n```",
-        f"## What was measured\n\n{_measured(name, results)}",
+        f"```sh\njaxdrones explain {name}\n{_training(name)}\n{_flight(name)}```",
+        f"## What was measured\n\n{_bundled(name)}{_measured(name, results)}",
         f"## Observation: {observation}\n\n{_ONE_DRONE} {_NUMBERS}\n\n{_entries(table.observation)}",
         *([f"## Images\n\n{_table(['image', ''], table.images.items())}"] if table.images else []),
         f"## Action: {action}\n\n{_ONE_DRONE}\n\n{_entries(table.action)}",
@@ -54,12 +56,31 @@ def _training(name: str) -> str:
     return f"jaxdrones train {name}{'' if known else '   # there are no tuned settings'}"
 
 
+def _flight(name: str) -> str:
+    return f"jaxdrones fly --policy {name} --live   # the bundled policy\n" if name in assets.policies() else ""
+
+
+def _bundled(name: str) -> str:
+    """What the report of the bundled policy says."""
+    if name not in assets.policies():
+        return ""
+    report = Run(assets.policies()[name]).report() or {}
+    evaluation, seconds = report["evaluation"], sum(report["seconds"].values())
+    interval = evaluation["success_interval"]
+    bound = f"lower bound {100 * interval[0]:.1f} %" if interval else "all from the same start"
+    success = f"{100 * evaluation['success']:.1f} % of {evaluation['episodes']:,} episodes succeed, {bound}"
+    return (
+        f"The bundled policy (`jaxdrones train {name} --seed 0`, {seconds:.0f} s with compiling and evaluations, commit "
+        f"{report['commit']}): {success}.\n\n"
+    )
+
+
 def _measured(name: str, results: str) -> str:
     """Rows of a task in the table of results."""
     head, rows = re.search(r"^(\| task, learner .*\n\|[-|: ]+\n)((?:\|.*\n)+)", results, re.M).groups()
     own = [row for row in rows.splitlines(keepends=True) if re.match(rf"\| `{name}`[ ,]", row)]
     if not own:
-        return "Not measured."
+        return "" if name in assets.policies() else "Not measured."
     return f"On 2 shared CPU cores; see [Train a policy](../training.md#results).\n\n{head}{''.join(own)}"
 
 

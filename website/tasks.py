@@ -70,7 +70,7 @@ def _bundled(name: str) -> str:
     bound = f"lower bound {100 * interval[0]:.1f} %" if interval else "all from the same start"
     success = f"{100 * evaluation['success']:.1f} % of {evaluation['episodes']:,} episodes succeed, {bound}"
     return (
-        f"The bundled policy (`jaxdrones train {name} --seed 0`, {seconds:.0f} s with compiling, commit "
+        f"The bundled policy (`jaxdrones train {name} --seed 0`, {seconds:.0f} s in all, commit "
         f"{report['commit']}): {success}.\n\n"
     )
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import assets
+from jaxdrones.checks import hint
 from jaxdrones.cli.common import run_folder
 from jaxdrones.errors import UserError
 from jaxdrones.user_code import is_reference
@@ -64,6 +65,8 @@ def open_policy(
     for name, x in given.items():
         if x not in (None, False):
             raise UserError(f"{name} is given beside the run {policy}, which determines it; leave it out")
+    if not policy.exists() and not is_bundled(policy) and (close := hint(str(policy), assets.policies())):
+        raise UserError(f"{policy} is neither a folder nor a bundled policy{close}")
     run = Run(assets.policies()[str(policy)] if is_bundled(policy) else policy)
     recipe = run.sidecar_entry("last" if last else "best", "recipe")
     names = recipe.get("files", ()) if isinstance(recipe, dict) else ()

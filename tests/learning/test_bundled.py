@@ -8,6 +8,7 @@ from documents import ROOT
 
 import jaxdrones as jd
 from jaxdrones import assets
+from jaxdrones.cli import main
 from jaxdrones.envs import TASKS
 from jaxdrones.learning import evaluate
 
@@ -41,6 +42,11 @@ def test_a_policy_succeeds_as_often_as_its_report_says(task):
     with jd.make(task) as env:
         found = evaluate(env, jd.make_policy(task, env), jax.random.key(7), 200)
     assert abs(found.success - expected) <= 4 * (expected * (1 - expected) / 200) ** 0.5 + 0.01
+
+
+def test_a_name_that_is_nearly_that_of_a_bundled_policy_is_corrected(capsys):
+    assert main(["eval", "forrest"]) == 2
+    assert "forrest is neither a folder nor a bundled policy; did you mean 'forest'?" in capsys.readouterr().err
 
 
 def test_what_cannot_be_flown_is_refused():

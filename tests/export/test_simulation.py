@@ -111,6 +111,18 @@ def test_a_thousand_steps_in_javascript_are_those_of_the_environment(env, made):
     assert np.linalg.norm(found[-1] - GOAL) < 0.1 < np.linalg.norm(found[0] - GOAL)
 
 
+@pytest.mark.float32
+def test_a_thousand_steps_in_javascript_are_those_of_the_environment_in_float32():
+    from jaxdrones.export.simulation import simulation
+
+    env = jd.make("hover", effects=(jd.drag, jd.ground_contact))
+    made = simulation(jd.make_policy("hover"), env)
+    found = places(made, "policy", 1000, WIND)
+    expected = flown_by_the_environment(env, start_of(made), len(found))
+    assert expected.dtype == np.float32
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("pilot", ["pid", "geometric", "mellinger"])
 def test_a_controller_in_the_page_flies_to_the_goal_and_stays(pilot, made):
     """Far enough and pushed a little; all four rotors turn at the speeds that the controller of JAX commands."""

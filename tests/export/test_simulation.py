@@ -111,6 +111,7 @@ def test_a_thousand_steps_in_javascript_are_those_of_the_environment(env, made):
     assert np.linalg.norm(found[-1] - GOAL) < 0.1 < np.linalg.norm(found[0] - GOAL)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_a_thousand_steps_in_javascript_are_those_of_the_environment_in_float32():
     from jaxdrones.export.simulation import simulation

@@ -35,7 +35,7 @@ def test_a_function_in_javascript_has_the_values_of_jax():
 
     def function(x, y):
         turned = jnp.arctan2(x[0], x[1]) + jnp.sqrt(jnp.abs(x[2])) ** 1.5
-        chosen = jnp.where((x > y) & (x != 0.5), jnp.sin(x) * y, jnp.exp(-x) / (1 + y**2))
+        chosen = jnp.where((x > y) & (x != 0.5), jnp.sin(x) - y, jnp.exp(-x) / (1 + y**2))
         either = jnp.where((x < 0) | ~(y <= 1), jnp.tanh(x), jnp.maximum(x, jnp.minimum(y, 0.25)))
         summed, _ = jax.lax.scan(lambda total, z: (total * 0.5 + jnp.cos(z), None), turned, x)
         return {"a": chosen @ either, "b": summed, "c": jnp.floor(3 * x) + jnp.sign(y)}
@@ -43,6 +43,8 @@ def test_a_function_in_javascript_has_the_values_of_jax():
     text = javascript("f", function, x=jnp.zeros(3), y=jnp.zeros(3))
     for seed in range(20):
         x, y = np.random.default_rng(seed).normal(size=(2, 3)) * 1.5
+        x[seed % 3] = (y[seed % 3], 0.0, 0.5, y[seed % 3])[seed % 4]  # where branches meet
+        y[(seed + 1) % 3] = 1.0
         found = in_node(f"(() => {{ {text}\nconst out = []; f(out, a, b); return out; }})()", x.tolist(), y.tolist())
         expected = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(function(x, y))])
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)

@@ -112,7 +112,9 @@ TRAININGS = {
     "fly --policy runs/crowd --drones 64": Short(f"crowd by bptt, drones 64, policy of runs/crowd ... {LOGGED}"),
     "eval runs/crowd --drones 64 --episodes 32": Short("crowd by bptt ... success", "--episodes 2"),
     "train race": Short(f"race by bptt ... {TRAINED}", f"{TRAINING} --set horizon=4"),
-    "train race --algo league": Short(f"race by league ... {TRAINED}", f"{TRAINING} --set horizon=4"),
+    "train race --algo league --output runs/league": Short(
+        f"race by league ... {TRAINED}", f"{TRAINING} --set horizon=4"
+    ),
     "train sling": Short(f"sling by bptt ... {TRAINED}", TRAINING),
     "train recovery --set recurrent_size=32": Short(f"recovery by bptt ... {TRAINED}", TRAINING),
     "train hover --resume": Short(TRAINED),

@@ -46,7 +46,10 @@ def test_a_policy_succeeds_as_often_as_its_report_says(task):
 
 def test_a_name_that_is_nearly_that_of_a_bundled_policy_is_corrected(capsys):
     assert main(["eval", "forrest"]) == 2
-    assert "forrest is neither a folder nor a bundled policy; did you mean 'forest'?" in capsys.readouterr().err
+    assert (
+        "forrest/best.json does not exist, and forrest is no bundled policy; did you mean 'forest'?"
+        in capsys.readouterr().err
+    )
 
 
 def test_what_cannot_be_flown_is_refused():

@@ -138,6 +138,12 @@ def nothing(scenario: Scenario, pilot: Pilot) -> Obtained:
     return Obtained(lambda obs: jnp.zeros((len(obs), 4)), 0.0, 0.0)
 
 
+def merit(env: Env, policy: Any, flights: int) -> tuple[float, float]:
+    """Success in flights from the starts of tuning, and of equals the negative error."""
+    came = evaluate(env, policy, jax.random.key(TUNING), flights)
+    return came.success, -came.rms_error if np.isfinite(came.rms_error) else -np.inf
+
+
 def tuned(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
     """Controller with gains, or LQR with weights, from a random search."""
 
@@ -151,13 +157,12 @@ def tuned(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
             center = best
             for i in range(pilot.candidates // len(_WIDTHS)):
                 factors = center * np.exp(rng.uniform(-1, 1, len(names)) * np.log(width)) if i else center
-                came = evaluate(env, make(factors), jax.random.key(TUNING), pilot.tuning_starts)
-                error = came.rms_error if np.isfinite(came.rms_error) else np.inf
-                if (came.success, -error) > score:
-                    best, score = factors, (came.success, -error)
-        found = ", ".join(f"{name} {factor:.2g}" for name, factor in zip(names, best, strict=True))
+                found = merit(env, make(factors), pilot.tuning_starts)
+                if found > score:
+                    best, score = factors, found
+        said = ", ".join(f"{name} {factor:.2g}" for name, factor in zip(names, best, strict=True))
         flown = pilot.candidates * pilot.tuning_starts * env.steps * env.dt
-        return Obtained(make(best), time.process_time() - began, flown, f"gains times {found}")
+        return Obtained(make(best), time.process_time() - began, flown, f"gains times {said}")
 
     return obtain
 
@@ -199,12 +204,10 @@ def planner(module: ModuleType) -> Callable[[Scenario, Pilot], Obtained]:
         for name, chosen in (("of the package", weights()), ("of lqr", regulator.policy.gains.weights)):
             settings = module.settings(env.physics, chosen)
             policy = Controller(settings, params, init(settings, params, state, *key), module, env.dt)
-            came = evaluate(env, policy, jax.random.key(TUNING), PLANNED_STARTS)
-            error = came.rms_error if np.isfinite(came.rms_error) else np.inf
-            scores[name] = (came.success, -error, policy)
-        name = max(scores, key=lambda name: scores[name][:2])
+            scores[name] = (merit(env, policy, PLANNED_STARTS), policy)
+        name = max(scores, key=lambda name: scores[name][0])
         flown = regulator.flown + 2 * PLANNED_STARTS * env.steps * env.dt
-        return Obtained(scores[name][2], time.process_time() - began, flown, f"weights {name}")
+        return Obtained(scores[name][1], time.process_time() - began, flown, f"weights {name}")
 
     return obtain
 

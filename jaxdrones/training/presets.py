@@ -197,10 +197,9 @@ def preset(
     env = make(task, realistic=realistic, **options)
     if isinstance(task, str):
         config = dataclasses.replace(config, **_settings(task, algorithm, realistic))
-    if getattr(config, "gradient", None) == "surrogate" and env.physics.physics.rotors is not instant_rotors:
-        config = dataclasses.replace(
-            config, gradient="exact"
-        )  # the surrogate has instant rotors, and nothing is learned
+    lagging = env.physics.physics.rotors is not instant_rotors
+    if lagging and getattr(config, "gradient", None) == "surrogate":  # without the lag; nothing would be learned
+        config = dataclasses.replace(config, gradient="exact")
     return env, config
 
 

@@ -44,7 +44,7 @@ test-rllib: .venv-rllib/installed
 	.venv-rllib/bin/pytest tests/adapters/test_rllib.py tests/test_examples.py -k rllib
 
 test-ros2: .venv-ros2/installed  ## a node in a real graph of ROS 2, with rclpy, in an environment of its own
-	.venv-ros2/bin/pytest tests/ros2/test_real_rclpy.py
+	.venv-ros2/bin/pytest tests/ros2/test_rclpy.py tests/ros2/test_crazyswarm.py tests/ros2/test_serialization.py
 
 lint: .venv/installed
 	$(BIN)/ruff format --check .
@@ -82,7 +82,7 @@ viewer:  ## the page of the viewer, from its sources; needs Node.js, which nothi
 # rclpy as wheels, for CPython 3.11; elsewhere it comes with an installed ROS 2.
 .venv-ros2/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv-ros2
-	.venv-ros2/bin/pip install --quiet -c constraints.txt -e ".[cli,ros2]" beartype pytest scipy
+	.venv-ros2/bin/pip install --quiet -c constraints.txt -e ".[bullet,cli,ros2]" beartype pytest scipy
 	.venv-ros2/bin/pip install --quiet $(addprefix ros-,rclpy==9.1.2 rmw-fastrtps-cpp==9.3.3 std-msgs sensor-msgs geometry-msgs nav-msgs std-srvs rosgraph-msgs)
 	touch $@
 

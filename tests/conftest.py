@@ -15,8 +15,7 @@ import pytest
 
 PACKAGE = Path(importlib.util.find_spec("jaxdrones").submodule_search_locations[0])
 MODULES = {".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in PACKAGE.rglob("*.py")}
-# Shapes are checked everywhere but where messages are translated: a check takes longer than a message.
-jaxtyping.install_import_hook(sorted(MODULES - {"jaxdrones.ros2.schema"}), "shapes.checked")
+jaxtyping.install_import_hook(sorted(MODULES), "shapes.checked")
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -2,7 +2,11 @@
 
 from collections import defaultdict
 
-from jaxdrones.ros2 import topics
+import numpy as np
+
+from jaxdrones import State, rotation
+from jaxdrones.ros2 import convert, topics
+from jaxdrones.ros2 import messages as msg
 
 
 class Wire:
@@ -40,16 +44,8 @@ class InProcess:
     def serve(self, name, answer):
         self.wire.services[name] = answer
 
-    def call(self, name, timeout):
-        if name not in self.wire.services:
-            raise TimeoutError(f"no server of the service {name!r}")
-        return self.wire.services[name]()
-
-    def connect(self, topic, timeout):
-        return topic.name in self.wire.subscribers
-
     def flush(self, timeout):
-        return True
+        pass
 
     def spin(self, timeout):
         end = self.wire.now + timeout
@@ -66,6 +62,46 @@ class InProcess:
 
     def close(self):
         pass
+
+
+class Peer:
+    """Who commands the team on a wire, and reads its latest state there."""
+
+    def __init__(self, wire, drones=2):
+        self.wire, self.team, self.transport = wire, range(drones), InProcess(wire)
+
+    def send(self, i, name, message):
+        self.transport.publisher(topics.command(i, name))(message)
+
+    def fly_to(self, pos, yaw=0.0):
+        turned = msg.Quaternion(z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2)))
+        for i, target in zip(self.team, np.asarray(pos, float).tolist(), strict=True):
+            self.send(i, "cmd_pose", msg.PoseStamped(pose=msg.Pose(msg.Point(*target), turned)))
+
+    def step(self):
+        done, _ = self.wire.services[topics.STEP_SERVICE]()
+        assert done
+        return self.state()
+
+    def state(self):
+        return from_messages([{name: self.latest(i, name) for name in ("odom", "motors")} for i in self.team])
+
+    def latest(self, i, name):
+        return self.wire.sent[topics.output(i, name).name][-1]
+
+
+def from_messages(sent):
+    """State of a team from the messages of its drones; the inverse of `convert.state_messages`."""
+    odom = [messages["odom"] for messages in sent]
+    quat = np.array([convert.numbers(m.pose.pose.orientation) for m in odom])
+    vel = np.array([convert.numbers(m.twist.twist.linear) for m in odom])
+    return State(
+        pos=np.array([convert.numbers(m.pose.pose.position) for m in odom]),
+        quat=quat,
+        vel=np.stack([rotation.to_matrix(q) @ v for q, v in zip(quat, vel, strict=True)]),
+        omega=np.array([convert.numbers(m.twist.twist.angular) for m in odom]),
+        rpm=np.array([messages["motors"].data for messages in sent]),
+    )
 
 
 def positions(wire, i):

@@ -45,7 +45,7 @@ PLACE = {
     module: (layer, peer) for layer, peers in enumerate(LAYERS) for peer, group in enumerate(peers) for module in group
 }
 OPTIONAL = ("gymnasium", "pettingzoo", "brax", "stable_baselines3", "torch", "pybullet", "matplotlib", "tqdm", "casadi")
-OPTIONAL += ("cyclonedds", "onnx", "rosbags", "rclpy", "ray", "shtab", "tianshou")
+OPTIONAL += ("onnx", "rosbags", "rclpy", "ray", "shtab", "tianshou")
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 

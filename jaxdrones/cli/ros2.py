@@ -19,7 +19,6 @@ from jaxdrones.params import repeat
 from jaxdrones.ros2 import bag, topics
 from jaxdrones.ros2.command import CONTROLLERS
 from jaxdrones.ros2.failsafe import ACTIONS, Failsafe, PeerLost
-from jaxdrones.ros2.network import TRANSPORTS, open_transport
 from jaxdrones.ros2.node import Node
 from jaxdrones.ros2.simulation import Simulation
 from jaxdrones.ros2.transport import Transport
@@ -29,7 +28,7 @@ from jaxdrones.urdf import load_params
 
 _SPACING = 0.5  # m between drones at the start, along y
 _MAX_HZ = 20_000
-_OF_REPLAY = ("bag", "speed", "transport", "json", "run", "debug")
+_OF_REPLAY = ("bag", "speed", "json", "run", "debug")
 
 
 def add(commands) -> None:
@@ -58,7 +57,6 @@ def add(commands) -> None:
     )
     watch.add_argument("--wait", type=float, default=30.0, metavar="S", help="the same before the first command (30)")
     watch.add_argument("--failsafe", default="hover", metavar="NAME", help=f"{', '.join(ACTIONS)} (hover)")
-    _add_transport(wire)
     wire.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
     add_json(wire)
     parser.set_defaults(run=_run)
@@ -66,23 +64,20 @@ def add(commands) -> None:
     replay = commands.add_parser("replay", help="publish the messages of a bag", allow_abbrev=False)
     replay.add_argument("bag", type=folder, metavar="BAG", help="folder of a bag; nothing is simulated")
     replay.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
-    _add_transport(replay)
     add_json(replay)
     replay.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     replay.set_defaults(run=functools.partial(_replay, parser))
 
 
-def _add_transport(group) -> None:
-    group.add_argument(
-        "--transport",
-        default="auto",
-        metavar="NAME",
-        help=f"{', '.join(TRANSPORTS)} (rclpy if installed, else cyclonedds)",
-    )
+def join() -> Transport:
+    """Start a node of rclpy."""
+    from jaxdrones.ros2.rclpy_transport import RclpyTransport  # optional
+
+    return RclpyTransport()
 
 
 def _run(options: argparse.Namespace) -> int:
-    with contextlib.closing(open_transport(options.transport)) as transport:
+    with contextlib.closing(join()) as transport:
         failsafe, camera = Failsafe(options.failsafe, options.timeout, options.wait), _camera(options)
         with contextlib.ExitStack() as stack:
             simulation = _simulation(options, stack)
@@ -153,7 +148,7 @@ def _replay(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int
         if name not in _OF_REPLAY and getattr(options, name) != parser.get_default(name):
             raise UserError(f"--{name.replace('_', '-')} is an option of flights; leave it out of `replay`")
     check_options(options, speed=number(above=0))
-    with contextlib.closing(open_transport(options.transport)) as transport:
+    with contextlib.closing(join()) as transport:
         report = _published(options, transport)
     _print(options, report)
     return 0

@@ -1,9 +1,9 @@
-"""Conversion of states to messages and of messages to states and commands."""
+"""Conversion of states to messages and of messages to commands."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,6 @@ from jaxdrones.ros2 import messages as msg
 from jaxdrones.ros2 import topics
 from jaxdrones.ros2.command import Command, Mode
 from jaxdrones.sensing import Camera
-from jaxdrones.state import State
 
 _NS = 1_000_000_000
 _LITHIUM_POLYMER, _DISCHARGING, _HEALTH_GOOD = 3, 2, 1  # constants of sensor_msgs/BatteryState
@@ -125,29 +124,10 @@ def camera_info(camera: Camera, header: msg.Header) -> msg.CameraInfo:
     )
 
 
-def to_state(odometry: Sequence[msg.Odometry], rotors: Sequence[msg.Float64MultiArray]) -> State:
-    """State of a team from the messages of its drones; the inverse of `state_messages`."""
-    quat = np.array([numbers(m.pose.pose.orientation) for m in odometry])
-    vel = np.array([numbers(m.twist.twist.linear) for m in odometry])
-    arrays: dict[str, Any] = {  # NumPy's float64, as in messages, independent of JAX
-        "pos": np.array([numbers(m.pose.pose.position) for m in odometry]),
-        "quat": quat,
-        "vel": to_world(quat, vel),
-        "omega": np.array([numbers(m.twist.twist.angular) for m in odometry]),
-        "rpm": np.array([m.data for m in rotors]),
-    }
-    return State(**arrays)
-
-
-def to_world(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """R v of every row of `quat` (n, 4) and `v` (n, 3): v + w t + u x t with t = 2 u x v and q = (u, w)."""
-    t = 2 * np.cross(quat[:, :3], v)
-    return v + quat[:, 3:] * t + np.cross(quat[:, :3], t)
-
-
 def to_body(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """R^T v of every row of `quat` (n, 4) and `v` (n, 3)."""
-    return to_world(quat * np.array([-1, -1, -1, 1], quat.dtype), v)
+    """R^T v of every row of `quat` (n, 4) and `v` (n, 3): v - w t + u x t with t = 2 u x v and q = (u, w)."""
+    t = 2 * np.cross(quat[:, :3], v)
+    return v - quat[:, 3:] * t + np.cross(quat[:, :3], t)
 
 
 class Refused(UserError):

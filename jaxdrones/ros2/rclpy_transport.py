@@ -1,11 +1,11 @@
-"""Transport by rclpy, for computers with an installed and sourced ROS 2."""
+"""Transport by rclpy, the Python library of ROS 2."""
 
 from __future__ import annotations
 
 import array
 import importlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 try:
@@ -16,7 +16,7 @@ try:
     import rclpy.signals
 except ImportError as error:
     raise ImportError(
-        "rclpy is not there; it comes with ROS 2 (source its setup.bash), or take the transport 'cyclonedds'"
+        "rclpy is not installed; source the setup.bash of a ROS 2, or install its wheels (docs/ros2.md)"
     ) from error
 
 from jaxdrones.ros2 import messages as msg
@@ -39,93 +39,86 @@ class RclpyTransport:
         self._executor = rclpy.executors.SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._topics: list[tuple[Topic, bool]] = []
-        self._publishers: dict[str, Any] = {}
-        self._clients: dict[str, Any] = {}
+        self._publishers: dict[Topic, Any] = {}
         self._said: set[str] = set()
         self._looked = -_LOOK
+        self._subscriptions: list[tuple[Any, int, Callable[[Any], None]]] = []
 
     def publisher(self, topic: Topic) -> Callable[[msg.Message], None]:
         """Function that publishes messages."""
         publisher = self._node.create_publisher(ros_class(topic.type), f"/{topic.name}", _ros_qos(topic.qos))
-        self._publishers[topic.name] = publisher
+        self._publishers[topic] = publisher
         self._topics.append((topic, True))
-        return lambda message: publisher.publish(msg.encode(message, ros_class, _ros_array))
+        return lambda message: publisher.publish(to_ros(message))
 
     def subscribe(self, topic: Topic, receive: Callable[[Any], None]) -> None:
         """Call a function with every message of a topic."""
 
         def received(message: Any) -> None:
-            receive(msg.decode(topic.type, message))
+            receive(from_ros(topic.type, message))
 
-        self._node.create_subscription(ros_class(topic.type), f"/{topic.name}", received, _ros_qos(topic.qos))
+        qos = _ros_qos(topic.qos)
+        end = self._node.create_subscription(ros_class(topic.type), f"/{topic.name}", received, qos)
+        self._subscriptions.append((end, topic.qos.depth, received))
         self._topics.append((topic, False))
 
     def serve(self, name: str, answer: Answer) -> None:
-        """Offer a service. A pending request is answered after the first pending message of each topic."""
+        """Offer a service. Messages before a request are delivered before its answer."""
 
         def respond(request: Any, response: Any) -> Any:
+            self._deliver()
             response.success, response.message = answer()
             return response
 
         self._node.create_service(_trigger(), f"/{name}", respond)
 
-    def call(self, name: str, timeout: float) -> tuple[bool, str]:
-        """Call a service of another process.
+    def _deliver(self) -> None:
+        """Deliver all received messages; an executor takes one of a topic at a time, and those of a call unordered."""
+        for end, depth, received in self._subscriptions:
+            for _ in range(depth):
+                if (taken := end.handle.take_message(end.msg_type, False)) is None:
+                    break
+                received(taken[0])
 
-        Raises:
-            TimeoutError: no answer within `timeout` s.
-        """
-        if name not in self._clients:
-            self._clients[name] = self._node.create_client(_trigger(), f"/{name}")
-        client = self._clients[name]
-        if not client.wait_for_service(timeout_sec=timeout):
-            raise TimeoutError(f"no server of the service {name!r} within {timeout:g} s; is the node there?")
-        future = client.call_async(_trigger().Request())
-        self._executor.spin_until_future_complete(future, timeout_sec=timeout)
-        if not future.done():
-            raise TimeoutError(f"the service {name!r} did not answer within {timeout:g} s")
-        reply = future.result()
-        return reply.success, reply.message
+    def subscribers(self, topic: Topic) -> int:
+        """Number of discovered subscribers of a published topic."""
+        return self._publishers[topic].get_subscription_count()
 
-    def connect(self, topic: Topic, timeout: float) -> bool:
-        """Wait at most `timeout` s for a subscriber; return whether there is one."""
+    def flush(self, timeout: float) -> None:
+        """Wait at most `timeout` s for delivery to all readers."""
         end = time.monotonic() + timeout
-        while not self._publishers[topic.name].get_subscription_count():
-            if time.monotonic() > end:
-                return False
-            self.spin(0.01)
-        return True
-
-    def flush(self, timeout: float) -> bool:
-        """Wait at most `timeout` s for delivery to all readers; return whether it succeeded."""
-        end = time.monotonic() + timeout
-
-        def acknowledged(publisher: Any) -> bool:
+        for publisher in self._publishers.values():
             left = max(end - time.monotonic(), 1e-3)
-            return publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=left))
-
-        return all(map(acknowledged, self._publishers.values()))
+            publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=left))
 
     def spin(self, timeout: float) -> None:
-        """Deliver received messages; wait up to `timeout` s for one."""
+        """Deliver all received messages; wait up to `timeout` s for one."""
         self._executor.spin_once(timeout_sec=max(timeout, 0.0))
+        self._deliver()
 
     def complaints(self) -> list[str]:
-        """New mismatches with endpoints of other processes, such as another type."""
+        """New mismatches with endpoints of other processes: another type, or an incompatible quality of service."""
         if time.monotonic() < self._looked + _LOOK:
             return []
         self._looked = time.monotonic()
-        found = []
-        for topic, published in self._topics:
-            name = f"/{topic.name}"
-            look = self._node.get_subscriptions_info_by_topic if published else self._node.get_publishers_info_by_topic
-            does = "subscribes to" if published else "publishes"
-            for end in look(name):
-                text = f"a peer {does} {name} as {end.topic_type}; its type is {topic.type}"
-                if end.topic_type != topic.type and text not in self._said:
-                    self._said.add(text)
-                    found.append(text)
+        texts = [text for topic, published in self._topics for text in self._mismatches(topic, published)]
+        found = [text for text in dict.fromkeys(texts) if text not in self._said]
+        self._said.update(found)
         return found
+
+    def _mismatches(self, topic: Topic, published: bool) -> Iterator[str]:
+        """Mismatches of the endpoints of other processes with a topic of this node."""
+        look = self._node.get_subscriptions_info_by_topic if published else self._node.get_publishers_info_by_topic
+        who, own = f"a peer {'subscribes to' if published else 'publishes'} /{topic.name}", _ros_qos(topic.qos)
+        for end in look(f"/{topic.name}"):
+            if end.topic_type != topic.type:
+                yield f"{who} as {end.topic_type}; its type is {topic.type}"
+            given = end.qos_profile  # with infinite deadlines, which do not compare with the unspecified ones of `own`
+            other = rclpy.qos.QoSProfile(depth=1, reliability=given.reliability, durability=given.durability)
+            offered, requested = (own, other) if published else (other, own)
+            compatible, reason = rclpy.qos.qos_check_compatible(offered, requested)
+            if compatible == rclpy.qos.QoSCompatibility.ERROR:
+                yield f"{who} with an incompatible quality of service: {reason.removeprefix('ERROR: ').rstrip(';')}"
 
     def close(self) -> None:
         """Leave the network, and stop rclpy if it was started here."""
@@ -146,6 +139,16 @@ def ros_class(kind: str) -> Any:
         return getattr(importlib.import_module(f"{package}.msg"), name)
     except ImportError as error:
         raise ImportError(f"{kind} is not there; install the ROS 2 package {package}") from error
+
+
+def to_ros(message: msg.Message) -> Any:
+    """Convert a message to the installed ROS 2."""
+    return msg.encode(message, ros_class, _ros_array)
+
+
+def from_ros(kind: str, message: Any) -> msg.Message:
+    """Convert a message of the installed ROS 2 of the type `kind`."""
+    return msg.decode(kind, message)
 
 
 def _trigger() -> Any:

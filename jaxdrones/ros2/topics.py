@@ -22,7 +22,7 @@ class QoS:
     reliable: bool = True
 
 
-_STATE = QoS(depth=200)  # 2 s at 100 Hz; queued messages stay below the 500 kB at which CycloneDDS blocks a writer
+_STATE = QoS(depth=200)  # 2 s at 100 Hz
 _COMMAND = QoS(depth=100)
 _IMAGE = QoS(depth=5, reliable=False)  # sensor data in ROS: a slow subscriber loses images without blocking others
 

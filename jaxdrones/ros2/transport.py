@@ -24,18 +24,8 @@ class Transport(Protocol):
     def serve(self, name: str, answer: Answer) -> None:
         """Offer a service. Messages before a request are delivered before its answer."""
 
-    def call(self, name: str, timeout: float) -> tuple[bool, str]:
-        """Call a service of another process.
-
-        Raises:
-            TimeoutError: no answer within `timeout` s.
-        """
-
-    def connect(self, topic: Topic, timeout: float) -> bool:
-        """Wait at most `timeout` s for a connected subscriber; return whether there is one."""
-
-    def flush(self, timeout: float) -> bool:
-        """Wait at most `timeout` s for delivery to all readers; return whether it succeeded."""
+    def flush(self, timeout: float) -> None:
+        """Wait at most `timeout` s for delivery to all readers."""
 
     def spin(self, timeout: float) -> None:
         """Deliver received messages; wait up to `timeout` s for one."""

@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from in_process import InProcess, Wire
+from in_process import InProcess, Peer, Wire
 from ros2_team import make_simulation
 
 from jaxdrones.cli import main
 from jaxdrones.flights import read_log
 from jaxdrones.flights.fly import fly
-from jaxdrones.ros2 import Node, Peer, bag, convert, topics
+from jaxdrones.ros2 import Node, bag, convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.sensing import Camera
 
@@ -24,7 +24,7 @@ def recorded(tmp_path):
     with bag.Recorder(tmp_path / "bag") as recorder:
         camera = Camera(resolution=(8, 6), rate=20.0)
         node = Node(make_simulation(2), InProcess(wire), clock=wire.clock, recorder=recorder, camera=camera)
-        peer = Peer(InProcess(wire), 2)
+        peer = Peer(wire)
         wire.script = [(0.042, lambda: peer.fly_to([[0.1, 0.0, 1.0], [0.1, 0.5, 1.0]]))]
         node.run(0.1)
     return tmp_path / "bag", wire
@@ -119,7 +119,7 @@ def test_a_bag_without_a_flight_is_refused(tmp_path):
 def wired(monkeypatch):
     """The command line on a transport within this process."""
     wire = Wire()
-    monkeypatch.setattr("jaxdrones.cli.ros2.open_transport", lambda name: InProcess(wire))
+    monkeypatch.setattr("jaxdrones.cli.ros2.join", lambda: InProcess(wire))
     monkeypatch.setattr("time.monotonic", wire.clock)
     return wire
 

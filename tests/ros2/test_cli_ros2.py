@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import sys
 import xml.etree.ElementTree
 from pathlib import Path
 
@@ -16,7 +17,7 @@ FILES = Path(__file__).parents[2] / "ros2"
 @pytest.fixture
 def wire(monkeypatch):
     wire = Wire()
-    monkeypatch.setattr("jaxdrones.cli.ros2.open_transport", lambda name: InProcess(wire))
+    monkeypatch.setattr("jaxdrones.cli.ros2.join", lambda: InProcess(wire))
     return wire
 
 
@@ -74,9 +75,12 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, wire, capsys,
     assert code == 2 and message in said.err and said.err.count("\n") == 1
 
 
-def test_an_unknown_transport_is_refused(capsys):
-    assert main(["ros2", "--transport", "pigeon"]) == 2
-    assert "unknown transport 'pigeon'" in capsys.readouterr().err
+def test_without_rclpy_the_remedy_is_named(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    monkeypatch.delitem(sys.modules, "jaxdrones.ros2.rclpy_transport", raising=False)
+    assert main(["ros2"]) != 0
+    said = capsys.readouterr().err
+    assert "rclpy is not installed; source the setup.bash of a ROS 2" in said and said.count("\n") == 1
 
 
 def test_the_launch_file_starts_a_command_that_exists():

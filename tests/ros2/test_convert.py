@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import assert_close, flying
+from in_process import from_messages
 from ros2_team import make_simulation
 
 import jaxdrones as jd
@@ -27,8 +28,7 @@ def measured(n=3):
 def test_a_state_comes_back_from_its_messages():
     simulation, now = measured()
     sent = [convert.state_messages(now, i, 0) for i in range(3)]
-    back = convert.to_state([m["odom"] for m in sent], [m["motors"] for m in sent])
-    assert_close(back, jax.device_get(simulation.state), atol=1e-14)
+    assert_close(from_messages(sent), jax.device_get(simulation.state), atol=1e-14)
 
 
 @pytest.mark.slow

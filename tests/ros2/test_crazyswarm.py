@@ -1,8 +1,11 @@
 """The backend for Crazyswarm2, held to the interface and the laws of Crazyswarm2's own backend."""
 
-import fake_ros
+import time
+
 import numpy as np
 import pytest
+
+pytestmark = [pytest.mark.needs("rclpy"), pytest.mark.filterwarnings("default")]
 
 
 class Swarm:
@@ -18,47 +21,32 @@ class Action:
         self.rpm = rpm
 
 
-class Parameter:
-    def __init__(self, value):
-        self.value = value
-
-
-class Server(fake_ros.FakeNode):
-    """Crazyswarm2's server as far as a backend sees it."""
-
-    def __init__(self, **parameters):
-        super().__init__(fake_ros.Graph(), "crazyflie_server")
-        self.parameters, self.clocks = {f"sim.jaxdrones.{k}": v for k, v in parameters.items()}, []
-
-    def has_parameter(self, name):
-        return name in self.parameters
-
-    def get_parameter(self, name):
-        return Parameter(self.parameters[name])
-
-    def create_publisher(self, kind, topic, depth):
-        assert (kind.NAME, topic, depth) == ("rosgraph_msgs/msg/Clock", "clock", 10)
-        server = self
-
-        class Publisher:
-            def publish(self, message):
-                assert type(message) is kind
-                server.clocks.append(message.clock)
-
-        return Publisher()
-
-
 @pytest.fixture
-def backend(monkeypatch):
-    fake_ros.install(monkeypatch)
+def backend(ros):
+    import rclpy
+    from rosgraph_msgs.msg import Clock
+
     from jaxdrones.ros2.crazyswarm import Backend
 
+    rclpy.init()
+    servers = []
+
     def make(heights=(1.0,), **parameters):
-        server = Server(**parameters)
+        """The backend in a server, which has its parameters as a node that declares those of its file."""
+        given = [rclpy.Parameter(f"sim.jaxdrones.{name}", value=value) for name, value in parameters.items()]
+        server = rclpy.create_node(
+            "crazyflie_server", parameter_overrides=given, automatically_declare_parameters_from_overrides=True
+        )
+        servers.append(server)
+        server.clocks = []
+        server.create_subscription(Clock, "clock", server.clocks.append, 10)
         states = [Swarm([i, 0.0, z]) for i, z in enumerate(heights)]
         return Backend(server, [f"cf{i}" for i in range(len(heights))], states), server
 
-    return make
+    yield make
+    for server in servers:
+        server.destroy_node()
+    rclpy.shutdown()
 
 
 def hover_rpm():
@@ -70,13 +58,18 @@ def hover_rpm():
 
 
 def test_time_goes_by_dt_and_the_clock_is_published(backend):
+    import rclpy
+
     made, server = backend(dt=0.001)
     assert made.time() == 0
     states = None
     for _ in range(3):
         states = made.step([None], [Action([0, 0, 0, 0])])
-    assert made.time() == pytest.approx(0.003) and [c.nanosec for c in server.clocks] == [10**6, 2 * 10**6, 3 * 10**6]
-    assert len(states) == 1 and made.shutdown() is None
+    end = time.monotonic() + 20
+    while len(server.clocks) < 3 and time.monotonic() < end:
+        rclpy.spin_once(server, timeout_sec=0.1)
+    assert [message.clock.nanosec for message in server.clocks] == [10**6, 2 * 10**6, 3 * 10**6]
+    assert made.time() == pytest.approx(0.003) and len(states) == 1 and made.shutdown() is None
 
 
 @pytest.mark.slow

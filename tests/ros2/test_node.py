@@ -7,10 +7,10 @@ import jax
 import numpy as np
 import pytest
 from helpers import assert_close
-from in_process import InProcess, Wire, positions
+from in_process import InProcess, Peer, Wire, positions
 from ros2_team import HZ, make_simulation, team_step
 
-from jaxdrones.ros2 import Failsafe, Node, Peer, PeerLost, convert, topics
+from jaxdrones.ros2 import Failsafe, Node, PeerLost, convert, topics
 from jaxdrones.ros2 import messages as msg
 from jaxdrones.sensing import Camera
 
@@ -39,7 +39,7 @@ def test_every_step_is_published_once_for_every_drone():
 def test_drones_fly_where_they_are_told():
     wire = Wire()
     node, warnings = make_node(wire, failsafe=Failsafe("hover", timeout=5.0))
-    peer = Peer(InProcess(wire), 2)
+    peer = Peer(wire, 2)
     target = np.array([[0.3, 0.0, 1.2], [0.3, 0.5, 0.8]])
     wire.script = [(0.1, lambda: peer.fly_to(target, yaw=0.5))]
     node.run(4.0)
@@ -52,7 +52,7 @@ def test_drones_fly_where_they_are_told():
 def test_velocities_turn_with_the_heading():
     wire = Wire()
     node, _ = make_node(wire, n=1)
-    peer = Peer(InProcess(wire), 1)
+    peer = Peer(wire, 1)
     twist = msg.Twist(msg.Vector3(0.5), msg.Vector3(z=1.0))
     wire.script = [(0.005 + 0.1 * k, lambda: peer.send(0, "cmd_vel", twist)) for k in range(30)]
     node.run(3.0)
@@ -64,7 +64,7 @@ def test_velocities_turn_with_the_heading():
 def test_body_rates_and_thrust_are_flown():
     wire = Wire()
     node, _ = make_node(wire, n=1)
-    peer = Peer(InProcess(wire), 1)
+    peer = Peer(wire, 1)
     twist = msg.Twist(msg.Vector3(z=11.0), msg.Vector3(x=1.0))
     wire.script = [(0.0, lambda: peer.send(0, "cmd_rates", twist))]
     node.run(0.3)
@@ -78,7 +78,7 @@ def test_in_lockstep_a_tape_of_rotor_speeds_is_flown_bit_for_bit_as_by_the_engin
     node, _ = make_node(wire, lockstep=True)
     simulation = make_simulation()
     tape = np.random.default_rng(0).uniform(0.9, 1.1, (20, 2, 4)) * np.asarray(simulation.params.hover_rpm)[:, None]
-    peer, seen = Peer(InProcess(wire), 2), []
+    peer, seen = Peer(wire, 2), []
 
     def fly():
         for rpm in tape:
@@ -101,7 +101,7 @@ def test_in_lockstep_a_tape_of_rotor_speeds_is_flown_bit_for_bit_as_by_the_engin
 def test_a_lost_peer_leaves_drones_that_hover_at_their_last_target(silent_from):
     wire = Wire()
     node, warnings = make_node(wire, failsafe=Failsafe("hover", timeout=0.3, wait=1.0))
-    peer, target = Peer(InProcess(wire), 2), np.array([[0.2, 0.0, 1.0], [0.2, 0.5, 1.0]])
+    peer, target = Peer(wire, 2), np.array([[0.2, 0.0, 1.0], [0.2, 0.5, 1.0]])
     wire.script = [(0.1 * k, lambda: peer.fly_to(target)) for k in range(round(10 * silent_from))]
     flown = node.run(3.0)
     expected = target if silent_from else np.array([[0, 0, 1], [0, 0.5, 1.0]])
@@ -114,7 +114,7 @@ def test_a_lost_peer_leaves_drones_that_hover_at_their_last_target(silent_from):
 def test_a_peer_that_comes_back_is_heard():
     wire = Wire()
     node, warnings = make_node(wire, n=1, failsafe=Failsafe("hover", timeout=0.2, wait=0.2))
-    peer = Peer(InProcess(wire), 1)
+    peer = Peer(wire, 1)
     wire.script = [(1.0, lambda: peer.fly_to([[0.2, 0.0, 1.0]]))]
     node.run(1.1)
     assert warnings == ["no command for drone_0 for 0.2 s; it hovers", "commands for drone_0 are back; it flies them"]
@@ -166,7 +166,7 @@ def test_a_wrong_type_is_said_and_the_flight_goes_on_or_stops(action):
 def test_refused_messages_of_a_kind_are_said_once_whatever_their_numbers():
     wire = Wire()
     node, warnings = make_node(wire, n=1)
-    peer = Peer(InProcess(wire), 1)
+    peer = Peer(wire, 1)
     bad = {  # of each kind, k-th message -> message
         "cmd_motors": [
             lambda k: msg.Float64MultiArray(data=(1.0,) * (k + 5)),

@@ -4,6 +4,7 @@ python rclpy_peer.py FILE.npz DRONES STEPS
 """
 
 import sys
+import time
 
 import numpy as np
 import rclpy
@@ -53,6 +54,24 @@ def main(path: str, drones: int, steps: int) -> None:
     np.savez(path, t=t, pos=pos, vel=vel, answers=answers)
     node.destroy_node()
     rclpy.shutdown()
+
+
+def stream(drones: int) -> None:
+    """Command positions at 20 Hz, once the team has been seen, until the process is killed."""
+    rclpy.init()
+    node = rclpy.create_node("outsider")
+    commands = [
+        node.create_publisher(PoseStamped, f"/drone_{i}/cmd_pose", QoSProfile(depth=100)) for i in range(drones)
+    ]
+    while not all(publisher.get_subscription_count() for publisher in commands):
+        rclpy.spin_once(node, timeout_sec=0.01)
+    while True:
+        for i, publisher in enumerate(commands):
+            message = PoseStamped()
+            message.pose.position.y, message.pose.position.z = 0.5 * i - 0.25, 0.6
+            publisher.publish(message)
+        print("sent", flush=True)
+        time.sleep(0.05)
 
 
 def stamp(message: Odometry) -> int:

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 import jaxdrones as jd
-from benchmarks import racing
+from benchmarks import self_play
 from jaxdrones.learning import bptt, checkpoint
 from jaxdrones.tasks.racetrack import GATES, OPENING, START
 from jaxdrones.tasks.starts import standing_height
@@ -57,14 +57,14 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         else:
             policy = jax.block_until_ready(bptt.train(jax.random.key(seed), train, config)).policy
         row = {"seed": seed, "seconds": time.perf_counter() - begin}
-        rows.append(row | racing.summary(racing.fly(env, policy, options.laps)))
+        rows.append(row | self_play.summary(self_play.fly(env, policy, options.laps)))
     lines = ["bound     | s"]
     lines += [f"{name:9} | {bound:.3f}" for name, bound in bounds.items()]
     lines += ["", f"seed | completed % [95 %]    | lap s           | over the bound: {', '.join(bounds)} | train s"]
     for row in rows:
         ratios = ", ".join(f"{row['lap'][0] / bound:.3f}" for bound in bounds.values())
         lines.append(
-            f"{row['seed']:4} | {racing.percent(row['completed'])} | {row['lap'][0]:.3f} +- {row['lap'][1]:.3f} |"
+            f"{row['seed']:4} | {self_play.percent(row['completed'])} | {row['lap'][0]:.3f} +- {row['lap'][1]:.3f} |"
             f" {ratios} | {row['seconds']:.0f}"
         )
     return {"about": changes | {"nodes": options.nodes}, "bounds": bounds, "rows": rows}, lines

@@ -34,7 +34,7 @@ from jaxdrones.engine.rollout import rollout
 from jaxdrones.engine.step import Step
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect
 from jaxdrones.envs import dryden, explain, make
-from jaxdrones.learning.published import make_policy
+from jaxdrones.learning.policies import make_policy
 from jaxdrones.params import Params, repeat, stack
 from jaxdrones.sensing import Camera, Scene, Sensor, render
 from jaxdrones.state import State

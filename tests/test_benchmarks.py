@@ -173,8 +173,8 @@ def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_
 
 
 @pytest.mark.slow
-def test_racing_reports_teams_and_single_drones_of_every_policy():
-    rows = quick("racing")["rows"]
+def test_self_play_reports_teams_and_single_drones_of_every_policy():
+    rows = quick("self_play")["rows"]
     assert [(row["policy"], row["drones"]) for row in rows] == [
         (name, drones) for name in ("alone", "blind", "self-play", "league") for drones in (2, 1)
     ]

@@ -9,7 +9,7 @@ from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.learning.published import POLICIES
+from jaxdrones.learning.policies import POLICIES
 from jaxdrones.training.algorithms import ALGORITHMS
 
 

@@ -14,7 +14,7 @@ from jaxdrones.user_code import is_reference
 
 def is_user_policy(policy: Path) -> bool:
     """Whether this is a policy of a user's file, `file.py:name`, or a published one, not the folder of a run."""
-    from jaxdrones.learning.published import POLICIES
+    from jaxdrones.learning.policies import POLICIES
 
     return is_reference(str(policy)) or (str(policy) in POLICIES and not policy.exists())
 

@@ -27,6 +27,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import checkpoint, files
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
+from jaxdrones.learning.policies import check_fits
 from jaxdrones.training.recipe import Recipe
 
 CHECKPOINTS = ("best", "last", "state")
@@ -128,32 +129,8 @@ class Run:
         self.check_identity(name)
         policy = checkpoint.load(self.folder / name)
         if env is not None:
-            sizes = (policy.obs_stats.mean.size, policy.network.output_size)
-            self.check_sizes(name, env, sizes, (env.observation_size, env.action_size))
-            networks = len(jax.tree.leaves(policy.params)[0])
-            if policy.per_agent and networks != env.drones:
-                raise UserError(
-                    f"{self.folder / name} has a network for each of {networks} drones; give as many, not {env.drones}"
-                )
+            check_fits(str(self.folder / name), policy, env)
         return policy
-
-    def check_sizes(self, name: str, env: Env, sizes: tuple[int, int], expected: tuple[int, int]) -> None:
-        """Raise unless a policy has the observation and action sizes of the environment.
-
-        Args:
-            name: `best` or `last`.
-            env: environment.
-            sizes: lengths of observation and action of the policy.
-            expected: lengths of observation and action of the environment.
-
-        Raises:
-            ValueError: different sizes.
-        """
-        if sizes != expected:
-            raise UserError(
-                f"{self.folder / name} was trained on another version of {env.task.name}: its observations and "
-                f"actions have {sizes} numbers, those of the environment {expected}; train again"
-            )
 
     @property
     def started(self) -> bool:

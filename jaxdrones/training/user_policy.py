@@ -13,7 +13,7 @@ from jaxdrones.envs import Env, make
 from jaxdrones.envs.functions import check_policy
 from jaxdrones.errors import UserError
 from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
-from jaxdrones.learning.published import POLICIES, make_policy
+from jaxdrones.learning.policies import POLICIES, check_fits, make_policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +22,7 @@ class UserPolicy:
 
     reference: str
     """`file.py:name` of a function from observations (n, d) to actions (n, a), or of a recurrent policy; or a name of
-    `jaxdrones.learning.published.POLICIES`."""
+    `jaxdrones.learning.policies.POLICIES`."""
     task: str
     """A name of `jaxdrones.envs.TASKS`, or `file.py:function`."""
     realistic: bool | str
@@ -57,11 +57,8 @@ class UserPolicy:
         policy = user_code.load(self.reference)
         sizes = (env.drones, env.observation_size), (env.drones, env.action_size)
         recurrent = isinstance(policy, RecurrentPolicy)
-        if isinstance(policy, Policy) and policy.obs_stats.mean.size != env.observation_size:
-            raise UserError(
-                f"{self.reference} observes {policy.obs_stats.mean.size} numbers, {self.task} has "
-                f"{env.observation_size}; give the task and the options that it was trained with"
-            )
+        if isinstance(policy, Policy):
+            check_fits(self.reference, policy, env)
         if isinstance(policy, type) or not (callable(policy) or recurrent):
             raise UserError(
                 f"{self.reference} is {policy!r:.60}; give a function from observations {sizes[0]} to actions "

@@ -219,7 +219,10 @@ def test_a_damaged_run_is_one_line(file, content, message, run, tmp_path, capsys
         (["RUN", "--to", "c", "--output", "RUN/best.json"], "best.json: "),
         (["mine.py:policy", "--to", "c"], "--task is missing"),
         (["mine.py:policy", "--to", "c", "--task", "hover"], "the layers of a function are unknown"),
-        (["mine.py:trained", "--to", "c", "--task", "leader-follower"], "observes 22 numbers, leader-follower has 12"),
+        (
+            ["mine.py:trained", "--to", "c", "--task", "leader-follower"],
+            "has 22 observations and 4 actions, the environment leader-follower 12",
+        ),
     ],
 )
 def test_a_mistake_is_one_line(arguments, message, run, tmp_path, monkeypatch, capsys):

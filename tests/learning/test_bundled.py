@@ -53,7 +53,9 @@ def test_a_name_that_is_nearly_that_of_a_bundled_policy_is_corrected(capsys):
 
 
 def test_what_cannot_be_flown_is_refused():
-    with pytest.raises(ValueError, match=r"the policy forest has \d+ observations and 4 actions, the environment 22"):
+    with pytest.raises(
+        ValueError, match=r"the policy forest has \d+ observations and 4 actions, the environment hover 22"
+    ):
         jd.make_policy("forest", jd.make("hover"))
     with pytest.raises(ValueError, match=r"unknown policy 'forrest'; did you mean 'forest'\?"):
         jd.make_policy("forrest")

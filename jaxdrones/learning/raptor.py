@@ -1,9 +1,7 @@
-"""Bundled and published policies by name."""
+"""RAPTOR, a published policy for all quadrotors. Needs the extra `raptor`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import flax.struct
@@ -12,12 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones import assets
-from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError, install
-from jaxdrones.learning import checkpoint
-from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 
@@ -125,41 +119,3 @@ def _placed(params: Params) -> tuple[np.ndarray, tuple[int, ...]]:
         if np.abs(turned).min() > _CENTERED * np.abs(turned).max() and spin[order[0]] < 0:
             return turn, order
     raise UserError("raptor needs four rotors at the corners of a cross, neighbors of opposite spins")
-
-
-POLICIES: dict[str, Callable[[Env], RecurrentPolicy]] = {"raptor": Raptor.of}
-
-
-def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
-    """Bundled or published policy.
-
-    Args:
-        name: a task with a bundled policy, for example `forest` (all: `jaxdrones list`), or `raptor`.
-        env: environment that the policy is to fly in, of which its observations and actions are checked. Optional for
-            a bundled policy, which flies in `jaxdrones.make(name)`, and in environments with the same observations.
-
-    Returns:
-        Policy, for `evaluate` and the functions of `learning.networks`.
-
-    Raises:
-        ValueError: an unknown name, or an environment with other observations or actions than the policy has.
-        ImportError: a policy whose package is not installed.
-    """
-    bundled = assets.policies()
-    check_choice("policy", name, [*bundled, *POLICIES])
-    if name in bundled:
-        return _bundled(name, bundled[name], env)
-    if env is None:
-        raise UserError(f"{name} adapts to a vehicle; give its environment, for example make_policy({name!r}, env)")
-    return POLICIES[name](env)
-
-
-def _bundled(name: str, folder: Path, env: Env | None) -> Policy:
-    policy = checkpoint.load(folder / "best")
-    sizes = policy.obs_stats.mean.size, policy.network.output_size
-    if env is not None and sizes != (env.observation_size, env.action_size):
-        raise UserError(
-            f"the policy {name} has {sizes[0]} observations and {sizes[1]} actions, the environment "
-            f"{env.observation_size} and {env.action_size}; give jaxdrones.make({name!r}), or train another policy"
-        )
-    return policy

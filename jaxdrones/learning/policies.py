@@ -1,0 +1,65 @@
+"""Bundled and published policies by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+
+from jaxdrones import assets
+from jaxdrones.checks import check_choice
+from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
+from jaxdrones.learning import checkpoint
+from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
+from jaxdrones.learning.raptor import Raptor
+
+POLICIES: dict[str, Callable[[Env], RecurrentPolicy]] = {"raptor": Raptor.of}
+"""Published policies, which adapt to the vehicle of an environment."""
+
+
+def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
+    """Bundled or published policy.
+
+    Args:
+        name: a task with a bundled policy, for example `forest` (all: `jaxdrones list`), or `raptor`.
+        env: environment that the policy is to fly in, of which its observations and actions are checked. Optional for
+            a bundled policy, which flies in `jaxdrones.make(name)`, and in environments with the same observations.
+
+    Returns:
+        Policy, for `evaluate` and the functions of `learning.networks`.
+
+    Raises:
+        ValueError: an unknown name, or an environment with other observations or actions than the policy has.
+        ImportError: a policy whose package is not installed.
+    """
+    bundled = assets.policies()
+    check_choice("policy", name, [*bundled, *POLICIES])
+    if name in bundled:
+        policy = checkpoint.load(bundled[name] / "best")
+        if env is not None:
+            check_fits(name, policy, env)
+        return policy
+    if env is None:
+        raise UserError(f"{name} adapts to a vehicle; give its environment, for example make_policy({name!r}, env)")
+    return POLICIES[name](env)
+
+
+def check_fits(name: str, policy: Policy, env: Env) -> None:
+    """Check that a policy has the observations and actions of an environment, and a network for each of its drones.
+
+    Raises:
+        ValueError: it has not; the message calls the policy `name`.
+    """
+    own = policy.obs_stats.mean.size, policy.network.output_size
+    expected = env.observation_size, env.action_size
+    if own != expected:
+        raise UserError(
+            f"the policy {name} has {own[0]} observations and {own[1]} actions, the environment {env.task.name} "
+            f"{expected[0]} and {expected[1]}; give the task and the options that it was trained with"
+        )
+    networks = len(jax.tree.leaves(policy.params)[0])
+    if policy.per_agent and networks != env.drones:
+        raise UserError(
+            f"the policy {name} has a network for each of {networks} drones; give as many, not {env.drones}"
+        )

@@ -1,8 +1,9 @@
-"""Makes the flights of `jaxdrones demo`, assets/demo: an episode of every bundled policy, and a simulation to fly in.
+"""Makes the flights of `jaxdrones demo`, in assets/demo.
 
     python website/demo.py [NAME ...]
 
-It needs the extra casadi.
+They are an episode of every bundled policy, a thousand drones, a recorded flight beside its simulation, and a drone
+that is simulated in the page. It needs the extra casadi.
 """
 
 import dataclasses
@@ -12,16 +13,23 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 import jaxdrones as jd
 from jaxdrones import assets
+from jaxdrones.control import firmware_pid
+from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.export import simulation
+from jaxdrones.flights import load_flights, load_vehicle, simulate_closed_loop
 from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
 from jaxdrones.training.episode import fly_episode
 from jaxdrones.training.run import Run
 from jaxdrones.visualization.viewer.gallery import Exhibit
 from jaxdrones.visualization.viewer.payload import encode
 from jaxdrones.visualization.viewer.show import looks, records_of
+
+sys.path.append(str(Path(__file__).parent.parent / "examples"))
+import word
 
 FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 FLIGHTS: dict[str, dict[str, Any]] = {
@@ -41,15 +49,17 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "hover": {},
 }
 """Task -> options."""
-_OWN = "fly it yourself"
-_RATE = 25.0  # rows per second, at most
+_OWN, _REAL, _WORD = "fly it yourself", "real flight", "thousand drones"
+_RECORDED = "B10_lissajous_slow_rep1"
+_WORD_RATE = 2.0  # rows per second
 
 
 def main() -> None:
     """Make the named flights, by default all."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[1:] or (_OWN, *FLIGHTS):
-        _write(_simulation() if name == _OWN else _exhibit(name, FLIGHTS[name]))
+    made = {_OWN: _simulation, _REAL: _reality, _WORD: _word}
+    for name in sys.argv[1:] or (*made, *FLIGHTS):
+        _write(made[name]() if name in made else _exhibit(name, FLIGHTS[name]))
 
 
 def _write(exhibit: Exhibit) -> None:
@@ -67,6 +77,41 @@ def _simulation() -> Exhibit:
         "compare the policy with three controllers."
     )
     return Exhibit(_OWN, about, "jaxdrones demo --policy runs/hover", page.payload)
+
+
+def _reality() -> Exhibit:
+    """A recorded flight, and its simulation from the recorded set-points alone."""
+    (log,) = load_flights(assets.folder() / "flights" / f"{_RECORDED}.npz")
+    vehicle, motors = load_vehicle("cf21"), crazyflie_motors("2.1+")
+    twin = simulate_closed_loop(log, vehicle, motors, firmware_pid.gains(propellers="2.1+"))
+    real = _cut(log, slice(*np.searchsorted(log.t, twin.t[[0, -1]] + [0, 1e-9])))
+    sim = {name: getattr(twin.sim, name)[:, None] for name in STATE}
+    simulated = FlightLog(twin.t, **sim, target_pos=twin.ref_pos[:, None], params=jd.repeat(vehicle.params, 1))
+    apart = twin.as_dict()
+    about = (
+        "A Crazyflie 2.1 in a motion capture system (NanoBench, Ullah and Baca 2026, BSD-3), and the vehicle cf21 "
+        "under the PID of its firmware, which knows nothing of the flight but its set-points and battery voltage. The "
+        f"paths are {100 * apart['xyz_rms_m']:.1f} cm apart (root mean square); the real one is "
+        f"{100 * apart['tracking_real_m']:.0f} cm from its set-points, which its PID trails."
+    )
+    worlds = [dataclasses.replace(log, t=log.t - log.t[0]) for log in map(_thinned, (real, simulated))]
+    shown = looks(worlds) | {"signals": ["position x", "distance from target"]}
+    payload = encode(worlds, ["real", "simulated"], _REAL, layout="ghosts", play=True, **shown)
+    return Exhibit(_REAL, about, f"jaxdrones score {_RECORDED} --vehicle cf21", payload)
+
+
+def _word() -> Exhibit:
+    """A thousand drones that write a word."""
+    flight = word.fly(jd.make_policy("crowd"), "JAX", 1000)
+    safe, reached = (100 * float(np.mean(flight.metrics[name][-1])) for name in ("safe", "reached"))
+    (record,) = records_of(flight, dict.fromkeys(("params", "dt", "targets", "labels", "images")))
+    record = _rounded(_thinned(record, _WORD_RATE))
+    about = (
+        "The policy of crowd, which eight drones learned, flies a thousand to the points of a word. In this flight "
+        f"{safe:.1f} % touched nobody, and {reached:.1f} % were at their points in the end."
+    )
+    payload = encode([record], [_WORD], _WORD, layout="alone", play=True, **looks([record]))
+    return Exhibit(_WORD, about, "python examples/word.py --policy assets/policies/crowd", payload)
 
 
 def _exhibit(task: str, options: dict[str, Any]) -> Exhibit:
@@ -93,11 +138,22 @@ def _success(task: str) -> str:
     return f"The policy succeeds in {share}, each with another start."
 
 
-def _thinned(record: FlightLog) -> FlightLog:
-    """Every few rows of a log, without images."""
-    every = max(1, round(1 / (_RATE * (record.t[1] - record.t[0]))))
-    rows = {name: getattr(record, name)[::every] for name in ("t", *STATE, *OPTIONAL)}
-    return dataclasses.replace(record, images={}, **rows)
+def _thinned(record: FlightLog, rate: float = 25.0) -> FlightLog:
+    """At most `rate` rows of a log per second, without images."""
+    every = max(1, round(1 / (rate * (record.t[1] - record.t[0]))))
+    return _cut(record, slice(None, None, every))
+
+
+def _rounded(record: FlightLog) -> FlightLog:
+    """Log with as many digits as can be seen, which takes a third of the bytes."""
+    digits = {"pos": 2, "quat": 2, "vel": 1, "omega": 1, "rpm": -2}
+    return dataclasses.replace(record, **{name: np.round(getattr(record, name), n) for name, n in digits.items()})
+
+
+def _cut(record: FlightLog, rows: slice) -> FlightLog:
+    return dataclasses.replace(
+        record, images={}, **{name: getattr(record, name)[rows] for name in ("t", *STATE, *OPTIONAL)}
+    )
 
 
 if __name__ == "__main__":

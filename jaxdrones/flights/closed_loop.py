@@ -40,14 +40,19 @@ class ClosedLoopResult:
     """(K,) time, s."""
     pos: np.ndarray
     """(K, 3) recorded position, m, world."""
-    sim_pos: np.ndarray
-    """(K, 3) simulated position, m, world."""
+    sim: State
+    """Simulated states, (K, ...) on every array."""
     ref_pos: np.ndarray
     """(K, 3) set-points of the position, m, world."""
     pwm: np.ndarray
     """(K, 4) recorded PWM, 0 to 65535."""
     sim_pwm: np.ndarray
     """(K, 4) simulated PWM, 0 to 65535."""
+
+    @property
+    def sim_pos(self) -> np.ndarray:
+        """(K, 3) simulated position, m, world."""
+        return np.asarray(self.sim.pos)
 
     def as_dict(self) -> dict[str, float | str | bool]:
         """RMS distances between the paths, RMS tracking errors and mean PWM, for JSON."""
@@ -151,15 +156,15 @@ def simulate_closed_loop(
     """
     rows, begin = rows_after_climb(log), motor_start_row(log)
     ref_pos, _, recorded_pwm, _ = closed_loop_columns(log)
-    simulated = _simulate(vehicle, motors, gains, closed_loop_inputs(log))
-    pos, pwm = (np.asarray(x)[rows.start - begin : rows.stop - begin] for x in simulated)
-    return ClosedLoopResult(log.name, log.t[rows], log.pos[rows, 0], pos, ref_pos[rows], recorded_pwm[rows], pwm)
+    simulated = jax.device_get(_simulate(vehicle, motors, gains, closed_loop_inputs(log)))
+    sim, pwm = jax.tree.map(lambda x: x[rows.start - begin : rows.stop - begin], simulated)
+    return ClosedLoopResult(log.name, log.t[rows], log.pos[rows, 0], sim, ref_pos[rows], recorded_pwm[rows], pwm)
 
 
 def simulate(
     vehicle: Vehicle, motors: Motors, gains: firmware_pid.Gains, inputs: ClosedLoopInputs
-) -> tuple[Float[Array, "K 3"], Float[Array, "K 4"]]:
-    """Positions (m, world) and PWM (0 to 65535) of a closed-loop simulation."""
+) -> tuple[State, Float[Array, "K 4"]]:
+    """States, (K, ...) on every array, and PWM (0 to 65535) of a closed-loop simulation."""
     params, instruments = vehicle.params, vehicle.instruments
     team = jax.tree.map(lambda x: x[None], params)
     dt, derivative = PERIOD / _SUBSTEPS, equations_of_motion(jnp.zeros(4))
@@ -175,14 +180,13 @@ def simulate(
 
     def row(carry, row_inputs):
         after, pwm = jax.lax.scan(lambda carry, _: substep(carry, *row_inputs), carry, length=_SUBSTEPS)
-        return after, (carry[1].pos, jnp.mean(pwm, axis=0))
+        return after, (carry[1], jnp.mean(pwm, axis=0))
 
     flying = jnp.isinf(inputs.ground)
     integral = jnp.where(flying, _hover_integral(vehicle, motors, gains, inputs), 0)
     memory = firmware_pid.init().replace(vel_integral=integral * jnp.array([0.0, 0, 1]))
     start = inputs.start.replace(rpm=jnp.where(flying, params.hover_rpm, 0) * jnp.ones(4))
-    _, (pos, pwm) = jax.lax.scan(row, (memory, start), (inputs.setpoint, inputs.battery))
-    return pos, pwm
+    return jax.lax.scan(row, (memory, start), (inputs.setpoint, inputs.battery))[1]
 
 
 def _above_ground(inputs: ClosedLoopInputs, state: State) -> State:

@@ -142,8 +142,8 @@ def _path_residuals(
     x: Array,
 ) -> Array:
     vehicle = with_parameters(start, PATH_PARAMETERS, list(x))
-    pos, _ = jax.vmap(lambda each: simulate(vehicle, motors, gains, each))(inputs)
-    return ((pos[:, ::_STRIDE, :2] - recorded) / _PATH_STD * mask[..., None]).reshape(-1)
+    sim, _ = jax.vmap(lambda each: simulate(vehicle, motors, gains, each))(inputs)
+    return ((sim.pos[:, ::_STRIDE, :2] - recorded) / _PATH_STD * mask[..., None]).reshape(-1)
 
 
 def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float) -> tuple[Array, np.ndarray]:

@@ -3,6 +3,7 @@
 import json
 import re
 
+import numpy as np
 import pytest
 from documents import ROOT
 
@@ -27,9 +28,19 @@ def test_every_bundled_policy_has_a_flight_that_can_be_shown():
     names = [exhibit.name for exhibit in EXHIBITS]
     assert set(assets.policies()) <= set(names)
     for exhibit in EXHIBITS:
-        (world,) = decode(exhibit.payload)["worlds"]
-        assert len(world["pos"]) > 40 or exhibit.name == "fly it yourself"
-        assert exhibit.command.startswith("jaxdrones ")
+        for world in decode(exhibit.payload)["worlds"]:
+            assert len(world["pos"]) > 40 or exhibit.name == "fly it yourself"
+        assert exhibit.command.startswith(("jaxdrones ", "python examples/word.py "))
+
+
+def test_a_thousand_drones_and_a_real_flight_beside_its_simulation_are_shown():
+    worlds = {exhibit.name: decode(exhibit.payload)["worlds"] for exhibit in EXHIBITS}
+    (swarm,) = worlds["thousand drones"]
+    assert swarm["pos"].shape[1] == 1000
+    real, simulated = worlds["real flight"]
+    assert (real["name"], simulated["name"]) == ("real", "simulated")
+    apart = np.linalg.norm(real["pos"] - simulated["pos"], axis=-1)
+    assert 0.01 < np.sqrt(np.mean(apart**2)) < 0.1  # m
 
 
 def test_the_page_begins_with_the_flight_that_was_asked_for(page):

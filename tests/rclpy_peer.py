@@ -28,8 +28,8 @@ def main(path: str, drones: int, steps: int) -> None:
     seen = [[] for _ in range(drones)]
     commands = []
     for i in range(drones):
-        node.create_subscription(Odometry, f"/drone_{i}/odom", seen[i].append, QoSProfile(depth=200))
-        commands.append(node.create_publisher(PoseStamped, f"/drone_{i}/cmd_pose", QoSProfile(depth=100)))
+        node.create_subscription(Odometry, f"/drone_{i}/odom", seen[i].append, QoSProfile(depth=500))
+        commands.append(node.create_publisher(PoseStamped, f"/drone_{i}/cmd_pose", QoSProfile(depth=500)))
     client = node.create_client(Trigger, "/step")
     assert client.wait_for_service(timeout_sec=PATIENCE), "there is no service /step"
     while not all(publisher.get_subscription_count() for publisher in commands):
@@ -61,7 +61,7 @@ def stream(drones: int) -> None:
     rclpy.init()
     node = rclpy.create_node("outsider")
     commands = [
-        node.create_publisher(PoseStamped, f"/drone_{i}/cmd_pose", QoSProfile(depth=100)) for i in range(drones)
+        node.create_publisher(PoseStamped, f"/drone_{i}/cmd_pose", QoSProfile(depth=500)) for i in range(drones)
     ]
     while not all(publisher.get_subscription_count() for publisher in commands):
         rclpy.spin_once(node, timeout_sec=0.01)

@@ -22,8 +22,7 @@ class QoS:
     reliable: bool = True
 
 
-_STATE = QoS(depth=200)  # 2 s at 100 Hz
-_COMMAND = QoS(depth=100)
+_STREAM = QoS(depth=500)  # 5 s at 100 Hz: Fast DDS sends lost messages again after up to 3 s
 _IMAGE = QoS(depth=5, reliable=False)  # sensor data in ROS: a slow subscriber loses images without blocking others
 
 
@@ -37,25 +36,25 @@ class Topic:
     qos: QoS
 
 
-CLOCK = Topic("clock", "rosgraph_msgs/msg/Clock", _STATE)
+CLOCK = Topic("clock", "rosgraph_msgs/msg/Clock", _STREAM)
 
 OUTPUTS = {
-    "pose": ("geometry_msgs/msg/PoseStamped", _STATE),
-    "twist": ("geometry_msgs/msg/TwistStamped", _STATE),
-    "odom": ("nav_msgs/msg/Odometry", _STATE),
-    "imu": ("sensor_msgs/msg/Imu", _STATE),
-    "motors": ("std_msgs/msg/Float64MultiArray", _STATE),
-    "battery": ("sensor_msgs/msg/BatteryState", _STATE),
+    "pose": ("geometry_msgs/msg/PoseStamped", _STREAM),
+    "twist": ("geometry_msgs/msg/TwistStamped", _STREAM),
+    "odom": ("nav_msgs/msg/Odometry", _STREAM),
+    "imu": ("sensor_msgs/msg/Imu", _STREAM),
+    "motors": ("std_msgs/msg/Float64MultiArray", _STREAM),
+    "battery": ("sensor_msgs/msg/BatteryState", _STREAM),
     "camera/image_raw": ("sensor_msgs/msg/Image", _IMAGE),
     "camera/camera_info": ("sensor_msgs/msg/CameraInfo", _IMAGE),
 }
 """Outputs of every drone, in its namespace."""
 
 COMMANDS = {
-    "cmd_pose": ("geometry_msgs/msg/PoseStamped", _COMMAND),
-    "cmd_vel": ("geometry_msgs/msg/Twist", _COMMAND),
-    "cmd_rates": ("geometry_msgs/msg/Twist", _COMMAND),
-    "cmd_motors": ("std_msgs/msg/Float64MultiArray", _COMMAND),
+    "cmd_pose": ("geometry_msgs/msg/PoseStamped", _STREAM),
+    "cmd_vel": ("geometry_msgs/msg/Twist", _STREAM),
+    "cmd_rates": ("geometry_msgs/msg/Twist", _STREAM),
+    "cmd_motors": ("std_msgs/msg/Float64MultiArray", _STREAM),
 }
 """Command topics of every drone, in its namespace; the latest message of any of them applies."""
 

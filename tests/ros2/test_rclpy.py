@@ -1,5 +1,6 @@
 """Nodes in a real graph of ROS 2, with peers that know rclpy alone; by `make test-ros2`."""
 
+import functools
 import json
 import signal
 import subprocess
@@ -45,7 +46,9 @@ def start():
     running = []
 
     def begin(*command):
-        running.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # also where tests run in the background
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        running.append(subprocess.Popen(command, preexec_fn=heed, **pipes))
         return running[-1]
 
     yield begin
@@ -171,7 +174,13 @@ class Commander:
             transport.subscribe(topics.output(i, "odom"), seen.append)
         self.commands = [topics.command(i, "cmd_pose") for i in range(drones)]
         self.publish = [transport.publisher(topic) for topic in self.commands]
-        until(lambda: all(map(transport.subscribers, self.commands)) and all(self.odom), transport)
+        until(lambda: all(map(transport.subscribers, self.commands)) and all(map(self.hears, range(drones))), transport)
+        for seen in self.odom:  # states before both sides know each other may be missing
+            del seen[:-1]
+
+    def hears(self, i):
+        """Whether the newest states of a drone came one after the other."""
+        return list(np.diff(self.times(i)[-20:])) == 19 * [10_000_000]
 
     def fly_to(self, pos, seconds):
         """Command positions (n, 3), at 100 Hz or as fast as this computer can; returns how many to each drone."""

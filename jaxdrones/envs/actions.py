@@ -1,8 +1,9 @@
-"""Action types: from numbers in [-1, 1] to rotor speeds, scaled by the vehicle so that 0 is hover."""
+"""Action types: from numbers in [-1, 1] to rotor speeds, scaled by the vehicle so that 0 is hover (but `throttle`)."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -19,6 +20,7 @@ from jaxdrones.state import State
 
 Command = Callable[[Params, Any, State, Array, Setpoint, float], tuple[Any, Float[Array, "4"]]]
 Entries = tuple[Quantity, ...]
+_ROTORS = [f"speed of rotor {i}" for i in range(4)]
 _AHEAD = "way from the drone to the setpoint"
 
 
@@ -50,20 +52,25 @@ class Action:
 
 def rpm(near_hover: float | None = None) -> Action:
     """Four rotor speeds: -1 is standstill, 0 hover speed, 1 full speed; or hover speed times 1 +- `near_hover`."""
-    return _rotor_speeds([f"speed of rotor {i}" for i in range(4)], near_hover)
+    return _rotor_speeds(_ROTORS, functools.partial(_rotor_speed, near_hover=near_hover))
+
+
+def throttle() -> Action:
+    """Four rotor speeds over the largest: -1 is standstill, 1 full speed; hover is for the policy to find."""
+    return _rotor_speeds(_ROTORS, lambda params, action: (action + 1) / 2 * params.max_rpm)
 
 
 def one_d_rpm(near_hover: float | None = 0.05) -> Action:
     """One speed for all rotors; the default range of 5 % about hover is that of gym-pybullet-drones (2021)."""
-    return _rotor_speeds(["speed of all rotors"], near_hover)
+    return _rotor_speeds(["speed of all rotors"], functools.partial(_rotor_speed, near_hover=near_hover))
 
 
-def _rotor_speeds(names: list[str], near_hover: float | None) -> Action:
+def _rotor_speeds(names: list[str], speed: Callable[[Params, Array], Array]) -> Action:
     def command(params, memory, state, action, setpoint, dt):
-        return memory, jnp.broadcast_to(_rotor_speed(params, action, near_hover), (4,))
+        return memory, jnp.broadcast_to(speed(params, action), (4,))
 
     def entries(params: Params) -> Entries:
-        return tuple(Quantity(name, "RPM", values=_speeds(params, near_hover)) for name in names)
+        return tuple(Quantity(name, "RPM", values=_at_ends(speed, params)) for name in names)
 
     return Action(len(names), command, entries=entries)
 
@@ -96,10 +103,10 @@ def angular_acceleration(largest: tuple[float, float, float] = (100.0, 100.0, 10
         torque = jnp.stack([y, -x, params.rotor_spin * params.km / params.kf])  # of 1 N of each rotor
         share = torque / jnp.sum(torque**2, axis=1, keepdims=True)  # rows are orthogonal at corners of a rectangle
         difference = (params.inertia * jnp.array(largest) * action[1:]) @ share / (2 * params.kf * params.hover_rpm)
-        return memory, jnp.clip(_rotor_speed(params, action[0], None) + difference, 0, params.max_rpm)
+        return memory, jnp.clip(_rotor_speed(params, action[0]) + difference, 0, params.max_rpm)
 
     def entries(params: Params) -> Entries:
-        speed = Quantity("speed of all rotors", "RPM", values=_speeds(params, None))
+        speed = Quantity("speed of all rotors", "RPM", values=_at_ends(_rotor_speed, params))
         return speed, *_about_axes("angular acceleration", "rad/s^2", largest)
 
     return Action(4, command, entries=entries)
@@ -256,10 +263,10 @@ def _about_axes(name: str, unit: str, largest: Iterable) -> Entries:
     return tuple(Quantity(f"{axis} of the {name}", unit, "body", (-value, 0.0, value)) for axis, value in axes)
 
 
-def _speeds(params: Params, near_hover: float | None) -> tuple[float, float, float]:
+def _at_ends(speed: Callable[[Params, Array], Array], params: Params) -> tuple[float, float, float]:
     """Rotor speeds at -1, 0 and 1, RPM."""
-    low, hover, high = (float(_rotor_speed(params, jnp.asarray(x), near_hover)) for x in (-1.0, 0.0, 1.0))
-    return low, hover, high
+    low, middle, high = (float(speed(params, jnp.asarray(x))) for x in (-1.0, 0.0, 1.0))
+    return low, middle, high
 
 
 def _thrust(low: Array | float, zero: Array, high: Array) -> Entries:
@@ -267,7 +274,7 @@ def _thrust(low: Array | float, zero: Array, high: Array) -> Entries:
     return (Quantity("collective thrust", "N", "body", (float(low), float(zero), float(high))),)
 
 
-def _rotor_speed(params: Params, action: Array, near_hover: float | None) -> Array:
+def _rotor_speed(params: Params, action: Array, near_hover: float | None = None) -> Array:
     if near_hover is None:
         return _from_hover(action, params.hover_rpm, params.max_rpm)
     return params.hover_rpm * (1 + near_hover * action)
@@ -285,6 +292,7 @@ def _from_hover(action: Array, hover: Array, highest: Array) -> Array:
 
 ACTIONS: dict[str, Callable[..., Action]] = {
     "rpm": rpm,
+    "throttle": throttle,
     "one_d_rpm": one_d_rpm,
     "thrust_and_torques": thrust_and_torques,
     "angular_acceleration": angular_acceleration,

@@ -11,11 +11,13 @@ from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import checkpoint
+from jaxdrones.learning.adaptive import AdaptivePolicy
 from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
 from jaxdrones.learning.raptor import Raptor
 
-POLICIES: dict[str, Callable[[Env], RecurrentPolicy]] = {"raptor": Raptor.of}
-"""Published policies, which adapt to the vehicle of an environment."""
+_NETWORKS: dict[str, Callable[[], RecurrentPolicy]] = {"raptor": Raptor.load}
+POLICIES = tuple(_NETWORKS)
+"""Policies for all vehicles; see `learning.adaptive`."""
 
 
 def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
@@ -42,7 +44,7 @@ def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
         return policy
     if env is None:
         raise UserError(f"{name} adapts to a vehicle; give its environment, for example make_policy({name!r}, env)")
-    return POLICIES[name](env)
+    return AdaptivePolicy.of(name, _NETWORKS[name](), env)
 
 
 def check_fits(name: str, policy: Policy, env: Env) -> None:

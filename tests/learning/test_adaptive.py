@@ -1,4 +1,4 @@
-"""Published policies fly like their own code, whatever the vehicle's axes."""
+"""Policies for all vehicles fly like their own code, whatever the axes of the vehicle."""
 
 import jax
 import jax.numpy as jnp

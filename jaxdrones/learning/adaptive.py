@@ -1,0 +1,87 @@
+"""Policies for all quadrotors: a recurrent network that adapts to the vehicle, and the arrangement of its rotors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdrones.envs import Env
+from jaxdrones.errors import UserError
+from jaxdrones.learning.networks import RecurrentPolicy
+from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
+
+OBSERVED = ("position_error", "rotation_matrix", "velocity_error", "omega")
+_CORNERS = np.array([(1, -1), (-1, -1), (-1, 1), (1, 1)])  # front right, rear right, rear left, front left
+_TURNS = (0.0, 90.0, 45.0, -45.0)  # degrees
+_CENTERED = 0.3  # of the largest coordinate of a rotor: below, it is on an axis
+
+
+class AdaptivePolicy(PyTreeNode):
+    """Policy that hovers any quadrotor at the target of a task, without its parameters.
+
+    Its network observes `OBSERVED` and its last action, and commands rotor speeds over the largest, -1 for standstill
+    and 1 for full speed. Rotors should be `lagging`: with instant rotors most vehicles oscillate.
+    """
+
+    network: RecurrentPolicy
+    """(hidden state, observations (*batch, 22)) -> (hidden state, actions (*batch, 4)), in its own body axes."""
+    turn: Float[Array, "3 3"]
+    """From body axes to those of a vehicle whose front right rotor turns clockwise, seen from above."""
+    order: tuple[int, ...] = flax.struct.field(pytree_node=False)
+    """Indices of its rotors: front right, rear right, rear left, front left in those axes."""
+    hover_share: Float[Array, ""]
+    """Rotor speed in hover over the largest, to convert to actions of the type `rpm`."""
+
+    @classmethod
+    def of(cls, name: str, network: RecurrentPolicy, env: Env) -> AdaptivePolicy:
+        """Policy for the nominal vehicle of an environment.
+
+        Raises:
+            ValueError: another observation or action than the policy has; the message calls it `name`.
+        """
+        names = tuple(term.name for term in env.terms)
+        if names[: len(OBSERVED)] != OBSERVED or env.action.name != "rpm":
+            raise UserError(
+                f"{name} observes {', '.join(OBSERVED)}, and commands rotor speeds; the environment observes "
+                f"{', '.join(names)} and has the action {env.action.name}; leave out observation and give action='rpm'"
+            )
+        params = jax.tree.map(lambda x: x[0], env.params)
+        turn, order = _placed(name, params)
+        return cls(network, jnp.asarray(turn, jnp.float32), order, params.hover_rpm / params.max_rpm)
+
+    def initial_hidden_state(self, batch: tuple[int, ...]) -> tuple[Any, Array]:
+        """Hidden state of the network, and the last action."""
+        return self.network.initial_hidden_state(batch), jnp.zeros((*batch, 4), self.turn.dtype)
+
+    def act(
+        self, hidden_state: tuple[Any, Array], obs: Float[Array, "*batch d"]
+    ) -> tuple[Any, Float[Array, "*batch 4"]]:
+        """Hidden state after the observations, and actions of the type `rpm`."""
+        hidden, last = hidden_state
+        away, matrix, vel, omega = jnp.split(obs[..., :18].astype(last.dtype), (3, 12, 15), axis=-1)
+        turned = (matrix.reshape(*matrix.shape[:-1], 3, 3) @ self.turn.T).reshape(matrix.shape)
+        seen = jnp.concatenate([away, turned, vel, omega @ self.turn.T, last], axis=-1)
+        hidden, own = self.network.act(hidden, seen)
+        own = jnp.clip(own, -1, 1)
+        share = jnp.zeros_like(own).at[..., jnp.array(self.order)].set((own + 1) / 2)
+        span = jnp.where(share > self.hover_share, 1 - self.hover_share, self.hover_share)
+        return (hidden, own), (share - self.hover_share) / span
+
+
+def _placed(name: str, params: Params) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Turn of the body axes (3, 3), and the indices of the rotors at the corners of the turned axes."""
+    places, spin = np.asarray(params.rotor_pos)[:, :2], np.asarray(params.rotor_spin)
+    for degrees in _TURNS:
+        sin, cos = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        turned = places @ turn[:2, :2].T
+        order = tuple(int(i) for i in np.argmax(_CORNERS @ turned.T, axis=1))
+        if np.abs(turned).min() > _CENTERED * np.abs(turned).max() and spin[order[0]] < 0:
+            return turn, order
+    raise UserError(f"{name} needs four rotors at the corners of a cross, neighbors of opposite spins")

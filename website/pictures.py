@@ -53,7 +53,7 @@ def _film(page: Page) -> list[Image.Image]:
     """Frames of the page, the whole flight in real time, or its first seconds."""
     with open_tab() as tab, tempfile.TemporaryDirectory() as folder:
         tab.open(page.save(Path(folder) / "page.html"), *_SIZE)
-        tab.run("jaxdrones.film('orbit', Math.max(3, jaxdrones.player.panel.size))")
+        tab.run("jaxdrones.film('orbit')")
         tab.press("l")  # no names
         count = round(_FPS * min(_LONGEST, tab.run("jaxdrones.player.end")))
         frames = []

@@ -235,7 +235,7 @@ def test_drones_of_a_few_pixels_are_where_the_log_says(tmp_path):
             seen = tab.run("jaxdrones.positionsAt(2.0)")[0]
             np.testing.assert_allclose(seen, pos[19], rtol=0, atol=1e-4)
         drawn = np.reshape(tab.run(vertices), (-1, 3))
-        reach = tab.run("jaxdrones.player.panel.size * jaxdrones.player.arm")
+        reach = tab.run("jaxdrones.player.fleet.largest * jaxdrones.player.arm")
         assert np.abs(drawn - pos[19, 7]).max() < 1.5 * reach
         np.testing.assert_allclose(drawn[:, :2].mean(axis=0), pos[19, 7, :2], atol=1e-3)
         assert tab.problems == []

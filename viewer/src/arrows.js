@@ -60,14 +60,14 @@ export class Arrows {
     world.labels.forEach((_, i) => this.targets.mesh.setColorAt(i, new Color(colors(i))));
   }
 
-  show(time, shown, { hidden, ghost, offset }, scale) {
+  show(time, shown, { hidden, ghost, offset }, fleet) {
     const { world } = this, [row, share] = world.at(time), { p, v, w, q, r } = scratch;
     const thrust = shown.thrust && !hidden && !ghost, wrench = shown.wrench && !hidden && !ghost;
     const targets = shown.targets && !hidden && world.targets !== null;
     for (let i = 0; i < world.n && (thrust || wrench || targets); i++) {
-      const kind = world.kinds[i], arm = scale * this.arms[i], weight = kind.mass * kind.gravity;
       const there = world.position(row, share, i, p);
       p.add(offset);
+      const kind = world.kinds[i], scale = fleet.scale(world.vehicle[i], p), arm = scale * this.arms[i], weight = kind.mass * kind.gravity;
       world.attitude(row, share, i, q);
       if (thrust)
         for (let k = 0; k < 4; k++) {

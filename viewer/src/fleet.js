@@ -1,61 +1,49 @@
 // All drones of all worlds: for every kind of vehicle a mesh for each level of detail, and the same for ghosts.
 
-import {
-  Color, DoubleSide, DynamicDrawUsage, InstancedBufferAttribute, InstancedMesh, Matrix4, MeshBasicMaterial, MeshLambertMaterial, Vector3,
-} from "three";
-import { Batch, sent } from "./batch.js";
+import { Color, DoubleSide, Matrix4, MeshBasicMaterial, MeshLambertMaterial, Quaternion, ShaderMaterial, Vector3 } from "three";
+import { Batch } from "./batch.js";
 import { armOf, scratch } from "./flight.js";
-import { coarse, discs, dot, fine, plain } from "./vehicle.js";
+import { coarse, discs, dot, fine, plain, shadow } from "./vehicle.js";
 
 const SLOWED = 0.02; // rotors turn so much slower than they do, so that an eye can follow
 const LEVELS = [ // of detail, for drones whose arm is at least so many pixels long, as they are drawn
-  { pixels: 14, geometry: fine, Material: MeshLambertMaterial },
-  { pixels: 9, geometry: plain, Material: MeshLambertMaterial },
+  { pixels: 14, geometry: fine, Material: MeshLambertMaterial, discs: true },
+  { pixels: 9, geometry: plain, Material: MeshLambertMaterial, discs: true },
   { pixels: 3.5, geometry: coarse, Material: MeshBasicMaterial },
   { pixels: 0, geometry: dot, Material: MeshBasicMaterial },
 ];
-const NOWHERE = new Matrix4().makeScale(0, 0, 0);
+const SMALLEST = 12, SMALLEST_ALONE = 40; // pixels, from rotor to rotor, of drones that are enlarged to be seen; alone or in a crowd
+const BLURRED = 0.2; // of the speed of hovering: above it blades are a disc
+const OPAQUE = 1.6; // of the speed of hovering, at which a disc is as dense as it gets
 const GHOST_OPACITY = 0.28;
+const SHADOW_DARKNESS = 0.5; // of a drone on the ground, of the light
+const NOWHERE = new Matrix4().makeScale(0, 0, 0), LEVEL = new Quaternion(), WHITE = new Color(1, 1, 1);
 
 export class Fleet {
   constructor(stage, worlds, vehicles, colors) {
     this.stage = stage;
     this.worlds = worlds;
-    this.scale = 1;
+    this.size = 1; // how many times as large as they are drones are drawn; 0: as large as it takes to see them
     this.colors = worlds.map((world, w) => world.labels.map((_, i) => new Color(colors(w, i))));
     this.angles = worlds.map((world) => new Float32Array(4 * world.n));
     this.slots = worlds.map((world) => new Array(world.n).fill(null));
-    this.shapes = vehicles.map((vehicle, k) => {
-      const count = worlds.reduce((sum, world) => sum + world.vehicle.filter((v) => v === k).length, 0);
-      return [false, true].map((ghost) => LEVELS.map((level) => this.mesh(level, vehicle, count, ghost)));
-    });
+    this.meshes = [];
+    const add = (mesh) => (this.stage.scene.add(mesh), this.meshes.push(mesh), mesh);
+    this.shapes = vehicles.map((vehicle) => [{}, { transparent: true, opacity: GHOST_OPACITY, depthWrite: false }].map((look) => {
+      const levels = LEVELS.map(({ geometry, Material }) => add(new Batch(geometry(vehicle), new Material({ vertexColors: true, side: DoubleSide, ...look }))));
+      const blur = new MeshBasicMaterial({ vertexColors: true, side: DoubleSide, transparent: true, opacity: look.opacity ?? 1, depthWrite: false });
+      return { levels, discs: add(new Batch(discs(vehicle), blur)) };
+    }));
+    this.shadows = add(new Batch(shadow(), softShadow()));
+    this.smallest = Math.max(SMALLEST, SMALLEST_ALONE / Math.sqrt(Math.max(...worlds.map(({ n }) => n))));
     this.arms = vehicles.map(armOf);
-    this.meshes = this.shapes.flat(2);
+    this.hover = vehicles.map(({ mass, gravity, kf }) => Math.sqrt((mass * gravity) / 4 / kf)); // RPM
   }
 
-  mesh({ geometry: shape, Material }, vehicle, count, ghost) {
-    const geometry = shape(vehicle), look = ghost ? { transparent: true, opacity: GHOST_OPACITY, depthWrite: false } : {};
-    if (shape === coarse || shape === dot) {
-      const batch = new Batch(geometry, new Material({ vertexColors: true, side: DoubleSide, ...look }), count);
-      batch.castShadow = !ghost;
-      this.stage.scene.add(batch);
-      return batch;
-    }
-    geometry.setAttribute("spin", new InstancedBufferAttribute(new Float32Array(4 * count), 4).setUsage(DynamicDrawUsage));
-    const mesh = new InstancedMesh(geometry, turning(new Material({ vertexColors: true, side: DoubleSide, ...look })), count);
-    mesh.instanceMatrix.setUsage(DynamicDrawUsage);
-    mesh.instanceColor = new InstancedBufferAttribute(new Float32Array(3 * count), 3).setUsage(DynamicDrawUsage);
-    mesh.castShadow = !ghost;
-    mesh.frustumCulled = false;
-    this.stage.scene.add(mesh);
-    if (shape === fine) {
-      const look = { color: 0x445566, transparent: true, opacity: ghost ? 0.06 : 0.22, side: DoubleSide, depthWrite: false };
-      mesh.discs = new InstancedMesh(discs(vehicle), new MeshBasicMaterial(look), count);
-      mesh.discs.instanceMatrix = mesh.instanceMatrix;
-      mesh.discs.frustumCulled = false;
-      this.stage.scene.add(mesh.discs);
-    }
-    return mesh;
+  /** How many times as large as it is a drone at a point is drawn. */
+  scale(kind, point) {
+    if (this.size) return this.size;
+    return Math.max(1, this.smallest / (2 * this.arms[kind] * this.stage.magnification(point)));
   }
 
   /**
@@ -63,36 +51,59 @@ export class Fleet {
    * The drone `aboard` carries the camera, which does not see it: { world, drone }, or null.
    */
   place(time, passed, layout, aboard) {
-    const { p, q } = scratch, { camera, canvas } = this.stage, size = new Vector3().setScalar(this.scale), matrix = new Matrix4();
-    const pixels = (this.stage.detail * canvas.clientHeight) / 2 / Math.tan((camera.fov * Math.PI) / 360); // of 1 m at 1 m
+    const { p, q } = scratch, { stage } = this, size = new Vector3(), matrix = new Matrix4();
     this.layout = layout;
+    this.largest = 1;
     for (const mesh of this.meshes) mesh.count = 0;
     this.worlds.forEach((world, w) => {
-      const [row, share] = world.at(time), angles = this.angles[w], { offset, ghost, hidden } = layout[w], slots = this.slots[w];
+      const [row, share] = world.at(time), { offset, ghost, hidden } = layout[w], slots = this.slots[w];
       slots.fill(null);
       for (let i = 0; i < world.n && !hidden; i++) {
         const there = world.position(row, share, i, p);
         world.attitude(row, share, i, q);
         p.add(offset);
-        const kind = world.vehicle[i], near = (this.scale * this.arms[kind] * pixels) / p.distanceTo(camera.position);
-        const mesh = this.shapes[kind][ghost ? 1 : 0][LEVELS.findIndex((level) => !(near < level.pixels))], place = mesh.count++;
-        const seen = there && Number.isFinite(q.w) && !(aboard && aboard.world === w && aboard.drone === i);
-        mesh.setMatrixAt(place, seen ? matrix.compose(p, q, size) : NOWHERE);
+        const kind = world.vehicle[i], scale = this.scale(kind, p), near = scale * this.arms[kind] * stage.magnification(p) * stage.detail;
+        const shapes = this.shapes[kind][ghost ? 1 : 0], level = LEVELS.findIndex(({ pixels }) => !(near < pixels)), mesh = shapes.levels[level];
+        const seen = there && Number.isFinite(q.w) && !(aboard && aboard.world === w && aboard.drone === i), place = mesh.add();
+        if (seen) matrix.compose(p, q, size.setScalar(scale));
+        const turns = LEVELS[level].discs && this.turn(world, row, i, passed);
+        mesh.setMatrixAt(place, seen ? matrix : NOWHERE, turns?.blades);
         mesh.setColorAt(place, this.colors[w][i]);
-        const spin = world.kinds[i].rotor_spin, turned = mesh.geometry.attributes.spin?.array;
-        for (let k = 0; k < 4 && turned; k++) {
-          angles[4 * i + k] -= spin[k] * world.speed(row, i, k) * ((2 * Math.PI) / 60) * passed * SLOWED;
-          turned[4 * place + k] = angles[4 * i + k] % (2 * Math.PI);
-        }
         slots[i] = { mesh, place };
+        if (!seen) continue;
+        if (turns) this.blur(shapes.discs, matrix, turns, this.colors[w][i]);
+        if (!ghost && stage.hasGround && p.z > 0) this.shade(p, scale * this.arms[kind], matrix);
+        this.largest = Math.max(this.largest, scale);
       }
     });
-    for (const mesh of this.meshes) {
-      if (mesh instanceof Batch) mesh.update();
-      else for (const attribute of [mesh.instanceMatrix, mesh.instanceColor, mesh.geometry.attributes.spin]) sent(attribute, mesh.count);
-      mesh.visible = mesh.count > 0;
-      if (mesh.discs) [mesh.discs.count, mesh.discs.visible] = [mesh.count, mesh.visible];
+    for (const mesh of this.meshes) mesh.update();
+  }
+
+  /** Turn the rotors of a drone: their angles, those of blades slow enough to be seen, and the density of the others' discs. */
+  turn(world, row, i, passed) {
+    const all = this.angles[world.index], hover = this.hover[world.vehicle[i]], turns = { angles: [], blades: [], density: [] };
+    for (let k = 0; k < 4; k++) {
+      const speed = world.speed(row, i, k), blurred = speed > BLURRED * hover;
+      all[4 * i + k] = (all[4 * i + k] - world.kinds[i].rotor_spin[k] * speed * ((2 * Math.PI) / 60) * passed * SLOWED) % (2 * Math.PI);
+      turns.angles.push(all[4 * i + k]);
+      turns.blades.push(blurred ? NaN : all[4 * i + k]);
+      turns.density.push(blurred ? Math.min(1, speed / hover / OPAQUE) : 0);
     }
+    return turns;
+  }
+
+  blur(discs, matrix, { angles, density }, color) {
+    const place = discs.add();
+    discs.setMatrixAt(place, matrix, angles);
+    discs.setTintAt(place, color, density);
+  }
+
+  /** A shadow under a drone, which is wider and lighter the higher it flies. */
+  shade(point, arm, matrix) {
+    const height = point.z / this.stage.radius, place = this.shadows.add(), radius = arm * (2 + height);
+    matrix.compose(scratch.v.set(point.x, point.y, 0), LEVEL, scratch.w.setScalar(radius));
+    this.shadows.setMatrixAt(place, matrix);
+    this.shadows.setTintAt(place, WHITE, [SHADOW_DARKNESS / (1 + height)]);
   }
 
   /** Positions as the scene has them: read back from the matrices of the meshes, m, one row per drone of a world. */
@@ -106,20 +117,11 @@ export class Fleet {
   }
 }
 
-/** A material whose vertices turn about the hub of their rotor. */
-function turning(material) {
-  material.onBeforeCompile = (shader) => {
-    shader.vertexShader = shader.vertexShader
-      .replace("#include <common>", "#include <common>\nattribute float rotor;\nattribute vec2 hub;\nattribute vec4 spin;")
-      .replace(
-        "#include <begin_vertex>",
-        `#include <begin_vertex>
-        if (rotor > 0.5) {
-          float angle = rotor < 1.5 ? spin.x : rotor < 2.5 ? spin.y : rotor < 3.5 ? spin.z : spin.w;
-          vec2 arm = transformed.xy - hub;
-          transformed.xy = hub + vec2(arm.x * cos(angle) - arm.y * sin(angle), arm.x * sin(angle) + arm.y * cos(angle));
-        }`,
-      );
-  };
-  return material;
+/** Black, less towards the edge; red and green are the place in a square from -1 to 1. */
+function softShadow() {
+  return new ShaderMaterial({
+    vertexShader: "attribute vec4 color; varying vec4 at; void main() { at = color; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }",
+    fragmentShader: "varying vec4 at; void main() { float clear = 1.0 - min(1.0, dot(at.xy, at.xy)); gl_FragColor = vec4(0.0, 0.0, 0.0, at.w * clear * clear); }",
+    transparent: true, depthWrite: false, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -4,
+  });
 }

@@ -6,18 +6,18 @@ import { Fleet } from "./fleet.js";
 import { armOf, bounds, scratch, World } from "./flight.js";
 import { CameraImages } from "./camera.js";
 import { drawCurve } from "./curve.js";
+import { JET, jet, Jets } from "./jets.js";
+import { Names, named } from "./names.js";
 import { Panel } from "./panel.js";
 import { decode } from "./payload.js";
 import { Plot, short } from "./plots.js";
 import { Plant, Simulation } from "./simulation.js";
 import { solids } from "./solids.js";
 import { Stage } from "./stage.js";
+import { legible, theme } from "./theme.js";
 import { Trail } from "./trails.js";
 
-const NAMED = 24; // drones in a world of which all have their names in the view
 const STILL = 200; // ms without a change after which the picture is drawn in full resolution
-const SMALLEST = 0.012; // arm over the radius of the flight from which on drones are drawn in their true size at first
-const SMALLEST_ALONE = 0.035; // of a single drone, which touches nobody if it is drawn larger
 const BEHIND = 0.4; // s, how far a flight that is running may be ahead of what is shown
 const ROOM = 0.2; // share of its extent that a flight that is running may grow to every side before the camera moves
 const REPAINT = 200; // ms between two paintings of the plots of a flight that is running
@@ -31,19 +31,20 @@ class Player {
     this.playing = false;
     this.begin(header);
     this.last = null;
-    this.colors = (w, i) => header.palette[(this.worlds[w].n > 1 || this.worlds.length === 1 ? i : w) % header.palette.length];
+    const palette = header.palette.map(legible);
+    this.colors = (w, i) => palette[(this.worlds[w].n > 1 || this.worlds.length === 1 ? i : w) % palette.length];
     this.stage = new Stage(find("view"));
     this.fleet = new Fleet(this.stage, this.worlds, header.vehicles, this.colors);
     this.surroundings = header.scenes.map((scene) => ({ ...scene, groups: [] }));
     this.trails = this.worlds.map((world, w) => new Trail(this.stage, world, (i) => this.colors(w, i)));
     this.arrows = this.worlds.map((world, w) => new Arrows(this.stage, world, (i) => this.colors(w, i)));
+    this.jets = new Jets(this.stage, this.worlds);
     this.panel = new Panel(this, this);
     const first = this.worlds[0];
     this.panel.set("trail", first.n > 60 ? "1" : "Infinity");
     this.panel.set("layout", header.layout);
-    this.sizeDrones();
     this.plots = [...document.querySelectorAll(".plot")].map((box, k) => new Plot(box, header.signals[k], (time) => this.seek(time)));
-    this.labels = [];
+    this.names = new Names();
     this.images = new CameraImages(find("cameras"));
     this.frames = 0;
     this.moved = 0;
@@ -91,10 +92,7 @@ class Player {
     this.end = world.end;
     this.span = Math.max(this.span, this.end);
     for (const trail of this.trails) trail.extend();
-    if (!this.within(rows.pos)) {
-      this.arranged = null; // the camera has to see more
-      this.sizeDrones();
-    }
+    if (!this.within(rows.pos)) this.arranged = null; // the camera has to see more
     if (this.arranged === null || performance.now() > (this.painted ?? 0) + REPAINT) {
       this.painted = performance.now();
       this.changed();
@@ -123,15 +121,6 @@ class Player {
     for (const plot of this.plots ?? []) plot.stale = true;
   }
 
-  /** Draw drones in their true size if they can be seen so, unless the user chose. */
-  sizeDrones() {
-    const { low, high } = bounds(this.worlds, this.surroundings), seen = armOf(this.worlds[0].kinds[0]) / (low.distanceTo(high) / 2);
-    if (this.sized && this.panel.size !== this.sized) return;
-    const smallest = this.worlds[0].n > 1 ? SMALLEST : SMALLEST_ALONE;
-    this.sized = [1, 3].find((size) => size * seen > smallest) ?? 10;
-    this.panel.set("size", this.sized);
-  }
-
   /** Something was chosen: arrange everything anew. */
   changed() {
     const { panel, stage } = this, world = this.worlds[panel.world];
@@ -140,11 +129,10 @@ class Player {
       this.arrange();
       this.arranged = key;
     }
-    this.fleet.scale = panel.size;
+    this.fleet.size = panel.size;
     for (const plot of this.plots) plot.look(world, panel.drone, (i) => this.colors(panel.world, i), this.span);
     this.pose(scratch.p, scratch.q);
-    if (stage.mode !== panel.mode) stage.setMode(panel.mode, scratch.p, panel.size * this.arm);
-    find("legend").innerHTML = this.legend();
+    if (stage.mode !== panel.mode) stage.setMode(panel.mode, scratch.p, (panel.size || 1) * this.arm);
     this.labelNames();
     stage.dirty = true;
   }
@@ -162,9 +150,11 @@ class Player {
       hidden: mode === "alone" && w !== panel.world,
     }));
     for (const scene of this.surroundings) for (const group of scene.groups.splice(0)) stage.scene.remove(group);
+    const obstacles = [];
     worlds.forEach((world, w) => {
       if (mode !== "grid" && w !== panel.world) return;
       const scene = this.surroundings[world.scene], group = solids(scene);
+      obstacles.push(...group.children.filter((mesh) => !mesh.material.transparent));
       group.position.copy(this.layout[w].offset);
       scene.groups.push(group);
       stage.scene.add(group);
@@ -178,8 +168,8 @@ class Player {
     this.fitted = { low: low.toArray(), high: high.toArray() };
     low.z = ground ? Math.min(low.z, 0) : low.z;
     const points = this.layout.flatMap(({ offset }) => corners.map((point) => point.clone().add(offset)));
-    if (mode === "grid") stage.fit(low.clone().setY(low.y + last.y), high.clone().setX(high.x + wide.x), ground, points);
-    else stage.fit(low, high, ground, points, this.live);
+    if (mode === "grid") stage.fit(low.clone().setY(low.y + last.y), high.clone().setX(high.x + wide.x), ground, obstacles, points);
+    else stage.fit(low, high, ground, obstacles, points, this.live);
   }
 
   /** Pose of the drone that is looked at. */
@@ -243,13 +233,15 @@ class Player {
 
   draw(passed) {
     const { panel, stage, time } = this, shown = panel.shown;
-    if (this.pose(scratch.p, scratch.q)) stage.track(scratch.p, scratch.q, panel.size * this.arm);
+    if (this.pose(scratch.p, scratch.q)) stage.track(scratch.p, scratch.q, (panel.size || 1) * this.arm);
     if (panel.mode !== "board") stage.orbit.update(); // which turns the camera to its own target
     this.fleet.place(time, passed, this.layout, panel.mode === "board" ? panel : null);
     this.trails.forEach((trail, w) => trail.show(time, panel.trail, this.layout[w], stage));
-    this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], panel.size));
+    this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], this.fleet));
+    this.jets.show(time, shown.jets, this.layout);
     stage.render();
     this.placeNames();
+    this.explain();
     if (!stage.hurried || this.frames % 4 === 0) {
       for (const plot of this.plots) plot.draw(time);
       this.images.show(this.worlds[panel.world], panel.drone, time);
@@ -258,39 +250,38 @@ class Player {
     this.frames++;
   }
 
-  legend() {
+  /** Colors, the grid, and how much larger than they are drones are drawn. */
+  explain() {
     const { panel } = this, rows = [];
     const row = (color, text) => rows.push(`<i style="background:${color}"></i>${text}`);
     if (panel.shown.thrust) row(THRUST, "thrust of a rotor");
     if (panel.shown.wrench) row(FORCE, "resultant force") && row(TORQUE, "resultant torque");
+    if (panel.shown.jets) row(JET, "downwash, as wide as it has half the speed of its axis");
     if (this.stage.cell && this.surroundings.some((scene) => scene.ground)) rows.push(`squares of ${short(this.stage.cell)} m`);
-    if (panel.size > 1) rows.push(`drones are drawn ${panel.size} times as large as they are`);
-    return rows.join("\n");
+    const times = short(Math.round(this.fleet.largest * 10) / 10);
+    if (panel.size > 1) rows.push(`drones are drawn ${times} times as large as they are`);
+    else if (times > 1) rows.push(`drones are drawn up to ${times} times as large as they are`);
+    const text = rows.join("\n");
+    if (text !== this.explained) find("legend").innerHTML = this.explained = text;
   }
 
-  /** Names of drones above them, and of worlds that stand side by side. */
   labelNames() {
-    const { panel } = this, world = this.worlds[panel.world], element = (text, color) => {
-      const label = document.createElement("span");
-      label.textContent = text;
-      label.style.borderColor = color;
-      return label;
-    };
-    const all = world.labels.map((_, i) => i), named = !panel.shown.names ? [] : world.n > NAMED ? [panel.drone] : all;
-    this.labels = named.map((drone) => ({ drone, element: element(world.labels[drone], this.colors(world.index, drone)) }));
+    const { panel } = this, world = this.worlds[panel.world], color = (drone) => this.colors(world.index, drone);
+    const drones = panel.shown.names ? named(world, panel.drone) : [];
+    const labels = drones.map((drone) => ({ drone, text: world.labels[drone], color: color(drone) }));
     if (this.sideBySide && panel.shown.names)
-      this.worlds.forEach(({ name }, w) => this.labels.push({ point: this.top.clone().add(this.layout[w].offset), element: element(name, "#444") }));
-    find("labels").replaceChildren(...this.labels.map(({ element }) => element));
+      this.worlds.forEach(({ name }, w) => labels.push({ point: this.top.clone().add(this.layout[w].offset), text: name, color: theme.note }));
+    this.names.list(labels);
   }
 
   placeNames() {
     const { panel } = this, world = this.worlds[panel.world], [row, share] = world.at(this.time), { p } = scratch;
-    const up = 1.1 * panel.size * this.arm, { offset } = this.layout[panel.world];
-    this.labels.forEach(({ drone, point, element }) => {
-      if (!point && !world.position(row, share, drone, p)) return (element.hidden = true);
-      const at = this.stage.project(point ?? p.add(offset).setZ(p.z + up));
-      element.hidden = !at || (panel.mode === "board" && drone === panel.drone);
-      if (at) [element.style.left, element.style.top] = [`${at[0]}px`, `${at[1] - 4}px`];
+    const { offset } = this.layout[panel.world];
+    this.names.place(({ drone, point }) => {
+      if (point) return this.stage.project(point);
+      if (!world.position(row, share, drone, p) || (panel.mode === "board" && drone === panel.drone)) return null;
+      p.add(offset).setZ(p.z + 1.1 * this.arm * this.fleet.scale(world.vehicle[drone], p));
+      return this.stage.project(p);
     });
   }
 }
@@ -299,6 +290,7 @@ class Player {
 function handles(player) {
   return {
     player,
+    jet,
     /** Move to a time, draw, and read the positions back from the scene: [world][drone] = [x, y, z]. */
     positionsAt(time) {
       player.playing = false;

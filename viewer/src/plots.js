@@ -1,6 +1,8 @@
 // Plots of chosen signals, linked to the time line.
 
-const LINES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
+import { legible, theme } from "./theme.js";
+
+const LINES = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"].map(legible);
 const MOST = 24; // drones with a line of their own
 const MARGIN = { left: 52, right: 16, top: 20, bottom: 18 };
 
@@ -76,7 +78,7 @@ export class Plot {
     context.drawImage(this.image, 0, 0);
     context.scale(ratio, ratio);
     const x = MARGIN.left + ((width - MARGIN.left - MARGIN.right) * Math.min(time, this.end)) / this.end;
-    context.fillStyle = "#222";
+    context.fillStyle = theme.ink;
     context.fillRect(x - 0.75, MARGIN.top, 1.5, height - MARGIN.top - MARGIN.bottom);
     this.read(time);
   }
@@ -85,7 +87,7 @@ export class Plot {
     const signal = SIGNALS[this.select.value], row = this.world.at(time)[0];
     const parts = signal.parts ?? [""];
     const text = parts.map((_, k) => short(signal.value(this.world, row, this.drone, k))).join("  ");
-    const full = `${this.world.labels[this.drone]}: ${text} ${signal.unit}`;
+    const of = this.world.n > 1 ? `${this.world.labels[this.drone]}: ` : "", full = `${of}${text} ${signal.unit}`;
     if (this.readout.value !== full) this.readout.value = full;
   }
 
@@ -103,8 +105,8 @@ export class Plot {
     const X = (t) => left + ((right - left) * t) / this.end, Y = (y) => bottom - ((bottom - top) * (y - low)) / (high - low);
     context.font = "11px system-ui, sans-serif";
     context.lineWidth = 1;
-    context.strokeStyle = "#e1e5e9";
-    context.fillStyle = "#55606a";
+    context.strokeStyle = theme.grid;
+    context.fillStyle = theme.note;
     context.textAlign = "right";
     context.textBaseline = "middle";
     const levels = ticks(low, high, 4);
@@ -142,7 +144,7 @@ export class Plot {
 
   note(context, width, height) {
     context.font = "12px system-ui, sans-serif";
-    context.fillStyle = "#55606a";
+    context.fillStyle = theme.note;
     context.textAlign = "center";
     context.fillText("no values", width / 2, height / 2);
   }
@@ -156,7 +158,7 @@ export class Plot {
     if (signal.parts) return signal.parts.map((_, k) => curve((row) => signal.value(world, row, drone, k), { color: LINES[k], wide: true }));
     const others = world.labels.map((_, i) => i).filter((i) => i !== drone).slice(0, MOST);
     const found = others.map((i) => curve((row) => signal.value(world, row, i), { color: this.colors(i) }));
-    if (signal.target) found.push(curve((row) => signal.target(world, row, drone), { color: "#555", dashed: true }));
+    if (signal.target) found.push(curve((row) => signal.target(world, row, drone), { color: theme.target, dashed: true }));
     found.push(curve((row) => signal.value(world, row, drone), { color: this.colors(drone), wide: true }));
     return found;
   }

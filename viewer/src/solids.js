@@ -1,8 +1,9 @@
 // Obstacles of a scene as instances of unit shapes.
 
 import {
-  BoxGeometry, CapsuleGeometry, Color, CylinderGeometry, Group, InstancedMesh, Matrix4, MeshLambertMaterial, Quaternion, SphereGeometry, SRGBColorSpace, Vector3,
+  BoxGeometry, CapsuleGeometry, Color, CylinderGeometry, Group, InstancedMesh, Matrix4, Quaternion, SphereGeometry, SRGBColorSpace, Vector3,
 } from "three";
+import { materialOf } from "./materials.js";
 
 const SHAPES = {
   Box: () => new BoxGeometry(1, 1, 1),
@@ -20,15 +21,11 @@ export function solids(scene) {
   }
   const group = new Group();
   for (const solids of alike.values()) {
-    const opacity = solids[0].color[3], clear = opacity < 1;
-    const material = new MeshLambertMaterial({ transparent: clear, opacity, depthWrite: !clear });
-    const mesh = new InstancedMesh(SHAPES[solids[0].kind](solids[0]), material, solids.length);
+    const [{ kind, color }] = solids, mesh = new InstancedMesh(SHAPES[kind](solids[0]), materialOf(kind, color[3]), solids.length);
     solids.forEach((solid, i) => {
       mesh.setMatrixAt(i, new Matrix4().compose(new Vector3(...solid.pos), new Quaternion(...solid.quat), new Vector3(...scale(solid))));
       mesh.setColorAt(i, new Color().setRGB(...solid.color.slice(0, 3), SRGBColorSpace));
     });
-    mesh.castShadow = !clear;
-    mesh.receiveShadow = true;
     group.add(mesh);
   }
   return group;

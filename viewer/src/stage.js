@@ -1,13 +1,16 @@
-// Renderer, lights, ground with shadows, and the three cameras: orbit, follow, on board.
+// Renderer, lights, sky, ground, and the three cameras: orbit, follow, on board.
 
-import {
-  BasicShadowMap, Color, DirectionalLight, Fog, HemisphereLight, Mesh, MeshLambertMaterial, PCFShadowMap, PerspectiveCamera, PlaneGeometry, Scene,
-  Vector2, Vector3, WebGLRenderer,
-} from "three";
+import { Box3, DirectionalLight, Fog, HemisphereLight, PerspectiveCamera, Scene, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { Ground } from "./ground.js";
+import { ObstacleShadows } from "./shadows.js";
+import { sky } from "./sky.js";
+import { theme } from "./theme.js";
 
-const SKY = 0xdfe8f0, GROUND = 0xf1efe9;
-const VIEW = new Vector3(-0.62, -0.72, 0.45).normalize(); // from the middle of the flight to the camera
+const SUN = new Vector3(-0.45, -0.35, 1); // direction, behind the camera
+const SHADED = 1.8; // how far shadows of obstacles are drawn, over the radius of the flight
+const VIEW = new Vector3(-0.62, -0.72, 0.34).normalize(); // from the middle of the flight to the camera
+const LOW = 1; // height above the ground, over its extent, up to which a flight is shown with its shadows
 const SLOWEST = 1 / 32; // s a frame may take before the resolution falls
 const COARSEST = 0.25; // of the full resolution
 const SETTLING = 3; // frames after a change that are not counted
@@ -26,110 +29,72 @@ function round(x) {
   return power * [1, 2, 5, 10].reduce((best, y) => (Math.abs(Math.log((y * power) / x)) < Math.abs(Math.log((best * power) / x)) ? y : best));
 }
 
-/** A material of the ground with lines every `cell` m, darker every ten; they fade where they would be too dense. */
-function ruled(material, cell) {
-  material.onBeforeCompile = (shader) => {
-    shader.uniforms.cell = { value: cell };
-    shader.vertexShader = shader.vertexShader
-      .replace("#include <common>", "#include <common>\nvarying vec2 place;")
-      .replace("#include <begin_vertex>", "#include <begin_vertex>\nplace = (modelMatrix * vec4(position, 1.0)).xy;");
-    shader.fragmentShader = shader.fragmentShader
-      .replace("#include <common>", `#include <common>
-        varying vec2 place; uniform float cell;
-        float ruling(vec2 x, vec2 wide) {
-          vec2 near = abs(fract(x - 0.5) - 0.5) / wide;
-          return clamp(1.3 - min(near.x, near.y), 0.0, 1.0) * clamp(1.15 - 3.0 * max(wide.x, wide.y), 0.0, 1.0);
-        }`)
-      .replace("#include <color_fragment>", `#include <color_fragment>
-        vec2 square = place / cell, wide = fwidth(square);
-        diffuseColor.rgb *= 1.0 - max(0.12 * ruling(square, wide), 0.25 * ruling(0.1 * square, 0.1 * wide));`);
-  };
-  return material;
-}
-
 export class Stage {
   constructor(canvas) {
     this.canvas = canvas;
     this.software = drawnInSoftware();
     this.renderer = new WebGLRenderer({ canvas, antialias: !this.software, powerPreference: "high-performance" });
-    this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.type = this.software ? BasicShadowMap : PCFShadowMap;
     this.scene = new Scene();
-    this.scene.background = new Color(SKY);
     this.camera = new PerspectiveCamera(45, 1, 0.01, 1000);
     this.camera.up.set(0, 0, 1);
     this.pixels = new Vector2(1, 1);
     this.share = 1; // of the full resolution, while playing
     this.sharp = true; // whether the picture stands still and is drawn in full resolution
     this.slow = 0; // s, a frame took on average
-    this.drawn = 0; // frames
     this.waited = 0; // frames since the resolution changed
     this.mode = "orbit";
     this.orbit = new OrbitControls(this.camera, canvas);
     this.orbit.maxPolarAngle = 0.98 * Math.PI;
     this.orbit.addEventListener("start", () => (this.moved = true));
     this.orbit.addEventListener("change", () => (this.dirty = true));
-    this.scene.add(new HemisphereLight(0xffffff, 0xb9c0c6, 1.7));
-    this.sun = new DirectionalLight(0xffffff, 1.7);
-    this.sun.castShadow = true;
-    this.sun.shadow.mapSize.setScalar(this.software ? 1024 : 2048);
-    this.sun.shadow.radius = 2;
-    this.scene.add(this.sun, this.sun.target);
+    const sun = new DirectionalLight(0xfff4e2, 1.9);
+    sun.position.copy(SUN);
+    this.shadows = new ObstacleShadows(this.renderer, [SUN.x / SUN.z, SUN.y / SUN.z]);
+    this.ground = new Ground(this.shadows.texture);
+    this.scene.add(sky(), this.ground, sun, new HemisphereLight(...theme.hemisphere, 1.6));
   }
 
-  /** Fit ground and light to a box, and the camera to points in it, unless it is to stay where a user has moved it. */
-  fit(low, high, ground, points, stay) {
+  /** Fit the ground and the shadows of obstacles to a box, and the camera to points in it, unless it is to stay where a user has moved it. */
+  fit(low, high, ground, obstacles, points, stay) {
     this.points = points;
     this.middle = low.clone().add(high).multiplyScalar(0.5);
     this.radius = Math.max(0.25, low.distanceTo(high) / 2);
     const { middle, radius } = this;
     this.camera.near = radius / 200;
     this.camera.far = 60 * radius;
-    this.scene.fog = new Fog(SKY, 8 * radius, 28 * radius);
+    this.scene.fog = new Fog(theme.haze, 8 * radius, 28 * radius);
     this.orbit.maxDistance = 20 * radius;
     this.orbit.minDistance = radius / 100;
-    this.light(middle, radius);
-    if (this.ground) this.scene.remove(this.ground);
-    if (ground) this.addGround(Math.ceil(30 * radius));
+    this.cell = round(radius / 2);
+    this.hasGround = this.ground.visible = ground;
+    this.ground.lay(middle, radius, this.cell, SHADED * radius);
+    if (ground) this.shadows.draw(obstacles, middle, SHADED * radius);
     if (!stay || (!this.moved && this.mode === "orbit")) this.home();
-  }
-
-  /** Let shadows be sharp about a point. */
-  light(middle, radius) {
-    this.sun.position.copy(middle).add(new Vector3(0.35, -0.25, 1).normalize().multiplyScalar(4 * radius));
-    this.sun.target.position.copy(middle);
-    const reach = 1.25 * radius;
-    Object.assign(this.sun.shadow.camera, { left: -reach, right: reach, top: reach, bottom: -reach, near: radius, far: 8 * radius });
-    this.sun.shadow.camera.updateProjectionMatrix();
-    this.sun.shadow.normalBias = radius / 400;
   }
 
   /** Put the camera at a point, with another in the middle of the picture. */
   look(eye, target) {
     this.camera.position.set(...eye);
     this.orbit.target.set(...target);
-    this.light(this.orbit.target, 0.7 * this.camera.position.distanceTo(this.orbit.target));
-  }
-
-  addGround(size) {
-    this.cell = round(this.radius / 2);
-    this.ground = new Mesh(new PlaneGeometry(2 * size, 2 * size), ruled(new MeshLambertMaterial({ color: GROUND }), this.cell));
-    this.ground.receiveShadow = true;
-    this.ground.position.set(this.middle.x, this.middle.y, 0);
-    this.scene.add(this.ground);
   }
 
   /** The camera that shows all of the flight. */
   home() {
-    const right = new Vector3(0, 0, 1).cross(VIEW).normalize(), up = VIEW.clone().cross(right);
+    const right = new Vector3(0, 0, 1).cross(VIEW).normalize(), up = VIEW.clone().cross(right), p = new Vector3();
+    const box = new Box3().setFromPoints(this.points), middle = box.getCenter(new Vector3()), points = [...this.points];
+    if (this.hasGround && box.min.z < LOW * box.min.distanceTo(box.max)) {
+      points.push(middle.clone().setZ(0)); // where the shadows are
+      middle.z = Math.min(box.min.z, 0) / 2 + box.max.z / 2;
+    }
     const tall = Math.tan((45 * Math.PI) / 360), wide = tall * this.camera.aspect;
     let away = 0;
-    for (const point of this.points) {
-      const p = point.clone().sub(this.middle);
+    for (const point of points) {
+      p.subVectors(point, middle);
       away = Math.max(away, Math.max(Math.abs(p.dot(right)) / wide, Math.abs(p.dot(up)) / tall) + p.dot(VIEW));
     }
-    this.camera.position.copy(this.middle).addScaledVector(VIEW, Math.max(1.25 * away, 0.3 * this.radius));
-    this.orbit.target.copy(this.middle);
+    away = Math.max(1.25 * away, 0.3 * this.radius);
+    this.camera.position.copy(middle).addScaledVector(VIEW, away);
+    this.orbit.target.copy(middle);
     this.orbit.update();
     this.moved = false;
     this.dirty = true;
@@ -192,6 +157,11 @@ export class Stage {
     return this.sharp ? 1 : this.share;
   }
 
+  /** Pixels of the screen of 1 m at a point, at least. */
+  magnification(point) {
+    return this.canvas.clientHeight / 2 / Math.tan((this.camera.fov * Math.PI) / 360) / point.distanceTo(this.camera.position);
+  }
+
   /** Whether everything but the drones may be drawn less often. */
   get hurried() {
     return !this.sharp && this.share < 0.7;
@@ -213,8 +183,6 @@ export class Stage {
   }
 
   render() {
-    this.renderer.shadowMap.autoUpdate = !this.hurried;
-    this.renderer.shadowMap.needsUpdate = this.drawn++ % 3 === 0;
     this.renderer.render(this.scene, this.camera);
     this.dirty = false;
   }

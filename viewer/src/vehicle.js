@@ -1,11 +1,12 @@
 // The shape of a vehicle, from where its rotors are and how large they are.
 
-import { BoxGeometry, BufferAttribute, CircleGeometry, Color, ConeGeometry, CylinderGeometry, PlaneGeometry } from "three";
+import { BoxGeometry, BufferAttribute, Color, ConeGeometry, CylinderGeometry, PlaneGeometry, RingGeometry } from "three";
 import { armOf } from "./flight.js";
 import { mergeGeometries } from "three/examples/jsm/utils/BufferGeometryUtils.js";
 
-const BODY = new Color(1, 1, 1), FRAME = new Color(0.12, 0.12, 0.14), NOSE = new Color(1, 1, 1), BLADE = new Color(0.1, 0.1, 0.1);
+const BODY = new Color(1, 1, 1), FRAME = new Color(0.09, 0.09, 0.1), NOSE = new Color(1, 1, 1), BLADE = new Color(0.1, 0.1, 0.1);
 const PLAIN = 0.82; // brightness of the body, whose color is that of the drone
+const SIDES = 20; // of a disc
 
 // In all of these `rotor` names the rotor that a vertex turns with (0: none), and `hub` is the place of its axis.
 
@@ -20,7 +21,7 @@ export function fine(vehicle) {
   vehicle.rotor_pos.forEach(([x, y, z], k) => {
     const top = z + 0.12 * arm, height = Math.max(0.16 * arm, Math.abs(z)), hub = [x, y];
     parts.push(spoke(beam(Math.hypot(x, y), thickness, 0.7 * thickness), hub, arm));
-    parts.push(part(cylinder(0.1 * arm, height, 10).translate(x, y, top - height / 2), FRAME));
+    parts.push(part(cylinder(0.12 * arm, height, 10).translate(x, y, top - height / 2), BODY, 0.7));
     parts.push(part(beam(2 * radius, 0.16 * radius, 0.03 * radius).translate(x, y, top + 0.02 * arm), BLADE, 1, k + 1, hub));
   });
   return mergeGeometries(parts);
@@ -51,7 +52,7 @@ export function coarse(vehicle) {
 /** A pixel or two. */
 export function dot(vehicle) {
   const arm = armOf(vehicle);
-  return part(strip(1.3 * arm, 1.3 * arm).rotateZ(Math.PI / 4).translate(0, 0, 0.1 * arm), BODY, PLAIN);
+  return part(strip(1.5 * arm, 1.5 * arm).rotateZ(Math.PI / 4).translate(0, 0, 0.1 * arm), BODY, PLAIN);
 }
 
 const beam = (length, width, height) => new BoxGeometry(length, width, height);
@@ -60,15 +61,30 @@ const strip = (length, width) => new PlaneGeometry(length, width);
 /** An arm from the middle to a rotor; those in front are in the color of the drone. */
 function spoke(geometry, [x, y], arm) {
   const turned = geometry.translate(Math.hypot(x, y) / 2, 0, 0).rotateZ(Math.atan2(y, x)), front = x > 0.1 * arm;
-  return part(turned, front ? BODY : FRAME, front ? 0.6 : 1);
+  return part(turned, front ? BODY : FRAME, front ? PLAIN : 1);
 }
 
-/** The discs that the rotors sweep. */
+/**
+ * The discs that the blurred blades of rotors are seen as: denser towards the tips, and along the two blades, so that
+ * one sees them turn. Of the colors only the opacity counts.
+ */
 export function discs(vehicle) {
-  const arm = armOf(vehicle);
+  const arm = armOf(vehicle), shades = [0.35, 0.5, 0.75];
   return mergeGeometries(
-    vehicle.rotor_pos.map(([x, y, z]) => new CircleGeometry(vehicle.prop_radius, 32).translate(x, y, z + 0.15 * arm)),
+    vehicle.rotor_pos.map(([x, y, z], k) => {
+      const disc = part(new RingGeometry(0, vehicle.prop_radius, SIDES, shades.length - 1), BODY, 1, k + 1, [x, y]), colors = [];
+      for (const shade of shades)
+        for (let side = 0; side <= SIDES; side++) colors.push(1, 1, 1, shade * (0.62 + 0.38 * Math.cos((4 * Math.PI * side) / SIDES)));
+      return disc.translate(x, y, z + 0.15 * arm).setAttribute("color", new BufferAttribute(new Float32Array(colors), 4));
+    }),
   );
+}
+
+/** A square around a shadow of radius 1; its colors are places in it. */
+export function shadow() {
+  const square = part(strip(2, 2), BODY), { array } = square.attributes.position;
+  const places = [0, 1, 2, 3].flatMap((v) => [array[3 * v], array[3 * v + 1], 0, 1]);
+  return square.setAttribute("color", new BufferAttribute(new Float32Array(places), 4));
 }
 
 function cylinder(radius, height, sides) {

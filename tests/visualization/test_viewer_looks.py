@@ -1,0 +1,168 @@
+"""What the page looks like: sizes, shadows, rotors, downwash and texts, in a real browser."""
+
+import contextlib
+import io
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxdrones as jd
+from jaxdrones.dynamics.interaction import _jet
+from jaxdrones.sensing import Cylinder, Scene
+from jaxdrones.visualization import browser
+from jaxdrones.visualization.viewer import show
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")]
+
+SMALLEST = 12  # pixels
+PIXELS = """((index) => {
+    const { fleet, stage } = jaxdrones.player, { mesh, place } = fleet.slots[0][index], size = 3 * mesh.vertices;
+    const drawn = [...mesh.geometry.attributes.position.array.slice(place * size, (place + 1) * size)];
+    const point = stage.orbit.target.clone(), seen = [];
+    for (let k = 0; k < drawn.length; k += 3) seen.push(stage.project(point.fromArray(drawn, k)));
+    const extent = (values) => Math.max(...values) - Math.min(...values);
+    return Math.max(...[0, 1].map((axis) => extent(seen.map((at) => at[axis]))));
+})"""
+BOXES = """[...document.querySelectorAll("h1, #legend, #labels span:not([hidden]), .plot label, .plot output")]
+    .map((element) => element.getBoundingClientRect()).filter((box) => box.width)
+    .map(({ left, right, top, bottom }) => [left, right, top, bottom])"""
+
+
+def at_rest(pos, rpm=None):
+    """Trajectory of drones at positions (n, 3) that do not change, with rotor speeds (n,)."""
+    state = jd.State.at_rest(jnp.asarray(pos, jnp.float32))
+    if rpm is not None:
+        state = state.replace(rpm=jnp.broadcast_to(jnp.asarray(rpm)[:, None], (len(pos), 4)))
+    return jax.tree.map(lambda x: jnp.stack([x] * 3), state)
+
+
+def page_of(pos, rpm=None, **more):
+    return show(at_rest(pos, rpm), jd.repeat(jd.load_params("cf2x"), len(pos)), dt=0.1, **more)
+
+
+@pytest.fixture
+def view(tmp_path):
+    """Function that opens a page and moves to its second row; at the end the console must be empty."""
+    with contextlib.ExitStack() as stack:
+        tabs = []
+
+        def view(page, size=(1100, 720)):
+            tabs.append(stack.enter_context(browser.open_tab()))
+            tabs[-1].open(page.save(tmp_path / "flight.html"), *size)
+            tabs[-1].run("jaxdrones.positionsAt(0.1)")
+            return tabs[-1]
+
+        yield view
+        assert [tab.problems for tab in tabs] == [[]] * len(tabs)
+
+
+@pytest.mark.parametrize(("drones", "spacing"), [(1, 10.0), (20, 2.0), (300, 0.5)])
+def test_no_drone_is_smaller_than_12_pixels_unless_the_true_size_is_chosen(view, drones, spacing):
+    side = int(np.ceil(np.sqrt(drones)))
+    pos = spacing * np.stack([np.arange(drones) % side, np.arange(drones) // side, np.ones(drones)], axis=-1)
+    tab = view(page_of(pos), (390, 844))
+    for away in (1, 3):  # times as far as at first
+        tab.run(f"jaxdrones.player.stage.camera.position.multiplyScalar({away}); jaxdrones.player.draw(0)")
+        sizes = [tab.run(f"{PIXELS}({drone})") for drone in range(0, drones, max(1, drones // 10))]
+        assert min(sizes) >= SMALLEST
+    tab.run("jaxdrones.player.panel.set('size', 1); jaxdrones.player.changed(); jaxdrones.player.draw(0)")
+    assert tab.run("jaxdrones.player.fleet.largest") == 1
+    assert tab.run(f"{PIXELS}(0)") < SMALLEST
+
+
+def test_a_shadow_is_below_its_drone_and_fades_with_height(view):
+    heights = np.array([0.05, 0.5, 2.0])
+    pos = np.stack([np.arange(3.0), np.zeros(3), heights], axis=-1)
+    tab = view(page_of(pos))
+    shadows = "jaxdrones.player.fleet.shadows.geometry.attributes"
+    drawn = np.reshape(tab.run(f"[...{shadows}.position.array.slice(0, 36)]"), (3, 4, 3))
+    np.testing.assert_allclose(drawn.mean(axis=1), pos * [1, 1, 0], atol=1e-4)
+    dark = np.reshape(tab.run(f"[...{shadows}.color.array.slice(0, 48)]"), (3, 4, 4))[:, :, 3]
+    assert (np.diff(dark.mean(axis=1)) < 0).all() and dark.max() <= 0.5
+    nothing = view(page_of(pos, scene=Scene(ground=False)))
+    assert nothing.run("jaxdrones.player.fleet.shadows.count") == 0
+
+
+def test_the_ground_is_darker_where_an_obstacle_is_between_it_and_the_sun(view):
+    trunk = Scene.of(Cylinder(pos=(0.0, 0.0, 1.0), radius=0.2, height=2.0))
+    shade, sun = (0.45, 0.35, 0.0), (-0.9, 0.7, 0.0)  # half of the way to the end of the shadow, and beside it
+    tab = view(page_of([[-1.0, -1.0, 1.0], [1.5, 1.5, 1.0]], scene=trunk))
+    tab.run("jaxdrones.player.stage.setSharp(true); jaxdrones.player.draw(0); new Promise(requestAnimationFrame)")
+    with Image.open(io.BytesIO(tab.screenshot())) as image:
+        picture = np.asarray(image.convert("L"), float)
+    at = "(x => jaxdrones.player.stage.project(jaxdrones.player.stage.orbit.target.clone().set(...x)))"
+    bright = []
+    for point in (shade, sun):
+        x, y = (round(value) for value in tab.run(f"{at}({list(point)})"))
+        bright.append(np.median(picture[y - 2 : y + 3, x - 2 : x + 3]))
+    assert bright[0] < 0.85 * bright[1]
+
+
+def test_the_discs_of_rotors_are_denser_the_faster_they_turn_and_blades_are_seen_when_they_stand(view):
+    hover = float(jd.load_params("cf2x").hover_rpm)
+    pos = np.stack([np.arange(4.0) / 4, np.zeros(4), np.ones(4)], axis=-1)
+    tab = view(page_of(pos, hover * np.array([0.0, 0.5, 1.0, 1.4])))
+    tab.run("jaxdrones.player.panel.set('size', 10); jaxdrones.player.changed(); jaxdrones.player.draw(0)")
+    turns = tab.run("[0, 1, 2, 3].map((i) => jaxdrones.player.fleet.turn(jaxdrones.player.worlds[0], 0, i, 0))")
+    density = [turn["density"][0] for turn in turns]
+    np.testing.assert_allclose(density, np.array([0, 0.5, 1.0, 1.4]) / 1.6, rtol=1e-3)
+    assert turns[0]["blades"][0] == 0.0 and turns[1]["blades"][0] is None  # NaN has no JSON
+    discs = "jaxdrones.player.fleet.shapes[0][0].discs"
+    opacity = np.reshape(
+        tab.run(f"[...{discs}.geometry.attributes.color.array.slice(0, 16 * {discs}.vertices)]"), (4, -1, 4)
+    )
+    np.testing.assert_allclose(opacity[:, :, 3].max(axis=1), 0.75 * np.array(density), rtol=1e-3)
+
+
+def test_the_cone_of_the_downwash_is_the_jet_that_is_simulated(view):
+    tab = view(page_of([[0.0, 0.0, 1.0]]))
+    for z in (0.0, 0.4, 1.0, 3.0, 15.0):
+        drawn = tab.run(f"jaxdrones.jet({z})")
+        np.testing.assert_allclose(drawn["speed"], _jet(jnp.asarray(z), jnp.asarray(0.0)), rtol=1e-5)
+        at_edge = _jet(jnp.asarray(z), jnp.asarray(drawn["width"] ** 2))
+        np.testing.assert_allclose(at_edge, drawn["speed"] / 2, rtol=1e-5)
+    assert tab.run("jaxdrones.player.jets.mesh.count") == 0
+    tab.press("d")
+    tab.run("jaxdrones.player.draw(0)")
+    jets = "jaxdrones.player.jets.mesh"
+    cone = np.reshape(tab.run(f"[...{jets}.geometry.attributes.position.array.slice(0, 3 * {jets}.vertices)]"), (-1, 3))
+    length = np.sqrt(2) * float(jd.load_params("cf2x").arm)
+    np.testing.assert_allclose(np.hypot(cone[:, 0], cone[:, 1]), 0.07668 * (1 - cone[:, 2] + 5.817 * length), rtol=1e-3)
+
+
+@pytest.mark.parametrize("size", [(390, 844), (880, 600), (1400, 900)])
+def test_no_text_covers_another(view, size):
+    pos = np.stack([0.02 * np.arange(6.0), np.zeros(6), np.ones(6)], axis=-1)  # closer than their names are long
+    tab = view(page_of(pos, title="Six drones side by side"), size)
+    boxes = np.array(tab.run(BOXES))
+    assert len(boxes) >= 10
+    for i, (left, right, top, bottom) in enumerate(boxes):
+        others = np.delete(boxes, i, axis=0)
+        covers = (others[:, 0] < right) & (others[:, 1] > left) & (others[:, 2] < bottom) & (others[:, 3] > top)
+        assert not covers.any()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_texts_stand_out_from_the_page(view, scheme):
+    tab = view(page_of([[0.0, 0.0, 1.0]]))
+    tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+    tab.call("Page.reload")
+    tab.wait(
+        f"document.documentElement?.dataset.theme === '{scheme}' && document.documentElement.dataset.ready === 'true'"
+    )
+
+    def luminance(script):
+        channels = np.array(tab.run(f"{script}.match(/\\d+/g).slice(0, 3).map(Number)")) / 255
+        return float(
+            np.array([0.2126, 0.7152, 0.0722])
+            @ np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+        )
+
+    paper = luminance("getComputedStyle(document.body).backgroundColor")
+    for selector in ("body", "#legend", ".plot output"):
+        text = luminance(f"getComputedStyle(document.querySelector('{selector}')).color")
+        contrast = (max(text, paper) + 0.05) / (min(text, paper) + 0.05)
+        assert contrast >= 4.5  # WCAG 2.2, AA

@@ -1,10 +1,19 @@
-"""API pages, one per subpackage, from docstrings."""
+"""API pages from docstrings, one per subpackage, after those of the most used names."""
 
 from pathlib import Path
 
 _LEFT_OUT = ("cli", "_assets", "__pycache__")
 _HEAD = "# {name}\n\n{link}::: {name}\n    options:\n      members: false\n"
 _MODULE = "\n## {name}\n\n::: {name}\n    options:\n      heading_level: 3\n"
+_FIRST = {  # with a page of their own, before the rooms
+    "make": "jaxdrones.envs.registry.make",
+    "State": "jaxdrones.state.State",
+    "make_step": "jaxdrones.engine.explicit.make_step",
+}
+_ONE = (
+    "# {name}\n\n`jaxdrones.{name}`, from [`{module}`]({room}.md).\n\n::: {path}\n    options:\n"
+    "      show_root_heading: true\n"
+)
 _ROOT = (
     "The names in `jaxdrones` itself come from the modules here and in the rooms: `jaxdrones.make_step`, for example, "
     "from `jaxdrones.engine.explicit`.\n\n"
@@ -12,10 +21,17 @@ _ROOT = (
 
 
 def pages(root: Path) -> dict[str, str]:
-    """Path -> Markdown; the package itself first."""
+    """Path -> Markdown, in the order of the navigation."""
     package = root / "jaxdrones"
     rooms = [package, *(f for f in sorted(package.iterdir()) if f.is_dir() and f.name not in _LEFT_OUT)]
-    return {f"api/{room.name}.md": _page(root, room) for room in rooms}
+    first = {f"api/{name}.md": _one(name, path) for name, path in _FIRST.items()}
+    return first | {f"api/{room.name}.md": _page(root, room) for room in rooms}
+
+
+def _one(name: str, path: str) -> str:
+    module = path.rpartition(".")[0]
+    room = module.split(".")[1] if module.count(".") > 1 else "jaxdrones"
+    return _ONE.format(name=name, path=path, module=module, room=room)
 
 
 def _page(root: Path, room: Path) -> str:

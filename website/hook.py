@@ -1,4 +1,4 @@
-"""MkDocs hooks: generated pages, links out of docs/, code beside formulas.
+"""MkDocs hooks: generated pages, the flight of the start page, links out of docs/, code beside formulas.
 
 `<!-- code: dynamics/aero.py drag -->` on a page becomes the source of that function.
 """
@@ -15,6 +15,10 @@ import latex2mathml.converter
 import tasks
 from mkdocs.structure.files import File
 
+from jaxdrones import assets
+from jaxdrones.visualization.viewer.gallery import read_exhibits
+from jaxdrones.visualization.viewer.page import Page
+
 ROOT = Path(__file__).parent.parent
 COPIED = {  # file of the repository -> page of the site
     "benchmarks/README.md": "benchmarks.md",
@@ -22,6 +26,7 @@ COPIED = {  # file of the repository -> page of the site
     "CONTRIBUTING.md": "contributing.md",
     "README.md": "index.md",
 }
+FLIGHT = "forest.html"  # of the start page
 _SOURCE = {page: source for source, page in COPIED.items() if page != "index.md"}
 
 _log = logging.getLogger("mkdocs.website")
@@ -38,7 +43,7 @@ def on_config(config):
     _made.update(tasks.pages(ROOT) | api.pages(ROOT))
     sections = {title: content for entry in config.nav for title, content in entry.items()}
     sections["Tasks"] += [path for path in _made if path.startswith("tasks/")]
-    sections["API"] += [path for path in _made if path.startswith("api/") and path != "api/jaxdrones.md"]
+    sections["API"] += [path for path in _made if path.startswith("api/")]
     return config
 
 
@@ -46,11 +51,18 @@ def on_files(files, config):
     """Add files from outside docs/."""
     for path, text in _made.items():
         files.append(File.generated(config, path, content=text))
+    files.append(File.generated(config, FLIGHT, content=_flight()))
     for path, source in _SOURCE.items():
         files.append(File.generated(config, path, abs_src_path=str(ROOT / source)))
     for figure in sorted((ROOT / "benchmarks" / "figures").iterdir()):
         files.append(File.generated(config, f"figures/{figure.name}", abs_src_path=str(figure)))
     return files
+
+
+def _flight():
+    """Viewer page with the flight of the bundled forest policy in the demo."""
+    (forest,) = (exhibit for exhibit in read_exhibits(assets.folder() / "demo") if exhibit.name == "forest")
+    return Page("The bundled policy of the task forest", forest.payload).html
 
 
 def on_page_markdown(markdown, page, config, files):
@@ -105,7 +117,8 @@ def on_page_content(html, page, config, files):
 
     def drawn(match):
         display = "block" if match[1] == "div" else "inline"
-        return latex2mathml.converter.convert(html_entities.unescape(match[2]), display=display)
+        formula = latex2mathml.converter.convert(html_entities.unescape(match[2]), display=display)
+        return f'<div class="formula">{formula}</div>' if match[1] == "div" else formula
 
     return _FORMULA.sub(drawn, html)
 

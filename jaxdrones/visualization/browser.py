@@ -21,6 +21,7 @@ from jaxdrones.errors import UserError
 _PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = ("--headless=new", "--remote-debugging-pipe", "--no-first-run", "--hide-scrollbars", "--disable-extensions")
 _SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_READY = "document.documentElement?.dataset.ready === 'true'"  # of the viewer's page
 _LAUNCH = """import os, sys
 read, write = (os.dup(os.dup(int(fd))) for fd in sys.argv[1:3])
 os.dup2(read, 3), os.dup2(write, 4)
@@ -43,8 +44,8 @@ class Tab:
         self.problems: list[str] = []
         """Errors and warnings of the console, exceptions, and requests beyond the file or the server."""
 
-    def open(self, page: Path | str, width: int = 1100, height: int = 720) -> None:
-        """Open a file, or the address of a local server, and wait until the page is ready."""
+    def open(self, page: Path | str, width: int = 1100, height: int = 720, ready: str = _READY) -> None:
+        """Open a file, or the address of a local server, and wait until a JavaScript condition holds."""
         self._url = page if isinstance(page, str) else page.absolute().as_uri()
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
@@ -53,7 +54,7 @@ class Tab:
         size = dict(width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Emulation.setDeviceMetricsOverride", **size)
         self.call("Page.navigate", url=self._url)
-        self.wait("document.documentElement?.dataset.ready === 'true'")
+        self.wait(ready)
 
     def call(self, method: str, timeout: float = 120, **arguments: Any) -> dict[str, Any]:
         """Call a method of the protocol; return its result."""

@@ -48,11 +48,19 @@ class Player {
     this.images = new CameraImages(find("cameras"));
     this.frames = 0;
     this.moved = 0;
+    if (location.hash === "#view") this.embed();
     new ResizeObserver(() => this.resize()).observe(find("stage"));
     this.resize();
     this.changed();
     this.stage.home();
     requestAnimationFrame((now) => this.frame(now));
+  }
+
+  /** Show the view and the time line alone, in a page that scrolls. */
+  embed() {
+    document.body.classList.add("embedded");
+    this.stage.orbit.enableZoom = false;
+    this.stage.canvas.style.touchAction = "pan-y";
   }
 
   /** Learn whether the flight is still running, or is to be shown again and again. */
@@ -258,7 +266,7 @@ class Player {
     if (panel.shown.wrench) row(FORCE, "resultant force") && row(TORQUE, "resultant torque");
     if (panel.shown.jets) row(JET, "downwash, as wide as it has half the speed of its axis");
     if (this.stage.cell && this.surroundings.some((scene) => scene.ground)) rows.push(`squares of ${short(this.stage.cell)} m`);
-    const times = short(Math.round(this.fleet.largest * 10) / 10);
+    const times = Number(this.fleet.largest.toPrecision(2));
     if (panel.size > 1) rows.push(`drones are drawn ${times} times as large as they are`);
     else if (times > 1) rows.push(`drones are drawn up to ${times} times as large as they are`);
     const text = rows.join("\n");

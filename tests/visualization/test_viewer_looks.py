@@ -145,6 +145,23 @@ def test_no_text_covers_another(view, size):
         assert not covers.any()
 
 
+def test_names_find_places_wherever_their_drones_are(view):
+    tab = view(page_of(np.stack([np.arange(12.0), np.zeros(12), np.ones(12)], axis=-1)))
+    boxes = """(() => {
+        const { names } = jaxdrones.player, random = (k) => Math.sin(k * k), found = [];
+        const place = ({ element: { style }, width }) => [parseFloat(style.left), parseFloat(style.top), width];
+        for (let seed = 0; seed < 1000; seed++) {
+            names.place(({ drone }) => [300 + 90 * random(seed + drone), 70 * random(seed + drone + 100)]);
+            found.push(names.labels.map(place));
+        }
+        return found;
+    })()"""
+    for x, y, width in np.array(tab.run(boxes)).transpose(0, 2, 1):
+        beside = np.abs(x[:, None] - x) >= (width[:, None] + width) / 2
+        above = np.abs(y[:, None] - y) >= 18
+        assert (beside | above | np.eye(12, dtype=bool)).all()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_texts_stand_out_from_the_page(view, scheme):
     tab = view(page_of([[0.0, 0.0, 1.0]]))

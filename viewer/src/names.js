@@ -25,7 +25,7 @@ export class Names {
       element.hidden = !spot;
       if (!spot) continue;
       let [x, y] = spot;
-      const covers = (other) => Math.abs(x - other.x) < (width + other.width) / 2 + 2 && Math.abs(y - other.y) < HEIGHT;
+      const covers = (other) => Math.abs(x - other.x) < (width + other.width) / 2 + 2 && Math.abs(y - other.y) < HEIGHT - 0.5; // pixels, beyond rounding
       for (let other; (other = taken.find(covers)); ) y = other.y - HEIGHT;
       taken.push({ x, y, width });
       [element.style.left, element.style.top] = [`${x}px`, `${y - 4}px`];

@@ -50,7 +50,8 @@ def add(commands) -> None:
         "  state          complete state of the training, for --resume\n"
         "  progress.csv   a row for each update\n"
         "  curve.png      learning curves\n"
-        "  report.json    evaluation of the best policy, and duration of the training\n\n"
+        "  report.json    evaluation of the best policy, and duration of the training\n"
+        "  history        policies of all evaluations, with --keep-history\n\n"
         "Ctrl-C keeps the best policy and the state. A run in --output, finished or not, is replaced only with\n"
         "--overwrite.\n\n"
         "  --resume                     continue a run that was stopped, with its own settings\n"
@@ -112,6 +113,11 @@ def add(commands) -> None:
         "--resume", action="store_true", help="continue the run in --output; with --budget train a finished one longer"
     )
     files.add_argument("--overwrite", action="store_true", help="replace the run in --output, finished or not")
+    files.add_argument(
+        "--keep-history",
+        action="store_true",
+        help="keep the policies of all evaluations, for `jaxdrones view RUN --history`",
+    )
     files.add_argument(
         "--log",
         metavar="NAME,NAME",
@@ -226,7 +232,7 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
                 on_progress = LiveTraining(live, trainer, run, title, on_progress).update
             try:
                 with display:
-                    loop.train(trainer, run, seed, on_progress, deadlines.next(), loggers[seed])
+                    loop.train(trainer, run, seed, on_progress, deadlines.next(), loggers[seed], request.keep_history)
             except KeyboardInterrupt:
                 if not (run.folder / "last.json").exists():
                     return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)

@@ -39,6 +39,7 @@ class Request:
     output: Path
     resume: bool
     overwrite: bool
+    keep_history: bool
     live: int | None
     figure: bool
     json: bool
@@ -76,7 +77,7 @@ class Request:
             **{
                 name: getattr(options, name) for name in ("realistic", "stop_at", "episodes", "budget", "seeds", "seed")
             },
-            **{name: getattr(options, name) for name in ("resume", "overwrite", "live", "json", "log")},
+            **{name: getattr(options, name) for name in ("resume", "overwrite", "keep_history", "live", "json", "log")},
         )
 
     def swept(self, sweep: list[str]) -> list[Request]:

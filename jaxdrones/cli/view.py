@@ -5,15 +5,19 @@ import sys
 import webbrowser
 import zipfile
 from pathlib import Path
+from typing import Any
 
 from jaxdrones.arguments import choice, whole
 from jaxdrones.cli.common import check_options, check_writable, folder
 from jaxdrones.cli.options import add_json, add_output
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.policies import open_policy
+from jaxdrones.cli.report import as_json, described
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
 from jaxdrones.visualization import video
 from jaxdrones.visualization.viewer.film import CAMERAS, film
+from jaxdrones.visualization.viewer.history import show_history
+from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.show import LAYOUTS, show
 
 
@@ -35,9 +39,12 @@ def add(commands) -> None:
     )
     page = parser.add_argument_group("page and output")
     filmed = parser.add_argument_group("film")
-    add_output(page, "path of the page (flight.html beside the first log)", metavar="FILE")
+    add_output(page, "path of the page (flight.html beside the first log; history.html)", metavar="FILE")
     page.add_argument(
         "--others", default="ghosts", metavar="NAME", help=f"layout of further flights: {', '.join(LAYOUTS)} (ghosts)"
+    )
+    page.add_argument(
+        "--history", action="store_true", help="show the policies that a run of `train --keep-history` evaluated"
     )
     page.add_argument("--title", help="title of the page (the conditions of the first flight)")
     page.add_argument("--open", action="store_true", help="open the page in the browser")
@@ -50,6 +57,8 @@ def add(commands) -> None:
 
 
 def _view(options: argparse.Namespace) -> int:
+    if options.history:
+        return _view_history(options)
     given, skipped = _flights(options.flights)
     names, logs = [*map(str, given)], [*given.values()]
     output = options.output or logs[0].with_name("flight.html")
@@ -68,10 +77,42 @@ def _view(options: argparse.Namespace) -> int:
     if options.video:
         film(page, options.video, options.fps, size, options.camera)
         files.append(options.video)
+    return _finish(options, files, {"flights": names, "skipped": [*map(str, skipped)]})
+
+
+def _view_history(options: argparse.Namespace) -> int:
+    """Write the page of a training."""
+    if len(options.flights) > 1 or options.video:
+        raise UserError("--history shows one run and makes no film; give one folder, without --video")
+    output = options.output or options.flights[0] / "history.html"
+    run = open_policy(options.flights[0], None, False, {})
+    check_writable(output)
+    _history_of(run, options.title).save(output)
+    return _finish(options, [output], {"run": str(run.folder), "policies": len(run.kept)})
+
+
+def _history_of(run: Any, title: str | None) -> Page:
+    from jaxdrones.training.history import fly_history
+
+    recipe = run.recipe()
+    with recipe.env() as env:
+        evaluated = fly_history(run, env)
+        label = "return" if env.task.success is None else "success"
+    return show_history(
+        [policy.flight for policy in evaluated],
+        [(policy.update, policy.value) for policy in evaluated],
+        run.sidecar_entry("best", "update"),
+        label,
+        title or described(recipe),
+    )
+
+
+def _finish(options: argparse.Namespace, files: list[Path], about: dict[str, Any]) -> int:
+    """Open the first file if asked to, and print what was written."""
     if options.open:
-        webbrowser.open(output.absolute().as_uri())
+        webbrowser.open(files[0].absolute().as_uri())
     if options.json:
-        print(as_json({"flights": names, "skipped": [*map(str, skipped)], "files": [*map(str, files)]}))
+        print(as_json(about | {"files": [*map(str, files)]}))
     else:
         print("wrote " + ", ".join(f"{file} ({file.stat().st_size / 1e6:.1f} MB)" for file in files))
     return 0

@@ -40,6 +40,7 @@ def train(
     on_progress: OnProgress,
     deadline: float | None = None,
     loggers: Sequence[Callback] = (),
+    keep_history: bool = False,
 ) -> None:
     """Train one seed to the end, from the start or from the state of the run; evaluate the best policy.
 
@@ -51,6 +52,7 @@ def train(
         deadline: end of the training, s on the clock of `time.perf_counter`; the number of updates then follows from
             the measured durations of updates and evaluations, and is at least one more.
         loggers: called with the metrics of every update, such as those of `learning.loggers`.
+        keep_history: whether to keep the policies of all evaluations; a run that has kept some goes on.
 
     Raises:
         Diverged: parameters, or the gradients of `PATIENCE` updates in a row, are not finite; the best policy so far is
@@ -59,7 +61,7 @@ def train(
     """
     recipe = trainer.recipe
     try:
-        loop = _Loop(trainer, run, seed, deadline)
+        loop = _Loop(trainer, run, seed, deadline, keep_history)
         run.remove_report()
         loop.save()
         try:
@@ -96,9 +98,10 @@ def _load(trainer: Trainer, run: Run) -> Any:
 class _Loop:
     """State and results of the training of one seed."""
 
-    def __init__(self, trainer: Trainer, run: Run, seed: int, deadline: float | None = None):
+    def __init__(self, trainer: Trainer, run: Run, seed: int, deadline: float | None, keep_history: bool):
         """Start a training, or continue that of the run."""
         self.trainer, self.run, self.seed = trainer, run, seed
+        self.keeps_history = keep_history or bool(run.kept)
         self.key = jax.random.key(seed)
         self.evaluation_seconds, self.last_evaluation_seconds = 0.0, 0.0
         self.nonfinite_streak = 0  # latest consecutive updates with numbers that are not finite
@@ -190,8 +193,11 @@ class _Loop:
             self.run.save_policy("best", policy, **about)
         if self.plan is not None:
             self.plan.add_evaluation(update, self.last_evaluation_seconds)
-        results = (report.success, report.mean_return, report.final_error_percentiles[50])
-        return {name: x for name, x in zip(_EVALUATED, results, strict=True) if x is not None}
+        values = (report.success, report.mean_return, report.final_error_percentiles[50])
+        results = {name: x for name, x in zip(_EVALUATED, values, strict=True) if x is not None}
+        if self.keeps_history:
+            self.run.keep_policy(policy, **self._about(update), evaluation=results)
+        return results
 
     def save(self) -> None:
         """Write the newest policy and the training state."""

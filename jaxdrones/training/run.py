@@ -4,9 +4,10 @@
     state            complete state of the training, to continue bit for bit
     progress.csv     a row for each update
     report.json      evaluation of the best policy, and duration of the training
+    history/         policies of all evaluations, by their update, if asked for
 
-Each of best, last and state is a .msgpack file with a .json sidecar. All contain the id of their training, and files of
-different trainings in one folder are rejected.
+Each checkpoint is a .msgpack file with a .json sidecar. All contain the id of their training, and files of different
+trainings in one folder are rejected.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from jaxdrones.learning.policies import check_fits
 from jaxdrones.training.recipe import Recipe
 
 CHECKPOINTS = ("best", "last", "state")
+_HISTORY = "history"
 
 
 class Run:
@@ -42,11 +44,16 @@ class Run:
 
     @property
     def files(self) -> list[Path]:
-        """Existing files of a run: checkpoints, progress, report."""
-        names = [f"{name}.{suffix}" for name in CHECKPOINTS for suffix in ("msgpack", "json")]
+        """Existing files of a run: checkpoints, progress, report, history."""
+        names = [f"{name}.{suffix}" for name in (*CHECKPOINTS, *self.kept) for suffix in ("msgpack", "json")]
         whole = [self.folder / name for name in (*names, "progress.csv", "report.json")]
         candidates = (*whole, *map(writing.beside, whole))
         return [file for file in candidates if file.exists()]
+
+    @property
+    def kept(self) -> list[str]:
+        """Names of the policies in the history, in the order of their updates."""
+        return [f"{_HISTORY}/{file.stem}" for file in sorted((self.folder / _HISTORY).glob("*.json"))]
 
     def prepare(self, size: int) -> None:
         """Create the folder and check that `size` bytes can be written to it.
@@ -120,7 +127,7 @@ class Run:
         return Recipe.from_dict(self.sidecar_entry(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Policy:
-        """Policy `best` or `last`.
+        """Policy `best`, `last` or one of `kept`.
 
         Raises:
             FileNotFoundError: there is no such policy.
@@ -145,6 +152,11 @@ class Run:
     def save_policy(self, name: str, policy: Policy, **about: Any) -> None:
         """Write `best` or `last` with entries of its sidecar."""
         checkpoint.save(self.folder / name, policy, **about)
+
+    def keep_policy(self, policy: Policy, **about: Any) -> None:
+        """Write a policy to the history with entries of its sidecar, among them its `update`."""
+        (self.folder / _HISTORY).mkdir(exist_ok=True)
+        self.save_policy(f"{_HISTORY}/{about['update']:08}", policy, **about)
 
     def save_state(self, state: Any, **about: Any) -> None:
         """Write the training state with entries of its sidecar."""

@@ -1,4 +1,4 @@
-// The learning curve of a training that is running.
+// The learning curve of a training.
 
 import { short } from "./plots.js";
 
@@ -11,11 +11,11 @@ function element(name, attributes) {
   return made;
 }
 
-/** Draw a curve of points (update, value) into a figure, which is hidden where there are none. */
-export function drawCurve(figure, curve) {
+/** Draw a curve of points (update, value) into a figure, which is hidden where there are none; one point may be chosen. */
+export function drawCurve(figure, curve, chosen) {
   figure.hidden = !curve?.points.length;
   if (figure.hidden) return;
-  const { label, points } = curve, share = label === "success", text = (y) => (share ? `${Math.round(100 * y)} %` : short(y));
+  const { label, points, best } = curve, share = label === "success", text = (y) => (share ? `${Math.round(100 * y)} %` : short(y));
   const values = points.map(([, y]) => y), [last, value] = points[points.length - 1];
   const low = share ? 0 : Math.min(...values), high = share ? 1 : Math.max(...values, low + 1e-6);
   const place = ([x, y]) => [EDGE + ((WIDTH - 2 * EDGE) * x) / last, HEIGHT - EDGE - ((HEIGHT - 2 * EDGE) * (y - low)) / (high - low)];
@@ -26,7 +26,12 @@ export function drawCurve(figure, curve) {
     picture.append(element("line", { x1: 0, x2: WIDTH, y1: at, y2: at, class: "level" }));
   }
   picture.append(element("polyline", { points: places.map((at) => at.join(",")).join(" ") }));
-  for (const [cx, cy] of places) picture.append(element("circle", { cx, cy, r: 3 }));
+  places.forEach(([cx, cy], k) => {
+    const kept = points[k][0] === best;
+    const point = element("circle", { cx, cy, r: k === chosen ? 5 : 3, class: [k === chosen && "chosen", kept && "kept"].filter(Boolean).join(" ") });
+    if (kept) point.append(Object.assign(element("title", {}), { textContent: "the policy that was kept" }));
+    picture.append(point);
+  });
   const caption = document.createElement("figcaption");
   caption.textContent = `${label}, ${text(low)} to ${text(high)}, by update ${last}`;
   figure.replaceChildren(picture, caption);

@@ -6,6 +6,7 @@ import { Fleet } from "./fleet.js";
 import { armOf, bounds, scratch, World } from "./flight.js";
 import { CameraImages } from "./camera.js";
 import { drawCurve } from "./curve.js";
+import { History } from "./history.js";
 import { JET, jet, Jets } from "./jets.js";
 import { Names, named } from "./names.js";
 import { Panel } from "./panel.js";
@@ -40,6 +41,7 @@ class Player {
     this.arrows = this.worlds.map((world, w) => new Arrows(this.stage, world, (i) => this.colors(w, i)));
     this.jets = new Jets(this.stage, this.worlds);
     this.panel = new Panel(this, this);
+    this.history = header.history && new History(header.history, (w) => this.chooseWorld(w));
     const first = this.worlds[0];
     this.panel.set("trail", first.n > 60 ? "1" : "Infinity");
     this.panel.set("layout", header.layout);
@@ -140,15 +142,31 @@ class Player {
     this.fleet.size = panel.size;
     for (const plot of this.plots) plot.look(world, panel.drone, (i) => this.colors(panel.world, i), this.span);
     this.pose(scratch.p, scratch.q);
+    if (this.history) this.showPolicy(world);
     if (stage.mode !== panel.mode) stage.setMode(panel.mode, scratch.p, (panel.size || 1) * this.arm);
     this.labelNames();
     stage.dirty = true;
   }
 
+  /** Show the policy of a world of the film of a training. */
+  showPolicy(world) {
+    this.end = this.span = world.end;
+    this.time = Math.min(this.time, this.end);
+    this.history.mark(world.index, world.name);
+    this.panel.describe(`${this.title}, ${world.name}`, this);
+  }
+
+  chooseWorld(w) {
+    this.panel.setWorld(w, this.worlds[w]);
+    this.time = 0;
+    this.changed();
+  }
+
   /** Where each world is drawn, and the obstacles around it. */
   arrange() {
     const { panel, worlds, stage } = this, mode = worlds.length > 1 ? panel.layout : "ghosts";
-    const { low, high, points: corners } = bounds(worlds, this.surroundings), span = high.clone().sub(low), columns = Math.ceil(Math.sqrt(worlds.length));
+    const seen = this.history ? [worlds[this.history.kept]] : worlds;
+    const { low, high, points: corners } = bounds(seen, this.surroundings), span = high.clone().sub(low), columns = Math.ceil(Math.sqrt(worlds.length));
     const [dx, dy] = [1.25 * Math.max(span.x, 0.5), 1.25 * Math.max(span.y, 0.5)];
     this.sideBySide = mode === "grid";
     this.top = low.clone().add(high).multiplyScalar(0.5).setZ(high.z);
@@ -177,7 +195,7 @@ class Player {
     low.z = ground ? Math.min(low.z, 0) : low.z;
     const points = this.layout.flatMap(({ offset }) => corners.map((point) => point.clone().add(offset)));
     if (mode === "grid") stage.fit(low.clone().setY(low.y + last.y), high.clone().setX(high.x + wide.x), ground, obstacles, points);
-    else stage.fit(low, high, ground, obstacles, points, this.live);
+    else stage.fit(low, high, ground, obstacles, points, this.live || this.history);
   }
 
   /** Pose of the drone that is looked at. */
@@ -231,6 +249,7 @@ class Player {
       if (this.time >= this.end) {
         this.time = this.again ? 0 : this.end;
         this.playing = this.running || this.again;
+        if (this.history) this.chooseWorld((this.panel.world + 1) % this.worlds.length);
       }
     }
     if (this.playing || this.stage.dirty) {

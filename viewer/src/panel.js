@@ -56,6 +56,11 @@ export class Panel {
 
   set(id, value) { find(id).value = value; }
 
+  setWorld(w, world) {
+    this.set("world", w);
+    this.listDrones(world);
+  }
+
   listDrones(world) {
     const chosen = Math.min(this.drone || 0, world.n - 1);
     find("drone").replaceChildren(...world.labels.map((label, i) => new Option(label, i)));

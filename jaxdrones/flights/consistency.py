@@ -30,6 +30,9 @@ _HORIZONTAL_RATIO, _VERTICAL_RATIO = (0.87, 1.08), (0.94, 1.06)  # of distances 
 _TURN_RATIO = (0.88, 1.14)  # of turns of the attitudes and by the rates
 _ACC_RATIO = (0.5, 1.5)  # of accelerations and those of the tilted thrust
 _MAX_CLOCK_MISFIT = 0.1  # largest misfit for a meaningful ratio
+_MAX_DRIFT = 1.15  # of horizontal distances over integrals of vel between the halves of a flight
+_MIN_CORRELATION = 0.85  # of horizontal vectors for a meaningful angle between them
+_MAX_HEADING = np.radians(15)  # the bundled flights have up to 3 degrees
 _NED, _SWAPPED = np.array([1, -1, -1]), np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _MAX_RISE = 0.1  # V; largest rise of a battery when the motors start
 
@@ -93,7 +96,9 @@ def contradictions(motion: Motion, thrusts: np.ndarray, sag: float) -> list[str]
         sag: of the battery at take-off, V.
     """
     found, read = _check_axes(motion)
-    found = (found or _check_scales(motion)) + check_motors(thrusts, read.attitude, read.vel, read.omega)
+    found = (found or _check_scales(motion) or _check_headings(motion)) + check_motors(
+        thrusts, read.attitude, read.vel, read.omega
+    )
     if sag < -_MAX_RISE:
         found.append(f"vbat rises by {-sag:.2f} V when the motors start: the load of the battery has the wrong sign")
     return found
@@ -127,9 +132,12 @@ class _Test(NamedTuple):
 
     @property
     def passes(self) -> bool:
-        """Whether the log is consistent, or the motion too small for the test."""
+        """Whether the log is consistent, or the motion too small for the test. A constant column is inconsistent."""
+        if not self.observable:
+            return True
+        both_vary = min(np.ptp(self.has, axis=0).max(), np.ptp(self.implied, axis=0).max()) > 0
         error = np.sqrt(_typical(self.has - self.implied))
-        return not self.observable or self.misfit < self.max_misfit or float(error) < self.max_error
+        return bool(both_vary and (self.misfit < self.max_misfit or error < self.max_error))
 
 
 def _rms(x: np.ndarray) -> float:
@@ -245,7 +253,7 @@ def _check_scales(motion: Motion) -> list[str]:
         if ratio is not None and not low <= ratio <= high
     ]
     if not off:
-        return []
+        return _check_drift(shifts)
     turns = ratios["turns of quat over integrals of omega"][0]
     values = [ratio for name, (ratio, _) in ratios.items() if ratio is not None and any(name in each for each in off)]
     clock = turns is None or all((turns - 1) * (ratio - 1) > 0 for ratio in values)
@@ -253,3 +261,40 @@ def _check_scales(motion: Motion) -> list[str]:
         "t runs at another rate than the flight (a wrong clock)" if clock else "pos or vel has another unit or scale"
     )
     return [f"{'; '.join(off)} instead of 1: {cause}"]
+
+
+def _check_drift(shifts: _Test) -> list[str]:
+    """Check that the first and the second half of a flight have the same scale of distances."""
+    middle = len(shifts.has) // 2
+    halves = (slice(middle), slice(middle, None))
+    ratios = [_ratio(shifts._replace(has=shifts.has[i], implied=shifts.implied[i]), slice(0, 2)) for i in halves]
+    first, second = ratios
+    if first is None or second is None or max(first / second, second / first) < _MAX_DRIFT:
+        return []
+    name = "horizontal distances over integrals of vel"
+    return [f"{name}: {first:.2f} and {second:.2f} in the halves of the flight: the rate of t changes (a wrong clock)"]
+
+
+def _check_headings(motion: Motion) -> list[str]:
+    """Check that horizontal accelerations and turns have the heading that the attitude implies."""
+    _, attitude, vel, omega = motion
+    tests = (
+        ("the tilt of the thrust and the acceleration", force_test(vel, attitude), "world axes of quat and vel"),
+        ("the turns of quat and the integrals of omega", turn_test(attitude, omega), "body axes of quat and omega"),
+    )
+    return [
+        f"{name} are {abs(np.degrees(angle)):.0f} degrees apart about z: the {axes} differ"
+        for name, test, axes in tests
+        if abs(angle := _heading(test)) > _MAX_HEADING
+    ]
+
+
+def _heading(test: _Test) -> float:
+    """Angle about z from implied to logged horizontal vectors, rad; 0 where they are small or hardly correlated."""
+    has, implied = (x[:, 0] + 1j * x[:, 1] for x in (test.has, test.implied))
+    if not test.observable:
+        return 0.0
+    has, implied = has - np.mean(has), implied - np.mean(implied)
+    product = np.vdot(implied, has)
+    correlated = np.abs(product) > _MIN_CORRELATION * np.linalg.norm(has) * np.linalg.norm(implied)
+    return float(np.angle(product)) if correlated else 0.0

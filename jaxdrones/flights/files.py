@@ -37,6 +37,7 @@ _MEANINGS = {
     "target_vel": "commanded velocity, m/s, world",
     "target_yaw": "commanded heading, rad",
 }
+_MAX_STRETCH = 0.05  # largest deviation of the length of a quaternion from 1
 _IMAGES = "images/"  # prefix of the names of their arrays
 # What NumPy and zipfile raise for damaged files; NotImplementedError for an unknown compression.
 _DAMAGE = (OSError, ValueError, EOFError, KeyError, NotImplementedError, RuntimeError, MemoryError)
@@ -77,14 +78,15 @@ def read_log(path: str | os.PathLike) -> FlightLog:
     for alias, name in _ALIASES.items():
         if alias in arrays:
             arrays.setdefault(name, arrays.pop(alias))
+    if "labels" in arrays:
+        arrays["labels"] = np.ravel(arrays["labels"])
     columns = _columns(file.name, arrays)
-    labels = arrays.get("labels")
     try:
         texts = {name: json.loads(str(arrays[name])) for name in ("conditions", "params", "scene") if name in arrays}
         params = {name: np.asarray(x, float) for name, x in texts["params"].items()} if "params" in texts else None
         log = FlightLog(
             **columns,
-            labels=() if labels is None else tuple(map(str, labels)),
+            labels=tuple(map(str, arrays.get("labels", ()))),
             conditions=LoggedConditions(texts.get("conditions", {}), str(arrays.get("about", file.name))),
             params=None if params is None else Params(**params),  # type: ignore[arg-type]  # names are the file's
             scene=scene_from_dict(texts["scene"]) if "scene" in texts else Scene(),
@@ -161,17 +163,21 @@ def _npz(file: Path) -> dict[str, np.ndarray]:
 def _csv(file: Path) -> dict[str, np.ndarray]:
     """Arrays of a table of `save_csv`; without the column `drone` it is of one drone."""
     try:
-        with file.open(newline="") as lines:
+        with file.open(newline="", encoding="utf-8-sig") as lines:  # spreadsheets write a mark of the byte order
             reader = csv.DictReader(lines)
             table: dict[str, list[str]] = {name: [] for name in reader.fieldnames or ()}
             for row in reader:
                 for name, entries in table.items():
                     entries.append(row[name])
-        labels = list(dict.fromkeys(table.pop("drone", ["drone 0"])))
+        drones = table.pop("drone", ["drone 0"])
+        labels = list(dict.fromkeys(drones))
         numbers = {name: np.array(x, float).reshape(-1, len(labels)) for name, x in table.items()}
     except (*_DAMAGE, TypeError, csv.Error) as error:
         raise UserError(f"{file}: is not a table of numbers ({error}); give the log of a flight") from None
-    arrays = {"t": numbers.pop("t")[:, 0]} if "t" in numbers else {}
+    t = numbers.pop("t", np.zeros((0, 1)))
+    if drones != labels * (len(drones) // max(len(labels), 1)) or (t != t[:, :1]).any():
+        raise UserError(f"{file.name}: has other drones at some times; give one row for each time and drone, in order")
+    arrays = {"t": t[:, 0]} if len(t) else {}
     for name in (*_WIDTHS, *_ALIASES):
         axes = [f"{name}_{axis}".rstrip("_") for axis in _AXES.get(_ALIASES.get(name, name), "xyz")]
         if all(axis in numbers for axis in axes):
@@ -261,11 +267,22 @@ def _check(log: FlightLog) -> None:
         row, drone = broken[0].tolist()
         where = f"before row {row}" if row else "in row 0"
         raise UserError(f"{log.name}: the state of {log.labels[drone]} is not finite {where}; remove such rows")
+    length = np.linalg.norm(log.quat, axis=-1)
+    if (np.abs(length - 1) > _MAX_STRETCH).any():
+        row, drone = np.argwhere(np.abs(length - 1) > _MAX_STRETCH)[0].tolist()
+        raise UserError(
+            f"{log.name}: quat of {log.labels[drone]} has a length of {length[row, drone]:.4g} in row {row}, which "
+            "looks like no unit quaternion; give x, y, z, w"
+        )
     n = len(log.labels)
     for field, x in vars(log.params).items():
         if field != "aux" and (np.ndim(x) < 1 or len(x) != n):
             raise UserError(f"{log.name}: params.{field} has shape {np.shape(x)}; give one entry for each drone, {n}")
     for kind, images in log.images.items():
-        if len(images.t) != len(images.frames) or np.shape(images.frames)[1:2] != (n,):
-            shape = np.shape(images.frames)
-            raise UserError(f"{log.name}: images {kind!r} have shape {shape} for {len(images.t)} times")
+        t, frames = images
+        numbers = t.dtype.kind in "fiu" and frames.dtype.kind in "fiu"
+        if not numbers or frames.ndim not in (4, 5) or frames.shape[:2] != (np.size(t), n):
+            raise UserError(
+                f"{log.name}: images {kind!r} are {frames.dtype} of shape {frames.shape} at {t.dtype} of shape "
+                f"{t.shape}; give numbers (times, {n} drones, height, width) or with channels, and their times"
+            )

@@ -25,7 +25,7 @@ _MAX_RATE = 60.0  # rad/s; gyroscopes of small quadrotors saturate at 35
 _MIN_VOLTAGE, _MAX_VOLTAGE = 1.0, 60.0  # V
 _MAX_RPM = 1e6
 _MIN_MEDIAN_RPM = 2700.0  # lowest median speed of small quadrotors; 16,000 RPM are 1,700 rad/s
-_MAX_PERCENT = 100.0  # PWM below this is a percentage
+_MIN_PEAK_PWM = 0.1 * _FULL_PWM  # no quadrotor flies below a tenth of the duty cycle
 
 
 def load_flights(*files: str | os.PathLike, allow_inconsistent: bool = False) -> list[FlightLog]:
@@ -177,7 +177,7 @@ def _check_units(name: str, column: str, x: np.ndarray) -> None:
         require(np.min(x) >= _MIN_VOLTAGE, "no voltage that turns motors", "V")
     elif column == "pwm":
         require(0 <= np.min(x) and largest <= _FULL_PWM, "no duty cycle of 16 bits", "0 to 65535")
-        require(largest > _MAX_PERCENT, "percent", "0 to 65535")
+        require(largest > _MIN_PEAK_PWM, "percent, 8 bits or microseconds", "0 to 65535")
     elif column == "rpm":
         require(0 <= np.min(x) and largest <= _MAX_RPM, "no rotor speed", "RPM")
         require(np.median(x) >= _MIN_MEDIAN_RPM, "rad/s", "RPM, 60 / (2 pi) times as many")

@@ -47,6 +47,21 @@ DAMAGE = {
         lambda c: others(c, vel=lambda x: np.roll(x, len(x) // 3, axis=0)),
         "vel is not the derivative",
     ),
+    "a clock that slows down": (
+        lambda c: others(
+            c, t=lambda t: np.append(t[0], t[0] + np.cumsum(np.diff(t) * np.linspace(0.75, 1.25, len(t) - 1)))
+        ),
+        "wrong clock",
+    ),
+    "a world turned about z": (
+        lambda c: others(c, quat=lambda q: (Rotation.from_euler("z", -0.5) * Rotation.from_quat(q)).as_quat()),
+        "apart about z: the world axes of quat and vel differ",
+    ),
+    "a body turned about z": (
+        lambda c: others(c, quat=lambda q: (Rotation.from_quat(q) * Rotation.from_euler("z", 0.7)).as_quat()),
+        "apart about z: the body axes of quat and omega differ",
+    ),
+    "no rates": (lambda c: others(c, omega=lambda w: 0 * w), "omega is not the rate of quat"),
     "half velocities": (lambda c: others(c, vel=lambda x: x / 2), "vel is not the derivative of pos"),
 }
 

@@ -40,6 +40,13 @@ def test_a_log_is_read_as_it_was_written(columns, tmp_path):
         (lambda c: c.update(omega=np.rad2deg(c["omega"]) + 100), "looks like degrees/s; give rad/s"),
         (lambda c: c.update(rpm=c["rpm"] / 9.549), "looks like rad/s; give RPM"),
         (lambda c: c.update(pwm=c.pop("rpm") / 300, vbat=np.full(300, 3.7)), "pwm .* looks like percent"),
+        (lambda c: c.update(pwm=c.pop("rpm") / 80, vbat=np.full(300, 3.7)), "pwm .* 8 bits"),
+        (lambda c: c.update(pwm=1000 + c.pop("rpm") / 20, vbat=np.full(300, 3.7)), "pwm .* microseconds"),
+        (
+            lambda c: c.update(quat=c["quat"] * (np.arange(300) != 9)[:, None]),
+            "length of 0 in row 9, .*no unit quaternion",
+        ),
+        (lambda c: c.update(labels=np.array(["a", "b"])), "has 300 times, 1 drones and 2 labels"),
         (lambda c: c.update(pwm=c.pop("rpm"), vbat=np.full(300, 3700.0)), "vbat .* looks like millivolts"),
         (lambda c: c.update(quat=c["quat"] * 2), "looks like no unit quaternion"),
         (lambda c: c.update({k: v[:50] for k, v in c.items()}), "has 50 rows, 0.49 s; give at least one second"),
@@ -91,6 +98,43 @@ def test_a_table_of_one_drone_or_of_a_team_is_read_as_it_was_written(columns, tm
         assert read.labels == log.labels
         for name in ("t", *STATE, "rpm"):
             np.testing.assert_allclose(getattr(read, name), getattr(log, name), rtol=1e-6)
+
+
+def test_a_table_that_mixes_drones_or_times_is_refused(columns, tmp_path):
+    """Rows of two drones belong together by time; a table says which is whose, so no other order is guessed."""
+    one = written(tmp_path, columns)
+    twice = {name: np.repeat(getattr(one, name), 2, axis=1) for name in STATE | OPTIONAL}
+    save_csv(dataclasses.replace(one, **twice, labels=("a", "b"), params=None), tmp_path / "flight.csv")
+    head, *rows = (tmp_path / "flight.csv").read_text().splitlines()
+    orders = {
+        "swapped": [*rows[:4], rows[5], rows[4], *rows[6:]],
+        "missing": rows[:-1],
+        "other times": [*rows[:4], rows[4].replace(rows[4].split(",")[0], "0.0201", 1), *rows[5:]],
+    }
+    for name, lines in orders.items():
+        (tmp_path / f"{name}.csv").write_text("\n".join([head, *lines]))
+        with pytest.raises(
+            ValueError, match="one row for each time and drone" if name != "missing" else "is not a table"
+        ):
+            read_log(tmp_path / f"{name}.csv")
+    (tmp_path / "marked.csv").write_text("\n".join([head, *rows]), encoding="utf-8-sig")  # as spreadsheets write it
+    assert read_log(tmp_path / "marked.csv").labels == ("a", "b")
+
+
+def test_a_name_of_a_single_drone_is_its_label(columns, tmp_path):
+    np.savez(tmp_path / "flight.npz", **columns, labels=np.asarray("scout"))
+    assert read_log(tmp_path / "flight.npz").labels == ("scout",)
+
+
+@pytest.mark.parametrize(
+    ("t", "frames"),
+    [(["a", "b"], (2, 1, 4, 4, 3)), ([0.0, 1.0], (2, 1)), ([0.0, 1.0], (3, 1, 4, 4)), ([0.0], (1, 2, 4, 4))],
+)
+def test_images_that_are_none_are_refused(columns, tmp_path, t, frames):
+    images = {"images/rgb/t": np.array(t), "images/rgb/frames": np.zeros(frames, np.uint8)}
+    np.savez(tmp_path / "flight.npz", **columns, **images)
+    with pytest.raises(ValueError, match=r"images 'rgb' are uint8 of shape .*; give numbers"):
+        read_log(tmp_path / "flight.npz")
 
 
 def test_what_fly_wrote_is_fitted(tmp_path, capsys):

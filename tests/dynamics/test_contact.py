@@ -241,6 +241,16 @@ def test_what_a_drone_does_to_another_it_feels_itself(vehicle, other):
     np.testing.assert_allclose(torque, -counter_torque, rtol=1e-9, atol=1e-12)
 
 
+def test_drones_touch_alike_however_fast_they_fly_together():
+    """Contact of two drones depends on their relative velocity alone (Galileo)."""
+    few = jax.tree.map(lambda x: x[:20], couples)
+    (force, torque), _ = both_ways(few, "cf2x", "cf2x")
+    assert np.mean(jnp.any(force != 0, axis=1)) > 0.3
+    faster = few.replace(vel=few.vel + jnp.array([[[5.0, -3.0, 2.0]]]))
+    for together, alone in zip(both_ways(faster, "cf2x", "cf2x")[0], (force, torque), strict=True):
+        np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-12)
+
+
 def crash(params, speed, towards, n=30):
     """Two drones without weight that fly at each other along `towards`, a little aside: paths (n, 3), trajectories."""
     rng = np.random.default_rng(0)

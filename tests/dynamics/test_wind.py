@@ -179,5 +179,7 @@ def test_what_the_air_does_is_proportional_to_its_density_and_nothing_in_a_vacuu
         jnp.array([0, 0.6125, 1.225, 1.225]), jnp.array([9.8, 9.8, 9.8, 0]), state
     )
     np.testing.assert_allclose(half - vacuum, (full - vacuum) / 2, rtol=1e-9, atol=1e-9)
+    gyroscopic = np.cross(state.omega, team.inertia * state.omega) / team.inertia
+    np.testing.assert_allclose(vacuum[:, 3:6], -gyroscopic, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(vacuum[:, [0, 1, 2, 6]], 0, atol=1e-12)
     assert_finite((weightless, slopes))

@@ -7,8 +7,9 @@ import pytest
 from sensing.estimates import along, few, flights
 
 import jaxdrones as jd
+from jaxdrones.dynamics.rigid_body import quat_rate
 from jaxdrones.sensing import EUROPE, PERFECT, MotionCaptureSystem, Noise, barometer, imu, magnetometer, motion_capture
-from jaxdrones.sensing.inertial import mean_motion
+from jaxdrones.sensing.inertial import mean_motion, motion
 
 KEY = jax.random.key(1)
 
@@ -36,6 +37,47 @@ def test_an_imu_feels_thrust_and_drag_and_the_turn_at_its_place(flown):
     omega, turn = np.asarray(states.omega), np.asarray(rates.omega)
     expected = np.cross(turn, offset) + np.cross(omega, np.cross(omega, offset))
     np.testing.assert_allclose(away["acc"] - read["acc"], expected, atol=1e-9)
+
+
+def random_state(seed):
+    """State of one drone, any attitude, and a time derivative of it."""
+    rng = np.random.default_rng(seed)
+    quat, vel, omega, acc, omega_rate = (jnp.array(rng.normal(size=n)) for n in (4, 3, 3, 3, 3))
+    state = jd.State(jnp.zeros(3), jd.rotation.normalize(quat), vel, 3 * omega, jnp.zeros(4))
+    rate = jax.tree.map(jnp.zeros_like, state).replace(vel=acc, omega=5 * omega_rate, quat=quat_rate(state))
+    return state, rate
+
+
+def test_an_imu_off_the_center_feels_the_acceleration_of_its_place():
+    params, (state, rate), offset = jd.load_params("cf2x"), random_state(2), jnp.array([0.02, -0.01, 0.03])
+
+    def velocity_there(state):
+        return state.vel + jd.rotation.rotate(state.quat, jd.vector.cross(state.omega, offset))
+
+    _, acc = jax.jvp(velocity_there, (state,), (rate,))
+    felt = jd.rotation.rotate_inverse(state.quat, acc + jd.vector.along_z(params.gravity))
+    np.testing.assert_allclose(motion(params, state, rate, offset)["acc"], felt, rtol=1e-12)
+
+
+def test_the_mean_acceleration_of_a_step_is_in_the_axes_of_its_middle():
+    params, (state, _), turn = jd.load_params("cf2x"), random_state(3), jnp.array([0.4, -0.2, 0.3])
+    force, dt = jnp.array([1.0, -2.0, 9.0]), 0.1
+    middle = jd.rotation.multiply(state.quat, jd.rotation.exp(turn / 2))
+    gained = (jd.rotation.rotate(middle, force) - jd.vector.along_z(params.gravity)) * dt
+    after = state.replace(quat=jd.rotation.multiply(state.quat, jd.rotation.exp(turn)), vel=state.vel + gained)
+    mean = mean_motion(params, state.quat, state.vel, after, dt)
+    np.testing.assert_allclose(mean["acc"], force, rtol=1e-12)
+    np.testing.assert_allclose(mean["gyro"], turn / dt, rtol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.004, 0.0125, 0.03])
+def test_a_pose_of_a_steady_motion_is_as_old_as_the_delay(delay):
+    sensor, params = motion_capture(MotionCaptureSystem(delay=delay)), jd.load_params("cf2x")
+    rate = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.zeros((1, 3))))
+    memory, vel = sensor.init(KEY, params), jnp.array([1.0, -2.0, 0.5])
+    for k in range(7):
+        memory, read = sensor.measure(KEY, params, rate.replace(pos=0.01 * k * vel), rate, jd.Scene(), memory)
+    np.testing.assert_allclose(read["pos"], (0.06 - delay) * vel, rtol=1e-12)
 
 
 @pytest.mark.slow

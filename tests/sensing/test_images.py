@@ -11,7 +11,8 @@ from helpers import jit_unoptimized
 
 import jaxdrones
 from jaxdrones import Camera, Scene, State, render, rotation
-from jaxdrones.sensing import Box, Capsule, Cylinder, Mesh, Sphere
+from jaxdrones.sensing import Box, Capsule, Cylinder, Mesh, Sphere, shading
+from jaxdrones.sensing.frustum import Ground
 from jaxdrones.sensing.images import drone_solids, view_of
 from jaxdrones.sensing.shading import SUN, shade
 from jaxdrones.sensing.visibility import depth
@@ -263,6 +264,18 @@ def test_what_is_turned_towards_the_sun_is_bright_by_lamberts_law_and_the_rest_i
     shadow = int(red[cosine.argmin()])
     assert 0 < shadow < 200
     np.testing.assert_allclose(red, shadow + (255 - shadow) * np.maximum(cosine, 0), atol=1)
+
+
+def test_the_sun_lights_the_ground_as_a_level_face():
+    """Tiles and the top of a box in the color of the bright ones, from above."""
+    above = team(([0, 0, 2.0], [0, np.pi / 2, 0]))
+    look_down = view_of(Camera(resolution=(4, 4)), *jax.tree.map(lambda x: x[0], above))
+    top = Scene.of(Box(pos=(0, 0, -1), size=(9, 9, 2)), ground=False).shapes(float)
+    colors, far = jnp.array([shading._BRIGHT]), jnp.full_like(look_down.u + look_down.v, 2.0)
+    index = far.astype(int) * 0
+    tiles = shade(look_down, [Ground.of(float)], colors, 0, index, far)
+    box = shade(look_down, top, colors, None, index, far)
+    np.testing.assert_array_equal(np.max(tiles, axis=(0, 1)), np.max(box, axis=(0, 1)))
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,9 @@ def test_a_device_is_turned_and_placed_on_the_body():
     )
     np.testing.assert_allclose(reading(backwards, at()), 0.9)
     np.testing.assert_allclose(reading(backwards, at(rpy=(0, 0, np.pi))), 1.9)
+    quarter = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))  # the device's x axis is the body's y axis
+    leftwards = range_finder("left", np.array([1.0, 0, 0]), max_range=9.0, orientation=quarter)
+    np.testing.assert_allclose(reading(leftwards, at()), 1.5)
 
 
 def test_a_range_is_in_meters_whatever_the_length_of_its_direction():

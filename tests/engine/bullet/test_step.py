@@ -71,11 +71,12 @@ def test_motors_are_limited_as_on_the_explicit_backend(team, rotors):
 def test_substeps_are_repeated_steps(team, step):
     start, (command,) = apart(flying(team)), np.asarray(tape(team, 1))
     with bullet.make_step(**EVERYTHING, substeps=3) as three:
-        once = three(team, start, command)
+        once, compiled = three(team, start, command), jax.jit(three)(team, start, command)
     state = start
     for _ in range(3):
         state = step(team, state, command)
     assert_same_motion(once, state, 1e-12)
+    assert_same_motion(compiled, state, 1e-12)
 
 
 @pytest.mark.slow

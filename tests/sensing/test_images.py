@@ -268,10 +268,10 @@ def test_what_is_turned_towards_the_sun_is_bright_by_lamberts_law_and_the_rest_i
 
 def test_the_sun_lights_the_ground_as_a_level_face():
     """Tiles and the top of a box in the color of the bright ones, from above."""
-    above = team(([0, 0, 2.0], [0, np.pi / 2, 0]))
-    look_down = view_of(Camera(resolution=(4, 4)), *jax.tree.map(lambda x: x[0], above))
+    above = team(([0, 0, 1.0], [0, np.pi / 2, 0]))
+    look_down = view_of(Camera(resolution=(16, 16)), *jax.tree.map(lambda x: x[0], above))
     top = Scene.of(Box(pos=(0, 0, -1), size=(9, 9, 2)), ground=False).shapes(float)
-    colors, far = jnp.array([shading._BRIGHT]), jnp.full_like(look_down.u + look_down.v, 2.0)
+    colors, far = jnp.array([shading._BRIGHT]), jnp.full_like(look_down.u + look_down.v, 1.0)
     index = far.astype(int) * 0
     tiles = shade(look_down, [Ground.of(float)], colors, 0, index, far)
     box = shade(look_down, top, colors, None, index, far)

@@ -246,6 +246,12 @@ def test_the_aspect_is_the_rotors_y_over_x(monkeypatch):
     assert 1.089 < y / x < 1.111
 
 
+def test_the_elongation_is_the_inertia_about_y_over_that_about_x(monkeypatch):
+    monkeypatch.setitem(vehicles.LAWS, "elongation", vehicles.Law(1.2, 0.01, 1.19, 1.21))
+    about_x, about_y, _ = vehicles.draw(KEYS[0], CF2X).inertia
+    assert 1.189 < about_y / about_x < 1.211
+
+
 def test_as_many_light_as_heavy_vehicles_are_drawn(drawn):
     """The logarithm of the mass is uniform: each fifth of its range has a fifth of the vehicles."""
     counts, _ = np.histogram(np.log(drawn.mass), 5, np.log([0.02, 3.0]))

@@ -155,6 +155,8 @@ def test_no_flight_computes_what_is_not_a_number(tmp_path):
         (["explain", "hoover"], "unknown task 'hoover'; did you mean 'hover'"),
         (["explain", "hover", "--set", "speeed=1"], "did you mean 'speed'"),
         (["explain", "hover", "--backend", "gazebo"], "unknown backend 'gazebo'"),
+        (["score", "B3_figure8_slow_rep2", "--vehicle", "cf2x", "--figure", "a.jpgg"], "ends in .png or .pdf"),
+        (["bench", "--worlds", "many"], "'many' is given; give whole numbers"),
         (["fly"], "required: FLIGHT"),
         (["soar"], "invalid choice: 'soar'"),
     ],

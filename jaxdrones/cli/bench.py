@@ -50,7 +50,10 @@ def add(commands) -> None:
 
 
 def _counts(text: str) -> list[int]:
-    return [int(count) for count in text.split(",")]
+    try:
+        return [int(count) for count in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is given; give whole numbers, for example 1024,16384") from None
 
 
 def _bench(options: argparse.Namespace) -> int:

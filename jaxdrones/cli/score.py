@@ -11,6 +11,7 @@ from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
 
 _NOMINAL = "cf2x"
+_PICTURES = (".png", ".pdf")
 
 
 def add(commands) -> None:
@@ -58,6 +59,8 @@ def _score(options: argparse.Namespace) -> int:
     logs = load_logs(options.logs, options.allow_inconsistent)
     gains = firmware_pid.gains(propellers=options.propellers)
     with_setpoints = [log for log in logs if log.has("target_pos", "pwm")]
+    if options.figure:
+        _check_figure(options.figure, bool(with_setpoints))
     flights = len(logs) + len(vehicles) * (len(logs) + len(with_setpoints))
     with bar(flights, "score", " flights") as shown:
 
@@ -75,9 +78,6 @@ def _score(options: argparse.Namespace) -> int:
         }
     closed_loop = {name: [result.as_dict() for result in flights] for name, flights in simulated.items()}
     if options.figure:
-        if not with_setpoints:
-            raise UserError("no log has set-points, so there are no paths to draw; leave --figure out")
-        check_writable(options.figure)
         save_paths(simulated["vehicle"], options.figure)
     results: dict[str, Any] = {
         "vehicle": options.vehicle,
@@ -93,6 +93,15 @@ def _score(options: argparse.Namespace) -> int:
         if with_setpoints:
             print(closed_loop_table(closed_loop))
     return 0
+
+
+def _check_figure(file: Path, has_paths: bool) -> None:
+    """Raise unless there are paths to draw, into a picture that can be written."""
+    if not has_paths:
+        raise UserError("no log has set-points, so there are no paths to draw; leave --figure out")
+    if file.suffix not in _PICTURES:
+        raise UserError(f"--figure is {str(file)!r}; give a name that ends in {' or '.join(_PICTURES)}")
+    check_writable(file)
 
 
 def open_loop_table(models: dict[str, Any]) -> str:

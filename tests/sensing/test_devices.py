@@ -80,6 +80,12 @@ def test_a_pose_of_a_steady_motion_is_as_old_as_the_delay(delay):
     np.testing.assert_allclose(read["pos"], (0.06 - delay) * vel, rtol=1e-12)
 
 
+def test_the_field_that_a_magnetometer_feels_is_that_of_the_world_in_body_axes():
+    sensor, params, (state, rate) = magnetometer(Noise()), jd.load_params("cf2x"), random_state(4)
+    _, read = sensor.measure(KEY, params, state, rate, jd.Scene(), sensor.init(KEY, params))
+    np.testing.assert_allclose(jd.rotation.rotate(state.quat, read), EUROPE, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_means_over_a_step_lead_from_one_state_to_the_next(flown):
     params, states, _ = flown

@@ -61,6 +61,19 @@ def test_a_disc_meets_what_is_on_its_way_and_nothing_else(solid):
     assert not hit[gap > 4e-3].any()
 
 
+def test_a_disc_that_turns_into_a_wall_beside_it_meets_it():
+    """Its center rests; at first its flat side faces the wall, 1.75 cm away, and in the end its rim is in it."""
+    kinds = Scene.of(Box(pos=(1.2, 0, 0), size=(2.0, 9.0, 9.0)), ground=False).shapes(float)  # its face is at x = 0.2 m
+    flat, level = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
+    start, end = (
+        Disc(jnp.array([0.17, 0.0, 0.0]), axis, jnp.asarray(RING), jnp.asarray(ROUNDING)) for axis in (flat, level)
+    )
+    assert not meets(kinds, start, start) and meets(kinds, start, end)
+    found = planes(kinds, start, end)
+    np.testing.assert_allclose(found.normals[0], [-1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(found.heights[0], -0.2, atol=1e-6)
+
+
 def test_three_walls_of_a_corner_are_three_planes_and_what_is_behind_is_none():
     corner = Scene.of(*(Box(pos=0.5 * np.eye(3)[i], size=np.full(3, 2.0) - 1.4 * np.eye(3)[i]) for i in range(3)))
     kinds = corner.shapes(jnp.float64)  # faces at x, y, z = 0.2 m

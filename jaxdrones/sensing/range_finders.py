@@ -7,6 +7,7 @@ light only.
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,9 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_shape
+from jaxdrones.arguments import checked, number
+from jaxdrones.checks import check_quaternion, check_shape
+from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
 from jaxdrones.sensing.distances import as_floats
@@ -73,14 +76,15 @@ def _to_ground(origin: Float[Array, "3"], direction: Float[Array, "3"]) -> Float
     return jnp.where(height > 0, far, 0)
 
 
+@checked
 def range_finder(
     name: str,
     directions: np.ndarray,
     *,
-    max_range: float,
+    max_range: Annotated[float, number("m", "{argument} of a range finder", above=0)],
     rate: float | None = None,
-    noise: float = 0.0,
-    dropout: float = 0.0,
+    noise: Annotated[float, number("m", "{argument} of a range finder", at_least=0)] = 0.0,
+    dropout: Annotated[float, number("a share", "{argument} of a range finder", at_least=0, at_most=1)] = 0.0,
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     orientation: tuple[float, float, float, float] = _IDENTITY,
 ) -> Sensor:
@@ -95,9 +99,18 @@ def range_finder(
         dropout: fraction of missing ranges, which read `max_range`.
         offset: (3,) origin of the rays relative to the center of mass, m, body axes.
         orientation: (4,) unit quaternion (x, y, z, w), device to body.
+
+    Raises:
+        ValueError: a direction of zero length, or a number out of range.
     """
     directions = np.asarray(directions, float)
-    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    if not directions.size or directions.shape[-1] != 3:
+        raise UserError(f"directions have shape {directions.shape}; give (..., 3), one row for each beam")
+    lengths = np.linalg.norm(directions, axis=-1, keepdims=True)
+    if not (np.isfinite(lengths) & (lengths > 0)).all():
+        raise UserError("a direction of a range finder has no length or is not finite; give vectors along the beams")
+    check_quaternion("orientation of a range finder", orientation)
+    directions = directions / lengths
     quat = np.asarray(orientation, float) / np.linalg.norm(orientation)
 
     def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: None):

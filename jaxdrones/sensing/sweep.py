@@ -49,6 +49,11 @@ class Disc(NamedTuple):
         radial = offset - dot(offset, self.axis) * self.axis
         return self.center + radial * jnp.minimum(1, self.ring / jnp.maximum(length(radial), 1e-9))
 
+    def lowest_point(self, normal: Point) -> Point:
+        """Lowest point of the disc, without its rounding, along a unit vector."""
+        radial = normal - dot(normal, self.axis) * self.axis
+        return self.center - radial * (self.ring / jnp.maximum(length(radial), 1e-9))
+
     def lowest(self, normal: Point) -> Number:
         """Height of the lowest point along a unit vector, m."""
         extent = self.ring * safe_sqrt(1 - dot(normal, self.axis) ** 2) + self.rounding
@@ -147,8 +152,8 @@ def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> Approach:
 
     zero = jnp.zeros_like(start.rounding)
     begin = zero, obstacle.nearest(start.center), jnp.zeros_like(way), zero
-    share, on_obstacle, normal, height = jax.lax.fori_loop(0, _ADVANCES, advance, begin)
-    touches = (share < 1) | (nearest(end, on_obstacle)[2] < 0)
+    share, _, normal, height = jax.lax.fori_loop(0, _ADVANCES, advance, begin)
+    touches = (share < 1) | (nearest(end, obstacle.nearest(end.lowest_point(normal)))[2] < 0)
     normal = rotation.rotate(obstacle.quat, normal)
     return Approach(touches, normal, height + dot(obstacle.pos, normal))
 

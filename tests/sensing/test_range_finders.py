@@ -93,6 +93,25 @@ def test_a_device_is_turned_and_placed_on_the_body():
     np.testing.assert_allclose(reading(leftwards, at()), 1.5)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (dict(directions=np.array([[1.0, 0, 0], [0, 0, 0]])), "has no length or is not finite"),
+        (dict(directions=np.array([0, np.nan, 1.0])), "has no length or is not finite"),
+        (dict(directions=np.ones((3, 2))), r"have shape \(3, 2\); give \(..., 3\)"),
+        (dict(orientation=(0, 0, 0, 0)), "orientation of a range finder has length 0"),
+        (dict(max_range=-1.0), "max_range of a range finder is -1.0; give a positive number"),
+        (dict(noise=-0.1), "noise of a range finder is -0.1"),
+        (dict(dropout=1.5), "dropout of a range finder is 1.5"),
+    ],
+)
+def test_beams_that_are_none_are_refused(wrong, says):
+    with pytest.raises(ValueError, match=says):
+        range_finder("wrong", **dict(directions=np.eye(3), max_range=4.0) | wrong)
+    with pytest.raises(ValueError, match=r"have shape \(0, 3\)"):
+        lidar(beams=0)
+
+
 def test_a_range_is_in_meters_whatever_the_length_of_its_direction():
     """The directions of one device have lengths from 1e-3 to 1e3, and its quaternion the largest error that passes."""
     lengths = np.array([1.0, 2.0, 0.5, 1e-3, 1e3])

@@ -62,16 +62,21 @@ def test_a_disc_meets_what_is_on_its_way_and_nothing_else(solid):
 
 
 def test_a_disc_that_turns_into_a_wall_beside_it_meets_it():
-    """Its center rests; at first its flat side faces the wall, 1.75 cm away, and in the end its rim is in it."""
+    """Its center rests; at first its flat side faces the wall, in the end its rim is in it, also after small turns."""
     kinds = Scene.of(Box(pos=(1.2, 0, 0), size=(2.0, 9.0, 9.0)), ground=False).shapes(float)  # its face is at x = 0.2 m
-    flat, level = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
-    start, end = (
-        Disc(jnp.array([0.17, 0.0, 0.0]), axis, jnp.asarray(RING), jnp.asarray(ROUNDING)) for axis in (flat, level)
-    )
-    assert not meets(kinds, start, start) and meets(kinds, start, end)
-    found = planes(kinds, start, end)
-    np.testing.assert_allclose(found.normals[0], [-1, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(found.heights[0], -0.2, atol=1e-6)
+
+    def at(distance, angle):
+        axis = jnp.array([jnp.cos(angle), 0.0, jnp.sin(angle)])
+        return Disc(jnp.array([0.2 - distance, 0.0, 0.0]), axis, jnp.asarray(RING), jnp.asarray(ROUNDING))
+
+    for angle in 0.2, 0.3, 0.7, np.pi / 2:
+        touching = RING * np.sin(angle) + ROUNDING
+        for distance in touching - 1e-3, touching + 1e-3:
+            start, end = at(distance, 0.0), at(distance, angle)
+            assert meets(kinds, start, end) == (distance < touching)
+        found = planes(kinds, at(touching - 1e-3, 0.0), at(touching - 1e-3, angle))
+        np.testing.assert_allclose(found.normals[0], [-1, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(found.heights[0], -0.2, atol=1e-6)
 
 
 def test_three_walls_of_a_corner_are_three_planes_and_what_is_behind_is_none():

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.arguments import checked, number
+from jaxdrones.arguments import checked, number, whole
 from jaxdrones.checks import check_quaternion, check_shape
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -152,8 +152,9 @@ def downward_range(
     return range_finder("downward_range", _DOWN, max_range=max_range, rate=rate, noise=noise, dropout=dropout)
 
 
+@checked
 def lidar(
-    beams: int = 360,
+    beams: Annotated[int, whole("{argument} of a lidar")] = 360,
     max_range: float = 12.0,
     rate: float | None = 10.0,
     noise: float = 0.0,
@@ -179,9 +180,10 @@ def lidar(
     )
 
 
+@checked
 def time_of_flight(
-    zones: int = 8,
-    field_of_view: float = 45.0,
+    zones: Annotated[int, whole("{argument} along an edge of the grid")] = 8,
+    field_of_view: Annotated[float, number("degrees", above=0, below=180)] = 45.0,
     max_range: float = 4.0,
     rate: float | None = 15.0,
     noise: float = 0.0,

@@ -108,8 +108,10 @@ def test_a_device_is_turned_and_placed_on_the_body():
 def test_beams_that_are_none_are_refused(wrong, says):
     with pytest.raises(ValueError, match=says):
         range_finder("wrong", **dict(directions=np.eye(3), max_range=4.0) | wrong)
-    with pytest.raises(ValueError, match=r"have shape \(0, 3\)"):
+    with pytest.raises(ValueError, match="beams of a lidar is 0; give a whole number of at least 1"):
         lidar(beams=0)
+    with pytest.raises(ValueError, match="field_of_view is 180; give a number above 0 and below 180"):
+        time_of_flight(field_of_view=180)
 
 
 def test_a_range_is_in_meters_whatever_the_length_of_its_direction():

@@ -25,7 +25,7 @@ from jaxdrones.control import Setpoint, firmware_pid, geometric, mellinger, pid
 from jaxdrones.envs import Env
 from jaxdrones.envs.observations import last_actions
 from jaxdrones.learning import evaluate
-from jaxdrones.learning.published import make_policy
+from jaxdrones.learning.policies import make_policy
 from jaxdrones.optimal import ilqr, lqr, mppi, weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -72,6 +72,8 @@ class Pilot:
     """Control steps whose setpoints a controller observes; -1 for a policy with observations of its own."""
     realistic: bool = False
     """Whether a policy is trained with drawn constants, noise and delays of 0 to 40 ms, and observes five actions."""
+    action: str = "rpm"
+    """Action type."""
     needs: str = ""
     """Optional library."""
     candidates: int = 48
@@ -89,7 +91,7 @@ class Pilot:
 
     def env(self, scenario: Scenario) -> Env:
         """Environment of a scenario as this pilot flies it."""
-        return scenario.env(self.hz, self.observation(scenario))
+        return scenario.env(self.hz, self.observation(scenario), self.action)
 
 
 class Controller(PyTreeNode):
@@ -255,9 +257,9 @@ def trained(algorithm: str) -> Callable[[Scenario, Pilot], Obtained]:
     return obtain
 
 
-def published(scenario: Scenario, pilot: Pilot) -> Obtained:
-    """RAPTOR as published."""
-    return Obtained(make_policy("raptor", pilot.env(scenario)), 0.0, 0.0)
+def named(name: str) -> Callable[[Scenario, Pilot], Obtained]:
+    """Policy for all vehicles, as it is."""
+    return lambda scenario, pilot: Obtained(make_policy(name, pilot.env(scenario)), 0.0, 0.0)
 
 
 PILOTS: dict[str, Pilot] = {
@@ -274,5 +276,5 @@ PILOTS: dict[str, Pilot] = {
     "shac": Pilot(trained("shac")),
     "bptt": Pilot(trained("bptt")),
     "bptt-random": Pilot(trained("bptt"), realistic=True),
-    "raptor": Pilot(published, needs="foundation_policy"),
+    "raptor": Pilot(named("raptor"), action="throttle", needs="foundation_policy"),
 }

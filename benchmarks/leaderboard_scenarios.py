@@ -62,18 +62,18 @@ class Scenario:
     near: bool = False
     """Whether success is to stay within `NEAR` of the goal for the last 2 s, not the criterion of the task."""
 
-    def env(self, hz: int, observation: tuple | None = None) -> Env:
+    def env(self, hz: int, observation: tuple | None = None, action: str = "rpm") -> Env:
         """Environment with a number of control steps per second, whose reward is the effort."""
-        env = jd.make(self.task, **self.settings(hz, observation), **self.options)
+        env = jd.make(self.task, **self.settings(hz, observation, action), **self.options)
         changes: dict[str, Any] = {"rewards": {"effort": (1.0, effort)}}
         if self.near:
             changes["success"] = near
         return dataclasses.replace(env, task=dataclasses.replace(env.task, **changes))
 
-    def settings(self, hz: int, observation: tuple | None = None) -> dict[str, Any]:
+    def settings(self, hz: int, observation: tuple | None = None, action: str = "rpm") -> dict[str, Any]:
         """Options of `jaxdrones.make` that all scenarios share."""
         physics = dict(vehicle=vehicle(), effects=("drag",), rotors=failing(lagging_rotors))
-        return physics | dict(action="rpm", control_hz=hz, substeps=PHYSICS_HZ // hz, observation=observation)
+        return physics | dict(action=action, control_hz=hz, substeps=PHYSICS_HZ // hz, observation=observation)
 
 
 def near(metrics: Mapping[str, Array], dt: float) -> Array:

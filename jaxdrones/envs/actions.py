@@ -95,23 +95,6 @@ def thrust_and_torques(torque_share: float = 0.05) -> Action:
     return Action(4, command, entries=entries)
 
 
-def angular_acceleration(largest: tuple[float, float, float] = (100.0, 100.0, 10.0)) -> Action:
-    """Common rotor speed (-1 standstill, 0 hover, 1 full), and angular accelerations up to `largest` in hover."""
-
-    def command(params, memory, state, action, setpoint, dt):
-        x, y, _ = params.rotor_pos.T
-        torque = jnp.stack([y, -x, params.rotor_spin * params.km / params.kf])  # of 1 N of each rotor
-        share = torque / jnp.sum(torque**2, axis=1, keepdims=True)  # rows are orthogonal at corners of a rectangle
-        difference = (params.inertia * jnp.array(largest) * action[1:]) @ share / (2 * params.kf * params.hover_rpm)
-        return memory, jnp.clip(_rotor_speed(params, action[0]) + difference, 0, params.max_rpm)
-
-    def entries(params: Params) -> Entries:
-        speed = Quantity("speed of all rotors", "RPM", values=_at_ends(_rotor_speed, params))
-        return speed, *_about_axes("angular acceleration", "rad/s^2", largest)
-
-    return Action(4, command, entries=entries)
-
-
 def one_d_thrust(share: float = 0.05) -> Action:
     """Collective thrust, the weight times 1 +- `share`."""
 
@@ -295,7 +278,6 @@ ACTIONS: dict[str, Callable[..., Action]] = {
     "throttle": throttle,
     "one_d_rpm": one_d_rpm,
     "thrust_and_torques": thrust_and_torques,
-    "angular_acceleration": angular_acceleration,
     "one_d_thrust": one_d_thrust,
     "velocity": velocity_input,
     "one_d_velocity": one_d_velocity,

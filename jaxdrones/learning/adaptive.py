@@ -25,8 +25,8 @@ _CENTERED = 0.3  # of the largest coordinate of a rotor: below, it is on an axis
 class AdaptivePolicy(PyTreeNode):
     """Policy that hovers any quadrotor at the target of a task, without its parameters.
 
-    Its network observes `OBSERVED` and its last action, and commands rotor speeds over the largest, -1 for standstill
-    and 1 for full speed. Rotors should be `lagging`: with instant rotors most vehicles oscillate.
+    Its network observes `OBSERVED` and its last action, and commands `throttle`. Rotors should be `lagging`, as in
+    training: with instant rotors most vehicles oscillate.
     """
 
     network: RecurrentPolicy
@@ -35,8 +35,6 @@ class AdaptivePolicy(PyTreeNode):
     """From body axes to those of a vehicle whose front right rotor turns clockwise, seen from above."""
     order: tuple[int, ...] = flax.struct.field(pytree_node=False)
     """Indices of its rotors: front right, rear right, rear left, front left in those axes."""
-    hover_share: Float[Array, ""]
-    """Rotor speed in hover over the largest, to convert to actions of the type `rpm`."""
 
     @classmethod
     def of(cls, name: str, network: RecurrentPolicy, env: Env) -> AdaptivePolicy:
@@ -46,14 +44,13 @@ class AdaptivePolicy(PyTreeNode):
             ValueError: another observation or action than the policy has; the message calls it `name`.
         """
         names = tuple(term.name for term in env.terms)
-        if names[: len(OBSERVED)] != OBSERVED or env.action.name != "rpm":
+        if names[: len(OBSERVED)] != OBSERVED or env.action.name != "throttle":
             raise UserError(
-                f"{name} observes {', '.join(OBSERVED)}, and commands rotor speeds; the environment observes "
-                f"{', '.join(names)} and has the action {env.action.name}; leave out observation and give action='rpm'"
+                f"{name} observes {', '.join(OBSERVED)}, and commands throttle; the environment observes "
+                f"{', '.join(names)} and has the action {env.action.name}; give action='throttle' and no observation"
             )
-        params = jax.tree.map(lambda x: x[0], env.params)
-        turn, order = _placed(name, params)
-        return cls(network, jnp.asarray(turn, jnp.float32), order, params.hover_rpm / params.max_rpm)
+        turn, order = _placed(name, jax.tree.map(lambda x: x[0], env.params))
+        return cls(network, jnp.asarray(turn, jnp.float32), order)
 
     def initial_hidden_state(self, batch: tuple[int, ...]) -> tuple[Any, Array]:
         """Hidden state of the network, and the last action."""
@@ -62,16 +59,14 @@ class AdaptivePolicy(PyTreeNode):
     def act(
         self, hidden_state: tuple[Any, Array], obs: Float[Array, "*batch d"]
     ) -> tuple[Any, Float[Array, "*batch 4"]]:
-        """Hidden state after the observations, and actions of the type `rpm`."""
+        """Hidden state after the observations, and actions."""
         hidden, last = hidden_state
         away, matrix, vel, omega = jnp.split(obs[..., :18].astype(last.dtype), (3, 12, 15), axis=-1)
         turned = (matrix.reshape(*matrix.shape[:-1], 3, 3) @ self.turn.T).reshape(matrix.shape)
         seen = jnp.concatenate([away, turned, vel, omega @ self.turn.T, last], axis=-1)
         hidden, own = self.network.act(hidden, seen)
         own = jnp.clip(own, -1, 1)
-        share = jnp.zeros_like(own).at[..., jnp.array(self.order)].set((own + 1) / 2)
-        span = jnp.where(share > self.hover_share, 1 - self.hover_share, self.hover_share)
-        return (hidden, own), (share - self.hover_share) / span
+        return (hidden, own), jnp.zeros_like(own).at[..., jnp.array(self.order)].set(own)
 
 
 def _placed(name: str, params: Params) -> tuple[np.ndarray, tuple[int, ...]]:

@@ -95,8 +95,9 @@ class GRU(nn.Module):
             hidden_state: (..., size) hidden state before the (first) input; zero by default.
             starts: (t, ...) whether an episode starts at this input, with a zero hidden state before it.
         """
-        # Initially three quarters of the hidden state are kept in every step, so early inputs have a gradient.
-        bias = jnp.repeat(jnp.array([0.0, 1.0, 0.0]), self.size)
+        # Initially 73 to 95 % of the hidden state are kept in every step, so early inputs have a gradient.
+        zero = jnp.zeros(self.size)
+        bias = jnp.concatenate([zero, jnp.linspace(1.0, 3.0, self.size), zero])
         gates = nn.Dense(3 * self.size, kernel_init=_kernel_init(1.0), bias_init=lambda k, s, dtype: bias.astype(dtype))
         inputs, kernel = gates(x), self.param("recurrent_kernel", _orthogonal_gates, self.size, gates.param_dtype)
 

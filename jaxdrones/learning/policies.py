@@ -15,7 +15,9 @@ from jaxdrones.learning.adaptive import AdaptivePolicy
 from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
 from jaxdrones.learning.raptor import Raptor
 
-_NETWORKS: dict[str, Callable[[], RecurrentPolicy]] = {"raptor": Raptor.load}
+_NETWORKS: dict[str, Callable[[], RecurrentPolicy]] = {
+    "raptor": Raptor.load,
+}
 POLICIES = tuple(_NETWORKS)
 """Policies for all vehicles; see `learning.adaptive`."""
 

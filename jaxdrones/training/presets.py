@@ -9,6 +9,7 @@ from typing import Any
 from jaxdrones.dynamics import instant_rotors
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.observations import last_actions
+from jaxdrones.learning.adaptive import OBSERVED
 from jaxdrones.tasks.task import Task
 from jaxdrones.training.algorithms import learner
 
@@ -22,8 +23,8 @@ _DELAYED_OBSERVATION = (
 )
 """Additional observations with rotor lag and a delay of up to four control steps."""
 
-_ANY_VEHICLE = {"action": "angular_acceleration"}
-"""The same rotor speeds turn the largest vehicles up to 30 times more slowly than the smallest ones."""
+_ANY_VEHICLE = {"action": "throttle", "observation": (*OBSERVED, last_actions(1))}
+"""Nothing that depends on the parameters of the vehicle."""
 
 _ONE_D = {
     "worlds": 64,
@@ -147,7 +148,18 @@ _REALISTIC_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
         updates=750, critic_hidden_sizes=(64, 64), privileged_critic=True, target_kl=0.01, anneal_fraction=0.6
     ),
 }
-_ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {("hover", "bptt"): dict(updates=1200)}
+_ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
+    # The size of RAPTOR, 2,048 weights. The horizon is that in which a vehicle of 3 kg responds.
+    ("hover", "bptt"): dict(
+        updates=8000,
+        horizon=96,
+        hidden_sizes=(16,),
+        recurrent_size=13,
+        learning_rate=5e-3,
+        max_grad_norm=0.1,
+        outlier_gradient=5.0,
+    ),
+}
 
 _BY_DEFAULT: dict[str, tuple[str, ...]] = {"hover": ("shac",), "landing": ("bptt",)}
 """Tasks and learners that work with default settings."""
@@ -180,9 +192,9 @@ def preset(
     Args:
         task: a name of `jaxdrones.envs.TASKS`, or a function that returns a task, with the learner's default settings.
         algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
-        realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters, or `any` with a
-            random vehicle in every episode and commanded angular accelerations; the policy also observes rotor speeds
-            and its last five actions.
+        realistic: whether to simulate rotor lag, drag, delay, sensor noise and random parameters; the policy also
+            observes rotor speeds and its last five actions. With `any`, every episode has a random vehicle, and the
+            policy observes its last action and commands `throttle`, which depend on no parameter of the vehicle.
         practice: whether to make the environment of training, possibly with easier starts than that of flight.
         **options: options of `jaxdrones.make`.
 
@@ -191,7 +203,7 @@ def preset(
     """
     config = learner(algorithm).Config()
     if realistic and task in ("hover", "recovery", "landing"):
-        options = {"observation": _DELAYED_OBSERVATION} | (_ANY_VEHICLE if realistic == "any" else {}) | options
+        options = (_ANY_VEHICLE if realistic == "any" else {"observation": _DELAYED_OBSERVATION}) | options
     if practice and isinstance(task, str):
         options = _PRACTICE_OPTIONS.get(task, {}) | options
     env = make(task, realistic=realistic, **options)

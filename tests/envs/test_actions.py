@@ -4,12 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import VEHICLES, jit_unoptimized, make_step
+from helpers import VEHICLES, make_step
 
 import jaxdrones
-from jaxdrones import State, assets, vehicles
+from jaxdrones import State, assets
 from jaxdrones.control import for_team, pid, velocity
-from jaxdrones.dynamics.rotors import rotor_wrench
 from jaxdrones.envs import ACTIONS, make
 
 HZ, SECONDS = 100, 6
@@ -136,22 +135,9 @@ def test_failing_rotors_lag_as_those_that_they_wrap():
             make("hover", vehicle=params, action="pid_gains", rotors=rotors)
 
 
-def test_an_angular_acceleration_is_the_same_for_all_sizes_and_turns_about_one_axis():
-    """By the derivative of the wrench in hover, which does not change the thrust."""
-    command = ACTIONS["angular_acceleration"]().rpm
-
-    def response(params):
-        def acceleration(action):
-            _, speeds = command(params, None, None, action, None, 0.01)
-            state = jax.tree.map(lambda x: x[0], State.at_rest(START[None])).replace(rpm=speeds)
-            wrench = rotor_wrench(params, state)
-            return jnp.append(wrench.torque / params.inertia, wrench.force[2] / params.weight)
-
-        return jax.jacobian(acceleration)(jnp.full(4, 1e-9))[:, 1:]
-
-    def of_drawn(key):
-        return response(vehicles.draw(key, CRAZYFLIE))
-
-    found = jit_unoptimized(jax.vmap(of_drawn))(jax.random.split(jax.random.key(0), 20))
-    expected = jnp.zeros((4, 3)).at[jnp.arange(3), jnp.arange(3)].set(jnp.array([100.0, 100.0, 10.0]))
-    np.testing.assert_allclose(found, np.tile(expected, (20, 1, 1)), atol=1e-5)
+def test_throttle_is_the_share_of_the_largest_speed_whatever_the_vehicle_hovers_with():
+    command = ACTIONS["throttle"]().rpm
+    for vehicle in VEHICLES:
+        params = jaxdrones.load_params(vehicle)
+        _, speeds = command(params, None, None, jnp.array([-1.0, -0.5, 0.0, 1.0]), None, 0.01)
+        np.testing.assert_allclose(speeds / params.max_rpm, [0, 0.25, 0.5, 1], atol=1e-12)

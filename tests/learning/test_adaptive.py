@@ -30,11 +30,15 @@ def speeds(env, action):
     return np.asarray(command / env.params.max_rpm[0])
 
 
+def make(**options):
+    return jd.make("hover", rotors="lagging", action="throttle", **options)
+
+
 def test_raptor_commands_the_rotor_speeds_of_its_own_code():
     """On cf2x, whose rotor at the front right turns as in RAPTOR's training, and whose rotors have its order."""
     from foundation_policy import Raptor
 
-    env, own = jd.make("hover", rotors="lagging"), Raptor()
+    env, own = make(), Raptor()
     own.reset()  # it has seen an example
     policy = jd.make_policy("raptor", env)
     hidden, last = policy.initial_hidden_state((1,)), np.zeros((1, 4))
@@ -50,7 +54,7 @@ def test_raptor_flies_a_vehicle_with_other_axes_like_its_turned_twin():
     sin = np.sqrt(0.5)
     turn = np.array([[sin, -sin, 0], [sin, sin, 0], [0, 0, 1]])
     plus = cross.replace(rotor_pos=cross.rotor_pos @ jnp.asarray(turn.T, jnp.float32))
-    envs = [jd.make("hover", rotors="lagging", vehicle=vehicle) for vehicle in (cross, plus)]
+    envs = [make(vehicle=vehicle) for vehicle in (cross, plus)]
     policies = [jd.make_policy("raptor", env) for env in envs]
     hidden = [policy.initial_hidden_state((1,)) for policy in policies]
     for obs in observations(envs[0], 5)[0]:
@@ -67,7 +71,7 @@ def test_raptor_flies_a_vehicle_with_other_axes_like_its_turned_twin():
 @pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["cf2x", "racer", "hummingbird"])
 def test_raptor_hovers_vehicles_of_30_to_1000_grams(vehicle):
-    env = jd.make("hover", vehicle=vehicle, rotors="lagging")
+    env = make(vehicle=vehicle)
     assert evaluate(env, jd.make_policy("raptor", env), KEY, 50).success > 0.9
 
 

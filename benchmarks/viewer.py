@@ -2,10 +2,13 @@
 
 Crazyflies on circles, 1,000 rows at 100 Hz, played at normal speed in a headless Chromium that draws in software, in a
 window of 1,100 x 720 pixels. The page lowers the resolution of the view while frames take longer than 1/32 s; `share`
-is what is left of it along each side. Beside it the size of the page and the seconds to make and to load it.
+is what is left of it along each side. `CPU ms` is the processor time of all processes of the browser for a frame at
+half of the resolution along each side; other programs on the cores hardly change it. Beside it the size of the page and
+the seconds to make and to load it.
 """
 
 import argparse
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -17,6 +20,19 @@ from jaxdrones.visualization.browser import find_browser, open_tab
 from jaxdrones.visualization.viewer import Page
 
 DT = 0.01  # s
+FRAMES = 60  # of which the processor time is taken
+DRAW = """(() => {
+    const { player } = jaxdrones, { stage } = player, gl = stage.renderer.getContext();
+    player.playing = false;
+    stage.setSharp(false);
+    stage.share = 0.5;
+    stage.resize();
+    for (let k = 0; k < COUNT; k++) {
+        player.time = (player.end * (k + 1)) / (COUNT + 1);
+        player.draw(0.03);
+        gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until it is drawn
+    }
+})()"""
 
 
 def page_of(drones: int, rows: int) -> tuple[Page, float]:
@@ -36,6 +52,22 @@ def page_of(drones: int, rows: int) -> tuple[Page, float]:
     return page, time.perf_counter() - start
 
 
+def processor_seconds() -> float:
+    """Processor time of the processes that this one has started, and of theirs, s."""
+    parents, seconds = {}, {}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (process / "stat").read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        parents[int(process.name)], seconds[int(process.name)] = int(fields[1]), sum(map(int, fields[11:15]))
+
+    def is_ours(process: int) -> bool:
+        return parents.get(process) == os.getpid() or (process in parents and is_ours(parents[process]))
+
+    return sum(seconds[process] for process in seconds if is_ours(process)) / os.sysconf("SC_CLK_TCK")
+
+
 def measure(drones: int, rows: int) -> dict:
     """Frames per second, and what belongs to them: half of the flight lets the page settle, a third is counted."""
     page, made = page_of(drones, rows)
@@ -49,11 +81,17 @@ def measure(drones: int, rows: int) -> dict:
         begun, first = time.perf_counter(), tab.run("jaxdrones.player.frames")
         time.sleep(rows * DT / 3)
         last, ended = tab.run("jaxdrones.player.frames"), time.perf_counter()
+        share = tab.run("jaxdrones.player.stage.share")
+        tab.run(DRAW.replace("COUNT", "5"))
+        before = processor_seconds()
+        tab.run(DRAW.replace("COUNT", str(FRAMES)))
+        spent = processor_seconds() - before
         return {
             "drones": drones,
             "rows": rows,
             "frames/s": (last - first) / (ended - begun),
-            "share": tab.run("jaxdrones.player.stage.share"),
+            "share": share,
+            "CPU ms": 1000 * spent / FRAMES,
             "MB": file.stat().st_size / 1e6,
             "made (s)": made,
             "loaded (s)": loaded,

@@ -21,6 +21,7 @@ from jaxdrones.tasks.curves import setpoint_on
 from jaxdrones.visualization.browser import open_tab
 
 DRONES, PERIOD, RATE, FPS, SIZE = 5, 6.0, 100, 15, (640, 360)
+WOOD = (0.4, 0.28, 0.18, 1.0)
 
 
 def place(drone, t):
@@ -56,7 +57,7 @@ def scene() -> Scene:
     return Scene.of(
         gate(pos=(1.41, 1.2, 1.0), opening=0.7, frame=0.12),
         gate(pos=(-1.41, -1.2, 1.0), opening=0.7, frame=0.12),
-        *(Cylinder(pos=(x, y, 0.9), radius=0.07, height=1.8) for x, y in trees),
+        *(Cylinder(pos=(x, y, 0.9), radius=0.07, height=1.8, color=WOOD) for x, y in trees),
     )
 
 

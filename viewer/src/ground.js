@@ -23,7 +23,10 @@ const FRAGMENT = `
 uniform sampler2D tile; uniform sampler2D shadows; uniform vec3 color; uniform vec3 haze; uniform vec2 middle; uniform vec2 scale; uniform float fading;
 varying vec2 place; varying vec2 away;
 void main() {
-  float light = texture2D(tile, place * scale.x).r * (1.0 - texture2D(shadows, (place - middle) * scale.y + 0.5).r);
+  float light = texture2D(tile, place * scale.x).r;
+  #ifdef SHADED
+  light *= 1.0 - texture2D(shadows, (place - middle) * scale.y + 0.5).r;
+  #endif
   float far = dot(away, away) * fading;
   gl_FragColor = vec4(mix(color * light, haze, far / (far + 1.0)), 1.0);
 }`;
@@ -64,13 +67,16 @@ export class Ground extends Mesh {
     );
   }
 
-  /** Lay squares of `cell` m, with haze from `radius` m on, and the picture of the shadows, `reach` m to every side. */
-  lay(middle, radius, cell, reach) {
+  /** Lay squares of `cell` m, with haze from `radius` m on, and the picture of the shadows, if any, `reach` m to every side. */
+  lay(middle, radius, cell, reach, shaded) {
     const { uniforms } = this.material;
     this.position.set(middle.x, middle.y, 0);
     this.scale.setScalar(60 * radius);
     uniforms.middle.value.set(middle.x, middle.y);
     uniforms.scale.value.set(1 / SQUARES / cell, 0.5 / reach);
     uniforms.fading.value = (14 * radius) ** -2;
+    if (shaded) this.material.defines.SHADED = 1;
+    else delete this.material.defines.SHADED;
+    this.material.needsUpdate = true;
   }
 }

@@ -67,8 +67,8 @@ export class Stage {
     this.orbit.minDistance = radius / 100;
     this.cell = round(radius / 2);
     this.hasGround = this.ground.visible = ground;
-    this.ground.lay(middle, radius, this.cell, SHADED * radius);
-    if (ground) this.shadows.draw(obstacles, middle, SHADED * radius);
+    this.ground.lay(middle, radius, this.cell, SHADED * radius, obstacles.length > 0);
+    if (ground && obstacles.length) this.shadows.draw(obstacles, middle, SHADED * radius);
     if (!stay || (!this.moved && this.mode === "orbit")) this.home();
   }
 

@@ -56,6 +56,16 @@ def test_no_page_is_wider_than_a_phone_and_none_asks_the_network_for_anything(si
     assert wide == {}
 
 
+def test_names_of_tasks_are_not_broken_on_a_phone(site, tab):
+    names = "[...document.querySelectorAll('td:first-child code')].filter((name) => /^[\\w-]+$/.test(name.textContent))"
+    for page in ("environments.html", "how-to-choose.html", "training.html"):
+        tab.open(site / page, *PHONE, ready=READY)
+        assert tab.run(f"{names}.length") > 5
+        assert (
+            tab.run(f"{names}.filter((name) => name.getClientRects().length > 1).map((name) => name.textContent)") == []
+        )
+
+
 def test_the_start_page_shows_a_flight_that_moves(site, tab):
     tab.open(site / "index.html", 1400, 900, ready=READY)
     tab.run("frame = document.querySelector('.flight').getBoundingClientRect(), null")

@@ -277,4 +277,5 @@ PILOTS: dict[str, Pilot] = {
     "bptt": Pilot(trained("bptt")),
     "bptt-random": Pilot(trained("bptt"), realistic=True),
     "raptor": Pilot(named("raptor"), action="throttle", needs="foundation_policy"),
+    "any-vehicle": Pilot(named("any-vehicle"), action="throttle"),
 }

@@ -3,7 +3,6 @@
 Hover policies are trained on our plant and flown, with their weights frozen, on
   own        our plant with the realistic preset: lag, drag, delay, noise, parameters drawn per episode;
   delay      the same with a delay of 0, 10, 20, 30 and 40 ms in all episodes;
-  mass       vehicles of one class of masses after the other, for policies of `--realistic any`;
   bullet     the same with Bullet as integrator, with contacts and the damping of gym-pybullet-drones (2021), 0.04 1/s;
              25 drones, 3 m apart, share a world;
   crazyflow  crazyflow 0.4.0: its airframes, thrust curves, rotors and drag, at its rate and by its integrator, in an
@@ -18,7 +17,6 @@ import argparse
 import dataclasses
 import importlib.metadata
 import importlib.util
-import itertools
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +29,6 @@ from benchmarks.common import success_rate
 from benchmarks.rivals import environment
 from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env
-from jaxdrones.envs.randomize import AnyVehicle
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.training.algorithms import ALGORITHMS, learner
@@ -39,12 +36,11 @@ from jaxdrones.training.episode import fly_episode
 from jaxdrones.training.recipe import Recipe
 from jaxdrones.training.run import Run
 
-PLANTS = ("own", "delay", "mass", "bullet", "crazyflow")
+PLANTS = ("own", "delay", "bullet", "crazyflow")
 DAMPING = 0.04  # 1/s, of gym-pybullet-drones (2021)
 TEAM = 25  # drones of a Bullet world
 SEED = 1_000_000  # of the episodes: the same for every policy
 DELAYS = (0, 10, 20, 30, 40)  # ms, those that `realistic` draws
-MASSES = (0.02, 0.035, 0.1, 0.3, 1.0, 2.0, 3.0)  # kg, bounds of the classes
 AGREED = 1e-9  # m, m/s, rad/s, RPM: largest difference that is rounding
 
 
@@ -116,15 +112,6 @@ def with_delays(recipe: Recipe, runs: list[Run], options) -> list[dict]:
     return [flown(f"own, delay {delay} ms", run, env, options.episodes) for delay, env in envs.items() for run in runs]
 
 
-def with_masses(recipe: Recipe, runs: list[Run], options) -> list[dict]:
-    rows, action = [], recipe.env().action
-    for low, high in itertools.pairwise(MASSES):
-        vehicles = dataclasses.replace(recipe, realistic=True)
-        env = vehicles.env(randomize=(AnyVehicle(low, high),), action=action)
-        rows += [flown(f"{low:g} to {high:g} kg", run, env, options.episodes) for run in runs]
-    return rows
-
-
 def on_bullet(recipe: Recipe, runs: list[Run], options) -> list[dict]:
     from jaxdrones.engine import bullet  # not in the environment of the rivals
 
@@ -149,7 +136,7 @@ def on_crazyflow(recipe: Recipe, runs: list[Run], options) -> list[dict]:
     return rows
 
 
-FLOWN = {"own": on_own, "delay": with_delays, "mass": with_masses, "bullet": on_bullet, "crazyflow": on_crazyflow}
+FLOWN = {"own": on_own, "delay": with_delays, "bullet": on_bullet, "crazyflow": on_crazyflow}
 
 
 def flown(plant: str, run: Run, env: Env, episodes: int) -> dict:

@@ -173,6 +173,15 @@ def test_accelerator_runs_every_section_and_names_the_source_of_every_ratio(tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.needs("foundation_policy")
+def test_any_vehicle_reports_every_policy_in_every_condition():
+    rows = quick("any_vehicle")["rows"]
+    assert [(row["condition"], row["policy"]) for row in rows] == [
+        (condition, policy) for condition in ("cf2x", "drawn") for policy in ("raptor", "any-vehicle")
+    ]
+
+
+@pytest.mark.slow
 def test_self_play_reports_teams_and_single_drones_of_every_policy():
     rows = quick("self_play")["rows"]
     assert [(row["policy"], row["drones"]) for row in rows] == [

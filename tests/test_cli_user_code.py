@@ -37,6 +37,7 @@ MORE = {  # command of a page -> what makes it short
     "eval my_policy.py:policy --task hover --set action=position --set reach=0.5 --set tilt=20": "--episodes 4",
     "fly --policy my_policy.py:policy --task hover --set action=position --backend bullet": "--no-figure",
     "eval raptor --task hover --vehicle x500 --set rotors=lagging --set action=throttle": "--episodes 4",
+    "eval any-vehicle --task hover --realistic any --set action=throttle": "--episodes 4",
 }
 
 

@@ -1,6 +1,6 @@
-"""Trains the bundled policies of assets/policies, each by `jaxdrones train TASK --seed 0`.
+"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`, and the one for any vehicle.
 
-    python website/policies.py [TASK ...]
+    python website/policies.py [NAME ...]
 
 Finished trainings in runs/policies are kept, so that a stopped run goes on. It takes about an hour on one core.
 """
@@ -30,6 +30,7 @@ TASKS = (
     "sling",
     "transport",
 )
+_ANY = "any-vehicle"
 _FILES = ("best.json", "best.msgpack", "report.json")
 _HEAD = """# Bundled policies
 
@@ -45,17 +46,18 @@ unless all episodes have the same start.
 
 def main() -> None:
     """Train, copy the policies, and write the table of the README there."""
-    for task in sys.argv[1:] or TASKS:
-        run = RUNS / task
+    for name in sys.argv[1:] or (*TASKS, _ANY):
+        run = RUNS / name
         if not (run / "report.json").exists():
             shutil.rmtree(run, ignore_errors=True)
             command = [sys.executable, "-c", "import sys; from jaxdrones.cli import main; sys.exit(main())"]
-            subprocess.run([*command, "train", task, "--seed", "0", "--output", run], check=True)
+            task = ["hover", "--realistic", "any"] if name == _ANY else [name]
+            subprocess.run([*command, "train", *task, "--seed", "0", "--output", run], check=True)
             (run / "commit").write_text(_git("rev-parse", "--short", "HEAD"))
-        folder = BUNDLED / task
+        folder = BUNDLED.parent / _ANY if name == _ANY else BUNDLED / name
         folder.mkdir(parents=True, exist_ok=True)
-        for name in _FILES:
-            shutil.copy(run / name, folder / name)
+        for file in _FILES:
+            shutil.copy(run / file, folder / file)
         about = json.loads((folder / "report.json").read_bytes()) | {"commit": (run / "commit").read_text().strip()}
         (folder / "report.json").write_text(json.dumps(about, indent=2))
     rows = [_row(BUNDLED / task) for task in TASKS if (BUNDLED / task).exists()]

@@ -21,8 +21,8 @@ def add(commands) -> None:
     parser = commands.add_parser(
         "eval",
         help="evaluate a trained policy over many episodes",
-        description="Fly many episodes with the best policy of a run, your own policy (file.py:name), or raptor. Print "
-        "the success rate with its 95 % interval over distinct episodes, errors, and ends of episodes.",
+        description="Fly many episodes with the best policy of a run, your own policy (file.py:name), or one for all "
+        "vehicles. Print the success rate with its 95 % interval over distinct episodes, errors, and ends of episodes.",
         allow_abbrev=False,
     )
     parser.add_argument(
@@ -30,9 +30,9 @@ def add(commands) -> None:
         type=folder,
         metavar="RUN",
         help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); "
-        "file.py:name, whose code is executed; or raptor",
+        "any-vehicle or raptor; or file.py:name, whose code is executed",
     )
-    own = parser.add_argument_group("your own policy", "only with file.py:name or raptor")
+    own = parser.add_argument_group("your own policy", "only with file.py:name, any-vehicle or raptor")
     evaluation = parser.add_argument_group("evaluation")
     own.add_argument("--task", metavar="TASK", help="task to fly, as for `jaxdrones train`")
     add_vehicle(own)

@@ -64,9 +64,11 @@ def add(commands) -> None:
         type=folder,
         metavar="RUN",
         help="in place of FLIGHT: a folder of `jaxdrones train`; a task with a bundled policy (`jaxdrones list`), for "
-        "example forest; file.py:name, whose code is executed; or raptor",
+        "example forest; any-vehicle or raptor; or file.py:name, whose code is executed",
     )
-    policy.add_argument("--task", metavar="TASK", help="with file.py:name or raptor: task, as for `jaxdrones train`")
+    policy.add_argument(
+        "--task", metavar="TASK", help="with file.py:name, any-vehicle or raptor: task, as for `jaxdrones train`"
+    )
     add_realistic(policy, "with file.py:name: ")
     add_set(policy, "with file.py:name: option of the environment (action, observation, ...)")
     add_backend(bullet)

@@ -17,6 +17,7 @@ from jaxdrones.learning.raptor import Raptor
 
 _NETWORKS: dict[str, Callable[[], RecurrentPolicy]] = {
     "raptor": Raptor.load,
+    "any-vehicle": lambda: checkpoint.load(assets.folder() / "any-vehicle" / "best"),
 }
 POLICIES = tuple(_NETWORKS)
 """Policies for all vehicles; see `learning.adaptive`."""
@@ -26,7 +27,8 @@ def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
     """Bundled or published policy.
 
     Args:
-        name: a task with a bundled policy, for example `forest` (all: `jaxdrones list`), or `raptor`.
+        name: a task with a bundled policy, for example `forest` (all: `jaxdrones list`), or one for all
+            vehicles: `any-vehicle`, which was trained here, and `raptor`, which was published.
         env: environment that the policy is to fly in, of which its observations and actions are checked. Optional for
             a bundled policy, which flies in `jaxdrones.make(name)`, and in environments with the same observations.
 

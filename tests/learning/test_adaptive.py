@@ -69,10 +69,32 @@ def test_raptor_flies_a_vehicle_with_other_axes_like_its_turned_twin():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("vehicle", ["cf2x", "racer", "hummingbird"])
-def test_raptor_hovers_vehicles_of_30_to_1000_grams(vehicle):
+@pytest.mark.parametrize("policy", ["raptor", "any-vehicle"])
+@pytest.mark.parametrize("vehicle", ["cf2x", "cf2p", "racer", "hummingbird"])
+def test_a_policy_for_all_vehicles_hovers_30_to_1000_grams(vehicle, policy):
     env = make(vehicle=vehicle)
-    assert evaluate(env, jd.make_policy("raptor", env), KEY, 50).success > 0.9
+    assert evaluate(env, jd.make_policy(policy, env), KEY, 50).success > 0.85
+
+
+@pytest.mark.slow
+def test_the_policy_for_any_vehicle_hovers_drawn_ones_in_spite_of_delay_and_noise():
+    env = jd.make("hover", realistic="any", action="throttle")
+    assert evaluate(env, jd.make_policy("any-vehicle", env), KEY, 200).success > 0.93
+
+
+def test_the_policy_for_any_vehicle_has_less_weights_than_raptor_and_is_not_told_the_vehicle():
+    """The same observations give the same throttle, whatever the mass and the largest speed of the vehicle."""
+    weights = jd.make_policy("any-vehicle", make()).network.params
+    assert sum(leaf.size for leaf in jax.tree.leaves(weights)) <= 2084
+    heavy = jd.load_params("cf2x").replace(mass=0.05, max_rpm=40_000.0, kf=1e-9)
+    actions = []
+    for env in (make(), make(vehicle=heavy)):
+        policy = jd.make_policy("any-vehicle", env)
+        hidden = policy.initial_hidden_state((1,))
+        for obs in observations(env, 5)[0]:
+            hidden, action = policy.act(hidden, jnp.asarray(obs))
+        actions.append(action)
+    np.testing.assert_array_equal(*actions)
 
 
 def test_an_environment_that_raptor_cannot_fly_is_named():

@@ -1,0 +1,73 @@
+"""Does one policy hover every quadrotor, and for how long a delay and how strong a wind?
+
+Policies for all vehicles: `any-vehicle`, trained here by `jaxdrones train hover --realistic any`, and RAPTOR as
+published. Neither is told a parameter of the vehicle. Both fly the default starts of `hover` (up to 1 m, 1 m/s, 1 rad/s
+and 90 degrees away, scaled by the vehicle where it is drawn) in the same episodes:
+  NAME        a bundled vehicle, lagging rotors, without delay and noise;
+  drawn       vehicles of 20 g to 3 kg, drag, sensor noise, a delay of 0 to 40 ms, another one in every episode;
+  A to B kg   the same, vehicles of a class of masses;
+  delay       drawn vehicles with a delay in all episodes;
+  wind        drawn vehicles with a delay of 0 to 40 ms in Dryden gusts of 7.7 m/s at 20 ft.
+Success is within 5 cm and 0.1 m/s of the goal for the last two of five seconds, in wind within 25 cm.
+"""
+
+import argparse
+import dataclasses
+import itertools
+
+import jax
+
+import jaxdrones as jd
+from benchmarks.common import success_rate
+from benchmarks.leaderboard_scenarios import near
+from jaxdrones import assets
+from jaxdrones.envs import Env
+from jaxdrones.envs.randomize import AnyVehicle
+from jaxdrones.learning import evaluate
+from jaxdrones.learning.policies import POLICIES
+
+SEED = 1_000_000  # of the episodes: the same for all policies, and not that of a training
+MASSES = (0.02, 0.035, 0.1, 0.3, 1.0, 2.0, 3.0)  # kg, bounds of the classes
+DELAYS = (0, 20, 40)  # ms
+WIND = 7.7  # m/s at 20 ft
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--policies", nargs="+", choices=POLICIES, default=list(POLICIES))
+    parser.add_argument("--episodes", type=int, default=1000)
+
+
+def conditions() -> dict[str, Env]:
+    """Environments by name."""
+    found = {name: jd.make("hover", action="throttle", vehicle=name, rotors="lagging") for name in assets.vehicles()}
+    found["drawn"] = drawn()
+    for low, high in itertools.pairwise(MASSES):
+        found[f"{low:g} to {high:g} kg"] = drawn(realistic=True, randomize=(AnyVehicle(low, high),))
+    found |= {f"delay {delay} ms": drawn(delay=delay / 1000) for delay in DELAYS}
+    wind = drawn(disturbance=jd.dryden(WIND))
+    found[f"wind {WIND} m/s"] = dataclasses.replace(wind, task=dataclasses.replace(wind.task, success=near))
+    return found
+
+
+def drawn(realistic: bool | str = "any", **options) -> Env:
+    """Environment with another vehicle in every episode."""
+    return jd.make("hover", action="throttle", realistic=realistic, **options)
+
+
+def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
+    envs = conditions()
+    if options.quick:
+        options.episodes, envs = 2, {name: envs[name] for name in ("cf2x", "drawn")}
+    rows = []
+    for (name, env), policy in itertools.product(envs.items(), options.policies):
+        report = evaluate(env, jd.make_policy(policy, env), jax.random.key(SEED), options.episodes)
+        error = report.final_error_percentiles
+        row = {"condition": name, "policy": policy, "success": report.success, "interval": report.success_interval}
+        rows.append(row | {"error p50": error[50], "error p99": error[99]})
+    lines = ["condition        | policy      | success [95 % interval]  | error cm p50    p99"]
+    lines += [
+        f"{row['condition']:16} | {row['policy']:11} | {success_rate(row['success'], row['interval']):24} |"
+        f" {100 * row['error p50']:12.2f} {100 * row['error p99']:6.2f}"
+        for row in rows
+    ]
+    return {"episodes": options.episodes, "rows": rows}, lines

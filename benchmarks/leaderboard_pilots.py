@@ -8,6 +8,7 @@ package's weights or those tuned for LQR, MPC with those of the package.
 from __future__ import annotations
 
 import dataclasses
+import json
 import time
 from collections.abc import Callable
 from types import ModuleType
@@ -21,6 +22,7 @@ from jaxtyping import Array, Float
 
 import jaxdrones as jd
 from benchmarks.leaderboard_scenarios import SETPOINT, TRAINING, TUNING, Scenario, flight
+from jaxdrones import assets
 from jaxdrones.control import Setpoint, firmware_pid, geometric, mellinger, pid
 from jaxdrones.envs import Env
 from jaxdrones.envs.observations import last_actions
@@ -257,9 +259,17 @@ def trained(algorithm: str) -> Callable[[Scenario, Pilot], Obtained]:
     return obtain
 
 
-def named(name: str) -> Callable[[Scenario, Pilot], Obtained]:
-    """Policy for all vehicles, as it is."""
-    return lambda scenario, pilot: Obtained(make_policy(name, pilot.env(scenario)), 0.0, 0.0)
+def raptor(scenario: Scenario, pilot: Pilot) -> Obtained:
+    """RAPTOR as published."""
+    return Obtained(make_policy("raptor", pilot.env(scenario)), 0.0, 0.0)
+
+
+def any_vehicle(scenario: Scenario, pilot: Pilot) -> Obtained:
+    """The bundled policy for all vehicles, with the cost of its training."""
+    report = json.loads((assets.folder() / "any-vehicle" / "report.json").read_bytes())
+    config, env = report["recipe"]["config"], pilot.env(scenario)
+    flown = config["updates"] * config["worlds"] * config["horizon"] * env.dt
+    return Obtained(make_policy("any-vehicle", env), sum(report["seconds"].values()), flown, "seed 0")
 
 
 PILOTS: dict[str, Pilot] = {
@@ -276,6 +286,6 @@ PILOTS: dict[str, Pilot] = {
     "shac": Pilot(trained("shac")),
     "bptt": Pilot(trained("bptt")),
     "bptt-random": Pilot(trained("bptt"), realistic=True),
-    "raptor": Pilot(named("raptor"), action="throttle", needs="foundation_policy"),
-    "any-vehicle": Pilot(named("any-vehicle"), action="throttle"),
+    "raptor": Pilot(raptor, action="throttle", needs="foundation_policy"),
+    "any-vehicle": Pilot(any_vehicle, action="throttle"),
 }

@@ -65,7 +65,7 @@ class AdaptivePolicy(PyTreeNode):
         turned = (matrix.reshape(*matrix.shape[:-1], 3, 3) @ self.turn.T).reshape(matrix.shape)
         seen = jnp.concatenate([away, turned, vel, omega @ self.turn.T, last], axis=-1)
         hidden, own = self.network.act(hidden, seen)
-        own = jnp.clip(own, -1, 1)
+        own = jnp.clip(own, -1, 1).astype(last.dtype)
         return (hidden, own), jnp.zeros_like(own).at[..., jnp.array(self.order)].set(own)
 
 

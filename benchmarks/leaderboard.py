@@ -37,6 +37,7 @@ from jaxdrones.learning.networks import act, initial_hidden_state
 TIMED = 200  # commands of a timing
 SHORTEST = 0.1  # s, of calls of it
 FIGURE = tables.ROOT / "benchmarks/figures/leaderboard.png"
+_LINE = 5.0  # % between two names in the figure
 DRAWN = ("hover", "rotor-70", "airframes")
 COSTS = (
     ("seconds a command", 1e-6, "processor time of a command, us"),
@@ -226,6 +227,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     pilots = [name for name in PILOTS if all((name, scenario) in flown for scenario in DRAWN) and name != "nothing"]
     figure = Figure(figsize=(10, 4.5), layout="constrained")
     for axes, (key, unit, label) in zip(figure.subplots(1, 2, sharey=True), COSTS, strict=True):
+        axes.set(xscale="log", xlabel=label, ylim=(-3, 106))
+        dots = []
         for name, color in zip(pilots, colors(len(pilots)), strict=True):
             own = [flown[name, scenario] for scenario in DRAWN]
             success, x = [100 * row["success"] for row in own], own[0][key] / unit
@@ -233,8 +236,14 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 axes.plot([x, x], [min(success), np.mean(success)], color=color, linewidth=1, alpha=0.5)
                 axes.plot(x, np.mean(success), "o", color=color)
                 axes.plot(x, min(success), "_", color=color)
-                axes.annotate(name, (x, np.mean(success)), xytext=(5, 4), textcoords="offset points", color=color)
-        axes.set(xscale="log", xlabel=label, ylim=(-3, 106))
+                dots.append((float(np.mean(success)), x, name))
+        right = 4 * max(x for _, x, _ in dots)
+        below = math.inf
+        for success, x, name in sorted(dots, reverse=True):  # names in a column, none upon another
+            below = min(success, below - _LINE)
+            line = {"arrowstyle": "-", "color": "0.8", "linewidth": 0.7}
+            axes.annotate(name, (x, success), (right, below), va="center", arrowprops=line, fontsize=9)
+        axes.set_xlim(right=20 * right)
         axes.xaxis.set_minor_formatter("")
         axes.grid(which="major", alpha=0.2)
     figure.axes[0].set_ylabel(f"success in {', '.join(DRAWN)}, %")

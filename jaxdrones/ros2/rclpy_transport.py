@@ -39,7 +39,7 @@ class RclpyTransport:
         self._executor = rclpy.executors.SingleThreadedExecutor()
         self._executor.add_node(self._node)
         self._topics: list[tuple[Topic, bool]] = []
-        self._publishers: dict[Topic, Any] = {}
+        self._publishers: list[Any] = []
         self._said: set[str] = set()
         self._looked = -_LOOK
         self._subscriptions: list[tuple[Any, int, Callable[[Any], None]]] = []
@@ -47,7 +47,7 @@ class RclpyTransport:
     def publisher(self, topic: Topic) -> Callable[[msg.Message], None]:
         """Function that publishes messages."""
         publisher = self._node.create_publisher(ros_class(topic.type), f"/{topic.name}", _ros_qos(topic.qos))
-        self._publishers[topic] = publisher
+        self._publishers.append(publisher)
         self._topics.append((topic, True))
         return lambda message: publisher.publish(to_ros(message))
 
@@ -73,21 +73,20 @@ class RclpyTransport:
         self._node.create_service(_trigger(), f"/{name}", respond)
 
     def _deliver(self) -> None:
-        """Deliver all received messages; an executor takes one of a topic at a time, and those of a call unordered."""
+        """Deliver all received messages.
+
+        An executor delivers one message of a topic at a time, and may deliver a request before earlier messages.
+        """
         for end, depth, received in self._subscriptions:
             for _ in range(depth):
                 if (taken := end.handle.take_message(end.msg_type, False)) is None:
                     break
                 received(taken[0])
 
-    def subscribers(self, topic: Topic) -> int:
-        """Number of discovered subscribers of a published topic."""
-        return self._publishers[topic].get_subscription_count()
-
     def flush(self, timeout: float) -> None:
         """Wait at most `timeout` s for delivery to all readers."""
         end = time.monotonic() + timeout
-        for publisher in self._publishers.values():
+        for publisher in self._publishers:
             left = max(end - time.monotonic(), 1e-3)
             publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=left))
 

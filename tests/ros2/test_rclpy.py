@@ -77,12 +77,17 @@ def until(condition, *transports, timeout=180.0):
             time.sleep(0.02)
 
 
+def subscribers(transport):
+    """Whether every topic that a transport publishes has a subscriber."""
+    return all(publisher.get_subscription_count() for publisher in transport._publishers)
+
+
 def test_messages_arrive_in_order_and_none_is_lost(join):
     here, there, got = join(), join("peer"), []
     topic = topics.output(0, "odom")
     there.subscribe(topic, got.append)
     publish = here.publisher(topic)
-    until(lambda: here.subscribers(topic), here)
+    until(lambda: subscribers(here), here)
     sent = [msg.Odometry(msg.Header(convert.stamp(k), "world")) for k in range(150)]
     for message in sent:
         publish(message)
@@ -172,9 +177,8 @@ class Commander:
         self.transport, self.odom = transport, [[] for _ in range(drones)]
         for i, seen in enumerate(self.odom):
             transport.subscribe(topics.output(i, "odom"), seen.append)
-        self.commands = [topics.command(i, "cmd_pose") for i in range(drones)]
-        self.publish = [transport.publisher(topic) for topic in self.commands]
-        until(lambda: all(map(transport.subscribers, self.commands)) and all(map(self.hears, range(drones))), transport)
+        self.publish = [transport.publisher(topics.command(i, "cmd_pose")) for i in range(drones)]
+        until(lambda: subscribers(transport) and all(map(self.hears, range(drones))), transport)
         for seen in self.odom:  # states before both sides know each other may be missing
             del seen[:-1]
 

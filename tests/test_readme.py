@@ -87,7 +87,7 @@ FLIGHTS = {
         "hover: fly to the goal ... x of the target, from the drone +m +world ... speed of rotor 0 +RPM ... position "
         "+-1 ... lost ... semi_implicit_euler ... 0.027 kg"
     ),
-    "demo": Short(r"wrote runs/demo\.html \(1\.\d MB\)", "--no-open"),
+    "demo": Short(r"wrote runs/demo\.html \(2\.\d MB\)", "--no-open"),
     "list": Short("flights +circle, velocity ... vehicles +agilicious, bebop, cf21, cf21_brushless"),
 }
 FLIGHTS |= {

@@ -51,7 +51,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
 """Task -> options."""
 _OWN, _REAL, _WORD = "fly it yourself", "real flight", "thousand drones"
 _RECORDED = "B10_lissajous_slow_rep1"
-_WORD_RATE = 2.0  # rows per second
+_WORD_RATE = 1.5  # rows per second
 
 
 def main() -> None:

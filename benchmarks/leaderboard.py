@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +33,9 @@ from jaxdrones.envs import Env
 from jaxdrones.learning import evaluate
 from jaxdrones.learning.evaluation import wilson_interval
 from jaxdrones.learning.networks import act, initial_hidden_state
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TIMED = 200  # commands of a timing
 SHORTEST = 0.1  # s, of calls of it
@@ -237,14 +240,19 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 axes.plot(x, np.mean(success), "o", color=color)
                 axes.plot(x, min(success), "_", color=color)
                 dots.append((float(np.mean(success)), x, name))
-        right = 4 * max(x for _, x, _ in dots)
-        below = math.inf
-        for success, x, name in sorted(dots, reverse=True):  # names in a column, none upon another
-            below = min(success, below - _LINE)
-            line = {"arrowstyle": "-", "color": "0.8", "linewidth": 0.7}
-            axes.annotate(name, (x, success), (right, below), va="center", arrowprops=line, fontsize=9)
-        axes.set_xlim(right=20 * right)
+        if dots:
+            _label(axes, dots)
         axes.xaxis.set_minor_formatter("")
         axes.grid(which="major", alpha=0.2)
     figure.axes[0].set_ylabel(f"success in {', '.join(DRAWN)}, %")
     figure.savefig(path, dpi=120)
+
+
+def _label(axes: "Axes", dots: Sequence[tuple[float, float, str]]) -> None:
+    """Write the names of dots (success, x, name) in a column at the right, none upon another."""
+    right, below = 4 * max(x for _, x, _ in dots), math.inf
+    for success, x, name in sorted(dots, reverse=True):
+        below = min(success, below - _LINE)
+        line = {"arrowstyle": "-", "color": "0.8", "linewidth": 0.7}
+        axes.annotate(name, (x, success), (right, below), va="center", arrowprops=line, fontsize=9)
+    axes.set_xlim(right=20 * right)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -46,16 +47,18 @@ def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[...
         needed = jnp.broadcast_to(needed, (worlds,))
         count, size = jnp.sum(needed), max(worlds // one_in, 1)
 
-        index = jnp.nonzero(needed, size=worlds + -worlds % size, fill_value=worlds)[0]
-
-        def some(i: Array, found: Any) -> Any:
+        def some(i: Array, found: Any, index: Array) -> Any:
             to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
             at = jnp.minimum(to, worlds - 1)
             new = every([leaf[at] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)])
             return jax.tree.map(lambda all, x: all.at[to].set(x, mode="drop"), found, new)
 
+        def compute(zeros: Any) -> Any:
+            index = jnp.nonzero(needed, size=worlds + -worlds % size, fill_value=worlds)[0]
+            return jax.lax.fori_loop(0, -(-count // size), functools.partial(some, index=index), zeros)
+
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(every, leaves))
-        out = jax.lax.fori_loop(0, -(-count // size), some, zeros)
+        out = jax.lax.cond(count > 0, compute, lambda zeros: zeros, zeros)
         return out, jax.tree.map(lambda _: True, out)
 
     @jax.custom_jvp

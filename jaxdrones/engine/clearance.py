@@ -1,4 +1,4 @@
-"""Skip obstacle contact for drones that are provably clear.
+"""Skip obstacle contact of drones that are provably clear.
 
 The distance from the nearest obstacle is 1-Lipschitz in the position. One distance query a control step therefore gives
 a free ball around each drone, and contact is exact without any computation for as long as the drone stays in its ball.
@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxdrones.accelerate.where_needed import where_needed
+from jaxdrones.accelerate.stored import stored
+from jaxdrones.accelerate.where_needed import in_all_worlds, where_needed
 from jaxdrones.checks import with_scene
 from jaxdrones.dynamics.contact import contact_radius, rim, stop_at
+from jaxdrones.engine.physics import Contact
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.distances import merged
@@ -56,7 +58,7 @@ class FreeBalls(NamedTuple):
 class NearObstacles:
     """Obstacle contact in the physics steps of a control step, for drones outside their free balls.
 
-    Under `vmap`, only worlds with a drone outside its ball are computed.
+    Under `vmap`, contact is computed only in worlds with a drone outside its ball.
     """
 
     def __init__(self, contacts: Sequence[Callable], state: State, scene: Scene):
@@ -67,9 +69,28 @@ class NearObstacles:
             state: of the team at the start of the control step.
             scene: obstacles.
         """
-        self._contacts, self._scene, self._free = contacts, scene, FreeBalls.about(state, scene)
+        self._contacts, self._scene, self._free = contacts, scene, stored(FreeBalls.about(state, scene))
 
-    def contact(self, params: Params, state: State) -> Wrench:
+    def step(self, params: Params, before: State, advance: Callable[[Contact], State]) -> State:
+        """Team after a physics step among the obstacles.
+
+        Where no drone leaves its ball in any world, this is the unobstructed step, and so is its derivative.
+
+        Args:
+            params: of a team of n drones.
+            before: the team at the start of the step.
+            advance: contact with obstacles -> the team at the end of the step with this contact.
+        """
+        unobstructed = advance(_no_contact)
+        still = jax.lax.stop_gradient((params, before, unobstructed))
+        clear = jnp.all(self._free.hold(*still[:2]) & self._free.hold(still[0], still[2]))
+
+        def among_obstacles() -> State:
+            return self._stopped(params, before, advance(self._contact))
+
+        return jax.lax.cond(in_all_worlds(clear), lambda: unobstructed, among_obstacles)
+
+    def _contact(self, params: Params, state: State) -> Wrench:
         """Wrench of the obstacles on every drone of a team."""
 
         def on_all(params: Params, state: State, scene: Scene) -> Wrench:
@@ -79,7 +100,7 @@ class NearObstacles:
         still = jax.lax.stop_gradient((params, state))
         return where_needed(on_all, _ONE_IN)(~jnp.all(self._free.hold(*still)), params, state, self._scene)
 
-    def stopped(self, params: Params, before: State, after: State) -> State:
+    def _stopped(self, params: Params, before: State, after: State) -> State:
         """Team at the end of a physics step, with no drone inside or behind an obstacle, at any speed.
 
         Compliant contact yields, and depends on the start of a step alone, so the path of every step is swept. The
@@ -105,6 +126,10 @@ class NearObstacles:
         still = jax.lax.stop_gradient((params, before, after, self._scene))
         free = self._free.hold(*still[:2]) & self._free.hold(still[0], still[2])
         return jax.vmap(stop)(params, after, where_needed(find, _ONE_IN)(~jnp.all(free), *still))
+
+
+def _no_contact(params: Params, state: State) -> Wrench:
+    return Wrench(jnp.zeros_like(state.pos), jnp.zeros_like(state.pos))
 
 
 def _core(params: Params, state: State) -> Disc:

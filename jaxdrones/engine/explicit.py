@@ -173,8 +173,11 @@ class ExplicitStep(Step):
             @recomputed
             def substep(state: State, command: jax.Array) -> State:
                 start = physics.at_speed(params, state, command)
-                end = integrator(lambda s: derivative(params, s, command, scene, near and near.contact), start, dt)
-                return near.stopped(params, start, end) if near else end
+
+                def advance(contact: Contact | None) -> State:
+                    return integrator(lambda s: derivative(params, s, command, scene, contact), start, dt)
+
+                return near.step(params, start, advance) if near else advance(None)
 
             if substeps == 1:
                 return substep(state, command)

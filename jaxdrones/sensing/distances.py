@@ -122,9 +122,18 @@ def _distances(kind: Obstacle, point: Point) -> Array:
     return jax.vmap(one)(kind)
 
 
+@jax.custom_jvp
 def _distance_of_kind(kind: Any, point: Point) -> Number:
-    obstacle = _nearest_obstacle(kind, point)
-    return jnp.where(obstacle.active, obstacle.distance(obstacle.to_local(point)), jnp.inf)
+    return jnp.min(_distances(kind, point))
+
+
+@_distance_of_kind.defjvp
+def _distance_of_kind_jvp(primals: tuple, tangents: tuple) -> tuple[Number, Number]:
+    def to_nearest(kind: Any, point: Point) -> Number:
+        obstacle = _nearest_obstacle(kind, point)
+        return jnp.where(obstacle.active, obstacle.distance(obstacle.to_local(point)), jnp.inf)
+
+    return jax.jvp(to_nearest, primals, tangents)
 
 
 def _no_surface(point: Point) -> Surface:

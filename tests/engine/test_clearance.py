@@ -42,17 +42,28 @@ def flown(effect, integrator, state, scene=SCENE, substeps=12):
 
 @pytest.mark.parametrize("integrator", [jd.semi_implicit_euler, pytest.param(jd.rk4, marks=pytest.mark.slow)])
 @pytest.mark.slow
-def test_worlds_that_are_near_and_worlds_that_are_not_fly_as_if_all_were_computed(integrator):
-    """Where few and where most are near; at up to 20 m/s, with 1 m between two control steps."""
+def test_worlds_that_are_near_and_worlds_that_are_not_fly_as_if_all_were_computed(integrator, monkeypatch):
+    """Where few, most and none are near; at up to 20 m/s, with 1 m between two control steps."""
     fly = partial(flown, jd.obstacle_contact, integrator)
-    alone, together = jit_unoptimized(fly), jit_unoptimized(jax.vmap(fly))  # a world alone is always computed
-    for near in 50, 6:
-        states = starts(64, near, 20.0)
-        found = together(states)
-        each = [alone(jax.tree.map(lambda x, i=i: x[i], states)) for i in range(64)]
-        assert_close(found, jax.tree.map(lambda *x: jnp.stack(x), *each), 1e-9)
+    together, everywhere = jit_unoptimized(jax.vmap(fly)), jit_unoptimized(jax.vmap(fly))
+    cases = {near: starts(64, near, 20.0) for near in (50, 6, 0)}
+    fast = {near: together(states) for near, states in cases.items()}
+    monkeypatch.setattr(FreeBalls, "hold", lambda self, params, state: jnp.zeros(2, bool))
+    for near, states in cases.items():
+        found = fast[near]
+        assert_close(found, everywhere(states), 1e-9)
         pushed = np.any(np.asarray(found.vel != states.vel)[..., :2], axis=(1, 2))  # the rotors stand still
-        assert near / 2 < pushed.sum() <= near
+        assert near / 2 <= pushed.sum() <= near
+
+
+def test_the_gradient_far_from_obstacles_is_that_of_a_flight_without_them():
+    def end(scene, push):
+        state = jd.State.at_rest(jnp.array([(0.0, 0, 50), (1, 0, 50)])).replace(vel=push)
+        return jnp.sum(flown(jd.obstacle_contact, jd.rk4, state, scene, substeps=2).pos ** 2)
+
+    push = jnp.ones((2, 3))
+    found, free = (jax.grad(partial(end, scene))(push) for scene in (SCENE, Scene(ground=False)))
+    np.testing.assert_array_equal(found, free)
 
 
 @pytest.mark.slow

@@ -78,15 +78,8 @@ def check_number(
 ) -> None:
     """Raise unless `value` is one real number within the bounds, also after rounding to float32.
 
-    Args:
-        name: name of the value.
-        value: number; traced values pass.
-        unit: unit for the message.
-        at_least: inclusive lower bound.
-        above: exclusive lower bound.
-        at_most: inclusive upper bound.
-        below: exclusive upper bound.
-        infinite: whether infinity is allowed.
+    Traced values pass. The bounds `above` and `below` are exclusive; `infinite` allows infinity, `unit` is for the
+    message.
     """
     if not is_concrete(value):
         return

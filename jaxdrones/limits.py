@@ -28,13 +28,7 @@ def check_at_most(name: str, value: int, limit: int, minimum: int = 1) -> None:
 
 
 def check_memory(what: str, size: int, advice: str) -> None:
-    """Raise if `size` bytes exceed the memory of this computer.
-
-    Args:
-        what: subject of the message.
-        size: lower bound, bytes.
-        advice: remedy.
-    """
+    """Raise if `what` needs more bytes than this computer has, with advice; `size` is a lower bound."""
     held = memory()
     if size > held:
         raise UserError(f"{what} needs about {_readable(size)} of memory, there are {_readable(held)}; {advice}")

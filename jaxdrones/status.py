@@ -58,12 +58,7 @@ def is_finite(tree: Any) -> Bool[Array, ""]:
 
 
 def check_on_failure(on_failure: str, *given: Any) -> None:
-    """Raise `ValueError` for an unknown `on_failure`, or for `raise` with traced arguments.
-
-    Args:
-        on_failure: a name of `ON_FAILURE`.
-        given: arguments of the planner.
-    """
+    """Raise unless `on_failure` is in `ON_FAILURE`; `raise` needs concrete arguments of the planner."""
     check_choice("on_failure", on_failure, ON_FAILURE)
     if on_failure == "raise" and not all(map(is_concrete, jax.tree.leaves(given))):
         raise UserError(

@@ -80,11 +80,7 @@ def load_params(vehicle: str | os.PathLike) -> Params:
 
 
 def parse_params(name: str, text: str) -> Params:
-    """Constants of one drone from the text of a URDF; `name` is that of the file, for messages.
-
-    Raises:
-        ValueError: missing or invalid entries.
-    """
+    """Constants of one drone from the text of a URDF; `name` is that of the file, for messages."""
     return _params(_Urdf(Path(name), text.encode()))
 
 

@@ -26,11 +26,7 @@ def is_reference(text: str) -> bool:
 
 
 def split_reference(reference: str) -> tuple[Path, str]:
-    """Split `file.py:name` into file and name.
-
-    Raises:
-        ValueError: a missing name.
-    """
+    """Split `file.py:name` into file and name."""
     file, _, name = reference.rpartition(":")
     if not (file and name):
         file = reference.removesuffix(":")
@@ -39,11 +35,7 @@ def split_reference(reference: str) -> tuple[Path, str]:
 
 
 def read_text(file: Path) -> str:
-    """Read the text of a user's file.
-
-    Raises:
-        ValueError: the file cannot be read.
-    """
+    """Read the text of a user's file."""
     try:
         return file.read_text(encoding="utf-8")
     except OSError as error:
@@ -53,11 +45,7 @@ def read_text(file: Path) -> str:
 
 
 def load(reference: str) -> Any:
-    """Load the object `file.py:name` by executing the file.
-
-    Raises:
-        ValueError: the file cannot be read or executed, or does not define the name.
-    """
+    """Load the object `file.py:name` by executing the file."""
     file, name = split_reference(reference)
     return definition(file.name, read_text(file), name)
 
@@ -65,13 +53,7 @@ def load(reference: str) -> Any:
 def definition(file: str, text: str, name: str) -> Any:
     """Object of a name in the text of a Python file; equal texts are executed once.
 
-    Args:
-        file: name of the file, for messages.
-        text: code to execute. It may import libraries, but no files beside it.
-        name: name of the object, for example a function.
-
-    Raises:
-        ValueError: the text cannot be executed, or does not define the name.
+    The code may import libraries, but no files beside it; `file` is its name in messages.
     """
     module = _executed(file, text)
     if name not in vars(module):

@@ -14,9 +14,6 @@ def replaced(file: str | os.PathLike) -> Iterator[Path]:
 
     If the context raises, or the process is killed, the old file is unchanged. Special files, such as /dev/stdout, are
     written in place.
-
-    Raises:
-        OSError: the file cannot be written.
     """
     file = Path(file)
     if file.exists() and not file.is_file():
@@ -37,11 +34,7 @@ def replaced(file: str | os.PathLike) -> Iterator[Path]:
 
 
 def write(file: Path, content: bytes) -> None:
-    """Write a file atomically.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write a file atomically."""
     with replaced(file) as new:
         new.write_bytes(content)
 

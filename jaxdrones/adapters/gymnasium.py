@@ -58,9 +58,6 @@ class GymnasiumEnv(gymnasium.Env):
             team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
             render_mode: `rgb_array` or `None`.
             **options: options of `jaxdrones.make`.
-
-        Raises:
-            ValueError: an invalid argument of `jaxdrones.make`.
         """
         self.env, self.render_mode = as_env(task, options), render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / self.env.dt)}
@@ -148,10 +145,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
                 `reset(options={"reset_mask": ...})`.
             render_mode: `rgb_array` or `None`.
             **options: options of `jaxdrones.make`.
-
-        Raises:
-            ValueError: an invalid argument of `jaxdrones.make`.
-            TypeError: an unknown option.
         """
         self.env, self.num_envs, self._numpy = as_env(task, options), num_envs, numpy
         if max_episode_steps is not None:

@@ -78,11 +78,7 @@ def of_gymnasium(space: gymnasium.Space, spaces: Spaces) -> Any:
 
 
 def action_table(discrete_actions: Any, size: int) -> Float[Array, "k a"]:
-    """Validated table of discrete actions, one a row.
-
-    Raises:
-        ValueError: not a table of finite numbers with rows of `size`.
-    """
+    """Validated table of discrete actions, one a row."""
     table = np.asarray(discrete_actions, np.float32)
     check_shape("discrete_actions", table, ("k", size), "one row for every discrete action")
     check_finite("discrete_actions", table)

@@ -31,16 +31,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
 
     @checked
     def __init__(self, task: str | Task | Env, *, render_mode: pictures.RenderMode = None, **options: Any):
-        """Wrap an environment.
-
-        Args:
-            task: a name, a task, or an environment.
-            render_mode: `rgb_array` or `None`.
-            **options: options of `jaxdrones.make`.
-
-        Raises:
-            ValueError: an invalid argument of `jaxdrones.make`.
-        """
+        """Wrap an environment; arguments are those of `GymnasiumEnv`."""
         self.env = as_env(task, options)
         self.render_mode = render_mode
         self.metadata = {

@@ -22,15 +22,7 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
     """One world with agents `drone_0`, `drone_1`, ...; episodes begin and end for all of them at once."""
 
     def __init__(self, task: str | Task | Env, **options: Any):
-        """Wrap an environment.
-
-        Args:
-            task: a name, a task, or an environment.
-            **options: options of `jaxdrones.make`.
-
-        Raises:
-            ValueError: an invalid argument of `jaxdrones.make`.
-        """
+        """Wrap an environment: a name, a task or an environment, and options of `jaxdrones.make`."""
         super().__init__()
         self.env = as_env(task, options)
         self.possible_agents = [f"drone_{i}" for i in range(self.env.drones)]

@@ -42,9 +42,6 @@ class VecEnv(vec_env.VecEnv):
             seed: seed of the first reset; SB3's algorithms set it too.
             render_mode: `rgb_array` or `None`.
             **options: options of `jaxdrones.make`, and `team_reward`, `sum` or `mean` of the rewards of the drones.
-
-        Raises:
-            ValueError: an invalid argument of `jaxdrones.make`.
         """
         self.envs = gymnasium.VectorEnv(task, num_envs, render_mode=render_mode, **options)
         self.render_mode = render_mode
@@ -96,19 +93,11 @@ class VecEnv(vec_env.VecEnv):
         return [getattr(self.envs, attr_name) for _ in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Unsupported: all worlds are one compiled step.
-
-        Raises:
-            ValueError: always.
-        """
+        """Unsupported: all worlds are one compiled step."""
         raise UserError(f"attribute {attr_name} cannot be set in a compiled environment; give it as an option")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Unsupported: all worlds are one compiled step.
-
-        Raises:
-            ValueError: always.
-        """
+        """Unsupported: all worlds are one compiled step."""
         raise UserError(f"method {method_name} cannot be called: the environments are one compiled step")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

@@ -61,12 +61,7 @@ class Session:
 
 
 def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:
-    """Environment from a name, a task, or an environment.
-
-    Raises:
-        ValueError: an invalid argument of `jaxdrones.make`.
-        TypeError: an unknown option, or options beside an environment.
-    """
+    """Environment from a name, a task, or an environment."""
     if not isinstance(task, Env):
         return make(task, **options)
     if options:
@@ -83,9 +78,6 @@ def rewarding(team_reward: Annotated[str, choice("team_reward", ("sum", "mean"))
 
     Args:
         team_reward: `sum`, as in gym-pybullet-drones' `MultiHoverAviary`, or `mean`, independent of the team's size.
-
-    Raises:
-        ValueError: another name.
     """
     return lambda rewards: getattr(rewards, team_reward)(-1)
 

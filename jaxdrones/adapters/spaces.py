@@ -80,11 +80,7 @@ class Layout:
         return stack(rows, axis=len(batch))
 
     def gather_present(self, actions: Any, present: Collection[str]) -> Any:
-        """`gather` for the agents that are still in the world; actions of the others are zero.
-
-        Raises:
-            ValueError: as for `gather`.
-        """
+        """`gather` for the agents that are still in the world; actions of the others are zero."""
         if isinstance(actions, Mapping):
             left = [name for name in self.names if name not in present]
             actions = dict.fromkeys(left, np.zeros(self.size, np.float32)) | dict(actions)

@@ -40,18 +40,7 @@ class VectorEnv(BaseVectorEnv):
         team_reward: str = "sum",
         **options: Any,
     ):
-        """Create the worlds.
-
-        Args:
-            task: a name, a task, or an environment.
-            num_envs: number of worlds.
-            seed: seed of the first reset of all worlds.
-            team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
-            **options: options of `jaxdrones.make`.
-
-        Raises:
-            ValueError: an invalid argument of `jaxdrones.make`.
-        """
+        """Create the worlds; arguments are those of `GymnasiumEnv`; `seed` is that of the first reset."""
         self.env, self.env_num = as_env(task, options), num_envs
         self.is_async = self.is_closed = False
         self._layout = Layout(self.env, None)
@@ -65,11 +54,7 @@ class VectorEnv(BaseVectorEnv):
         return [value] * int(self._mask(id).sum())
 
     def set_env_attr(self, key: str, value: Any, id: Any = None) -> None:
-        """Unsupported: all worlds are one compiled step.
-
-        Raises:
-            ValueError: always.
-        """
+        """Unsupported: all worlds are one compiled step."""
         raise UserError(f"attribute {key} cannot be set in a compiled environment; give it as an option")
 
     def seed(self, seed: int | Sequence[int] | None = None) -> list[int]:

@@ -144,11 +144,7 @@ def check_options(options: argparse.Namespace, **ranges: Check) -> None:
 
 
 def check_writable(file: Path) -> None:
-    """Raise unless a file can be written; create its folder.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Raise unless a file can be written; create its folder."""
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))

@@ -42,12 +42,7 @@ def add_conditions(parser: argparse.ArgumentParser) -> None:
 
 
 def fly_options(options: argparse.Namespace, **more: Any) -> FlightLog:
-    """Fly with the options of the command line and a progress bar; return the log.
-
-    Args:
-        options: options of the command line.
-        more: further arguments of `fly`.
-    """
+    """Fly with the options of the command line, `more` arguments of `fly`, and a progress bar; return the log."""
     with progress() as report:
         return fly(options.flight, progress=report, **_conditions(options), **more)
 
@@ -65,11 +60,7 @@ def _conditions(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def warn(diverged: dict[str, str]) -> int:
-    """Write a warning for a diverged flight to stderr; return the exit code.
-
-    Args:
-        diverged: result of `diverged`.
-    """
+    """Write a warning for a diverged flight to stderr; return the exit code."""
     if not diverged:
         return 0
     others = f" (and {len(diverged) - 1} more)" if len(diverged) > 1 else ""

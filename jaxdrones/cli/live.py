@@ -21,11 +21,7 @@ def add_live(parser: argparse._ActionsContainer, what: str) -> None:
 
 @contextlib.contextmanager
 def live_server(port: int | None, quiet: bool, title: str | None = None) -> Iterator[Live | None]:
-    """Context with a server, or `None` without a port; prints the address, on stderr if `quiet`.
-
-    Raises:
-        ValueError: a port in use.
-    """
+    """Context with a server, or `None` without a port; prints the address, on stderr if `quiet`."""
     if port is None:
         yield None
         return
@@ -42,15 +38,7 @@ class LiveTraining:
     """Live view of a training: learning curve and an episode of the newest policy after every evaluation."""
 
     def __init__(self, live: Live, trainer: Any, run: Any, what: str, then: Callable[[int, dict[str, float]], None]):
-        """Prepare, without a flight.
-
-        Args:
-            live: live view.
-            trainer: trainer of the run.
-            run: run with the newest policy.
-            what: title.
-            then: function for the progress afterwards.
-        """
+        """Prepare, without a flight; `what` is the title, and `then` gets the progress afterwards."""
         self._live, self._trainer, self._run, self._what = live, trainer, run, what
         self._then = then
         self._name = "success" if trainer.env.task.success is not None else "return"

@@ -44,15 +44,8 @@ def open_policy(
 ) -> Any:
     """Open the run in a folder, the policy of a user's file, a bundled or a published one, with a common interface.
 
-    Args:
-        policy: folder of a run, `file.py:name`, or the name of a bundled or published policy.
-        task: task for the policy of a file or a published one; `None` for a run and a bundled one.
-        realistic: as in `jaxdrones.make`; false for a run and a bundled one.
-        options: options of `jaxdrones.make`; empty for a run and a bundled one.
-        last: whether to open the newest policy of a run, not the best.
-
-    Raises:
-        ValueError: a missing task, or options that contradict a run.
+    A run and a bundled policy have their own task and options: for them `task` is `None`, `realistic` false and
+    `options`, those of `jaxdrones.make`, are empty. `last` opens the newest policy of a run, not the best.
     """
     from jaxdrones.training.run import Run
     from jaxdrones.training.user_policy import UserPolicy

@@ -98,11 +98,7 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
 
 
 def asked_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Settings of --set, --drones and --vehicle.
-
-    Raises:
-        ValueError: a duplicate, or a --set that is not NAME=VALUE.
-    """
+    """Settings of --set, --drones and --vehicle."""
     changes = parse_settings(options.set)
     given = {name: getattr(options, name) for name in ("drones", "vehicle") if getattr(options, name) is not None}
     for name in given:
@@ -121,11 +117,7 @@ def _value(text: str) -> Any:
 
 @contextlib.contextmanager
 def user_mistakes(changes: dict[str, Any], task: str):
-    """Context that converts errors caused by options of a task to a `UserError` with their names.
-
-    Raises:
-        UserError: in place of an error of Python or JAX outside of a user's file.
-    """
+    """Context that converts errors caused by options of a task to a `UserError` with their names."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError) as error:

@@ -78,14 +78,7 @@ class ProgressDisplay(contextlib.ExitStack):
     """Progress bar, with a line for every evaluation."""
 
     def __init__(self, total: int | None, what: str, episodes: int, print_line):
-        """Prepare; the bar appears with the first call of `update`.
-
-        Args:
-            total: number of updates of the whole training; `None` if unknown.
-            what: label, such as the seed.
-            episodes: number of episodes of an evaluation.
-            print_line: function to print a line.
-        """
+        """Prepare; the bar appears with the first call of `update`."""
         super().__init__()
         self._total, self._what, self._episodes, self._print_line = total, what, episodes, print_line
         self._bar: Any = None
@@ -151,12 +144,7 @@ def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
 
 
 def show_results(request: Request, runs: dict) -> int:
-    """Draw learning curves, choose the best seed, and print the results.
-
-    Args:
-        request: request with the folder for the figure and, with several seeds, the best policy.
-        runs: run of each seed.
-    """
+    """Draw learning curves, choose the best seed, and print the results."""
     from jaxdrones.training.run import Run
     from jaxdrones.training.selection import best_of, score_of
 

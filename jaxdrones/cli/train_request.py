@@ -49,11 +49,7 @@ class Request:
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> Request:
-        """Request of a command line.
-
-        Raises:
-            UserError: options that are out of range or contradictory.
-        """
+        """Request of a command line."""
         episodes = whole(limit=LARGEST_COUNT)
         check_options(options, seeds=whole(limit=_MAX_SEEDS), seed=check_seed, episodes=episodes)
         if options.seed is not None:
@@ -81,11 +77,7 @@ class Request:
         )
 
     def swept(self, sweep: list[str]) -> list[Request]:
-        """Request for each combination of the values of --sweep, each with its own folder.
-
-        Raises:
-            UserError: a sweep that is not NAME=VALUE,VALUE,..., or that is also in --set.
-        """
+        """Request for each combination of the values of --sweep, each with its own folder."""
         rows = [parse_sweep(text) for text in sweep]
         for name, _ in rows:
             if name in self.settings:
@@ -118,11 +110,7 @@ class Request:
         return command + f" --seeds {self.seeds}" * (self.seeds > 1) + f" --seed {first}" * (first > 0)
 
     def runs(self) -> dict:
-        """Run of each seed.
-
-        Raises:
-            UserError: nothing to continue.
-        """
+        """Run of each seed."""
         from jaxdrones.training.run import Run
 
         run = Run(self.output)
@@ -225,13 +213,7 @@ def parse_budget(text: str | None) -> tuple[int | None, float | None]:
 
 
 def remaining(runs: dict, updates: int, seconds: float | None) -> dict:
-    """Runs to train: all, or without the finished ones if nothing more is requested.
-
-    Args:
-        runs: run of each seed.
-        updates: requested number of updates.
-        seconds: requested time, s.
-    """
+    """Runs to train: all, or without the finished ones if no more updates or time (s) are requested."""
     longer = seconds is not None or updates > max((_updates(run) for run in runs.values() if run.started), default=0)
     return {seed: run for seed, run in runs.items() if longer or not (run.finished and _is_complete(run))}
 
@@ -259,13 +241,9 @@ def _not_free(run) -> UserError:
 
 
 def _total(had: int, requested: int | None, more: bool, finished: bool) -> int:
-    """Total number of updates of a resumed run.
+    """Total number of updates of a resumed run that had `had`.
 
-    Args:
-        had: total number of updates so far.
-        requested: requested number of updates.
-        more: whether to add it to those of a finished run, as with --budget, or to take it as the total, as with --set.
-        finished: whether the run is finished.
+    `more` adds the requested ones to those of a finished run, as --budget does; else they are the total, as by --set.
     """
     if requested is None:
         return had

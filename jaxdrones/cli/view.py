@@ -119,11 +119,7 @@ def _finish(options: argparse.Namespace, files: list[Path], about: dict[str, Any
 
 
 def _flights(paths: list[Path]) -> tuple[dict[Path, Path], list[Path]]:
-    """Logs of flights by path, and paths without a log, as of `runs/compare/*`.
-
-    Raises:
-        ValueError: no flight among the paths, or a missing path.
-    """
+    """Logs of flights by path, and paths without a log, as of `runs/compare/*`."""
     skipped = [path for path in paths if path.exists() and not _is_flight(path)]
     if len(skipped) == len(paths) > 1:
         raise UserError(f"none of {', '.join(map(str, paths))} is a flight; give the folders of `jaxdrones fly`")

@@ -80,13 +80,7 @@ def duty_cycle(motor: Motor, command: Float[Array, "4"], battery: Float[Array, "
 def mix(
     thrust: Float[Array, ""], torque: Float[Array, "3"], mixer: Float[Array, "4 3"] | None = None
 ) -> Float[Array, "4"]:
-    """Commands of the motors, not limited.
-
-    Args:
-        thrust: thrust of each motor, 16 bit.
-        torque: roll, pitch, yaw, 16 bit, right-handed body axes.
-        mixer: share of each motor in the torques; by default the firmware's for a Crazyflie in X configuration.
-    """
+    """Commands of the motors from thrust and torque, 16 bit, not limited; by default in the X of a Crazyflie."""
     shares = jnp.array(_MIXER) if mixer is None else mixer
     return jnp.stack([thrust + vector.dot(share, torque) for share in vector.components(shares)])
 

@@ -32,11 +32,7 @@ _CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name !
 
 
 def check_command(params: Params, state: State, rpm: ArrayLike) -> Float[Array, "n 4"]:
-    """Validated commanded rotor speeds in the precision of the state.
-
-    Raises:
-        ValueError: the arrays are not those of one team of n drones.
-    """
+    """Validated commanded rotor speeds in the precision of the state."""
     command = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
     check_team(params, state, command)
     return command

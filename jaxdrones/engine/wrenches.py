@@ -42,17 +42,7 @@ def _name(function: Callable) -> str:
 
 
 def check_wrench(name: str, function: Callable, wrench: Wrench, drones: int | None = None) -> Wrench:
-    """Validated wrench of a function.
-
-    Args:
-        name: argument of `make_step` with the function.
-        function: its function.
-        wrench: result of the function.
-        drones: number of drones of a team; `None` for one drone.
-
-    Raises:
-        ValueError: the result is not a wrench on one drone or on the team.
-    """
+    """Validated wrench that a function of the argument `name` of `make_step` returned; `drones` of a team."""
     called = f"{name}: {describe([function])}"
     if not isinstance(wrench, Wrench):
         given = f"an array of shape {wrench.shape}" if isinstance(wrench, jax.Array) else short_repr(wrench)

@@ -27,11 +27,7 @@ _processes: set[int] = set()  # in which environments were made
 
 
 def check_process() -> None:
-    """Raise in a process forked after environments were made, where JAX would hang.
-
-    Raises:
-        RuntimeError: a forked process; the message explains how to spawn one.
-    """
+    """Raise in a process forked after environments were made, where JAX would hang."""
     if os.getpid() not in _processes:
         if _processes:
             raise RuntimeError(
@@ -43,11 +39,7 @@ def check_process() -> None:
 
 
 def scene_example(scene: Scene | DrawScene) -> Scene:
-    """Scene, or shapes and types of a random scene.
-
-    Raises:
-        ValueError: neither a scene nor a function that returns one.
-    """
+    """Scene, or shapes and types of a random scene."""
     if isinstance(scene, Scene):
         return scene
     if not callable(scene):
@@ -141,13 +133,7 @@ def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> 
 
 
 def _check_functions(task: Task, world: World, dt: float) -> None:
-    """Validate target, rewards, conditions, metrics, `advance` and `success` of a task.
-
-    Args:
-        task: the task.
-        world: traced world at the start of an episode.
-        dt: control period, s.
-    """
+    """Validate target, rewards, conditions, metrics, `advance` and `success` in a traced world at the start."""
     n = task.drones
     if not _is_own(task.target):
         where, target = _where("target", task.target), task.target(world.variables, world.time)
@@ -170,14 +156,7 @@ def _check_functions(task: Task, world: World, dt: float) -> None:
 
 
 def check_policy(name: str, policy: Any, obs: Any, shape: tuple[int, int]) -> None:
-    """Raise unless a policy returns actions for an observation.
-
-    Args:
-        name: of the policy.
-        policy: function of observations, or a recurrent policy.
-        obs: observations of the team, or their shapes.
-        shape: of the actions.
-    """
+    """Raise unless a policy, recurrent or not, returns actions of this shape for observations (or their shapes)."""
 
     def act(obs):
         state, action = None, None

@@ -53,14 +53,7 @@ TASKS: dict[str, Callable[..., Task]] = {
 
 
 def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
-    """Function of a task by name or from a file.
-
-    Args:
-        task: a name of `TASKS`, `file.py:function`, or the function itself.
-
-    Raises:
-        ValueError: an unknown name, or a file that does not define the function.
-    """
+    """Function of a task: by a name of `TASKS`, from `file.py:function`, or the function itself."""
     if callable(task):
         return task
     if isinstance(task, str) and user_code.is_reference(task):
@@ -72,17 +65,7 @@ def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
 
 
 def make_task(task: str | Task | Callable[..., Task], options: dict[str, Any], others: Collection[str]) -> Task:
-    """Task for the arguments of `jaxdrones.make`.
-
-    Args:
-        task: a task, or an argument of `task_function`.
-        options: keyword arguments of the function.
-        others: names of the other options of `jaxdrones.make`, for error messages.
-
-    Raises:
-        ValueError: an unknown name, or a function that does not return a task.
-        TypeError: an unknown option.
-    """
+    """Task for the arguments of `jaxdrones.make`; `others` are the names of its other options, for messages."""
     if isinstance(task, Task):
         if options:
             option = next(iter(options))

@@ -110,9 +110,6 @@ def layers_of(policy: Policy, images: tuple[Tensor, ...]) -> Graph:
         policy: policy with a network of this library.
         images: images that it observes, in the order of their names: `depth` (height, width) and `rgb`
             (height, width, 4).
-
-    Raises:
-        ValueError: a user's network, or another one with unknown layers.
     """
     assert not policy.per_agent, "give the policy of one drone"
     network = policy.network

@@ -89,22 +89,14 @@ class ClosedLoopInputs(NamedTuple):
 
 
 def closed_loop_columns(log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Set-points of position (K, 3) and heading (K,), PWM (K, 4) and battery voltage (K,) of a log.
-
-    Raises:
-        UserError: a missing column.
-    """
+    """Set-points of position (K, 3) and heading (K,), PWM (K, 4) and battery voltage (K,) of a log."""
     if not log.has("target_pos", "pwm", "vbat"):
         raise UserError(f"{log.name}: has no set-points; add ref_pos, ref_yaw, pwm and vbat for a closed loop")
     return log.target_pos[:, 0], log.target_yaw[:, 0], log.pwm[:, 0], log.vbat[:, 0]
 
 
 def rows_after_climb(log: FlightLog) -> slice:
-    """Rows from the end of the climb to the landing.
-
-    Raises:
-        ValueError: the log has no set-points and battery, or the drone is never near the height of its set-point.
-    """
+    """Rows from the end of the climb to the landing."""
     ref_pos, *_ = closed_loop_columns(log)
     height = log.pos[:, 0, 2]
     up = log.in_flight & (height > _MIN_HEIGHT) & (np.abs(height - ref_pos[:, 2]) < _CLIMB_TOLERANCE)

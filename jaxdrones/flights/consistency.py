@@ -90,10 +90,7 @@ _ALL_NED = "all columns look like NED axes (z down in world and body)"
 def contradictions(motion: Motion, thrusts: np.ndarray, sag: float) -> list[str]:
     """Contradictions within a flight, a sentence each with the likely cause.
 
-    Args:
-        motion: of the T rows with running motors.
-        thrusts: (T, 4) relative thrusts of the motors.
-        sag: of the battery at take-off, V.
+    Motion and relative thrusts (T, 4) are those of the rows with running motors; `sag` is the battery's at take-off, V.
     """
     found, read = _check_axes(motion)
     found = (found or _check_scales(motion) or _check_headings(motion)) + check_motors(

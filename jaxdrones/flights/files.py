@@ -44,11 +44,7 @@ _DAMAGE = (OSError, ValueError, EOFError, KeyError, NotImplementedError, Runtime
 
 
 def find_log(path: str | os.PathLike) -> Path:
-    """Find a log: a bundled one by its name, a file, a bag, or the log in a folder of `jaxdrones fly`.
-
-    Raises:
-        UserError: no log.
-    """
+    """Find a log: a bundled one by its name, a file, a bag, or the log in a folder of `jaxdrones fly`."""
     path = assets.flights().get(os.fspath(path), Path(path))
     if path.is_file() or (path / "metadata.yaml").is_file():
         return path
@@ -105,11 +101,7 @@ def read_log(path: str | os.PathLike) -> FlightLog:
 
 
 def arrays_of(log: FlightLog, pwm: bool = False) -> dict[str, np.ndarray]:
-    """Arrays of a log by name; conditions, parameters and scene are JSON; `pwm` adds the Crazyflie's PWM signals.
-
-    Raises:
-        UserError: PWM of a vehicle other than the Crazyflie.
-    """
+    """Arrays of a log by name; conditions, parameters and scene are JSON; `pwm` adds the Crazyflie's PWM signals."""
     if pwm:
         check_pwm(log.conditions.vehicle)
     texts = {

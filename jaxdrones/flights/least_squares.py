@@ -97,16 +97,9 @@ def normal_equations(
     mask: Array,
     motors: Motors | None,
 ) -> Normal:
-    """Normal equations of one flight at the coordinates x.
+    """Normal equations of one flight at the coordinates x of the parameters; at x = 0 they are the vehicle's.
 
-    Args:
-        vehicle: the vehicle at x = 0.
-        names: names of the n parameters.
-        x: (n,) coordinates of the parameters.
-        scale: (horizons, 4) scales of the residuals.
-        windows: windows of the flight.
-        mask: (windows,) 1 for a window, 0 for padding.
-        motors: see `predict`.
+    Residuals are scaled by `scale` (horizons, 4); `mask` (windows,) is 1 for a window, 0 for padding.
     """
     matrix, gradient, loss, robust = _normal(
         vehicle, names, jnp.asarray(x, float), jnp.asarray(scale, float), windows, mask, motors

@@ -50,12 +50,7 @@ class Windows(NamedTuple):
 
 
 def cut_windows(log: FlightLog, starts: np.ndarray) -> Windows:
-    """Cut windows of a log at the given rows.
-
-    Args:
-        log: log of the flight.
-        starts: (n,) rows, from `window_starts`.
-    """
+    """Cut windows of a log at the given rows, from `window_starts`."""
     command = log.rpm[:, 0] if log.has("rpm") else _duty_and_voltages(log)
     padded = np.pad(command, ((_WARM_UP + _MAX_DELAY, _MAX_DELAY + 1), (0, 0)), mode="edge")
     rows = starts[:, None] + np.arange(_WARM_UP + _LENGTH + 2 * _MAX_DELAY + 1)
@@ -68,11 +63,7 @@ def cut_windows(log: FlightLog, starts: np.ndarray) -> Windows:
 
 
 def window_starts(log: FlightLog, stride: int = 1) -> np.ndarray:
-    """Every `stride`-th row with the drone in flight up to the last horizon.
-
-    Raises:
-        ValueError: no such row.
-    """
+    """Every `stride`-th row with the drone in flight up to the last horizon."""
     flying = np.convolve(~log.in_flight, np.ones(_LENGTH + 1), mode="valid") == 0
     starts = np.flatnonzero(flying)[::stride]
     if not len(starts):
@@ -158,10 +149,7 @@ def mean_errors(
 ) -> Float[Array, "horizons 4"]:
     """Mean norms of the errors over n windows: position (m), velocity (m/s), angle (rad), angular velocity (rad/s).
 
-    Args:
-        predicted: predicted states (n, horizons, ...).
-        logged: logged states at the same times.
-        weights: weights of the windows with sum one; by default equal.
+    States are (n, horizons, ...); the weights of windows sum to one, and are equal by default.
     """
     errors = jax.vmap(jax.vmap(_error))(predicted, logged)
     return jnp.mean(errors, axis=0) if weights is None else jnp.tensordot(weights, errors, 1)

@@ -82,11 +82,7 @@ def default_parameters(has_rotor_speeds: bool) -> tuple[str, ...]:
 
 
 def select_parameters(names: Sequence[str]) -> tuple[str, ...]:
-    """Expand names of parameters or fields to parameters, for example `inertia` to three axes.
-
-    Raises:
-        ValueError: an unknown name, or too many parameters.
-    """
+    """Expand names of parameters or fields to parameters, for example `inertia` to three axes."""
     fields = {parameter.field for parameter in PARAMETERS.values()}
     selected: dict[str, None] = {}
     for name in names:

@@ -74,11 +74,7 @@ def inconsistencies(log: FlightLog) -> list[str]:
 
 
 def named_apart(logs: Sequence[FlightLog]) -> list[FlightLog]:
-    """Logs with unique names: equal names get the differing folders of their files, or a number.
-
-    Raises:
-        UserError: a duplicate drone of a file.
-    """
+    """Logs with unique names: equal names get the differing folders of their files, or a number."""
     given = [(log.file.resolve(), log.labels) for log in logs if log.file is not None]
     for twice in (one for one in given if given.count(one) > 1):
         raise UserError(f"{twice[0]} is given twice; give each flight once")

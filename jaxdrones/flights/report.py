@@ -18,11 +18,7 @@ from jaxdrones.writing import write
 
 
 def write_vehicle(folder: Path, report: Report, started_from: str) -> None:
-    """Write `vehicle.urdf` and `report.json` into a new or empty folder.
-
-    Raises:
-        ValueError: files of an earlier fit in the folder.
-    """
+    """Write `vehicle.urdf` and `report.json` into a new or empty folder."""
     check_no_fit(folder)
     folder.mkdir(parents=True, exist_ok=True)
     flights = ", ".join(report.per_flight) or "flights"

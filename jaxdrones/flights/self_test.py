@@ -28,14 +28,8 @@ def self_test(backend: str) -> str | None:
     and yaws at a constant angular acceleration: after k steps of dt the semi-implicit Euler method has moved it by
     exactly a dt^2 k (k + 1) / 2. On the explicit backend the gradient of the climb in the mass is compared, too.
 
-    Args:
-        backend: `explicit` or `bullet`.
-
     Returns:
         `None` on success, else a message.
-
-    Raises:
-        ImportError: the Bullet backend without pybullet.
     """
     single = load_params("cf2x")
     single = single.replace(rotor_inertia=jnp.zeros_like(single.rotor_inertia))

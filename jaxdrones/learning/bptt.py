@@ -55,12 +55,7 @@ def gradient_step(
 ) -> tuple[S, dict[str, Array]]:
     """Simulate a trajectory of all worlds and take one gradient step on its rewards.
 
-    Args:
-        env: environment.
-        config: settings.
-        state: training state.
-        act: actions of all drones by the policy.
-        learning: drones whose rewards count.
+    The policy acts for all drones by `act`; the rewards of the drones in `learning` count.
     """
     key, start_key, restart_key, collect_key = jax.random.split(state.key, 4)
     progress = collect.progress_of(env, config, state.step)

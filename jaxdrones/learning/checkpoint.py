@@ -86,13 +86,7 @@ def save_tree(path: str | os.PathLike, tree: Any, **about: Any) -> None:
 def load_tree(path: str | os.PathLike, like: Any) -> Any:
     """Load a tree of `save_tree`, bit for bit.
 
-    Args:
-        path: path without a suffix.
-        like: tree of the same structure, shapes and dtypes, for example from `jax.eval_shape`.
-
-    Raises:
-        FileNotFoundError: there is no checkpoint.
-        ValueError: the files are damaged, or the shapes differ.
+    `like` has its structure, shapes and dtypes, for example from `jax.eval_shape`; `path` has no suffix.
     """
     path = Path(path)
     wanted, sidecar = jax.eval_shape(_without_keys, like), read_sidecar(path)

@@ -93,14 +93,7 @@ def empty_worlds(env: Env, count: int, policy: Policy | None = None) -> Worlds:
 
 
 def draw_starts(key: jax.Array, env: Env, count: int, progress: Array | None = None) -> Starts:
-    """Draw the starts of episodes.
-
-    Args:
-        key: random key.
-        env: environment.
-        count: number of worlds.
-        progress: progress of training, see `progress_of`.
-    """
+    """Draw the starts of episodes in `count` worlds; `progress` is that of `progress_of`."""
     obs, episodes = jax.vmap(AutoReset(env, progress).reset)(jax.random.split(key, count))
     return sharding.on_every_device((obs, _without_constants(env, episodes)))
 
@@ -221,13 +214,7 @@ def _with_constants(env: Env, episode: Episode) -> Episode:
 
 
 def progress_of(env: Env, config: Any, step: Array) -> Array | None:
-    """Progress of training in [0, 1] for a task with a curriculum; `None` for other tasks.
-
-    Args:
-        env: environment.
-        config: settings of a learner; `updates` is used.
-        step: () updates made.
-    """
+    """Progress of training in [0, 1] after `step` updates for a task with a curriculum; `None` for others."""
     task = getattr(env, "task", None)
     return (step / config.updates).astype(jnp.float32) if task and takes(task.start, "progress") else None
 
@@ -244,14 +231,7 @@ def deterministic(policy: Policy) -> Act:
 def update_obs_stats(
     statistics: RunningStatistics, trajectory: Trajectory, config: Any, step: Array
 ) -> RunningStatistics:
-    """Update the statistics with the observations of the valid steps of a trajectory, until they are frozen.
-
-    Args:
-        statistics: statistics so far.
-        trajectory: trajectory.
-        config: settings of a learner; `obs_stats_window`, `obs_stats_freeze` and `updates` are used.
-        step: () updates made.
-    """
+    """Update the statistics with the observations of the valid steps of a trajectory, until they are frozen."""
     obs = state_vector(trajectory.obs)
     new = statistics.update(obs, window=config.obs_stats_window * obs[..., 0].size, where=~trajectory.was_done)
     frozen = step >= config.obs_stats_freeze * config.updates

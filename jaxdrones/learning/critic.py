@@ -21,14 +21,7 @@ from jaxdrones.learning.normalize import map_state_vector, state_vector
 
 
 def init_critic(key: jax.Array, env: Env, policy: Policy, config: Any) -> Any:
-    """Parameters of the critic.
-
-    Args:
-        key: random key.
-        env: environment.
-        policy: policy of the critic.
-        config: settings of shac or ppo.
-    """
+    """Parameters of the critic of a policy."""
     centralized = getattr(config, "centralized_critic", False)
     n, size = env.drones, env.observation_size + (env.privileged_size if config.privileged_critic else 0)
     size = n * size + (n - 1) * env.action_size if centralized else size
@@ -39,13 +32,7 @@ def init_critic(key: jax.Array, env: Env, policy: Policy, config: Any) -> Any:
 
 
 def discounted_value(config: Any, params: Any, critic_obs: Obs) -> Float[Array, "*batch n"]:
-    """Discounted sum of future rewards; the network's output is that sum times one minus `gamma`.
-
-    Args:
-        config: settings of shac or ppo.
-        params: parameters of the critic.
-        critic_obs: observations of the critic, normalized.
-    """
+    """Discounted sum of future rewards; the network's output is that sum times one minus `gamma`."""
     network = make_network(critic_obs, config.critic_hidden_sizes, 1, 0.01)
     return apply(network, params, critic_obs, config.per_agent)[1][..., 0] / (1 - config.gamma)
 

@@ -83,16 +83,10 @@ def evaluate(env: Env, policy: AnyPolicy, key: Key, episodes: int = 1000) -> Rep
 def compile_evaluation(
     env: Env, policy: Any, episodes: int, devices: Sequence[jax.Device] | None = None
 ) -> Callable[[AnyPolicy, jax.Array], Report]:
-    """Compile `evaluate` for policies of one structure: (policy, key) -> report.
+    """Compile `evaluate` for policies of one structure on the explicit backend: (policy, key) -> report.
 
-    Args:
-        env: environment of the explicit backend.
-        policy: pytree policy, or its shapes.
-        episodes: number of episodes.
-        devices: devices of this host that share the episodes, if they can share them equally; by default all of them.
-
-    Raises:
-        ValueError: more episodes than fit in memory.
+    `policy` is one of them, or its shapes. The devices of this host share the episodes, if they can share them equally;
+    by default all of them.
     """
     check_episodes(env, episodes)
     split = functools.partial(jax.random.split, num=episodes)

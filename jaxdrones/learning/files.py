@@ -41,16 +41,7 @@ def save_bytes(file: Path, content: bytes, **about: Any) -> None:
 
 
 def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
-    """Content of a file of `save_bytes`.
-
-    Args:
-        file: path with its suffix.
-        sidecar: content of its sidecar, from `read_sidecar`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it cannot be read, or does not match the sidecar.
-    """
+    """Content of a file of `save_bytes` (with its suffix) that must match its sidecar, from `read_sidecar`."""
     found = [content for content in map(_read, (file, writing.beside(file))) if content is not None]
     for content in found:
         if _digest(content) == sidecar["sha256"]:
@@ -65,12 +56,7 @@ def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
 
 
 def read_sidecar(path: str | os.PathLike) -> dict[str, Any]:
-    """Content of the sidecar of a checkpoint.
-
-    Raises:
-        FileNotFoundError: there is no checkpoint.
-        ValueError: the sidecar is damaged, or of another version of this library.
-    """
+    """Content of the sidecar of a checkpoint."""
     path = Path(path)
     file = _sidecar_file(path)
     content = _read(file)

@@ -103,12 +103,7 @@ def scale_gradient(tree: Any, factor: Scalar) -> Any:
 
 @jax.custom_vjp
 def limit_gradient(worlds: Any, limit: Scalar) -> Any:
-    """Identity, in which the gradient of no world is longer than `limit` times the median of all worlds.
-
-    Args:
-        worlds: pytree of arrays (w, ...).
-        limit: largest ratio.
-    """
+    """Identity, in which the gradient of no world is longer than `limit` times the median of all worlds."""
     return worlds
 
 

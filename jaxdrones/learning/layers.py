@@ -206,9 +206,6 @@ def make_network(
         recurrent_size: size of the hidden state of a GRU; 0 for none.
         sets: sets in the observation.
         set_sizes: sizes of the layers that encode a row of a set.
-
-    Raises:
-        ValueError: an unsupported kind of image.
     """
     channels: tuple[int, ...] = ()
     strides: tuple[int, ...] = ()

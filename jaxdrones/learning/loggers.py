@@ -87,14 +87,7 @@ class KeepBest:
     """Evaluation of that policy."""
 
     def __init__(self, env: Env, key: jax.Array, every: int = 20, episodes: int = 200):
-        """Prepare the evaluations.
-
-        Args:
-            env: environment to evaluate in.
-            key: random key of the episodes, common to all policies.
-            every: updates between evaluations.
-            episodes: episodes per evaluation.
-        """
+        """Evaluate in `env` after `every` updates, in the same `episodes` of a random key for all policies."""
         self._env, self._key, self._every, self._episodes = env, key, every, episodes
         self._evaluate: Any = None
 
@@ -117,11 +110,7 @@ _NAMED: dict[str, Callable[[Path], Any]] = {
 
 
 def logger_names(names: str | None) -> list[str]:
-    """The names in a text such as `tensorboard,wandb`; none for `None`.
-
-    Raises:
-        UserError: an unknown name.
-    """
+    """The names in a text such as `tensorboard,wandb`; none for `None`."""
     wanted = names.split(",") if names else []
     for name in wanted:
         if name not in _NAMED:
@@ -130,15 +119,7 @@ def logger_names(names: str | None) -> list[str]:
 
 
 def named_loggers(names: str | None, folder: Path) -> list[Any]:
-    """The loggers of a run.
-
-    Args:
-        names: as for `logger_names`.
-        folder: folder of the run.
-
-    Raises:
-        UserError: an unknown name, or a library that is not installed.
-    """
+    """The loggers of a run, for names as of `logger_names`; `folder` is that of the run."""
     return [_NAMED[name](folder) for name in logger_names(names)]
 
 

@@ -52,11 +52,7 @@ def make_policy(name: str, env: Env | None = None) -> AnyPolicy:
 
 
 def check_fits(name: str, policy: Policy, env: Env) -> None:
-    """Check that a policy has the observations and actions of an environment, and a network for each of its drones.
-
-    Raises:
-        ValueError: it has not; the message calls the policy `name`.
-    """
+    """Raise unless a policy, called `name`, fits the observations, actions and number of drones of an environment."""
     own = policy.obs_stats.mean.size, policy.network.output_size
     expected = env.observation_size, env.action_size
     if own != expected:

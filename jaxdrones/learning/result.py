@@ -167,18 +167,10 @@ def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result
 
 
 def check_gradients(nonfinite: Sequence[int] | np.ndarray, patience: int = PATIENCE, before: int = 0) -> int:
-    """Raise after too many consecutive updates with gradients that are not finite.
+    """Raise `Diverged` after `patience` consecutive updates with gradients that are not finite.
 
-    Args:
-        nonfinite: (updates,) number of gradients of each update that are not finite.
-        patience: number of such updates in a row at which to raise.
-        before: number of consecutive such updates before these.
-
-    Returns:
-        The number of consecutive such updates at the end.
-
-    Raises:
-        Diverged: too many updates in a row.
+    `nonfinite` (updates,) is their number in each update, and `before` the number of such updates in a row before
+    these. Return the latter at the end.
     """
     streak = before
     for count in nonfinite:
@@ -191,15 +183,10 @@ def check_gradients(nonfinite: Sequence[int] | np.ndarray, patience: int = PATIE
 def cosine_adam(
     learning_rate: Scalar, steps: Scalar, max_grad_norm: Scalar, adam_b2: Scalar = 0.999
 ) -> optax.GradientTransformation:
-    """Adam with clipped gradients and a cosine decay of the learning rate to zero.
+    """Adam with clipped gradients and a cosine decay of the learning rate to zero in a number of steps.
 
-    All parameters are flattened to one vector, which compiles faster.
-
-    Args:
-        learning_rate: initial learning rate.
-        steps: number of steps of the decay.
-        max_grad_norm: largest norm of a gradient; see `clip_gradient`.
-        adam_b2: decay rate of Adam's mean of squared gradients.
+    All parameters are flattened to one vector, which compiles faster; `adam_b2` is the decay rate of the mean of
+    squared gradients.
     """
 
     def schedule(step):  # optax.cosine_decay_schedule, for a traced number of steps
@@ -209,14 +196,7 @@ def cosine_adam(
 
 
 def adapted_learning_rate(config: Any, updates: Scalar, learning_rate: Scalar, kl: Scalar) -> Array:
-    """Learning rate of PPO after an update, adapted to the divergence from the behavior policy.
-
-    Args:
-        config: settings of ppo.
-        updates: number of updates, this one included.
-        learning_rate: learning rate of this update.
-        kl: divergence of the updated policy from the behavior policy of this update.
-    """
+    """Learning rate of PPO after `updates` updates, adapted to the divergence from the behavior policy."""
     raised = jnp.where(kl < config.target_kl / 2, _RATE_FACTOR, 1)
     factor = jnp.where(kl > 2 * config.target_kl, 1 / _RATE_FACTOR, raised)
     high = annealed(config, updates, config.max_learning_rate, config.min_learning_rate)

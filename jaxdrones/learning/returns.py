@@ -40,19 +40,10 @@ def advantages(
 ) -> Float[Array, "t *w"]:
     """Generalized advantage estimation (Schulman et al. 2016), exact at time limits.
 
-    A termination ends the sum with a value of zero, a truncation with the value of the last observation.
-
-    Args:
-        reward: reward of every step.
-        value: value of the observation before the step.
-        next_value: value of the observation after the step, before a new episode starts.
-        terminated: whether the step terminated the episode.
-        truncated: whether the step truncated the episode.
-        gamma: discount factor.
-        gae_lambda: 0 sums one step, 1 all steps to the end of the episode.
-
-    Returns:
-        The advantages; the sums of advantage and value are the TD(lambda) targets of the value.
+    A termination ends the sum with a value of zero, a truncation with the value of the last observation. The values are
+    those of the observations before and after each step, the latter before a new episode starts. A `gae_lambda` of 0
+    sums one step, of 1 all steps to the end of the episode. The sums of advantage and value are the TD(lambda) targets
+    of the value.
     """
     td_error = reward + gamma * jnp.where(terminated, 0, next_value) - value
     decay = jnp.where(terminated | truncated, 0, gamma * gae_lambda)

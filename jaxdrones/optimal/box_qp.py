@@ -13,14 +13,7 @@ def box_qp(
 ) -> tuple[Float[Array, " m"], Bool[Array, " m"]]:
     """Minimize x H x / 2 + g x between bounds, by projected Newton steps (Tassa, Mansard, Todorov 2014, algorithm 1).
 
-    Args:
-        hessian: (m, m) H, symmetric, positive.
-        gradient: (m,) g.
-        low: (m,) lower bounds.
-        high: (m,) upper bounds, not below the lower ones.
-
-    Returns:
-        The minimizer (m,), and the mask of its free components, between their bounds.
+    H is symmetric and positive. Return the minimizer (m,), and the mask of its free components, between their bounds.
     """
     sizes = jnp.asarray(_STEP_SIZES, gradient.dtype)
 

@@ -44,15 +44,7 @@ class Recorder:
     """Writer of messages to a new bag; a context manager that finishes it."""
 
     def __init__(self, path: Path):
-        """Start a bag.
-
-        Args:
-            path: new folder, for an MCAP file and `metadata.yaml`.
-
-        Raises:
-            ValueError: an existing path, or a parent without write access.
-            ImportError: rosbags is not installed.
-        """
+        """Start a bag in a new folder: an MCAP file and `metadata.yaml`."""
         msg.typestore()
         from rosbags.rosbag2 import StoragePlugin, Writer
 

@@ -113,11 +113,7 @@ class Backend:
 
 
 def thrust_of(rpm: np.ndarray) -> np.ndarray:
-    """Thrust of a Crazyflie's rotor by the fit of Crazyswarm2, N; never negative.
-
-    Args:
-        rpm: speeds of any shape, RPM.
-    """
+    """Thrust of a Crazyflie's rotor at speeds (RPM) by the fit of Crazyswarm2, N; never negative."""
     return np.maximum(np.polyval(_GRAMS, rpm), 0) * _NEWTON_PER_GRAM
 
 
@@ -128,11 +124,7 @@ def _parameter(node: Any, name: str, default: Any) -> Any:
 
 
 def _rotors_of_motors(places: np.ndarray) -> np.ndarray:
-    """Number of the Crazyflie's motor in the quadrant of each rotor (4, 3) of a vehicle.
-
-    Raises:
-        ValueError: not an X configuration.
-    """
+    """Number of the Crazyflie's motor in the quadrant of each rotor (4, 3) of a vehicle."""
     signs = [
         tuple(row) for row in np.sign(np.where(np.abs(places[:, :2]) < 1e-6, 0, places[:, :2])).astype(int).tolist()
     ]

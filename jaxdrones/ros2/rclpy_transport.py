@@ -128,11 +128,7 @@ class RclpyTransport:
 
 
 def ros_class(kind: str) -> Any:
-    """Class of a message type in the installed ROS 2.
-
-    Raises:
-        ImportError: its package is not installed.
-    """
+    """Class of a message type in the installed ROS 2."""
     package, _, name = kind.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)

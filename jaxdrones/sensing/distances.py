@@ -57,13 +57,7 @@ def _as_solid(obstacle: Rounded) -> Solid:
 
 
 def distance_of(kinds: list[Any], ground: bool, point: Point) -> Number:
-    """Signed distance of a point from the nearest of some solids, m; infinity where there are none.
-
-    Args:
-        kinds: obstacles, each kind with a leading axis.
-        ground: whether all points below z = 0 are a solid, too.
-        point: (3,) m, world.
-    """
+    """Signed distance of a point from the nearest of some solids, m; infinity where there are none."""
     distances = [jnp.full((), jnp.inf, point.dtype)]
     if ground:
         distances.append(point[2])
@@ -81,10 +75,9 @@ def nearest_of(kinds: list[Any], ground: bool, point: Point) -> Surface:
 
 
 def nearest_few_of(kinds: list[Any], ground: bool, point: Point, count: int) -> Surface:
-    """The nearest surfaces of each of the `count` nearest solids, nearest first; other arguments as for `distance_of`.
+    """The nearest surfaces of each of the `count` nearest solids, nearest first.
 
-    Returns:
-        Surfaces with a leading axis of length `count`; there is none in the last ones of a smaller scene.
+    The leading axis has length `count`; the last ones of a smaller scene have no surface.
     """
     missing = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), _no_surface(point))
     surfaces = [missing] + [jax.vmap(_surface, in_axes=(0, None))(kind, point) for kind in kinds]
@@ -96,12 +89,9 @@ def nearest_few_of(kinds: list[Any], ground: bool, point: Point, count: int) -> 
 
 
 def touched_of(kinds: list[Any], points: Float[Array, "m 3"], within: Number) -> Surface:
-    """Nearest surface to each of several points close together, where it is nearer than `within`.
+    """Nearest surface to each of several points close together, where it is nearer than `within` (m).
 
-    Args:
-        kinds: obstacles, each kind with a leading axis; at least one kind.
-        points: m, world.
-        within: m; where nothing is nearer, the result is the surface of an arbitrary obstacle.
+    Where nothing is nearer, it is the surface of an arbitrary obstacle.
     """
     surfaces = [_touched_of_kind(kind, points, within) for kind in kinds]
     return functools.reduce(jax.vmap(_nearer), surfaces)
@@ -184,14 +174,9 @@ def _nearest_within(kind: Any, points: Float[Array, "m 3"], within: Number) -> I
 
 
 def fold_near(kind: Any, point: Point, reach: Number, look: Callable[[Any, Any, Any], Any], found: Any) -> Any:
-    """Fold a function over the obstacles of a kind within `reach` of a point, the nearest first; no gradient.
+    """Fold a function over the obstacles of a kind within `reach` (m) of a point, the nearest first; no gradient.
 
-    Args:
-        kind: obstacles with a leading axis.
-        point: m, world.
-        reach: m.
-        look: `look(found, obstacle, index)` returns the next value of `found`.
-        found: initial value.
+    `look(found, obstacle, index)` returns the next value of `found`.
     """
     kind, point, reach = jax.lax.stop_gradient((kind, point, reach))
 

@@ -118,16 +118,7 @@ def _check_clocks(sensors: Sequence[Sensor], dt: float) -> None:
 
 
 def init_sensors(sensors: Sequence[Sensor], key: jax.Array, params: Params) -> dict[str, Any]:
-    """Memories of the sensors of a team at the start of an episode.
-
-    Args:
-        sensors: with unique names.
-        key: a random key.
-        params: of a team of n drones.
-
-    Returns:
-        Memories by sensor name; every leaf has a leading axis of n drones.
-    """
+    """Memories by name of the sensors of a team of n drones at the start of an episode, each with n rows."""
     n = len(params.mass)
     keys = jax.random.split(key, (len(sensors), n))
     return {sensor.name: jax.vmap(sensor.init)(keys[i], params) for i, sensor in enumerate(sensors)}
@@ -142,22 +133,16 @@ def measure_sensors(
     scene: Scene,
     memories: dict[str, Any],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """One measurement of every sensor of a team.
+    """Memories and readings by name after one measurement of every sensor of a team of n drones, each with n rows.
 
     Args:
         sensors: with unique names.
         key: a random key.
-        params: of a team of n drones.
+        params: of the team.
         state: of the team.
         rate: the time derivative of `state`, as `step.rate` returns it.
         scene: of the world.
         memories: by sensor name, from `init_sensors` or the previous measurement.
-
-    Returns:
-        Memories and readings by sensor name; every leaf has a leading axis of n drones.
-
-    Raises:
-        ValueError: a sensor did not return its memory and a reading made of arrays.
     """
     n = len(params.mass)
     keys = jax.random.split(key, (len(sensors), n))
@@ -178,12 +163,8 @@ def hold_between(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Hold memories and readings between the measurements of sensors with their own rates.
 
-    Args:
-        sensors: with unique names.
-        step: () number of control steps since the start of the episode.
-        dt: control period, s.
-        before: memories and readings before this step; without readings every sensor measures.
-        after: memories and readings if every sensor measures at this step.
+    `step` counts control steps of `dt` (s) since the start of the episode. Without readings `before`, every sensor
+    measures; `after` is what it then has.
     """
     if not before[1]:
         return after

@@ -13,14 +13,10 @@ _CLASSES: dict[str, Any] = {kind.__name__: kind for kind in (*KINDS.values(), Me
 
 
 def scene_to_dict(scene: Scene) -> dict[str, Any]:
-    """Convert the scene of one world to a JSON object; inactive obstacles are left out.
+    """Convert the concrete scene of one world to a JSON object; inactive obstacles are left out.
 
-    Args:
-        scene: concrete, not traced.
-
-    Returns:
-        `ground`, whether there is a ground plane, and `obstacles`, a list of objects with the `kind` (such as `Box`)
-        and the fields of each obstacle.
+    It has `ground`, whether there is a ground plane, and `obstacles`, a list of objects with the `kind` (such as `Box`)
+    and the fields of each obstacle.
     """
     return {"ground": scene.ground, "obstacles": [_to_dict(solid) for solid in scene.numbered.values()]}
 

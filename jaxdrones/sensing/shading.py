@@ -28,15 +28,9 @@ def shade(
     index: Int[Array, "h w"],
     depth: Float[Array, "h w"],
 ) -> UInt8[Array, "h w 4"]:
-    """Red, green, blue and opacity of every pixel.
+    """Red, green, blue and opacity of every pixel, which shows the solid `index` at `depth` (m).
 
-    Args:
-        view: rays.
-        solids: visible solids.
-        colors: of every solid, 0 to 1.
-        ground: index of the ground, the last of the solids, if there is one.
-        index: solid of each pixel.
-        depth: of its surface, m; rounding of it is invisible.
+    Rounding of the depth is invisible. Colors are 0 to 1; `ground` is the index of the ground, the last of the solids.
     """
     color = _painted(view, solids if ground is None else solids[:-1], colors, index, depth)
     rays = [x + view.u * y + view.v * z for x, y, z in view.axes.T]  # world

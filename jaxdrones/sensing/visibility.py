@@ -75,14 +75,7 @@ def surfaces(view: View, solids: Solids, active: list[Array]) -> tuple[Float[Arr
 
 
 def normals(view: View, solids: Solids, index: Int[Array, "h w"], depth: Float[Array, "h w"]) -> Components:
-    """Normals of the visible surfaces in camera axes (forward, left, up), scaled to a product of 1 with (1, u, v).
-
-    Args:
-        view: rays.
-        solids: visible solids.
-        index: solid of each pixel.
-        depth: of its surface, m.
-    """
+    """Normals of the visible surfaces in camera axes (forward, left, up), scaled to a product of 1 with (1, u, v)."""
 
     def choose(slopes: Array, solid: Placed, active: Array, i: Array) -> Array:
         left, up = solid.slopes(view.u, view.v, depth)

@@ -51,13 +51,7 @@ def seen_from(x: Float[Array, "n 3"], index: Int[Array, "n k"] | None) -> Float[
 def closest_approach(
     pos: Float[Array, "*p 3"], vel: Float[Array, "*p 3"], horizon: float
 ) -> tuple[Float[Array, "*p"], Float[Array, "*p 3"]]:
-    """Time of the closest approach at constant velocities, between now and `horizon` (s), and the position then.
-
-    Args:
-        pos: relative positions, m.
-        vel: relative velocities, m/s.
-        horizon: latest time, s.
-    """
+    """Time of the closest approach at constant relative velocities, from now to `horizon` (s), and the position (m)."""
     time = jnp.clip(-jnp.sum(pos * vel, axis=-1) / (jnp.sum(vel**2, axis=-1) + _SLOW), 0, horizon)
     return time, pos + vel * time[..., None]
 
@@ -65,12 +59,9 @@ def closest_approach(
 def nearest_on_the_way(
     before: Float[Array, "n 3"], pos: Float[Array, "n 3"], index: Int[Array, "n k"] | None
 ) -> Float[Array, " n"]:
-    """Smallest distance of every drone from the indexed ones on straight ways between two control steps, m.
+    """Smallest distance of every drone from those of its `index` between two control steps, m; `None` for all.
 
-    Args:
-        before: positions at the last control step, m.
-        pos: positions now, m.
-        index: other drones of every drone; `None` for all.
+    Positions are joined by straight ways.
     """
     start, move = seen_from(before, index), seen_from(pos - before, index)
     length = jnp.sum(move**2, axis=-1)

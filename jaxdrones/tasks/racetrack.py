@@ -47,11 +47,7 @@ GATE_ENTRIES = tuple(
 def scene_of(level: int) -> Scene | Callable[[jax.Array], Scene]:
     """Scene of a level, or a function `(key) -> Scene` for levels with random tracks.
 
-    Args:
-        level: 0 and 1 nominal; 2 gates and poles displaced; 3 random tracks without poles.
-
-    Raises:
-        ValueError: an unknown level.
+    Levels 0 and 1 are nominal, 2 has gates and poles displaced, 3 random tracks without poles.
     """
     if level not in LEVELS:
         raise UserError(f"level is {short_repr(level)}; give one of {', '.join(map(str, LEVELS))}")
@@ -64,11 +60,7 @@ def randomization_of(level: int) -> tuple[Callable[[jax.Array, Params], Params],
 
 
 def gates_of(scene: Scene, dtype: DTypeLike) -> Float[Array, "4 4"]:
-    """Gates of a scene: x, y, z of the centers (m) and headings (rad).
-
-    Raises:
-        ValueError: the scene does not begin with four gates.
-    """
+    """Gates of a scene: x, y, z of the centers (m) and headings (rad)."""
     beams = BEAMS * len(GATES)
     if scene.boxes is None or len(scene.boxes.pos) < beams:
         found = 0 if scene.boxes is None else len(scene.boxes.pos)

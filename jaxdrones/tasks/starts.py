@@ -30,11 +30,7 @@ def hovering(params: Params, pos: Float[Array, "n 3"]) -> State:
 def above_ground(spread: Annotated[float, _SPREAD]) -> Callable[[jax.Array, Params], tuple[State, Float[Array, "n 3"]]]:
     """Start of gym-pybullet-drones, optionally with random heights: the state, and its positions.
 
-    Args:
-        spread: half width of the range of heights, m; drones start above the ground.
-
-    Raises:
-        ValueError: a number out of range.
+    Heights have a range of `spread` (m) to either side; drones start above the ground.
     """
     lower = min(spread, _CLEARANCE)
 

@@ -26,16 +26,7 @@ class PolicyPilot:
     """Policy that acts with collective thrust and body rates; Betaflight controls the rates."""
 
     def __init__(self, env: Env, policy: AnyPolicy, seed: int = 0):
-        """Start an episode of the task, whose drone is the simulated one.
-
-        Args:
-            env: environment of the policy, with one drone.
-            policy: policy.
-            seed: of the goals.
-
-        Raises:
-            UserError: an environment with another action type, sensors, cameras or several drones.
-        """
+        """Start an episode of the task, whose only drone is the simulated one; `seed` is that of the goals."""
         if env.action.name != ACTION or env.action.entries is None:
             raise UserError(
                 f"the policy acts by {env.action.name!r}, for which Betaflight has no sticks; train one with "

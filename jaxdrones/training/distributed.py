@@ -25,16 +25,10 @@ _READY = b"ready"  # answer of host 0
 @checked
 @contextlib.contextmanager
 def join_hosts(hosts: Count, host: int, coordinator: str, timeout: float = _TIMEOUT) -> Iterator[None]:
-    """Context of one of several hosts; enter it before any other use of JAX.
+    """Context of one of several hosts, counted from 0; enter it before any other use of JAX.
 
-    Args:
-        hosts: number of hosts.
-        host: number of this host, from 0.
-        coordinator: address and free port of host 0, such as 127.0.0.1:9911.
-        timeout: time to wait for the other hosts, s.
-
-    Raises:
-        ValueError: an invalid argument, or a host without connection.
+    `coordinator` is the address and a free port of host 0, such as 127.0.0.1:9911; `timeout` is the time to wait for
+    the others, s.
     """
     if not 0 <= host < hosts:
         raise UserError(f"host is {host}; give 0 to {hosts - 1}, a different number on each of the {hosts} hosts")

@@ -204,12 +204,7 @@ def _step(env: Env, decide: Decide, carry: tuple, key: jax.Array) -> tuple[tuple
 
 
 def _held(rows: tuple, before: tuple) -> tuple:
-    """Rows of a leg with the last values of every drone whose episode has ended.
-
-    Args:
-        rows: the leg.
-        before: rows before it, or for the first leg its own, all of whose drones are still active in the first row.
-    """
+    """Rows of a leg with the last values, of `before` it, of every drone whose episode has ended."""
     at = slice(0, 1) if before is rows else slice(-1, None)
     rows = jax.tree.map(lambda old, new: np.concatenate([old[at], new]), before, rows)
     active = rows[-1]

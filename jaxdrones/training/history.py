@@ -25,15 +25,7 @@ class Evaluated(NamedTuple):
 
 
 def fly_history(run: Run, env: Env) -> list[Evaluated]:
-    """Fly an episode with every policy in the history of a run.
-
-    Args:
-        run: run of a training that keeps its history.
-        env: environment of the run.
-
-    Raises:
-        ValueError: there is no history, or it is damaged.
-    """
+    """Fly an episode with every policy in the history of a run."""
     if not run.kept:
         raise UserError(
             f"{run.folder} holds no policies of its evaluations; train with --keep-history, or give that of one seed"

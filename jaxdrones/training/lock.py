@@ -20,15 +20,8 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)  # of file systems wi
 def locked(folder: Path, warn: Callable[[str], None]) -> Iterator[None]:
     """Context with an exclusive lock of the folder; an empty folder is removed at its end.
 
-    The operating system releases the lock when its process ends. On NFS the lock holds for all machines.
-
-    Args:
-        folder: folder, created if missing.
-        warn: function of a message, called if the file system has no locks; then nothing is locked.
-
-    Raises:
-        ValueError: a lock of another process.
-        OSError: a folder without write access.
+    The operating system releases the lock when its process ends. On NFS the lock holds for all machines. On a file
+    system without locks nothing is locked, and `warn` is called with a message.
     """
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)

@@ -76,12 +76,7 @@ def train(
 
 
 def check_resumable(trainer: Trainer, run: Run) -> None:
-    """Check that training can continue from the files of a run.
-
-    Raises:
-        FileNotFoundError: a missing file.
-        ValueError: a damaged file, or files of different trainings.
-    """
+    """Check that training can continue from the files of a run."""
     _load(trainer, run)
     run.history()
 

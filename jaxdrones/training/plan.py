@@ -20,11 +20,7 @@ _EVALUATION_SHARE = 0.25  # largest fraction of a time budget for evaluations, e
 
 
 def check_stop_at(stop_at: float | None, has_success: bool, episodes: int) -> None:
-    """Raise unless evaluations with this number of episodes can reach a lower bound of the success rate.
-
-    Raises:
-        ValueError: too few episodes, or a task without a criterion of success.
-    """
+    """Raise unless evaluations with this number of episodes can reach a lower bound of the success rate."""
     if stop_at is None:
         return
     if not 0 < stop_at < 1:

@@ -86,11 +86,7 @@ class Recipe:
 
     @classmethod
     def from_dict(cls, entries: dict[str, Any]) -> Recipe:
-        """Recipe from the entries of `as_dict`.
-
-        Raises:
-            ValueError: entries that are damaged, or of another version of this library.
-        """
+        """Recipe from the entries of `as_dict`."""
         try:
             user_files.task_of(entries["task"], entries.get("files", {}))
             config = {name: tuple(x) if isinstance(x, list) else x for name, x in entries["config"].items()}
@@ -103,11 +99,7 @@ class Recipe:
 def split_changes(
     task: str | Callable[..., Task], changes: dict[str, Any], known: Collection[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split changes into options of the environment and settings of the learner, with names `known`.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """Split changes into options of the environment and settings of the learner, with names `known`."""
     options = {*inspect.signature(make).parameters, *inspect.signature(task_function(task)).parameters}
     options -= {"task", "backend", "realistic", "options", "vision"}
     for name in changes:
@@ -133,11 +125,7 @@ def checked_preset(
 
 
 def convert_setting(name: str, value: Any, current: Any) -> Any:
-    """Convert a setting to the type of its current value, if lossless.
-
-    Raises:
-        ValueError: another type.
-    """
+    """Convert a setting to the type of its current value, if lossless."""
     if isinstance(current, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if isinstance(current, tuple) and isinstance(value, list):

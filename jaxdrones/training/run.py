@@ -56,11 +56,7 @@ class Run:
         return [f"{_HISTORY}/{file.stem}" for file in sorted((self.folder / _HISTORY).glob("*.json"))]
 
     def prepare(self, size: int) -> None:
-        """Create the folder and check that `size` bytes can be written to it.
-
-        Raises:
-            OSError: no access or no space.
-        """
+        """Create the folder and check that `size` bytes can be written to it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         probe = self.folder / ".probe"
         try:
@@ -80,12 +76,7 @@ class Run:
         return files.read_sidecar(self.folder / name)
 
     def sidecar_entry(self, name: str, entry: str) -> Any:
-        """Entry of the sidecar of a checkpoint.
-
-        Raises:
-            FileNotFoundError: there is no such checkpoint.
-            ValueError: it lacks the entry.
-        """
+        """Entry of the sidecar of a checkpoint."""
         sidecar = self.sidecar(name)
         if entry not in sidecar:
             file = self.folder / f"{name}.json"
@@ -93,22 +84,12 @@ class Run:
         return sidecar[entry]
 
     def verify(self, name: str) -> None:
-        """Check that a checkpoint is intact, and of the same training as the others.
-
-        Raises:
-            FileNotFoundError: there is no such checkpoint.
-            ValueError: it is damaged, or of another training.
-        """
+        """Check that a checkpoint is intact, and of the same training as the others."""
         self.check_identity(name)
         files.load_bytes(self.folder / f"{name}.msgpack", self.sidecar(name))
 
     def check_identity(self, name: str) -> None:
-        """Check that a checkpoint is of the same training as all readable files beside it.
-
-        Raises:
-            FileNotFoundError: there is no such checkpoint.
-            ValueError: it is damaged, or of another training.
-        """
+        """Check that a checkpoint is of the same training as all readable files beside it."""
         own = self.sidecar(name).get("run_id")
         for other in (*CHECKPOINTS, "report"):
             try:

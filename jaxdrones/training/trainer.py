@@ -26,16 +26,7 @@ class Trainer:
     """Compiled programs of a recipe, shared by all seeds; worlds are sharded over all devices of all hosts."""
 
     def __init__(self, recipe: Recipe, episodes: int = 1000):
-        """Prepare the programs; `compile` compiles them.
-
-        Args:
-            recipe: task, learner and settings.
-            episodes: number of episodes of an evaluation.
-
-        Raises:
-            ValueError: a number of worlds that is not a multiple of the devices or does not fit in memory, or too few
-                episodes for the success rate to stop at.
-        """
+        """Prepare the programs, with this number of episodes in an evaluation; `compile` compiles them."""
         self.recipe, self.episodes = recipe, episodes
         self.mesh = sharding.make_mesh(recipe.config.worlds, _devices(recipe.config))
         self.env, self.practice_env = recipe.env(), recipe.env(practice=True)
@@ -64,11 +55,7 @@ class Trainer:
         self.compile_seconds += time.perf_counter() - start
 
     def prepare(self, run: Run) -> None:
-        """Create the folder of a run and check that its files can be written.
-
-        Raises:
-            OSError: they cannot be written.
-        """
+        """Create the folder of a run and check that its files can be written."""
         run.prepare(_DISK_FACTOR * size_of(self.shapes))
 
     def start(self, key: jax.Array) -> Any:

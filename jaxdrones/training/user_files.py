@@ -22,15 +22,7 @@ Files = dict[str, str]
 
 
 def take_task(task: str, kept: Mapping[str, str] | None = None) -> tuple[str, Files]:
-    """Name of a task for a recipe, and its file.
-
-    Args:
-        task: a name of `jaxdrones.envs.TASKS`, or `folder/file.py:function`.
-        kept: files of a run, in place of missing ones.
-
-    Raises:
-        ValueError: a file that cannot be read, or a missing function name.
-    """
+    """Name of a task or `folder/file.py:function` for a recipe, and its file; `kept` files replace missing ones."""
     if not user_code.is_reference(task):
         return task, {}
     file, name = user_code.split_reference(task)
@@ -38,15 +30,7 @@ def take_task(task: str, kept: Mapping[str, str] | None = None) -> tuple[str, Fi
 
 
 def take_vehicle(options: dict[str, Any], kept: Mapping[str, str] | None = None) -> tuple[dict[str, Any], Files]:
-    """Options of `jaxdrones.make` for a recipe, and the file of the vehicle.
-
-    Args:
-        options: optionally with a `vehicle`, a bundled one or the path of a URDF.
-        kept: files of a run, in place of missing ones.
-
-    Raises:
-        ValueError: a file that cannot be read.
-    """
+    """Options of `jaxdrones.make` for a recipe, and the file of their vehicle; see `take_task` for `kept`."""
     vehicle = options.get("vehicle")
     if not (isinstance(vehicle, str) and vehicle.endswith(".urdf")):
         return options, {}
@@ -55,11 +39,7 @@ def take_vehicle(options: dict[str, Any], kept: Mapping[str, str] | None = None)
 
 
 def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
-    """Task of a recipe for `jaxdrones.make`: a name, or the function of a file.
-
-    Raises:
-        ValueError: an unknown name, or a file that is missing, cannot be executed or lacks the function.
-    """
+    """Task of a recipe for `jaxdrones.make`: a name, or the function of a file."""
     if not user_code.is_reference(task):
         check_choice("task", task, TASKS)
         return task
@@ -70,11 +50,7 @@ def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
 
 
 def options_of(options: dict[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
-    """Options of a recipe for `jaxdrones.make`, with the constants of a vehicle file.
-
-    Raises:
-        ValueError: a URDF that cannot be flown.
-    """
+    """Options of a recipe for `jaxdrones.make`, with the constants of a vehicle file."""
     vehicle = options.get("vehicle")
     if not (isinstance(vehicle, str) and vehicle.endswith(".urdf")):
         return options
@@ -82,11 +58,7 @@ def options_of(options: dict[str, Any], files: Mapping[str, str]) -> dict[str, A
 
 
 def check_unchanged(folder: Path, kept: Mapping[str, str], found: Mapping[str, str]) -> None:
-    """Raise if files have changed since the start of a run.
-
-    Raises:
-        ValueError: a changed file.
-    """
+    """Raise if files have changed since the start of a run."""
     for name, text in found.items():
         if kept.get(name, text) != text:
             raise UserError(

@@ -55,13 +55,8 @@ def drone_pictures(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """RGBA, depth and segmentation of the camera of every drone, each (n, height, width, ...).
 
-    The team has been placed. An eye inside a solid sees that solid, black, at `near`.
-
-    Args:
-        client: the world.
-        body: (n, 7+) poses of the drones.
-        looks: (n, 11) `views` of the team.
-        camera: on every drone.
+    The team has been placed at the poses `body` (n, 7+), and `looks` are its `views`. An eye inside a solid sees that
+    solid, black, at `near`.
     """
     p, (width, height) = client.p, camera.resolution
     frames = []

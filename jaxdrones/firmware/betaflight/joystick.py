@@ -24,15 +24,10 @@ class Joystick:
     """Pilot who holds a joystick; its switches are not used."""
 
     def __init__(self, device: Path, axes: Sequence[int] = AXES):
-        """Open a joystick.
+        """Open a joystick, such as /dev/input/js0.
 
-        Args:
-            device: such as /dev/input/js0.
-            axes: numbers of the axes for roll (right), pitch (forward), throttle (up) and yaw (right); -1, -2, ... are
-                the axes 0, 1, ... reversed.
-
-        Raises:
-            UserError: no such device.
+        `axes` are the numbers of those for roll (right), pitch (forward), throttle (up) and yaw (right); -1, -2, ...
+        are the axes 0, 1, ... reversed.
         """
         try:
             self._file = os.open(device, os.O_RDONLY | os.O_NONBLOCK)

@@ -70,11 +70,9 @@ class Client:
     """Connection to a flight controller."""
 
     def __init__(self, connection: socket.socket, idle: Callable[[], None] = lambda: time.sleep(0.001)):
-        """Use a connection, which the caller closes.
+        """Use a connected socket, which the caller closes.
 
-        Args:
-            connection: connected socket.
-            idle: called again and again while an answer is awaited; it takes about a millisecond.
+        While an answer is awaited, `idle` is called again and again; it takes about a millisecond.
         """
         self._socket, self._idle, self._decoder = connection, idle, Decoder()
         self._socket.setblocking(False)

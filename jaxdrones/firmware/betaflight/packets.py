@@ -98,14 +98,7 @@ def motor_outputs(datagram: bytes) -> np.ndarray | None:
 
 
 def motor_order(rotor_pos: np.ndarray) -> np.ndarray:
-    """(4,) Betaflight's motor of each rotor: 0 rear right, 1 front right, 2 rear left, 3 front left.
-
-    Args:
-        rotor_pos: (4, 3) positions of the rotors, m, body, in X configuration.
-
-    Raises:
-        AssertionError: rotors that are not in the four quadrants.
-    """
+    """(4,) Betaflight's motor of each rotor, in X: 0 rear right, 1 front right, 2 rear left, 3 front left."""
     front, left = np.asarray(rotor_pos)[:, 0] > 0, np.asarray(rotor_pos)[:, 1] > 0
     order = front + 2 * left
     assert sorted(order) == [0, 1, 2, 3], rotor_pos

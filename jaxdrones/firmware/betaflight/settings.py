@@ -115,13 +115,7 @@ def _with_loop(client: msp.Client, hz: float) -> bool:
 
 
 def mode_range(slot: int, mode: int, auxiliary: int) -> bytes:
-    """Payload that activates a mode by a switch.
-
-    Args:
-        slot: number of the rule.
-        mode: permanent number of the mode.
-        auxiliary: channel, 0 for AUX1.
-    """
+    """Payload of rule `slot`: a mode (permanent number) is activated by an auxiliary channel, 0 for AUX1."""
     return bytes([slot, mode, auxiliary, *((pulse - 900) // 25 for pulse in _SWITCH_ON)])
 
 
@@ -143,11 +137,7 @@ def status(client: msp.Client) -> Status:
 
 
 def parse_status(data: bytes) -> Status:
-    """Status in an answer.
-
-    Raises:
-        msp.NoAnswer: an answer that is too short.
-    """
+    """Status in an answer."""
     try:
         cycle, _, _, modes, *_ = _STATUS.unpack_from(data)
         more = data[_STATUS.size] & 0x0F  # bytes of further modes

@@ -50,13 +50,7 @@ class HighLevel:
     _defined: dict[int, tuple[int, int]] = dataclasses.field(default_factory=dict)
 
     def command(self, data: bytes, t: float, now: Goal) -> bytes:
-        """Execute a command at time t (s); the answer has its error number.
-
-        Args:
-            data: payload of the packet.
-            t: time, s.
-            now: state of the vehicle, at rest.
-        """
+        """Execute the payload of a packet at time t (s), from the vehicle at rest; the answer has its error number."""
         name, form = _FORMATS.get(data[0] if data else -1, ("", ""))
         if not name or len(data) != 1 + struct.calcsize("<" + form):
             return data[:3].ljust(3, b"\0") + bytes([ENOEXEC])

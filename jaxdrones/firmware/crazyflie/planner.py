@@ -85,15 +85,9 @@ class Trajectory:
 
 
 def go_to(start: Goal, pos: np.ndarray, yaw: float, duration: float, begin: float, linear: bool = False) -> Trajectory:
-    """Trajectory from a point to rest at a position (3,) (m) and yaw (rad, the shorter way), without jerk at its ends.
+    """Trajectory from `start` at `begin` (s) to rest at a position (m, world) and yaw (rad, the shorter way).
 
-    Args:
-        start: point at `begin`.
-        pos: position at the end, m, world.
-        yaw: heading at the end, rad.
-        duration: s, positive.
-        begin: time of the start, s.
-        linear: whether to move at constant velocity, at once.
+    It has no jerk at its ends; a `linear` one begins and ends at once with a constant velocity.
     """
     way = (yaw - start.yaw + math.pi) % (2 * math.pi) - math.pi
     first = np.append(start.pos, start.yaw)

@@ -71,11 +71,9 @@ class Toc:
     """Table of contents, downloaded entry by entry; its checksum tells a client whether it knows the table."""
 
     def __init__(self, types: Mapping[str, int], limits: bytes = b""):
-        """Build a table.
+        """Build a table of the `types` of entries `group.name`, in the order of their numbers.
 
-        Args:
-            types: name `group.name` of each entry -> byte of its type; the order numbers the entries.
-            limits: further bytes of the description of the table.
+        `limits` are further bytes of its description.
         """
         self.names: Sequence[str] = tuple(types)
         self._items = [

@@ -30,15 +30,7 @@ def quantities(
     parts: Sequence[Any] = "xyz",
     values: tuple[float, float, float] | None = None,
 ) -> tuple[Quantity, ...]:
-    """Components of a vector, or entries of a list: `x of the velocity`, ...
-
-    Args:
-        name: name of the whole.
-        unit: of every part.
-        frame: of every part.
-        parts: names of the parts; by default the axes.
-        values: values at -1, 0 and 1 of every part.
-    """
+    """Components of a vector, or entries of a list, with names such as `x of the velocity`; see `Quantity`."""
     return tuple(Quantity(f"{part} of the {name}", unit, frame, values) for part in parts)
 
 

@@ -88,11 +88,7 @@ class GymnasiumEnv(gymnasium.Env):
         return self._layout.arrange(obs), float(self._rewarding(reward)), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before `reset`.
-        """
+        """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`."""
         if self.render_mode is None:
             gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
             return None
@@ -199,11 +195,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return obs, reward, terminated, truncated, self._infos(info, terminated | truncated)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Picture (height, width, 3) of every world from the side, with `render_mode="rgb_array"`.
-
-        Raises:
-            gymnasium.error.ResetNeeded: before `reset`.
-        """
+        """Picture (height, width, 3) of every world from the side, with `render_mode="rgb_array"`."""
         if self.render_mode is None:
             gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
             return None

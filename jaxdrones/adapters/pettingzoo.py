@@ -67,11 +67,7 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         return self._observed(obs), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, np.ndarray]) -> tuple[Any, Any, Any, Any, Any]:
-        """One control step.
-
-        Raises:
-            ValueError: a missing action, an action of wrong shape or with NaN, or no episode.
-        """
+        """One control step."""
         if not self._session.running:
             raise UserError("step is called before reset or after the end of an episode; call reset")
         drones = {agent: i for i, agent in enumerate(self.possible_agents) if agent in self.agents}
@@ -88,21 +84,13 @@ class ParallelEnv(pettingzoo.ParallelEnv):
         )
 
     def state(self) -> np.ndarray:
-        """Concatenated observations of all agents without images, for centralized critics.
-
-        Raises:
-            ValueError: before `reset`.
-        """
+        """Concatenated observations of all agents without images, for centralized critics."""
         if self._session.world is None:
             raise UserError("state is called before reset; call reset")
         return self._state.copy()
 
     def render(self) -> np.ndarray | None:
-        """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`.
-
-        Raises:
-            ValueError: before `reset`.
-        """
+        """Picture (height, width, 3) of the team from the side, with `render_mode="rgb_array"`."""
         if self.render_mode is None:
             gymnasium.logger.warn('render is called without a render mode; make it with render_mode="rgb_array"')
             return None

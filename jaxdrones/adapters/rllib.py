@@ -42,11 +42,7 @@ class MultiAgentEnv(multi_agent_env.MultiAgentEnv):
         return self._layout.arrange(obs), {agent: {} for agent in self.agents}
 
     def step(self, action_dict: dict[str, np.ndarray]) -> tuple[Any, Any, Any, Any, Any]:
-        """One control step.
-
-        Raises:
-            ValueError: a missing action, an action of wrong shape or with NaN, or no episode.
-        """
+        """One control step."""
         if not self._session.running:
             raise UserError("step is called before reset or after the end of an episode; call reset")
         drones = {agent: i for i, agent in enumerate(self.possible_agents) if agent in self.agents}

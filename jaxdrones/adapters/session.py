@@ -35,14 +35,7 @@ class Session:
         return _numpy(obs)
 
     def step(self, action: np.ndarray) -> tuple[Any, np.ndarray, bool, bool, dict[str, Any]]:
-        """One control step.
-
-        Args:
-            action: (n, a), validated.
-
-        Returns:
-            Observation, reward (n,), terminated, truncated and info of the environment.
-        """
+        """One control step with a validated action (n, a); the result is that of the environment."""
         self.world, outcome = self.env.compiled(_advance)(self._key, self.world, action)
         obs, reward, terminated, truncated, info = _numpy(outcome)
         terminated, truncated = bool(terminated), bool(truncated)
@@ -83,11 +76,7 @@ def rewarding(team_reward: Annotated[str, choice("team_reward", ("sum", "mean"))
 
 
 def flat(info: dict[str, Any]) -> dict[str, Any]:
-    """Flatten the infos of an environment to one dictionary: `reward_position`, `metric_error`, ...
-
-    Args:
-        info: infos; `rewards`, `metrics`, `terminations` and `truncations` are used.
-    """
+    """Flatten the infos of an environment to one dictionary: `reward_position`, `metric_error`, ..."""
     return {f"{prefix}_{name}": x for group, prefix in _GROUPS.items() for name, x in info[group].items()}
 
 

@@ -58,14 +58,7 @@ class VectorEnv(BaseVectorEnv):
         raise UserError(f"attribute {key} cannot be set in a compiled environment; give it as an option")
 
     def seed(self, seed: int | Sequence[int] | None = None) -> list[int]:
-        """Seed all episodes of every world.
-
-        Args:
-            seed: seed of the first world, incremented for the others; or one for every world; `None` for random seeds.
-
-        Raises:
-            ValueError: a wrong number of seeds.
-        """
+        """Seed all episodes of every world: of the first world, incremented for the others; one for each; or `None`."""
         if seed is None:
             seed = int(np.random.default_rng().integers(SEEDS))
         seeds = [seed + i for i in range(self.env_num)] if isinstance(seed, int | np.integer) else list(seed)
@@ -77,11 +70,7 @@ class VectorEnv(BaseVectorEnv):
     def reset(
         self, env_id: int | Sequence[int] | np.ndarray | None = None, *, seed: int | Sequence[int] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Start an episode in worlds `env_id`, or in all; return their observations and infos.
-
-        Raises:
-            ValueError: a partial reset before that of all worlds.
-        """
+        """Start an episode in worlds `env_id`, or in all; return their observations and infos."""
         if seed is not None:
             self.seed(seed)
         mask = self._mask(env_id)
@@ -97,15 +86,7 @@ class VectorEnv(BaseVectorEnv):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One control step of worlds `id`, or of all; the others are unchanged.
 
-        Args:
-            action: one for each of these worlds.
-            id: indices of worlds.
-
-        Returns:
-            Observations, rewards, terminated, truncated and infos of these worlds, in their order.
-
-        Raises:
-            ValueError: before `reset`, or actions of wrong shape or with NaN.
+        Actions and results have a row for each of these worlds, in their order.
         """
         if not self._worlds.started:
             raise UserError("step is called before reset; call reset")
@@ -121,11 +102,7 @@ class VectorEnv(BaseVectorEnv):
         return self._rows(obs, chosen), reward, terminated, truncated, _infos(chosen)
 
     def render(self, **kwargs: Any) -> list[np.ndarray]:
-        """Picture (height, width, 3) of every world from the side.
-
-        Raises:
-            ValueError: before `reset`.
-        """
+        """Picture (height, width, 3) of every world from the side."""
         if not self._worlds.started:
             raise UserError("render is called before reset; call reset")
         return list(pictures.of_worlds(self.env, self._worlds.world))

@@ -28,11 +28,7 @@ from jaxdrones.cli.settings import task_first, with_config
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command.
-
-    Returns:
-        The exit code, see `EXIT_CODES`.
-    """
+    """Run one command; return the exit code, see `EXIT_CODES`."""
     parser, debug = _parser(), False
     try:
         options = parser.parse_args(task_first(with_config(sys.argv[1:] if arguments is None else arguments)))

@@ -69,13 +69,9 @@ def lasting_interrupts():
 
 
 def print_failure(error: BaseException, debug: bool) -> int:
-    """Write the error of a command to stderr; return the exit code.
+    """Write the error of a command to stderr, always with its traceback if `debug`; return the exit code.
 
     A user's mistake or an error in a user's file is one line. Everything else is an internal error.
-
-    Args:
-        error: exception of the command.
-        debug: whether to write the traceback of every error.
     """
     if debug:
         traceback.print_exception(error)

@@ -38,11 +38,7 @@ def processor() -> str:
 
 
 def devices() -> list[str]:
-    """Devices of JAX, such as `gpu: NVIDIA H200`.
-
-    Raises:
-        UserError: no device, for example of the platforms in `JAX_PLATFORMS`.
-    """
+    """Devices of JAX, such as `gpu: NVIDIA H200`."""
     try:
         return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
     except (AssertionError, RuntimeError) as error:  # an assertion, if the only requested platform has no driver

@@ -52,11 +52,7 @@ def task_first(arguments: list[str]) -> list[str]:
 
 
 def with_config(arguments: list[str]) -> list[str]:
-    """Insert the options of `train --config FILE`; options of the command line override them.
-
-    Raises:
-        UserError: a missing file, or one that is not TOML.
-    """
+    """Insert the options of `train --config FILE`; options of the command line override them."""
     command = next((i for i, word in enumerate(arguments) if not word.startswith("-")), None)
     if command is None or arguments[command] != "train" or "--config" not in arguments[:-1]:
         return arguments

@@ -1,8 +1,10 @@
 """Controllers of one drone.
 
 Each module has `gains()`, `init()` and `control(gains, params, memory, state, setpoint, dt=...) -> (memory, rpm)`, all
-for one drone; `velocity.control` takes an action instead of the setpoint. For a team use `jax.vmap` of `control`, with
-the memory `for_team(init(), n)`. `CONTROLLERS` maps command line names to controllers.
+for one drone; `velocity.control` takes an action instead of the setpoint. `params` and `state` are those of the drone,
+`memory` is that of the last call, and `dt` is the time between calls, s. For a team, whose arrays raise `ValueError`,
+use `jax.vmap` of `control`, with the memory `for_team(init(), n)`. `CONTROLLERS` maps command line names to
+controllers.
 """
 
 from jaxdrones.control import (

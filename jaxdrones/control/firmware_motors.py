@@ -62,11 +62,7 @@ class Command(PyTreeNode):
 
 @checked
 def motor(propellers: Annotated[str, choice("propellers", PROPELLERS)] = "2.1+") -> Motor:
-    """Motor of a Crazyflie with propellers of the 2.1, of the 2.1+, or of the thrust upgrade kit.
-
-    Raises:
-        ValueError: unknown propellers.
-    """
+    """Motor of a Crazyflie with propellers of the 2.1, of the 2.1+, or of the thrust upgrade kit."""
     return Motor(jnp.array(THRUST_CURVES[propellers]), *(jnp.array(x) for x in _COMMANDS[propellers]))
 
 

@@ -88,17 +88,11 @@ AnySetpoint = Setpoint | Velocity | Attitude | Rates | PerAxis
 
 
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
-    """Gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
+    """Gains of the firmware for a Crazyflie 2.1, or scaled to the drone with these parameters.
 
     With scaled gains, a command gives the thrust over weight and the angular acceleration of a Crazyflie. The
-    firmware's thrust curve of the motor voltage is not scaled.
-
-    Args:
-        params: parameters of the drone to scale to; by default a Crazyflie.
-        propellers: propellers of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
-
-    Raises:
-        ValueError: unknown propellers.
+    firmware's thrust curve of the motor voltage is not scaled. The propellers are a name of
+    `firmware_motors.PROPELLERS`.
     """
     torque, motor = jnp.ones(3), motors.motor(propellers)
     if params is not None:
@@ -157,21 +151,12 @@ def reset(memory: Memory) -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: AnySetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts commanded by the firmware.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
     With battery compensation a command is a fraction of `gains.motor.max_thrust` at any battery voltage, and the
-    vehicle's `kf` gives the rotor speed for this thrust. The mixing follows from the geometry of the rotors.
-
-    Args:
-        gains: gains of the four loops.
-        params: parameters of the drone.
-        memory: memory after the last call.
-        state: estimated state of the drone.
-        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude`, `Rates` or `PerAxis`.
-        dt: time between calls, s; 0.002 on the vehicle.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    vehicle's `kf` gives the rotor speed for this thrust. The mixing follows from the geometry of the rotors. The
+    setpoint is a `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude`, `Rates` or `PerAxis`; `dt` is 0.002 s
+    on the vehicle.
     """
     check_single(params, state)
     memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
@@ -189,17 +174,8 @@ def pwm(
 ) -> tuple[Memory, motors.Command]:
     """Firmware commands of one Crazyflie: desired attitude, thrust, and duty cycles of the motors.
 
-    Args:
-        gains: gains of the four loops.
-        memory: memory after the last call.
-        state: estimated state of the drone.
-        setpoint: `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude`, `Rates` or `PerAxis`.
-        battery: voltage for the battery compensation, V, filtered over 0.1 s; None disables the compensation, so that a
-            duty cycle equals the command.
-        dt: time between calls, s.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    Arguments are those of `control`, and the battery voltage for its compensation, V, filtered over 0.1 s; None
+    disables the compensation, so that a duty cycle equals the command.
     """
     memory, attitude, thrust, torque = _fly(gains, memory, state, setpoint, dt)
     voltage, duty = motors.duty_cycles(gains.motor, thrust, torque, battery, memory.battery, dt)

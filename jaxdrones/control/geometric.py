@@ -52,16 +52,7 @@ def control(
     f = m (a_d - k_x e_x - k_v e_v + g e_z), thrust f . R e_z, and
     tau = -J (k_R e_R + k_w e_w) + w x J w - J (w x R^T R_d w_d), with e_w = w - R^T R_d w_d.
 
-    Args:
-        gains: gains of position and attitude.
-        params: parameters of the drone.
-        memory: returned unchanged; this controller has none.
-        state: state of the drone.
-        setpoint: target; all of pos, vel, acc, yaw and omega are used.
-        dt: time between calls, s; not used.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    All of pos, vel, acc, yaw and omega of the setpoint are used. See `jaxdrones.control`.
     """
     check_single(params, state, setpoint)
 

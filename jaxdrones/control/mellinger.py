@@ -77,16 +77,10 @@ class Memory(PyTreeNode):
 
 
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
-    """Gains of the firmware for a Crazyflie 2.1, or scaled to another vehicle.
+    """Gains of the firmware for a Crazyflie 2.1, or scaled to the drone with these parameters.
 
-    With scaled gains, an error causes the same linear and angular acceleration as on a Crazyflie.
-
-    Args:
-        params: parameters of the drone to scale to; by default a Crazyflie.
-        propellers: propellers of the Crazyflie, a name of `firmware_motors.PROPELLERS`.
-
-    Raises:
-        ValueError: unknown propellers.
+    With scaled gains, an error causes the same linear and angular acceleration as on a Crazyflie. The propellers are a
+    name of `firmware_motors.PROPELLERS`.
     """
     motor = motors.motor(propellers)
     force, torque = jnp.ones(()), jnp.ones(3)
@@ -123,18 +117,9 @@ def init() -> Memory:
 def control(
     gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts commanded by the firmware.
+    """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
-    Args:
-        gains: gains of position and attitude.
-        params: parameters of the drone.
-        memory: memory after the last call.
-        state: estimated state of the drone.
-        setpoint: target; all of pos, vel, acc, yaw and omega are used.
-        dt: time between calls, s; 0.002 on the vehicle.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    All of pos, vel, acc, yaw and omega of the setpoint are used; `dt` is 0.002 s on the vehicle.
     """
     check_single(params, state)
     memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
@@ -152,16 +137,8 @@ def pwm(
 ) -> tuple[Memory, motors.Command]:
     """Firmware commands of one Crazyflie: desired attitude, thrust, and duty cycles of the motors.
 
-    Args:
-        gains: gains of position and attitude.
-        memory: memory after the last call.
-        state: estimated state of the drone.
-        setpoint: target; all of pos, vel, acc, yaw and omega are used.
-        battery: voltage for the battery compensation, V; without it a duty cycle equals the command.
-        dt: time between calls, s.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    Arguments are those of `control`, and the battery voltage for its compensation, V; without it a duty cycle equals
+    the command.
     """
     memory, axes, thrust, torque = _fly(gains, memory, state, setpoint, dt)
     voltage, duty = motors.duty_cycles(gains.motor, thrust, torque, battery, memory.battery, dt)

@@ -119,16 +119,7 @@ def control(
 
     As in gym-pybullet-drones, thrust is converted to PWM as in `pid`, and the torque in N m is mixed as if in PWM.
 
-    Args:
-        gains: initial gains.
-        params: parameters of the drone.
-        memory: memory after the last call.
-        state: state of the drone.
-        setpoint: target; pos, vel, yaw and omega (as body rates) are used, acc is not.
-        dt: time between calls, s.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    Of the setpoint, pos, vel, yaw and omega (as body rates) are used, acc is not. See `jaxdrones.control`.
     """
     check_single(params, state, setpoint)
     x = _state(state)

@@ -122,16 +122,7 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 
-    Args:
-        gains: gains of the two loops.
-        params: parameters of the drone.
-        memory: memory after the last call.
-        state: state of the drone.
-        setpoint: target; pos, vel, yaw and omega (as Euler rates) are used, acc is not.
-        dt: time between calls, s.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    Of the setpoint, pos, vel, yaw and omega (as Euler rates) are used, acc is not. See `jaxdrones.control`.
     """
     check_single(params, state, setpoint)
     memory, thrust, target = position_loop(gains, params, memory, state, setpoint, dt)

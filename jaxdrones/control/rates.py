@@ -49,16 +49,7 @@ def control(
 ) -> tuple[Any, Float[Array, "4"]]:
     """Rotor speeds of one drone by both loops, RPM, up to `max_rpm`.
 
-    Args:
-        gains: gains of both loops.
-        params: parameters of the drone.
-        memory: returned unchanged; this controller has none.
-        state: state of the drone.
-        setpoint: target; pos, vel, acc and yaw are used, omega is not.
-        dt: time between calls, s; not used.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    Of the setpoint, pos, vel, acc and yaw are used, omega is not. See `jaxdrones.control`.
     """
     collective, omega = command(gains, params, state, setpoint)
     return memory, follow(gains, params, state, collective, omega)

@@ -76,16 +76,7 @@ def control(
     first call has a spike. With the inertia of the Hummingbird it needs 60 calls per second; the paper uses 48 calls
     with five times this inertia.
 
-    Args:
-        gains: gains of the two loops.
-        params: parameters of the drone.
-        memory: memory after the last call.
-        state: state of the drone.
-        setpoint: target; only pos is used.
-        dt: time between calls, s.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    See `jaxdrones.control`.
     """
     check_single(params, state, setpoint)
 

@@ -17,20 +17,11 @@ SPEED_SHARE = 0.03  # speed at magnitude 1 over the vehicle's highest speed
 def control(
     gains: pid.Gains, params: Params, memory: pid.Memory, state: State, action: Float[Array, "4"], *, dt: float
 ) -> tuple[pid.Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM.
+    """Rotor speeds of one drone by the PID, RPM; see `jaxdrones.control`.
 
-    Args:
-        gains: gains of the PID.
-        params: parameters of the drone.
-        memory: memory of the PID.
-        state: state of the drone.
-        action: (4,) direction x, y, z of any length, and magnitude: the fraction of the speed limit, sign ignored.
-        dt: time between calls, s.
-
-    The position target is the position of the drone and the yaw target its heading, so only the velocity error acts.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`).
+    The action (4,) is a direction x, y, z of any length, and a magnitude: the fraction of the speed limit, sign
+    ignored. The position target is the position of the drone and the yaw target its heading, so only the velocity error
+    acts.
     """
     check_single(params, state)
     check_shape("action", action, (4,), "direction and magnitude of one drone; use jax.vmap for a team")

@@ -58,12 +58,8 @@ _ROUNDING = 1e-4  # m: smooths the distance of coincident points
 def ground_contact(params: Params, state: State, scene: Any = None) -> Wrench:
     """Normal force and friction of the ground, the plane z = 0, on a drone.
 
-    Not for the Bullet backend, which resolves contact with the ground itself.
-
-    Args:
-        params: of the drone.
-        state: of the drone.
-        scene: a `jaxdrones.Scene`; without a ground the wrench is zero. By default there is a ground.
+    Without a ground in the scene the wrench is zero. Not for the Bullet backend, which resolves contact with the ground
+    itself.
     """
     if scene is not None and not scene.ground:
         return Wrench(jnp.zeros_like(state.pos), jnp.zeros_like(state.pos))
@@ -100,10 +96,7 @@ def obstacle_contact(params: Params, state: State, scene: Any) -> Wrench:
     its rounding, at the surface of an obstacle (`stop_at`). Not for the Bullet backend, which resolves these contacts
     itself.
 
-    Args:
-        params: of the drone.
-        state: of the drone.
-        scene: obstacles as a `jaxdrones.Scene`; its ground is that of `ground_contact`.
+    The ground of the scene is that of `ground_contact`.
     """
     if not scene.has_obstacles:
         zero = jnp.zeros_like(state.pos)

@@ -65,11 +65,7 @@ class Model:
         return init(params, state) if self.of_team else jax.vmap(init)(params, state)
 
     def team_rate(self, params: Params, state: State, command: Float[Array, "n 4"]) -> Any:
-        """Time derivative of the state of a team.
-
-        Raises:
-            ValueError: `rate` returns another type than the state.
-        """
+        """Time derivative of the state of a team."""
         rate = (self.rate if self.of_team else jax.vmap(self.rate))(params, state, command)
         given, wanted = jax.eval_shape(lambda: rate), jax.eval_shape(lambda: state.aux[self.name])
         if _type(given) != _type(wanted):

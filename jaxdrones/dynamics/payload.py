@@ -123,15 +123,7 @@ def payload(shared: Switch = False) -> Model:
 
 @declare(Needs(largest_step=LARGEST_STEP))
 def cable(params: Params, state: State) -> Wrench:
-    """Pull of its cable on a drone; needs the model `payload()` and the constants of `with_payload`.
-
-    Args:
-        params: of the drone, with `aux["payload"]`.
-        state: of the drone, with the load in `aux["payload"]`.
-
-    Raises:
-        ValueError: missing constants, or a missing load.
-    """
+    """Pull of its cable on a drone; needs the model `payload()` and the constants of `with_payload`."""
     force = rotation.rotate_inverse(state.quat, _pull(params, state))
     return Wrench(force, vector.cross(_constants(params).anchor, force))
 

@@ -102,10 +102,7 @@ def battery_voltage(params: Params, state: State) -> Float[Array, ""]:
     """Terminal voltage U under the load of the turning rotors, V, from U (E - U) = R P.
 
     E is the voltage before the resistance R. The power is limited to the battery's maximum E^2 / (4 R), at U = E / 2.
-
-    Args:
-        params: parameters of the drone, with the constants of the battery in `aux["battery"]`.
-        state: state of the drone, with the state of the model `battery()`.
+    Constants and state of the model `battery()` are in `aux["battery"]`.
     """
     source = _source(params, state)
     return (source + safe_sqrt(source**2 - 4 * _constants(params).resistance * battery_power(params, state))) / 2

@@ -73,31 +73,16 @@ def cubic_motors(coefficients: ArrayLike, supply: Supply = 3.7) -> Motors:
 def crazyflie_motors(
     propellers: Annotated[str, choice("propellers", THRUST_CURVES)] = "2.1+", supply: Supply = 3.7
 ) -> Motors:
-    """Motors of the Crazyflie with the firmware's thrust curve.
-
-    Args:
-        propellers: a name of `THRUST_CURVES`: `2.1`, `2.1+` or `thrust upgrade`.
-        supply: supply voltage without a simulated battery, V.
-
-    Raises:
-        ValueError: unknown propellers, or a supply voltage that is not positive.
-    """
+    """Motors of the Crazyflie with the firmware's thrust curve, a name of `THRUST_CURVES`; see `cubic_motors`."""
     return cubic_motors(np.array(THRUST_CURVES[propellers]), supply)
 
 
 def pwm_rotors(params: Params, state: State, command: Float[Array, "4"]) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
-    """Rotors with a first-order lag and a PWM command for each motor, 0 to 65535.
+    """Rotors with a first-order lag and a PWM command (4,) for each motor, limited to 0 .. 65535.
 
     The mean voltage of a motor is the fraction PWM / 65535 of the supply voltage: that of `battery()` under load, or
     the motors' `supply` in a step without this model. The motors' cubic gives the thrust, and `kf` the speed for it.
-
-    Args:
-        params: parameters of the drone, with `Motors` in `aux["motors"]`.
-        state: state of the drone.
-        command: (4,) PWM, limited to 0 .. 65535.
-
-    Returns:
-        Rotor speeds and their rates, RPM and RPM/s.
+    `Motors` are in `params.aux["motors"]`.
     """
     thrust = _motors(params).thrust(_duty(command) * supply_voltage(params, state))
     return lagging_rotors(params, state, safe_sqrt(thrust / params.kf))
@@ -118,9 +103,6 @@ def failing(rotors: Rotors) -> Rotors:
 
     A rotor of health 1 is intact, and a rotor of health 0 slows down and stops. Like every parameter, the health can be
     randomized, change in flight, and have a gradient.
-
-    Args:
-        rotors: `lagging_rotors`, `pwm_rotors`, or a function `(params, state, command) -> (rpm, rpm_rate)`.
     """
 
     @functools.wraps(rotors)

@@ -44,13 +44,7 @@ def make_derivative(
 ) -> Derivative:
     """Build the equations of motion of a team, for linearization, sensors and custom integrators.
 
-    Args:
-        effects: as for `make_step`.
-        pairs: as for `make_step`.
-        team_effects: as for `make_step`.
-        models: as for `make_step`.
-        rotors: as for `make_step`.
-        neighbors: as for `make_step`.
+    Arguments are those of `make_step`.
 
     Returns:
         `derivative(params, state, command, scene=Scene()) -> State`, pure: params and state of a team of n drones,
@@ -58,9 +52,6 @@ def make_derivative(
         `vel` m/s^2 (world), `omega` rad/s^2 (body), `rpm` RPM/s, and that of every model in `aux`. Other leaves (extra
         fields of a subclass of `State`, `aux` without a model) have a zero rate. Rotors without a lag have their
         commanded speed, whatever `state.rpm` is.
-
-    Raises:
-        ValueError: an argument that is not a function, a model or a neighbor grid.
     """
     of_team = _derivative_of(Physics(effects, pairs, team_effects, models, rotors, neighbors))
 

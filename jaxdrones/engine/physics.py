@@ -119,11 +119,7 @@ class Physics:
         scene: Scene,
         contact: Contact | None = None,
     ) -> Loads:
-        """Rotor speeds, wrenches and rates of a team; arguments are those of `wrench` and the commanded speeds.
-
-        Raises:
-            ValueError: a missing model state, or a function with a result of another type.
-        """
+        """Rotor speeds, wrenches and rates of a team; arguments are those of `wrench` and the commanded speeds."""
         rpm, rpm_rate = self.rotor_speed(params, state, command)
         state = state.replace(rpm=rpm)
         aux_rate = {model.name: model.team_rate(params, state, command) for model in self.models}
@@ -133,11 +129,7 @@ class Physics:
     def rotor_speed(
         self, params: Params, state: State, command: Float[Array, "n 4"]
     ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
-        """Rotor speeds of a team and their rates, RPM and RPM/s.
-
-        Raises:
-            ValueError: a missing model state.
-        """
+        """Rotor speeds of a team and their rates, RPM and RPM/s."""
         for model in self.models:
             if model.name not in state.aux:
                 raise UserError(
@@ -151,13 +143,9 @@ class Physics:
         return state if speed is state.rpm else jax.vmap(with_rotor_speed)(params, state, speed)
 
     def wrench(self, params: Params, state: State, scene: Scene, contact: Contact | None = None) -> Wrench:
-        """Sum of the rotors' aerodynamic wrench and of all effects, one row per drone.
+        """Sum of the rotors' aerodynamic wrench and of all effects of a team, one row per drone.
 
-        Args:
-            params: of a team of n drones.
-            state: of the team.
-            scene: obstacles and ground.
-            contact: optional faster implementation of the team's contact with obstacles.
+        `contact` is an optional faster implementation of the team's contact with obstacles.
         """
         contacts = self.contacts("obstacles")
         effects = [effect for effect in self.effects if effect not in contacts]

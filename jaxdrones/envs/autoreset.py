@@ -34,12 +34,7 @@ class AutoReset:
     """
 
     def __init__(self, env: Env, progress: Array | None = None):
-        """Add automatic resets to an environment.
-
-        Args:
-            env: environment.
-            progress: () progress of training in [0, 1], for a task with a curriculum.
-        """
+        """Add automatic resets; `progress` is that of training in [0, 1], for a task with a curriculum."""
         self.env, self._progress = env, () if progress is None else (progress,)
 
     def __repr__(self) -> str:

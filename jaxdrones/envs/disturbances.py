@@ -76,9 +76,6 @@ def random_pushes(
     """External forces of U(-force, force) (fraction of the weight) along each axis, at random times.
 
     One begins every `interval` seconds and lasts `duration` seconds on average, both with exponential distributions.
-
-    Raises:
-        ValueError: a negative force, or times that are not positive.
     """
 
     def disturbance(key: jax.Array, params: Params, dt: float) -> Params:
@@ -149,12 +146,7 @@ def dryden(
 
 
 def scales(speed: float, altitude: float) -> dict[str, tuple[float, float]]:
-    """Length scale (m) and intensity (m/s) of the gusts by axis, u along the mean wind, v across, w upwards.
-
-    Args:
-        speed: mean wind speed at 20 ft, m/s.
-        altitude: altitude, m.
-    """
+    """Length scale (m) and intensity (m/s) of the gusts by axis, u along the mean wind, v across, w upwards."""
     feet = altitude / _FOOT
     ratio = 0.177 + 0.000823 * feet
     horizontal = altitude / ratio**1.2, 0.1 * speed / ratio**0.4

@@ -133,11 +133,7 @@ class Env:
 
     @functools.cached_property
     def term_sizes(self) -> list[int]:
-        """Length of every observation term of a drone.
-
-        Raises:
-            ValueError: a function of the task or an observation term returns an invalid result.
-        """
+        """Length of every observation term of a drone."""
         return check_episode(
             self.task, self.params, self.scene, self.terms, self.dt, functools.partial(episode.first_world, self)
         )

@@ -36,11 +36,7 @@ def _check_range(field: str, low: float, high: float) -> None:
 
 @checked
 def scaled(field: Field, low: float, high: float) -> Randomization:
-    """Nominal value times U(low, high), one factor for the whole array.
-
-    Raises:
-        ValueError: unknown field, `low` above `high`, or a factor that changes the sign of a positive field.
-    """
+    """Nominal value times U(low, high), one factor for the whole array."""
     _check_range(field, low, high)
     if field in POSITIVE:
         check_number(f"lower bound of {field}", low, "a factor", above=0)
@@ -54,11 +50,7 @@ def scaled(field: Field, low: float, high: float) -> Randomization:
 
 @checked
 def shifted(field: Field, low: float, high: float) -> Randomization:
-    """Nominal value plus U(low, high), drawn for each entry of the array.
-
-    Raises:
-        ValueError: unknown field, or `low` above `high`.
-    """
+    """Nominal value plus U(low, high), drawn for each entry of the array."""
     _check_range(field, low, high)
 
     def randomize(key: jax.Array, params: Params) -> Params:
@@ -70,11 +62,7 @@ def shifted(field: Field, low: float, high: float) -> Randomization:
 
 @checked
 def constant_wind(speed: Annotated[float, number("m/s", "speed of the wind", at_least=0)]) -> Randomization:
-    """Wind U(-speed, speed) (m/s) along x and y and a quarter of that along z, constant in an episode.
-
-    Raises:
-        ValueError: a negative speed.
-    """
+    """Wind U(-speed, speed) (m/s) along x and y and a quarter of that along z, constant in an episode."""
 
     def randomize(key: jax.Array, params: Params) -> Params:
         wind = jax.random.uniform(key, (3,), params.wind.dtype, -speed, speed)
@@ -185,9 +173,6 @@ def sensor_noise(
 
     The defaults for position and velocity are those of Huang et al.'s swarm simulator. Those for angle and rates are
     typical of attitude filters on the Crazyflie (L2F: 1 mrad and 2 mrad/s; DiffAero: 2.4e-2 rad/s).
-
-    Raises:
-        ValueError: a negative standard deviation.
     """
 
     def noise(key: jax.Array, state: State) -> State:

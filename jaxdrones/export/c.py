@@ -138,16 +138,9 @@ static inline void NAME_apply_{name}(int n, float y[])
 
 
 def header(graph: Graph, program: Program, description: Description, name: str = "policy") -> str:
-    """C99 header of a policy.
+    """C99 header of a policy: its weights, `NAME_step(obs, ..., act)`, and for a recurrent policy `NAME_reset`.
 
-    Args:
-        graph: layers of the policy.
-        program: their calls.
-        description: meaning of inputs and outputs, for the comment at the top.
-        name: prefix of all names, an identifier.
-
-    Returns:
-        Text of the header with the weights, `NAME_step(obs, ..., act)`, and for a recurrent policy `NAME_reset`.
+    `name` is the prefix of all names; `description`, the meaning of inputs and outputs, is the comment at the top.
     """
     upper = name.upper()
     sizes = {f"{x.name.upper()}_SIZE": x.size for x in graph.inputs if x.name != "hidden_state"}

@@ -112,16 +112,9 @@ _FUNCTIONS |= {
 
 
 def module(graph: Graph, program: Program, description: Description, name: str = "policy") -> str:
-    """ES module of a policy.
+    """ES module of a policy, with `step(obs, ...)`, and for a recurrent policy `initialHiddenState()`.
 
-    Args:
-        graph: layers of the policy.
-        program: their calls.
-        description: meaning of inputs and outputs, for the comment at the top.
-        name: name of the file without its suffix, for the comment.
-
-    Returns:
-        Text of the module, which exports `step(obs, ...)`, and for a recurrent policy `initialHiddenState()`.
+    `description`, the meaning of inputs and outputs, and the `name` of the file are in the comment at the top.
     """
     names = {"f32"} | {call.function for call in program.calls}
     names |= {"sigmoid"} if names & {"gates", "apply_silu"} else set()

@@ -152,18 +152,10 @@ class _Nodes:
 
 
 def model(graph: Graph, description: Description) -> bytes:
-    """Serialized ONNX model of a policy.
+    """Serialized ONNX model of a policy, with a `description` of inputs and outputs as metadata.
 
-    Args:
-        graph: layers of the policy.
-        description: meaning of inputs and outputs, for the metadata.
-
-    Returns:
-        Model with the inputs `obs` (batch, d), images (batch, height, width, ...) and `hidden_state` (batch, size),
-        and the outputs `act` (batch, a) and `next_hidden_state`.
-
-    Raises:
-        ValueError: onnx is not installed.
+    Its inputs are `obs` (batch, d), images (batch, height, width, ...) and `hidden_state` (batch, size), its outputs
+    `act` (batch, a) and `next_hidden_state`.
     """
     try:
         import onnx

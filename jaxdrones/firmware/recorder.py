@@ -30,13 +30,7 @@ class Recorder:
         self._rows.append((t, *(np.array(x, np.float32) for x in arrays)))
 
     def log(self, params: Params, conditions: dict[str, Any], about: str) -> FlightLog:
-        """Log of the flight.
-
-        Args:
-            params: of the drone.
-            conditions: for JSON; with `vehicle`.
-            about: title.
-        """
+        """Log of the flight; the conditions, with `vehicle`, are for JSON, and `about` is the title."""
         t, *arrays = map(np.array, zip(*self._rows, strict=True))
         pos, quat, vel, omega, rpm, target = (x[:, None] for x in arrays)
         known = np.isfinite(target).all()  # a log has targets in all rows or in none

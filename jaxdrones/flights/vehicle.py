@@ -59,12 +59,7 @@ class Instruments(PyTreeNode):
         return start + scale * (true - start)
 
     def motor_supply(self, logged: Float[Array, "*n"], sag: Float[Array, "*#n"]) -> Float[Array, "*n"]:
-        """Voltage of the motors at full PWM, V.
-
-        Args:
-            logged: voltage of the battery, V.
-            sag: of the battery at take-off, V.
-        """
+        """Voltage of the motors at full PWM with a logged battery voltage and its sag at take-off, V."""
         return logged + self.unfelt_sag * jnp.maximum(sag - _SAG_THRESHOLD, 0)
 
     def estimate(self, state: State) -> State:

@@ -38,11 +38,7 @@ class AdaptivePolicy(PyTreeNode):
 
     @classmethod
     def of(cls, name: str, network: RecurrentPolicy, env: Env) -> AdaptivePolicy:
-        """Policy for the nominal vehicle of an environment.
-
-        Raises:
-            ValueError: another observation or action than the policy has; the message calls it `name`.
-        """
+        """Policy for the nominal vehicle of an environment."""
         names = tuple(term.name for term in env.terms)
         if names[: len(OBSERVED)] != OBSERVED or env.action.name != "throttle":
             raise UserError(

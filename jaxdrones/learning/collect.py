@@ -99,13 +99,9 @@ def draw_starts(key: jax.Array, env: Env, count: int, progress: Array | None = N
 
 
 def restart(key: jax.Array, worlds: Worlds, starts: Starts, fraction: Scalar = 0.0) -> Worlds:
-    """Start a new episode in every world with a finished episode, and in the others with a given probability.
+    """Start a new episode in every world with a finished episode, and in the others with the probability `fraction`.
 
-    Args:
-        key: random key.
-        worlds: worlds.
-        starts: starts of the new episodes.
-        fraction: probability of a new episode in the other worlds, which decorrelates the times of their episodes.
+    New episodes in the others decorrelate the times of their episodes.
     """
     chosen = worlds.done | jax.random.bernoulli(key, fraction, worlds.done.shape)
     return _select(chosen, _started(worlds, starts), worlds)

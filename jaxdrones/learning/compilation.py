@@ -14,16 +14,10 @@ from jaxdrones.learning.settings import Config
 
 
 def jit(function: Callable, env: Env, config: Config | None = None, **arguments: Any) -> Any:
-    """`jax.jit` with compiler options for training.
+    """`jax.jit` with compiler options for the updates of a learner in an environment.
 
-    The result can be called or lowered, but not inside another traced function, where JAX rejects compiler options.
-    The options depend on the device, so this initializes it.
-
-    Args:
-        function: function to compile.
-        env: environment that the function simulates.
-        config: settings of the learner whose updates the function makes.
-        **arguments: further arguments of `jax.jit`.
+    The result can be called or lowered, but not inside another traced function, where JAX rejects compiler options. The
+    options depend on the device, so this initializes it.
     """
     has_epochs = config is not None and not isinstance(config, GradientConfig)
     options = training_options(large_arrays=has_epochs or env.vision is not None)

@@ -127,12 +127,9 @@ def point_mass(dt: float, response: float = 0.1) -> Callable[[Params, State, Arr
     """Step of a team of point masses, for the derivatives of `SurrogateStep`.
 
     The rotors command an acceleration: thrust along a body axis that their torque rotates. A torque that changes the
-    body rates by dw in a control period rotates the thrust by dw times `response` at once. Position and velocity are
-    differentiated with respect to that acceleration and to each other; attitude and rotors are not.
-
-    Args:
-        dt: control period, s.
-        response: time for which a change of the body rates acts before it is corrected, s.
+    body rates by dw in a control period dt (s) rotates the thrust by dw times `response` at once, the time (s) for
+    which such a change acts before it is corrected. Position and velocity are differentiated with respect to that
+    acceleration and to each other; attitude and rotors are not.
     """
 
     def step(params: Params, state: State, rpm: Array) -> State:

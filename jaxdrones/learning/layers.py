@@ -88,12 +88,9 @@ class GRU(nn.Module):
     def __call__(
         self, x: Float[Array, "*batch d"], hidden_state: Array | None = None, starts: Array | None = None
     ) -> Float[Array, "*batch size"]:
-        """Hidden state after each input.
+        """Hidden state (..., size) after each input, at first zero by default.
 
-        Args:
-            x: inputs; with `starts` sequences of them, along the leading axis.
-            hidden_state: (..., size) hidden state before the (first) input; zero by default.
-            starts: (t, ...) whether an episode starts at this input, with a zero hidden state before it.
+        With `starts` (t, ...), whether an episode starts at an input, the inputs are sequences along the leading axis.
         """
         # Initially 73 to 95 % of the hidden state are kept in every step, so early inputs have a gradient.
         zero = jnp.zeros(self.size)

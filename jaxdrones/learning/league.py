@@ -49,11 +49,7 @@ class TrainState(result.TrainState):
 
 
 def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> TrainState:
-    """State before the first update; all past policies are the initial one.
-
-    Raises:
-        ValueError: a network with a hidden state.
-    """
+    """State before the first update; all past policies are the initial one."""
     state = bptt.init(key, env, config, network)
     if state.policy.is_recurrent:
         raise UserError("network is recurrent; give a league one without a hidden state")
@@ -75,12 +71,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
 
 
 def against(past: Policy, policy: Policy) -> collect.Act:
-    """Actions of the first drones by a policy, and of the others by past policies.
-
-    Args:
-        past: (k, ...) policies; each flies in one of k equal groups of worlds.
-        policy: the policy that learns.
-    """
+    """Actions of the first drones by a policy, of the others by past ones, each in an equal group of worlds."""
 
     def act(policy: Policy, past: Policy, noise: Any, hidden_state: Any, obs: collect.Obs) -> tuple[Any, Array, Any]:
         count = len(jax.tree.leaves(past)[0])

@@ -15,19 +15,12 @@ from jaxdrones.learning import collect
 def measure(
     env: Env, config: Any, step: Array, worlds: collect.Worlds, trajectory: collect.Trajectory
 ) -> tuple[collect.Worlds, dict[str, Array]]:
-    """Update the returns of the worlds after a trajectory, and compute the metrics of an update.
+    """Update the returns of the worlds after a trajectory, and compute the metrics of update `step`.
 
     The metrics are the mean reward and the mean error (m) of the valid steps, the fraction of them that terminated an
     episode, and the mean return. The latter is NaN before a whole episode can have ended, as only failed episodes have
     ended by then: in the first `env.steps` steps of a training, and always if every trajectory is shorter and starts
     new episodes in all worlds.
-
-    Args:
-        env: environment.
-        config: settings of a learner; `horizon` and `restart_fraction` are used.
-        step: () updates made before this one.
-        worlds: worlds after the trajectory.
-        trajectory: trajectory.
     """
     counts = ~trajectory.was_done
     worlds = with_returns(worlds, trajectory, config.restart_fraction)
@@ -42,15 +35,10 @@ def measure(
 
 
 def with_returns(worlds: collect.Worlds, trajectory: collect.Trajectory, restart_fraction: Scalar) -> collect.Worlds:
-    """Worlds with the return and the weight of the last finished episode in each.
+    """Worlds after a trajectory with the return and the weight of the last finished episode in each.
 
     An episode of k updates survives `collect.restart` with the probability (1 - restart_fraction)^k. The inverse is the
     weight that corrects for missing long episodes (Horvitz and Thompson 1952).
-
-    Args:
-        worlds: worlds after the trajectory.
-        trajectory: trajectory.
-        restart_fraction: probability of being cut before an update.
     """
     ended = trajectory.done & ~jnp.all(trajectory.was_done, axis=-1)
     t = jnp.arange(len(ended))[:, None]

@@ -200,11 +200,7 @@ class Policy(PyTreeNode):
         return self.network.recurrent if own else bool(getattr(self.network, "recurrent_size", 0))
 
     def initial_hidden_state(self, batch: tuple[int, ...]) -> Any:
-        """Zero hidden state (*batch, ...) at the start of an episode; `None` for a policy without one.
-
-        Args:
-            batch: (drones,) for one team; (teams, drones) for many.
-        """
+        """Zero hidden state of (drones,) or (teams, drones) at the start of an episode; `None` without one."""
         if not self.is_recurrent:
             return None
         if isinstance(self.network, OwnNetwork):
@@ -213,12 +209,7 @@ class Policy(PyTreeNode):
         return jnp.zeros((*batch, cast(Network, self.network).recurrent_size))
 
     def act(self, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "*batch n a"]]:
-        """Hidden state (*batch, n, ...) after the observations, and actions in (-1, 1).
-
-        Args:
-            hidden_state: hidden state before them.
-            obs: observations (*batch, n, d), or a dictionary of such an array and of images.
-        """
+        """Hidden state after the observations, or a dictionary with images, and actions in (-1, 1)."""
         x = map_state_vector(self.obs_stats.normalize, obs)
         hidden_state, output = apply(self.network, self.params, x, self.per_agent, hidden_state)
         return hidden_state, jnp.tanh(output)
@@ -235,11 +226,7 @@ class Policy(PyTreeNode):
         return jnp.tanh(apply(self.network, self.params, obs, self.per_agent, hidden_state, starts)[1])
 
     def __call__(self, obs: Obs) -> Float[Array, "*batch n a"]:
-        """Actions of a policy without a hidden state.
-
-        Raises:
-            ValueError: the policy has a hidden state.
-        """
+        """Actions of a policy without a hidden state."""
         if self.is_recurrent:
             raise UserError(
                 "the policy is recurrent; call policy.act(hidden_state, obs), at the start of an episode with "

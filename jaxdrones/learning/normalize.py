@@ -43,12 +43,9 @@ class RunningStatistics(PyTreeNode):
     def update(
         self, obs: Float[Array, "*batch d"], window: Scalar = jnp.inf, where: Bool[Array, "*batch"] | None = None
     ) -> RunningStatistics:
-        """Update the statistics with new vectors (Chan et al. 1983).
+        """Update the statistics with the vectors `where` a mask holds, by default all (Chan et al. 1983).
 
-        Args:
-            obs: new vectors along the last axis.
-            window: largest weight of the old vectors, as a number of vectors, so that early ones are forgotten.
-            where: mask of the new vectors; by default all.
+        `window` limits the weight of the old vectors, as a number of vectors, so that early ones are forgotten.
         """
         new = RunningStatistics.of(obs, where)
         old_count = jnp.minimum(self.count, window)

@@ -18,11 +18,7 @@ class Raptor(PyTreeNode):
 
     @classmethod
     def load(cls) -> Raptor:
-        """Weights of the package foundation-policy.
-
-        Raises:
-            ImportError: it is not installed.
-        """
+        """Weights of the package foundation-policy."""
         try:
             from foundation_policy import Raptor as Published
         except ImportError:

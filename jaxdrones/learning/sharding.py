@@ -34,15 +34,7 @@ REPLICATED = PartitionSpec()
 
 
 def make_mesh(worlds: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """Mesh of devices, each with an equal share of the worlds.
-
-    Args:
-        worlds: number of worlds.
-        devices: devices to use; by default all devices of all hosts.
-
-    Raises:
-        ValueError: worlds is not a multiple of the number of devices.
-    """
+    """Mesh of devices, each with an equal share of the worlds; by default of all devices of all hosts."""
     devices = jax.devices() if devices is None else devices
     count = len(devices)
     if worlds % count:

@@ -50,11 +50,6 @@ def command_unit(params: Params) -> Float[Array, ""]:
 def difference(params: Params, state: State, reference: State) -> Float[Array, " d"]:
     """Difference between two states of one drone as a vector.
 
-    Args:
-        params: of the drone.
-        state: of the drone.
-        reference: subtracted state.
-
     Returns:
         (d,) in this order: position, m, world; rotation from the reference to the state, twice the vector part of its
         quaternion (in the limit of small angles the rotation vector, rad), body; velocity, m/s, world; angular
@@ -108,13 +103,9 @@ def tracking_error(params: Params, state: State, reference: State) -> Float[Arra
 def linearize_step(
     step: SingleStep, params: Params, state: State, rpm: Float[Array, "4"]
 ) -> tuple[Float[Array, "d d"], Float[Array, "d 4"]]:
-    """Matrices A and B of z' = A z + B u about a state and a command of one drone.
+    """Matrices A and B of z' = A z + B u about a state and a command (4,) (RPM) of one drone.
 
-    Args:
-        step: of one drone, such as `single(make_step(...))`.
-        params: of the drone.
-        state: of the drone.
-        rpm: (4,) commanded rotor speeds, RPM.
+    The step is that of one drone, such as `single(make_step(...))`.
 
     Returns:
         (d, d) and (d, 4): z is the `difference` from the state before the step, z' that from the state after it, and u
@@ -135,11 +126,7 @@ def linearize(
 ) -> tuple[Float[Array, "d d"], Float[Array, "d 4"]]:
     """Matrices A and B of the continuous model z' = A z + B u about the motion through a state of one drone.
 
-    Args:
-        derivative: of one drone, such as `single(make_derivative(...))`.
-        params: of the drone.
-        state: of the drone.
-        rpm: (4,) commanded rotor speeds, RPM.
+    The derivative is that of one drone, such as `single(make_derivative(...))`, under a command (4,) (RPM).
 
     Returns:
         (d, d) 1/s and (d, 4) 1/s: z is the `difference` from the motion, u the change of the command over the rotor

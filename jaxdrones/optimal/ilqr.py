@@ -79,13 +79,10 @@ class Solution(PyTreeNode):
 
 
 def settings(step: Any, weights: Weights | None = None, horizon: int = 25, iterations: int = 2) -> Settings:
-    """Settings of a planner.
+    """Settings of a planner, with the weights of the errors, by default `problem.weights()`.
 
-    Args:
-        step: of a team, over one control period: that of the simulation, or a simpler one.
-        weights: of the errors; by default `problem.weights()`.
-        horizon: planned control steps. The terminal cost is that of the regulator of `lqr`.
-        iterations: per call of `control`, starting from the previous plan.
+    The terminal cost after `horizon` control steps is that of the regulator of `lqr`. The `iterations` of a call of
+    `control` start from the previous plan.
     """
     return Settings(default_weights() if weights is None else weights, step, horizon, iterations)
 
@@ -110,22 +107,8 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of a plan over the horizon.
 
-    The guess is the previous plan, shifted by one step, and at first a flight with the regulator of `lqr`.
-
-    Args:
-        settings: of the planner.
-        params: of the drone.
-        memory: of `init` or the previous call.
-        state: of the drone.
-        setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
-        dt: time between calls, s.
-        on_failure: without a new plan, `hold` repeats the last safe command and `raise` raises. Inside `jax.jit` only
-            `hold` is possible. The memory has the status of the call.
-
-    Raises:
-        PlanningError: there is no new plan, and `on_failure` is `raise`.
-        ValueError: arrays of a team (use `jax.vmap`), a wrong number of setpoints, or a `dt` other than the period of
-            the step.
+    The guess is the previous plan, shifted by one step, and at first a flight with the regulator of `lqr`. See
+    `jaxdrones.optimal` for arguments and errors.
     """
     check_plan(settings, params, memory, state, setpoints, dt, on_failure)
     valid = is_finite((state, setpoints))
@@ -169,15 +152,9 @@ def solve(
     rpm: Float[Array, "H 4"],
     value: Float[Array, "d d"],
 ) -> Solution:
-    """Improve a guess by some iterations; return the best plan.
+    """Improve a guess (H, 4) (RPM) by some iterations; return the best plan.
 
-    Args:
-        settings: of the planner.
-        params: of the drone.
-        state: of the drone, at the start.
-        target: H + 1 states and commands to track.
-        rpm: (H, 4) the guess, RPM.
-        value: (d, d) weight of the tracking error at the end.
+    The target is H + 1 states and commands to track, and `value` (d, d) the weight of the tracking error at the end.
     """
     step, unit = single(settings.step), command_unit(params)
     high = params.max_rpm / unit

@@ -42,23 +42,12 @@ class Memory(PyTreeNode):
 
 
 def settings(step: Any, weights: Weights | None = None) -> Settings:
-    """Settings of a regulator.
-
-    Args:
-        step: of a team, over one control period: that of the simulation, or a simpler one.
-        weights: of the errors; by default `problem.weights()`.
-    """
+    """Settings of a regulator, with the weights of the errors, by default `problem.weights()`."""
     return Settings(default_weights() if weights is None else weights, step)
 
 
 def init(settings: Settings, params: Params, state: State) -> Memory:
-    """Regulator of one drone: linearization about hover, and solution of its Riccati equation.
-
-    Args:
-        settings: of the regulator.
-        params: of the drone.
-        state: of the drone, for the states of its models.
-    """
+    """Regulator of one drone with such models: linearization about hover, and solution of its Riccati equation."""
     at_rest = hover(params, state)
     a, b = linearize_step(single(settings.step), params, at_rest, at_rest.rpm)
     q, r = settings.weights.state_matrix(len(a)), settings.weights.command_matrix()
@@ -69,19 +58,7 @@ def init(settings: Settings, params: Params, state: State) -> Memory:
 def control(
     settings: Settings, params: Params, memory: Memory, state: State, setpoints: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`.
-
-    Args:
-        settings: of the regulator.
-        params: of the drone.
-        memory: of `init`.
-        state: of the drone.
-        setpoints: of the drone at this and the next two control steps, arrays (3, ...).
-        dt: time between calls, s.
-
-    Raises:
-        ValueError: arrays of a team (use `jax.vmap`), or a `dt` other than the period of the step.
-    """
+    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`, with three setpoints; see `jaxdrones.optimal`."""
     check_single(params, state)
     check_period(settings.step, dt)
     target = reference(params, setpoints, state.aux, dt)

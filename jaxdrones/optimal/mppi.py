@@ -75,11 +75,11 @@ def settings(
     temperature: float = 0.3,
     hold: int = 3,
 ) -> Settings:
-    """Settings of a planner.
+    """Settings of a planner, with the weights of the errors, by default `problem.weights()`.
 
     Args:
         step: of a team, over one control period: that of the simulation, or a simpler one.
-        weights: of the errors; by default `problem.weights()`.
+        weights: of the errors.
         horizon: planned control steps. The terminal cost is that of the regulator of `lqr`.
         samples: samples per call.
         temperature: in standard deviations of the samples' costs; a lower value favors the best sample.
@@ -98,14 +98,7 @@ def settings(
 
 
 def init(settings: Settings, params: Params, state: State, key: Array) -> Memory:
-    """Memory of one drone before its first call.
-
-    Args:
-        settings: of the planner.
-        params: of the drone.
-        state: of the drone, for the states of its models.
-        key: random key; one per drone.
-    """
+    """Memory of one drone with such models before its first call; every drone has its own random key."""
     regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
     always = jnp.ones((), bool)
     correction = jnp.zeros((settings.horizon, 4), regulator.gain.dtype)
@@ -124,20 +117,7 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`: the first command of the averaged plan.
 
-    Args:
-        settings: of the planner.
-        params: of the drone.
-        memory: of `init` or the previous call.
-        state: of the drone.
-        setpoints: of the drone at this and the next H control steps, arrays (H + 1, ...).
-        dt: time between calls, s.
-        on_failure: without a new plan, `hold` repeats the last safe command and `raise` raises. Inside `jax.jit` only
-            `hold` is possible. The memory has the status of the call.
-
-    Raises:
-        PlanningError: there is no new plan, and `on_failure` is `raise`.
-        ValueError: arrays of a team (use `jax.vmap`), a wrong number of setpoints, or a `dt` other than the period of
-            the step.
+    See `jaxdrones.optimal` for arguments and errors.
     """
     check_plan(settings, params, memory, state, setpoints, dt, on_failure)
     valid = is_finite((state, setpoints))

@@ -71,13 +71,7 @@ def reference(params: Params, setpoints: Setpoint, aux: dict, dt: float) -> Refe
     """Reference motion through setpoints by differential flatness (Mellinger, Kumar 2011).
 
     Thrust and attitude are those of the acceleration and heading; angular velocities and torques are differences of
-    attitudes in time. The angular velocity of the setpoints is not used.
-
-    Args:
-        params: of the drone.
-        setpoints: H + 1 setpoints of one drone, arrays (H + 1, ...), H >= 2.
-        aux: states of models of the reference.
-        dt: time between setpoints, s.
+    attitudes over `dt` (s). The angular velocity of the H + 1 >= 3 setpoints is not used; `aux` are states of models.
     """
     quat, thrust = jax.vmap(lambda acc, yaw: _upright(params, acc, yaw))(setpoints.acc, setpoints.yaw)
     omega = _with_last(jax.vmap(_turn)(quat[:-1], quat[1:]) / dt)

@@ -87,17 +87,9 @@ def casadi_model(
     """Convert the equations of motion of `jaxdrones.make_derivative` to a CasADi function.
 
     The traced program, with built-in or custom effects, is evaluated on symbols in double precision. It is for one
-    drone, or for a team with the constants of a team.
-
-    Args:
-        vehicle: a bundled vehicle, the path of a URDF, or constants of a drone or a team.
-        effects: as for `make_derivative`.
-        pairs: as for `make_derivative`; they need a team.
-        team_effects: as for `make_derivative`; they need a team.
-        models: as for `make_derivative`.
-        rotors: as for `make_derivative`.
-        scene: scene of effects with a `scene` parameter.
-        parameters: names of fields of `Params` to keep as symbols, such as `("wind",)`.
+    drone, or for a team with the constants of a team, which pairs and team effects need. The vehicle is a bundled one,
+    the path of a URDF, or constants; `parameters` are names of fields of `Params` to keep as symbols, such as
+    `("wind",)`; other arguments are those of `make_derivative`.
 
     Returns:
         The function, its symbols, and the mapping between a `State` and a vector.

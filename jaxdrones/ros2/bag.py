@@ -78,12 +78,7 @@ class Recorder:
 
 
 def read(path: Path) -> Iterator[Recorded]:
-    """Read the messages of a bag in the order of their times; unknown types are skipped.
-
-    Raises:
-        ValueError: no bag, or a damaged one.
-        ImportError: rosbags is not installed.
-    """
+    """Read the messages of a bag in the order of their times; unknown types are skipped."""
     msg.typestore()
     from rosbags.rosbag2 import Reader
 
@@ -97,12 +92,7 @@ def read(path: Path) -> Iterator[Recorded]:
 
 
 def write_flight(record: FlightLog, path: Path) -> None:
-    """Write the log of a flight as a bag: clock, poses, twists, odometry and rotor speeds.
-
-    Raises:
-        ValueError: an existing path.
-        ImportError: rosbags is not installed.
-    """
+    """Write the log of a flight as a bag: clock, poses, twists, odometry and rotor speeds."""
     with Recorder(path) as recorder:
         for k, t in enumerate(np.asarray(record.t, float)):
             ns = round(t * 1e9)

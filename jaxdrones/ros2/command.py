@@ -78,17 +78,9 @@ def control(
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM.
 
-    Positions and velocities are tracked by a controller of the package, body rates by the inner loop of `rates`; rotor
-    speeds pass unchanged. A velocity command uses the present position as set-point, as in the velocity input of the
-    paper.
-
-    Args:
-        controller: a name of `CONTROLLERS`.
-        params: of the drone.
-        memory: of the last step.
-        state: of the drone.
-        command: of the drone.
-        dt: control period, s.
+    Positions and velocities are tracked by a controller of `CONTROLLERS`, body rates by the inner loop of `rates`;
+    rotor speeds pass unchanged. A velocity command uses the present position as set-point, as in the velocity input of
+    the paper. `dt` is the control period, s.
     """
     flown = CONTROLLERS[controller]
     yaw = rotation.to_rpy(state.quat)[2]

@@ -84,17 +84,10 @@ class Backend:
         return self._steps * self.dt
 
     def step(self, states_desired: Sequence[Any], actions: Sequence[SwarmAction]) -> list[SwarmState]:
-        """Advance all drones by `dt` and publish the clock.
+        """Advance all drones by `dt`, publish the clock, and return the states; without actions the motors stop.
 
         Crazyswarm2's motor speeds are converted to thrust by its fit, and to rotor speeds of the vehicle, so the
         firmware's thrust is independent of the vehicle's coefficients.
-
-        Args:
-            states_desired: targets, unused.
-            actions: of the drones, in the order of their names; `None`, without a controller, stops the motors.
-
-        Returns:
-            The states of the drones.
         """
         speeds = np.array([np.zeros(4) if action is None else np.asarray(action.rpm, float) for action in actions])
         rpm = np.sqrt(thrust_of(speeds)[:, self._order] / self._kf)

@@ -130,15 +130,10 @@ class DepthNoise:
     """Value of a missing pixel: `zero`, as in most drivers, or `far`."""
 
     def apply(self, key: jax.Array, depth: Float[Array, "*images h w"], camera: Camera) -> Float[Array, "*images h w"]:
-        """Depth with noise, m.
+        """Depth with noise, m; the `far` of the camera is the depth of an empty pixel.
 
         The gradient with respect to the true depth is that of the scatter. Rounding has a straight-through gradient.
         Missing pixels have a zero gradient.
-
-        Args:
-            key: random key.
-            depth: true depth, m.
-            camera: camera of the images; its `far` is the depth of an empty pixel.
         """
         scatter_key, dropout_key = jax.random.split(key)
         far = jnp.asarray(camera.far, depth.dtype)

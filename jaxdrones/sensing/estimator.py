@@ -165,11 +165,7 @@ def state_estimate(
 def seen(now: kalman.Estimate, state: State, read: dict[str, Array], true: dict[str, Array]) -> State:
     """Estimated state; body rates are those of the gyroscope, less its estimated bias.
 
-    Args:
-        now: present estimate.
-        state: true state.
-        read: reading of the IMU; its error, of a mean over the period, is taken for that at the instant.
-        true: reading without errors.
+    The error of the reading, of a mean over the period, is taken for that at the instant.
     """
     omega = state.omega + (read["gyro"] - true["gyro"]) - now.gyro_bias
     return State(now.pos, now.quat, now.vel, omega, state.rpm)

@@ -91,15 +91,7 @@ def begin(part: ImuPart, key: jax.Array, params: Params) -> dict[str, Errors]:
 def read(
     part: ImuPart, key: jax.Array, errors: dict[str, Errors], true: dict[str, Array], dt: float
 ) -> tuple[dict[str, Errors], dict[str, Array]]:
-    """Errors and reading of one measurement.
-
-    Args:
-        part: the unit.
-        key: random key of this measurement.
-        errors: of the previous measurement, as `begin` returns them.
-        true: as `motion` returns it.
-        dt: time between measurements, s.
-    """
+    """Errors and reading of one measurement of a unit, `dt` (s) after the previous one; `true` is that of `motion`."""
     keys = dict(zip(("acc", "gyro"), jax.random.split(key), strict=True))
     result = {name: getattr(part, name).measure(keys[name], errors[name], true[name], dt) for name in keys}
     return {name: result[name][0] for name in keys}, {name: result[name][1] for name in keys}
@@ -108,16 +100,10 @@ def read(
 def mean_motion(
     params: Params, quat: Float[Array, "4"], vel: Float[Array, "3"], state: State, dt: float
 ) -> dict[str, Array]:
-    """Mean ideal reading over a step, as of a unit that integrates: `acc` and `gyro`, body.
+    """Mean ideal reading over a step of dt (s), as of a unit that integrates: `acc` and `gyro`, body.
 
     Rotation and change of velocity over the step follow exactly from these means, with `acc` in the axes of mid-step.
-
-    Args:
-        params: of the drone.
-        quat: (4,) attitude at the start of the step.
-        vel: (3,) velocity at the start of the step, m/s, world.
-        state: at the end.
-        dt: length of the step, s.
+    The attitude and velocity are those at the start of the step, the state that at its end.
     """
     turn = rotation.log(rotation.multiply(rotation.conjugate(quat), state.quat))
     middle = rotation.multiply(quat, rotation.exp(turn / 2))
@@ -128,14 +114,7 @@ def mean_motion(
 
 
 def motion(params: Params, state: State, rate: State, offset: Float[Array, "3"] | None = None) -> dict[str, Array]:
-    """Ideal reading: `acc` R^T (a - g) + dw/dt x r + w x (w x r), m/s^2, and `gyro` w, rad/s, body.
-
-    Args:
-        params: of the drone.
-        state: of the drone.
-        rate: its time derivative.
-        offset: (3,) r of the unit from the center of mass, m, body; by default zero.
-    """
+    """Ideal reading: `acc` R^T (a - g) + dw/dt x r + w x (w x r), m/s^2, and `gyro` w, rad/s, body; r is the offset."""
     acc = rotation.rotate_inverse(state.quat, rate.vel + along_z(params.gravity))
     if offset is not None:
         acc += cross(rate.omega, offset) + cross(state.omega, cross(state.omega, offset))

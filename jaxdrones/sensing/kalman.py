@@ -52,14 +52,7 @@ class ImuNoise(PyTreeNode):
 def init(
     pos: Float[Array, "3"], vel: Float[Array, "3"], quat: Float[Array, "4"], deviation: Float[Array, "15"]
 ) -> Estimate:
-    """Initial estimate, without correlations and with zero biases.
-
-    Args:
-        pos: m, world.
-        vel: m/s, world.
-        quat: body to world.
-        deviation: standard deviation of each part of the error.
-    """
+    """Initial estimate, without correlations and with zero biases; `deviation` is that of each part of the error."""
     zero = jnp.zeros_like(pos)
     return Estimate(pos, vel, quat, zero, zero, jnp.diag(deviation**2))
 
@@ -120,14 +113,7 @@ def move(
 def update(
     estimate: Estimate, residual: Float[Array, " k"], jacobian: Float[Array, "k 15"], cov: Float[Array, "k k"]
 ) -> Estimate:
-    """Update the estimate with a measurement; the covariance is in Joseph's form.
-
-    Args:
-        estimate: before it.
-        residual: measured less expected value.
-        jacobian: derivative of the measurement with respect to the error.
-        cov: covariance of the measurement's noise.
-    """
+    """Update the estimate with a residual, measured less expected; the covariance is in Joseph's form."""
     projected = jacobian @ estimate.cov
     gain = jnp.linalg.solve(projected @ jacobian.T + cov, projected).T
     kept = jnp.eye(15, dtype=gain.dtype) - gain @ jacobian
@@ -149,14 +135,7 @@ def update(
 def update_position(
     estimate: Estimate, pos: Float[Array, "3"], deviation: float | Array, offset: Float[Array, "3"] | None = None
 ) -> Estimate:
-    """Update the estimate with a measurement of the position.
-
-    Args:
-        estimate: before it.
-        pos: m, world.
-        deviation: standard deviation of each axis, m.
-        offset: (3,) measured point relative to the IMU, m, body; zero by default.
-    """
+    """Update the estimate with the position (m, world) of a point at an offset (m, body) from the IMU."""
     eye = jnp.eye(3, dtype=pos.dtype)
     offset = jnp.zeros_like(pos) if offset is None else offset
     turned = -rotation.to_matrix(estimate.quat) @ _skew(offset)
@@ -180,13 +159,9 @@ def update_height(estimate: Estimate, height: Float[Array, ""], deviation: float
 def update_direction(
     estimate: Estimate, measured: Float[Array, "3"], world: Float[Array, "3"], deviation: float | Array
 ) -> Estimate:
-    """Update the estimate with a measured vector of known world direction, for example the magnetic field.
+    """Update the estimate with a measured vector, in body axes, of known world direction, such as the magnetic field.
 
-    Args:
-        estimate: before it.
-        measured: the vector in body axes.
-        world: the vector in world axes.
-        deviation: standard deviation of each axis, in units of the vector.
+    The standard deviation of each axis is in units of the vector.
     """
     expected = rotation.rotate_inverse(estimate.quat, world)
     jacobian = jnp.zeros((3, 15), world.dtype).at[:, ANGLE].set(_skew(expected))

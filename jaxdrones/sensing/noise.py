@@ -77,27 +77,14 @@ class Noise:
         return math.hypot(self.turn_on, self.drift)
 
     def init(self, key: jax.Array, shape: tuple[int, ...], dtype: DTypeLike) -> Errors:
-        """Errors at the start of an episode.
-
-        Args:
-            key: random key.
-            shape: of a reading.
-            dtype: of a reading.
-        """
+        """Errors of a reading at the start of an episode."""
         turn_on, drift, scale = (jax.random.normal(k, shape, dtype) for k in jax.random.split(key, 3))
         return Errors(self.turn_on * turn_on, self.drift * drift, jnp.zeros(shape, dtype), self.scale * scale)
 
     def measure(
         self, key: jax.Array, errors: Errors, true: Float[Array, "*shape"], dt: float
     ) -> tuple[Errors, Float[Array, "*shape"]]:
-        """Errors and reading of one measurement.
-
-        Args:
-            key: random key of this measurement.
-            errors: of the previous measurement.
-            true: true value, u.
-            dt: time between measurements, s.
-        """
+        """Errors and reading, of the true value, at one measurement `dt` (s) after the previous one."""
         white, driven, step = (jax.random.normal(k, true.shape, true.dtype) for k in jax.random.split(key, 3))
         kept = math.exp(-dt / self.correlation)
         errors = errors.replace(

@@ -41,7 +41,8 @@ class Scene(PyTreeNode, kw_only=True):
     """Static obstacles, and by default a ground plane at z = 0. `Scene.of` builds one.
 
     Obstacles are numbered kind by kind: boxes, spheres, cylinders, capsules, meshes, URDF files; within a kind in the
-    order of the arguments.
+    order of the arguments. Distances and surfaces are of points (3,), m, world, for many of which use `jax.vmap`; they
+    are differentiable in point and scene, and `ValueError` is raised for meshes and URDF files.
     """
 
     boxes: Box | None = None
@@ -116,16 +117,7 @@ class Scene(PyTreeNode, kw_only=True):
     def distance(self, point: ArrayLike) -> Array:
         """Signed distance of a point from the nearest surface, m; negative inside an obstacle or underground.
 
-        It is differentiable in the point and in the scene. Where obstacles overlap, the deepest one counts.
-
-        Args:
-            point: (3,) m, world; for many points use `jax.vmap`.
-
-        Returns:
-            () m; infinity in an empty scene.
-
-        Raises:
-            ValueError: a wrong shape, or a mesh or URDF file in the scene.
+        Where obstacles overlap, the deepest one counts. It is infinity in an empty scene.
         """
         point = self._point(point)
         return distance_of(self.shapes(point.dtype), self.ground, point)
@@ -133,13 +125,7 @@ class Scene(PyTreeNode, kw_only=True):
     def nearest(self, point: ArrayLike) -> Surface:
         """Nearest surface: signed distance, nearest point and outward normal, also from inside.
 
-        It is differentiable in the point and in the scene. Ties are broken arbitrarily.
-
-        Args:
-            point: (3,) m, world; for many points use `jax.vmap`.
-
-        Raises:
-            ValueError: a wrong shape, or a mesh or URDF file in the scene.
+        Ties are broken arbitrarily.
         """
         point = self._point(point)
         return nearest_of(self.shapes(point.dtype), self.ground, point)
@@ -147,32 +133,16 @@ class Scene(PyTreeNode, kw_only=True):
     def nearest_few(self, point: ArrayLike, count: int) -> Surface:
         """Nearest surfaces of each of the `count` nearest obstacles, the ground among them; the nearest first.
 
-        It is differentiable in the point and in the scene.
-
-        Args:
-            point: (3,) m, world; for many points use `jax.vmap`.
-            count: number of surfaces; see `Surface` for those beyond the number of obstacles.
-
-        Returns:
-            Surfaces with a leading axis of length `count`.
-
-        Raises:
-            ValueError: a wrong shape, or a mesh or URDF file in the scene.
+        They have a leading axis of length `count`; see `Surface` for those beyond the number of obstacles.
         """
         point = self._point(point)
         return nearest_few_of(self.shapes(point.dtype), self.ground, point, count)
 
     def touched(self, points: Float[Array, "m 3"], within: Number) -> Surface:
-        """Nearest obstacle surface for each of several points of one body.
+        """Nearest obstacle surface for each of several points of one body, near each other.
 
-        Faster than `nearest`: only obstacles within reach of the body are considered.
-
-        Args:
-            points: m, world, near each other.
-            within: m; where no obstacle is nearer to a point, the surface is that of an arbitrary obstacle.
-
-        Raises:
-            ValueError: there is no obstacle, a wrong shape, or a mesh or URDF file in the scene.
+        Faster than `nearest`: only obstacles within reach of the body are considered. Where no obstacle is nearer than
+        `within` (m) to a point, the surface is that of an arbitrary obstacle.
         """
         check_scene(self)
         if not self.has_obstacles:

@@ -78,10 +78,6 @@ class Sensor:
         """Whether there is a measurement at a control step.
 
         The k-th measurement is in the first step at or after k / rate.
-
-        Args:
-            step: () number of control steps since the start of the episode.
-            dt: control period, s.
         """
         if self.rate is None or self.rate * dt >= 1:
             return jnp.ones((), bool)

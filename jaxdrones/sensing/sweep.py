@@ -81,13 +81,7 @@ class Planes(NamedTuple):
 
 
 def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
-    """Separating planes that a moving disc would cross, for up to three obstacles, nearest first.
-
-    Args:
-        kinds: obstacles, each kind with a leading axis.
-        start: the disc before the motion.
-        end: the disc after an unobstructed motion.
-    """
+    """Separating planes that a moving disc would cross, for up to three obstacles, nearest first."""
 
     def look(found: tuple[Planes, Point, Array], obstacle: Obstacle, _: Any) -> tuple[Planes, Point, Array]:
         known, center, count = found

@@ -22,13 +22,7 @@ _FEW = 128  # solids whose index fits into the last 7 of 23 bits of a depth
 
 @jax.custom_jvp
 def depth(view: View, solids: Solids, active: list[Array]) -> Float[Array, "h w"]:
-    """Depth of each pixel along the viewing axis, m; `far` for empty pixels.
-
-    Args:
-        view: rays.
-        solids: visible solids.
-        active: (k,) bool for each kind, the active solids.
-    """
+    """Depth along the viewing axis of each pixel that shows an active solid, m; `far` for empty pixels."""
 
     def nearer(depth: Array, solid: Placed, active: Array, index: Array) -> Array:
         return jnp.minimum(depth, _first_hit(view, solid, active))

@@ -91,14 +91,7 @@ def direction(gate: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
 def passes(
     gate: Float[Array, "n 4"], before: Float[Array, "n 3"], pos: Float[Array, "n 3"], opening: float = OPENING
 ) -> Bool[Array, " n"]:
-    """Whether the straight way between two positions (m) passes a gate in its direction.
-
-    Args:
-        gate: gate of every drone.
-        before: positions at the last control step, m.
-        pos: positions now, m.
-        opening: edge of the square opening, m.
-    """
+    """Whether the straight way of every drone between two positions (m) passes its gate's opening in its direction."""
     start, end = _in_gate(gate, before), _in_gate(gate, pos)
     crosses = (start[:, 0] < 0) & (end[:, 0] >= 0)
     share = -start[:, 0] / jnp.where(crosses, end[:, 0] - start[:, 0], 1)

@@ -66,8 +66,7 @@ def clearance(margin_time: float = 0.1) -> Term:
     Margin and term grow with the closing speed, as in the cost of DiffPhysDrone ("Back to Newton's laws", 2024): a
     drone needs more distance the faster it approaches an obstacle, and none beside it.
 
-    Args:
-        margin_time: growth of the margin with the closing speed, s.
+    `margin_time` is the growth of the margin with the closing speed, s.
     """
 
     def term(task: Task, world: World) -> Float[Array, " n"]:

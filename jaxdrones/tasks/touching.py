@@ -19,14 +19,9 @@ _ONE_IN = 8  # worlds: in forests and rooms usually fewer have something nearby
 
 
 def touches(world: World, before: Float[Array, "n 3"], scene: Scene | None = None) -> Collisions:
-    """Collision flags of a world by `jaxdrones.sensing.collisions`, with a sweep since the last step.
+    """Collision flags of a world by `jaxdrones.sensing.collisions`, with a sweep from the positions `before`.
 
-    Under `vmap`, only worlds with something within reach are computed.
-
-    Args:
-        world: only its poses matter.
-        before: positions at the last control step, m, world, for a sweep along a straight line.
-        scene: obstacles and ground; by default those of the world.
+    Under `vmap`, only worlds with something within reach are computed. By default the scene is that of the world.
     """
     scene = world.scene if scene is None else scene
     args = jax.lax.stop_gradient((world.params, world.drones, before, scene))

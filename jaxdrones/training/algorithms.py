@@ -44,9 +44,5 @@ class Learner(Protocol):
 
 @checked
 def learner(algorithm: Annotated[str, choice("algorithm", ALGORITHMS)]) -> Learner:
-    """Module of a learner.
-
-    Raises:
-        ValueError: unknown algorithm.
-    """
+    """Module of a learner."""
     return cast(Learner, importlib.import_module(ALGORITHMS[algorithm]))

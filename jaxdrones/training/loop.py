@@ -150,11 +150,7 @@ class _Loop:
                 length = max(1, round(_CALL_SECONDS / seconds * length))
 
     def advance(self, length: int) -> tuple[Any, list[dict[str, float]], float]:
-        """State after some more updates, a row of progress for each, and their duration, s.
-
-        Raises:
-            Diverged: parameters, or the gradients of too many updates in a row, are not finite.
-        """
+        """State after some more updates, a row of progress for each, and their duration, s."""
         start = time.perf_counter()
         state, metrics = self.trainer.advance(self.state, length)
         seconds = distributed.from_first_host(time.perf_counter() - start)

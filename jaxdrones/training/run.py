@@ -108,12 +108,7 @@ class Run:
         return Recipe.from_dict(self.sidecar_entry(name, "recipe"))
 
     def policy(self, name: str = "best", env: Env | None = None) -> Policy:
-        """Policy `best`, `last` or one of `kept`.
-
-        Raises:
-            FileNotFoundError: there is no such policy.
-            ValueError: it is damaged, of another training than the files beside it, or for another environment.
-        """
+        """Policy `best`, `last` or one of `kept`."""
         self.check_identity(name)
         policy = checkpoint.load(self.folder / name)
         if env is not None:
@@ -156,11 +151,7 @@ class Run:
         (self.folder / "report.json").unlink(missing_ok=True)
 
     def report(self) -> dict[str, Any] | None:
-        """Content of report.json; `None` for an unfinished run.
-
-        Raises:
-            ValueError: the file is damaged.
-        """
+        """Content of report.json; `None` for an unfinished run."""
         if not self.finished:
             return None
         report = self._report()
@@ -183,9 +174,6 @@ class Run:
         """Rows of progress.csv, each without the missing values of its update.
 
         A truncated last line, as left by a killed process, is ignored.
-
-        Raises:
-            ValueError: the file is damaged.
         """
         path = self.folder / "progress.csv"
         if not path.exists():

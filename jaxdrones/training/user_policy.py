@@ -47,11 +47,7 @@ class UserPolicy:
         return make(self.task, realistic=self.realistic, **self.options | options)
 
     def policy(self, env: Env) -> AnyPolicy:
-        """Policy.
-
-        Raises:
-            ValueError: a file that cannot be read or executed, or a name that is not a policy.
-        """
+        """Policy."""
         if self.reference in POLICIES:
             return make_policy(self.reference, env)
         policy = user_code.load(self.reference)

@@ -39,10 +39,7 @@ def one_array(state: State, rpm: jax.Array) -> jax.Array:
 def reach(radius: Any, height: Any, offset: Any) -> Any:
     """Radius (m) of a ball around a drone in which everything lies that Bullet may let touch it, its margins included.
 
-    Args:
-        radius: of the collision cylinder, m.
-        height: of the collision cylinder, m.
-        offset: of its center from the center of mass along body z, m.
+    Arguments are those of the collision cylinder, with its offset along body z, m.
     """
     return 1.05 * (radius**2 + (abs(offset) + height / 2) ** 2) ** 0.5 + 0.02
 

@@ -40,21 +40,11 @@ def make_step(
 ) -> BulletStep:
     """Build the step of a world with Bullet as integrator and contact solver.
 
-    Args:
-        effects: as for the explicit backend, but for `ground_contact` and `obstacle_contact`.
-        pairs: as for the explicit backend, but for `drone_contact`.
-        rotors: as for the explicit backend.
-        dt: physics step, s.
-        substeps: physics steps per call, with the command held.
-        team_effects: as for the explicit backend.
-        models: as for the explicit backend; their states take explicit Euler steps of `dt`, as rotors do.
-        neighbors: as for the explicit backend.
-        scene: ground and obstacles, by default a ground plane. A call can override it.
-        damping: Bullet's linear and angular damping, 1/s; that of gym-pybullet-drones is 0.04.
-        collision: `balls`, a ring of balls on a disc, stable at rest and in rebounds, or `cylinder`, the shape in
-            gym-pybullet-drones.
-        renderer: of the cameras: `tiny`, on the CPU, or `egl`, on a GPU.
-        gui: open a window; the cameras then render in it, too.
+    Arguments are those of the explicit backend, without `ground_contact`, `obstacle_contact` and `drone_contact`. By
+    default there is a ground plane. The states of models take explicit Euler steps of `dt`, as rotors do. `damping` is
+    Bullet's linear and angular damping, 1/s; that of gym-pybullet-drones is 0.04. `collision` is `balls`, a ring of
+    balls on a disc, stable at rest and in rebounds, or `cylinder`, the shape in gym-pybullet-drones. The `renderer` of
+    cameras is `tiny`, on the CPU, or `egl`, on a GPU. `gui` opens a window, in which the cameras then render, too.
 
     Returns:
         `step(params, state, rpm) -> state`, a context manager that closes the connection. Rotor speeds are limited to

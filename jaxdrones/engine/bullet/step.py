@@ -99,11 +99,7 @@ class BulletStep(HostStep):
         return _unpack(team.astype(self._flat_params.dtype), aux)
 
     def contacts(self, params: Params, state: State, scene: Scene | None = None) -> list[Contact]:
-        """Contacts in the next physics step, with the rotors held at `state.rpm`.
-
-        Raises:
-            ValueError: a wrong shape, a closed client, or a state that is not finite.
-        """
+        """Contacts in the next physics step, with the rotors held at `state.rpm`."""
         acting = self._set_scene(self._given(scene))
         team = self._pack(params, state, state.rpm)
         _check(state, state.rpm)
@@ -116,9 +112,6 @@ class BulletStep(HostStep):
         """Images of the camera of every drone, in the format of `jaxdrones.render`, rendered by Bullet.
 
         A camera inside an obstacle or underground sees it in black at `near`.
-
-        Raises:
-            ValueError: a wrong shape, a closed client, a state that is not finite, or an invalid camera.
         """
         check_camera("camera", camera)
         scene = self._given(scene)

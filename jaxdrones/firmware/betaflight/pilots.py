@@ -27,13 +27,9 @@ _MIN_CHECK = 0.05  # stick up to which the throttle is zero
 
 
 def sticks_for(params: Params, thrust: float, omega: ArrayLike, max_rate: float = MAX_RATE) -> Sticks:
-    """Sticks for a collective thrust and body rates.
+    """Sticks for a total thrust (N) and body rates (3,) (rad/s, x forward, y left, z up) of a drone.
 
-    Args:
-        params: of the drone.
-        thrust: total thrust of the rotors, N.
-        omega: (3,) rad/s, body, x forward, y left, z up.
-        max_rate: rate at the end of a stick, degrees/s.
+    `max_rate` is the rate at the end of a stick, degrees/s.
     """
     output = math.sqrt(max(thrust, 0.0) / (4 * float(params.kf))) / float(params.max_rpm)
     share = min(max((output - _IDLE) / (1 - _IDLE), 0.0), 1.0)

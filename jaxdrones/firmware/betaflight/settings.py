@@ -128,11 +128,7 @@ def rc_tuning(max_rate: int) -> bytes:
 
 
 def status(client: msp.Client) -> Status:
-    """Status of the flight controller.
-
-    Raises:
-        msp.NoAnswer: no answer, or one of another version.
-    """
+    """Status of the flight controller."""
     return parse_status(client.request(msp.STATUS))
 
 

@@ -73,11 +73,7 @@ class Commander:
                 self._stream(_decode(data[0], values), t)
 
     def plan(self, data: bytes, t: float, sample: Sample) -> bytes:
-        """Execute a command of the high-level commander, which flies if the stream has ended or is old.
-
-        Returns:
-            The answer.
-        """
+        """Answer to a command of the high-level commander, which flies if the stream has ended or is old."""
         now = Goal.at_rest(sample.pos, math.radians(sample.rpy[2]))
         answer = self.high_level.command(data, t, now)
         if self._valid_until is not None or t - self._time >= LEVEL_AFTER:

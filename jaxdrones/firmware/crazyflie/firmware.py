@@ -99,11 +99,7 @@ class Crazyflie:
             yield Packet(port, channel, answer)
 
     def advance(self, now: float) -> Iterator[tuple[Hashable, Packet]]:
-        """Fly for 10 ms; log packets of each client. Clients that were silent for 5 s are dropped.
-
-        Args:
-            now: real time, s.
-        """
+        """Fly for 10 ms; log packets of each client. Clients silent for 5 s of real time are dropped."""
         wanted = self.commander.target(self.time)
         self.target = wanted if self.supervisor.can_fly else motors_off()
         if not self.supervisor.can_fly:

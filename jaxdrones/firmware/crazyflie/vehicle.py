@@ -84,11 +84,7 @@ class Vehicle:
     """Crazyflie at rest on the ground at the origin, with the gains of its firmware."""
 
     def __init__(self, vehicle: str = "cf2x"):
-        """Compile the simulation.
-
-        Args:
-            vehicle: a bundled vehicle or the path of a URDF; the gains are scaled to other vehicles than a Crazyflie.
-        """
+        """Compile the simulation; the gains are scaled to other vehicles than a Crazyflie."""
         self.params = load_params(vehicle)
         self.gains = firmware_pid.gains(None if vehicle in VEHICLES else self.params)
         self._team = repeat(self.params, 1)

@@ -16,7 +16,7 @@ import jax
 from jaxdrones import checks
 from jaxdrones.checks import check_key, check_switch, check_whole, is_concrete, short_repr
 from jaxdrones.errors import UserError
-from jaxdrones.limits import check_at_most
+from jaxdrones.limits import LARGEST_COUNT, LARGEST_SEED
 
 Check = Callable[[str, Any], Any]
 """(name, value) of an argument; raises for a wrong value."""
@@ -48,14 +48,17 @@ def number(unit: str = "", name: str = "", **bounds: Any) -> Range:
 
 def whole(name: str = "", minimum: int = 1, limit: int | None = None) -> Range:
     """Integer of at least `minimum`, and at most `limit`."""
-    if limit is None:
-        return Range(functools.partial(check_whole, minimum=minimum), name)
-    return Range(functools.partial(check_at_most, limit=limit, minimum=minimum), name)
+    return Range(functools.partial(check_whole, minimum=minimum, limit=limit), name)
 
 
 def choice(kind: str, known: Iterable[str]) -> Check:
     """One of the known names."""
     return lambda argument, value: checks.check_choice(kind, value, known)
+
+
+def sequence(example: str) -> Check:
+    """Sequence, of which `example` is an entry."""
+    return functools.partial(checks.check_sequence, example=example)
 
 
 def choices(kind: str, known: Iterable[str], example: str) -> Check:
@@ -70,7 +73,7 @@ def choices(kind: str, known: Iterable[str], example: str) -> Check:
 
 def function(example: str) -> Check:
     """Function."""
-    return lambda argument, value: checks.check_callable(argument, value, example)
+    return lambda argument, value: checks.check_function(argument, value, example=example)
 
 
 def _check_whole_if_known(name: str, value: Any) -> None:
@@ -95,7 +98,8 @@ PositiveFraction = Annotated[Scalar, number(above=0, at_most=1)]
 BelowOne = Annotated[Scalar, number(at_least=0, below=1)]
 Seconds = Annotated[float, number("s", above=0)]
 Hertz = Annotated[float, number("1/s", above=0)]
-Count = Annotated[int, whole()]
+count, seed = whole(limit=LARGEST_COUNT), whole(minimum=0, limit=LARGEST_SEED)
+Count = Annotated[int, count]
 TracedCount = Annotated[int | jax.Array, _check_whole_if_known]
 NonNegativeInt = Annotated[int, whole(minimum=0)]
 Switch = Annotated[bool, check_switch]

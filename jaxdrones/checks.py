@@ -46,8 +46,8 @@ def short_repr(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
-def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: str) -> None:
-    """Raise unless `array` has `shape`; a string entry is any length of at least one."""
+def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: str, *, finite: bool = False) -> None:
+    """Raise unless `array` has `shape`, and finite numbers; a string entry is any length of at least one."""
     given = np.shape(array)
     fits = len(given) == len(shape) and all(
         n >= 1 if isinstance(wanted, str) else n == wanted for n, wanted in zip(given, shape, strict=True)
@@ -55,6 +55,8 @@ def check_shape(name: str, array: Any, shape: tuple[int | str, ...], meaning: st
     if not fits:
         wanted = "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
         raise UserError(f"{name} has shape {given}; expected {wanted}: {meaning}")
+    if finite:
+        check_finite(name, array)
 
 
 def check_finite(name: str, tree: Any) -> None:
@@ -109,14 +111,16 @@ def _within(value: float, bounds: dict[str, float], infinite: bool) -> bool:
     return all(holds[word](value, bound) for word, bound in bounds.items())
 
 
-def check_whole(name: str, value: int, minimum: int = 1) -> None:
-    """Raise unless `value` is an integer of at least `minimum`."""
+def check_whole(name: str, value: int, minimum: int = 1, limit: int | None = None) -> None:
+    """Raise unless `value` is an integer from `minimum` to `limit`."""
     try:
         whole = not isinstance(value, bool) and operator.index(value) >= minimum
     except TypeError:
         whole = False
     if not whole:
         raise UserError(f"{name} is {short_repr(value)}; give a whole number of at least {minimum}")
+    if limit is not None and value > limit:
+        raise UserError(f"{name} is {str(value)[:30]}; give at most {limit}")
 
 
 def check_switch(name: str, value: bool | str, others: tuple[str, ...] = ()) -> None:
@@ -153,23 +157,22 @@ def check_sequence(name: str, value: Any, example: str) -> tuple:
     return tuple(value)
 
 
-def check_callable(name: str, value: Any, example: str) -> None:
-    """Raise unless `value` is a function."""
+def check_function(
+    name: str, value: Any, arguments: tuple[str, ...] | None = None, *, example: str = "", hint: str = ""
+) -> None:
+    """Raise unless `value` is a function, and accepts these arguments if it has a signature."""
+    wanted = f"give a function of ({', '.join(arguments or ())})"
     if not callable(value):
-        raise UserError(f"{name}: {short_repr(value)} is not a function; give for example {example}")
-
-
-def check_arguments(name: str, function: Callable, arguments: tuple[str, ...], hint: str = "") -> None:
-    """Raise unless a function accepts these arguments; a function without a signature passes."""
+        remedy = f"give for example {example}" if example else wanted
+        raise UserError(f"{name}: {short_repr(value)} is not a function; {remedy}")
     try:
-        signature = inspect.signature(function)
+        signature = inspect.signature(value)
     except (TypeError, ValueError):
         return
     try:
-        signature.bind(*arguments)
+        signature.bind(*signature.parameters if arguments is None else arguments)
     except TypeError:
-        called = getattr(function, "__name__", repr(function))
-        wanted = f"give a function of ({', '.join(arguments)})"
+        called = getattr(value, "__name__", repr(value))
         raise UserError(f"{name}: {called} takes {signature}; {wanted}{hint}") from None
 
 

@@ -3,7 +3,6 @@
 import os
 from pathlib import Path
 
-from jaxdrones.checks import check_whole
 from jaxdrones.errors import UserError
 
 LARGEST_SEED = 2**31 - 1
@@ -13,18 +12,6 @@ LARGEST_COUNT = 2**31 - 1
 
 _UNKNOWN_MEMORY = 2**40  # bytes
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-
-
-def check_seed(name: str, seed: int) -> None:
-    """Raise unless a seed gives a unique random key."""
-    check_at_most(name, seed, LARGEST_SEED, minimum=0)
-
-
-def check_at_most(name: str, value: int, limit: int, minimum: int = 1) -> None:
-    """Raise unless `value` is an integer from `minimum` to `limit`."""
-    check_whole(name, value, minimum)
-    if value > limit:
-        raise UserError(f"{name} is {str(value)[:30]}; give at most {limit}")
 
 
 def check_memory(what: str, size: int, advice: str) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxdrones import limits
+from jaxdrones import arguments, limits
 
 
 def test_more_memory_than_there_is_is_refused():
@@ -27,10 +27,10 @@ def test_the_memory_of_a_container_counts(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("seed", [0, 2**31 - 1])
 def test_a_seed_that_jax_tells_from_others_passes(seed):
-    limits.check_seed("seed", seed)
+    arguments.seed("seed", seed)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**31, 2**70, 0.5, "1", None])
 def test_a_seed_that_jax_takes_for_another_is_refused(seed):
     with pytest.raises(ValueError, match="seed is"):
-        limits.check_seed("seed", seed)
+        arguments.seed("seed", seed)

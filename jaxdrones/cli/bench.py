@@ -8,17 +8,17 @@ from typing import Any
 
 import jax
 
+from jaxdrones import arguments
 from jaxdrones.accelerate.worlds import over_worlds
-from jaxdrones.checks import check_number
 from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
+from jaxdrones.cli.common import check_options
 from jaxdrones.cli.options import add_json
 from jaxdrones.cli.report import as_json
 from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics.aero import drag
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.envs import make
-from jaxdrones.limits import LARGEST_COUNT, check_at_most
 
 _WORLDS = {"cpu": (1024, 16384), "other": (16384, 262144)}
 _DT = 1 / 240  # s
@@ -56,12 +56,15 @@ def _counts(text: str) -> list[int]:
         raise argparse.ArgumentTypeError(f"{text!r} is given; give whole numbers, for example 1024,16384") from None
 
 
+def _check_worlds(name: str, worlds: list[int]) -> None:
+    for each in worlds:
+        arguments.count(name, each)
+
+
 def _bench(options: argparse.Namespace) -> int:
     begin = time.perf_counter()
-    check_number("seconds", options.seconds, "s", above=0)
+    check_options(options, seconds=arguments.number("s", above=0), worlds=_check_worlds)
     worlds = options.worlds or _WORLDS["cpu" if jax.default_backend() == "cpu" else "other"]
-    for count in worlds:
-        check_at_most("worlds", count, LARGEST_COUNT)
     rows: list[dict[str, Any]] = []
     longest: dict[str, float] = {}
     left_out = 0

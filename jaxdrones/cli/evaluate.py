@@ -4,7 +4,8 @@ import argparse
 import functools
 from typing import Any
 
-from jaxdrones.arguments import choice, number, whole
+from jaxdrones import arguments
+from jaxdrones.arguments import choice, number
 from jaxdrones.cli.common import DIVERGED, check_options, folder, print_error
 from jaxdrones.cli.options import add_backend, add_drones, add_json, add_set, add_vehicle
 from jaxdrones.cli.policies import is_user_policy, open_policy, team_of_run
@@ -54,12 +55,10 @@ def _evaluate(options: argparse.Namespace) -> int:
     import jax
 
     from jaxdrones.learning import evaluate
-    from jaxdrones.limits import LARGEST_COUNT, check_seed
     from jaxdrones.training.run import report_as_dict
 
-    passing = number(name="fail-below", above=0, at_most=1)
-    backend, episodes = choice("backend", BACKENDS), whole(limit=LARGEST_COUNT)
-    check_options(options, episodes=episodes, seed=check_seed, fail_below=passing, backend=backend)
+    passing, backend = number(name="fail-below", above=0, at_most=1), choice("backend", BACKENDS)
+    check_options(options, episodes=arguments.count, seed=arguments.seed, fail_below=passing, backend=backend)
     settings = asked_settings(options)
     team = team_of_run(options, settings)
     run = open_policy(options.policy, options.task, options.realistic, settings, options.last)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.arguments import choice
+from jaxdrones import arguments
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import check_options, check_writable, folder, print_error
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
@@ -22,7 +22,6 @@ from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.files import check_pwm, save_csv, save_npz
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.limits import check_seed
 from jaxdrones.visualization import films, plots
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
@@ -152,7 +151,7 @@ def _fly_policy(options: argparse.Namespace) -> int:
 
     from jaxdrones.training.episode import EpisodeConditions, fly_episode, to_record
 
-    check_options(options, backend=choice("backend", BACKENDS), seed=check_seed)
+    check_options(options, backend=arguments.choice("backend", BACKENDS), seed=arguments.seed)
     run = open_policy(options.policy, options.task, options.realistic, _options_of_task(options))
     seed = options.seed or 0
     recipe = run.recipe()

@@ -9,11 +9,11 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.arguments import whole
+from jaxdrones import arguments
 from jaxdrones.cli.common import check_options, run_folder
 from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
-from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_seed
+from jaxdrones.limits import LARGEST_COUNT
 
 _MAX_SEEDS = 1000
 _MAX_SECONDS = 3.6e6
@@ -50,10 +50,10 @@ class Request:
     @classmethod
     def of(cls, options: argparse.Namespace) -> Request:
         """Request of a command line."""
-        episodes = whole(limit=LARGEST_COUNT)
-        check_options(options, seeds=whole(limit=_MAX_SEEDS), seed=check_seed, episodes=episodes)
+        seeds = arguments.whole(limit=_MAX_SEEDS)
+        check_options(options, seeds=seeds, seed=arguments.seed, episodes=arguments.count)
         if options.seed is not None:
-            check_seed("the last seed", options.seed + options.seeds - 1)
+            arguments.seed("the last seed", options.seed + options.seeds - 1)
         if options.resume and options.overwrite:
             raise UserError("--resume and --overwrite are given; one continues a run, the other replaces it")
         from jaxdrones.learning.loggers import logger_names
@@ -247,7 +247,7 @@ def _total(had: int, requested: int | None, more: bool, finished: bool) -> int:
     """
     if requested is None:
         return had
-    check_at_most("updates", requested, LARGEST_COUNT)
+    arguments.count("updates", requested)
     if more and finished:
         requested += had
     elif requested < had or (more and requested != had):
@@ -255,5 +255,4 @@ def _total(had: int, requested: int | None, more: bool, finished: bool) -> int:
             f"the run was started with updates {had}, not {requested}; leave updates out to --resume, or give a larger "
             "number by --set updates=N"
         )
-    check_at_most("updates", requested, LARGEST_COUNT)
     return requested

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import bind, check_arguments, check_callable, short_repr
+from jaxdrones.checks import bind, check_function, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -52,9 +52,8 @@ class Model:
             raise UserError(f"name of a model is {short_repr(self.name)}; give a string that is not empty")
         for field, arguments in ("init", ("params",)), ("rate", ("params", "state", "command")):
             function = getattr(self, field)
-            check_callable(f"{field} of the model {self.name!r}", function, f"a function of ({', '.join(arguments)})")
             function = bind(function, state=None) if field == "init" else function
-            check_arguments(f"{field} of the model {self.name!r}", function, arguments)
+            check_function(f"{field} of the model {self.name!r}", function, arguments)
 
     def start(self, params: Params, state: State) -> Any:
         """Initial state of a team in a state without models, every array with a leading drone axis."""

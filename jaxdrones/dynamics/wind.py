@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdrones.arguments import checked, function, number
-from jaxdrones.checks import check_arguments, check_number
+from jaxdrones.arguments import checked, number
+from jaxdrones.checks import check_function, check_number
 from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -28,11 +28,7 @@ def clock() -> Model:
     )
 
 
-@checked
-def in_wind(
-    field: Annotated[WindField, function("jaxdrones.logarithmic_wind(5.0)")],
-    effect: Annotated[Effect, function("jaxdrones.drag")],
-) -> Effect:
+def in_wind(field: WindField, effect: Effect) -> Effect:
     """Wrap an effect in a wind field, which is added to `params.wind` at the position of the drone.
 
     Args:
@@ -44,8 +40,8 @@ def in_wind(
         ValueError: an argument of another type; in flight, a field of time without a clock.
     """
     arguments = ("pos", "time") if _arguments(field) > 1 else ("pos",)
-    check_arguments("field", field, arguments)
-    check_arguments("effect", effect, ("params", "state"))
+    check_function("field", field, arguments, example="jaxdrones.logarithmic_wind(5.0)")
+    check_function("effect", effect, ("params", "state"), example="jaxdrones.drag")
 
     @functools.wraps(effect)
     def blown(params: Params, state: State, **scene: Any) -> Wrench:

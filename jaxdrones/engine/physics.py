@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arguments, check_sequence, takes_scene, with_scene
+from jaxdrones.checks import check_function, check_sequence, takes_scene, with_scene
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rotors import instant_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
@@ -176,10 +176,8 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
         raise UserError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")
     functions = check_sequence(name, functions, example)
     for function in functions:
-        if not callable(function):
-            raise UserError(f"{name}: {function!r} is not a function; give for example {example}")
         given = with_scene(function, None) if name == "effects" else function
-        check_arguments(name, given, _ARGUMENTS[name], _ELSEWHERE.get(name, ""))
+        check_function(name, given, _ARGUMENTS[name], example=example, hint=_ELSEWHERE.get(name, ""))
         if needs_of(function).contact == "obstacles" and not takes_scene(function):
             raise UserError(
                 f"{name}: {describe([function])} has a scene of its own; give that to make_step(scene=...), and the "

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 from jaxdrones import user_code
-from jaxdrones.checks import UnexpectedKeyword, check_callable, check_choice, check_keyword, hint, short_repr
+from jaxdrones.checks import UnexpectedKeyword, check_choice, check_function, check_keyword, hint, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.tasks import (
     crowd,
@@ -57,11 +57,15 @@ def task_function(task: str | Callable[..., Task]) -> Callable[..., Task]:
     if callable(task):
         return task
     if isinstance(task, str) and user_code.is_reference(task):
-        function = user_code.load(task)
-        check_callable(task, function, "a function that returns a jaxdrones.tasks.Task")
-        return function
+        return check_task_function(task, user_code.load(task))
     check_choice("task", task, TASKS)
     return TASKS[task]
+
+
+def check_task_function(reference: str, function: Any) -> Callable[..., Task]:
+    """Validated function of a task from a user's file."""
+    check_function(reference, function, example="a function that returns a jaxdrones.tasks.Task")
+    return function
 
 
 def make_task(task: str | Task | Callable[..., Task], options: dict[str, Any], others: Collection[str]) -> Task:

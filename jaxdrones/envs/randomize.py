@@ -11,7 +11,7 @@ from jaxtyping import Array
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
 from jaxdrones.arguments import checked, choice, number
-from jaxdrones.checks import POSITIVE, check_callable, check_number, check_sequence, short_repr
+from jaxdrones.checks import POSITIVE, check_function, check_number, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -126,7 +126,7 @@ def all_randomizations(
         *check_sequence("randomize", given, _EXAMPLE),
     ]
     for function in chosen:
-        check_callable("randomize", function, _EXAMPLE)
+        check_function("randomize", function, example=_EXAMPLE)
     whole = [one for one in chosen if isinstance(one, AnyVehicle)]
     rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
     if len(whole) > 1 or (whole and vehicle is not None):

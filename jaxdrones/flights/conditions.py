@@ -7,13 +7,13 @@ import math
 import os
 from typing import Annotated
 
-from jaxdrones import control, optimal
+from jaxdrones import arguments, control, optimal
 from jaxdrones.arguments import Count, Seconds, Switch, checked, choice, choices, whole
 from jaxdrones.control import pid
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.errors import UserError
 from jaxdrones.flights.examples import FLIGHTS
-from jaxdrones.limits import check_memory, check_seed
+from jaxdrones.limits import check_memory
 
 BACKENDS = ("explicit", "bullet")
 CONTROLLERS = (*control.CONTROLLERS, *optimal.CONTROLLERS)
@@ -60,7 +60,7 @@ class Conditions:
     """`explicit` or `bullet`."""
     obstacles: bool = False
     """Whether to add the obstacles of gym-pybullet-drones (2021), in Bullet only."""
-    seed: Annotated[int | None, check_seed] = None
+    seed: Annotated[int | None, arguments.seed] = None
     """Seed of a random displacement of the start, 1 cm standard deviation; by default none."""
 
     def __post_init__(self):

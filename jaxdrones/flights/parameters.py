@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from jaxdrones.checks import check_choice
+from jaxdrones.checks import check_choice, check_whole
 from jaxdrones.flights.vehicle import Vehicle
-from jaxdrones.limits import check_at_most
 from jaxdrones.params import Params
 
 _MAX_PARAMETERS = 60
@@ -88,7 +87,7 @@ def select_parameters(names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         check_choice("parameter", name, sorted(fields | PARAMETERS.keys()))
         selected |= dict.fromkeys(p.name for p in PARAMETERS.values() if name in (p.name, p.field))
-    check_at_most("parameters", len(selected), _MAX_PARAMETERS)
+    check_whole("parameters", len(selected), limit=_MAX_PARAMETERS)
     return tuple(selected)
 
 

@@ -13,11 +13,12 @@ from jax.sharding import NamedSharding
 from jaxtyping import Array, UInt32
 
 from jaxdrones.arguments import Key, checked
+from jaxdrones.checks import check_whole
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.networks import AnyPolicy, act, initial_hidden_state
-from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
+from jaxdrones.limits import LARGEST_COUNT, check_memory
 from jaxdrones.pytree import PyTreeNode
 
 _CHUNK = 1000  # episodes simulated at a time
@@ -112,7 +113,7 @@ def compile_evaluation(
 
 def check_episodes(env: Env, episodes: int) -> None:
     """Raise if the episodes of an evaluation do not fit in memory."""
-    check_at_most("episodes", episodes, LARGEST_COUNT)
+    check_whole("episodes", episodes, limit=LARGEST_COUNT)
     check_memory(f"an evaluation of {episodes:,} episodes", episodes * env.drones * _EPISODE_BYTES, "give fewer")
 
 

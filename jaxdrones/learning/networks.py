@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_callable, is_concrete
+from jaxdrones.checks import check_function, is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.envs.env import Obs
 from jaxdrones.errors import UserError
@@ -60,7 +60,7 @@ class OwnNetwork:
     """
 
     def __init__(self, module: Any, output_size: int):
-        check_callable("network", module, "a flax or equinox module")
+        check_function("network", module, example="a flax or equinox module")
         self.module, self.output_size = module, output_size
         self.recurrent = hasattr(module, "initial_hidden_state")
         if self.recurrent and any(np.any(x) for x in jax.tree.leaves(module.initial_hidden_state()) if is_concrete(x)):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_arguments, check_callable, check_number, check_sequence, short_repr
+from jaxdrones.checks import check_function, check_number, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
@@ -64,10 +64,8 @@ class Sensor:
         if not isinstance(self.name, str) or not self.name:
             raise UserError(f"name of a sensor is {short_repr(self.name)}; give a text, for example 'imu'")
         measured, begun = f"measure of sensor {self.name!r}", f"init of sensor {self.name!r}"
-        check_callable(measured, self.measure, "lambda key, params, state, rate, scene, memory: (memory, state.pos)")
-        check_arguments(measured, self.measure, ("key", "params", "state", "rate", "scene", "memory"))
-        check_callable(begun, self.init, "lambda key, params: jax.numpy.zeros(3)")
-        check_arguments(begun, self.init, ("key", "params"))
+        check_function(measured, self.measure, ("key", "params", "state", "rate", "scene", "memory"))
+        check_function(begun, self.init, ("key", "params"))
         check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
         if self.rate is not None:
             check_number(f"rate of sensor {self.name!r}", self.rate, "1/s", above=0)

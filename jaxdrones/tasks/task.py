@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any
 
 import flax.struct
@@ -14,8 +13,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation, vector
-from jaxdrones.arguments import Count, Hertz, NonNegativeInt, Seconds, Switch, checked, choice, choices, number, whole
-from jaxdrones.checks import bind, check_arguments, check_choice, check_number, check_sequence, check_whole, short_repr
+from jaxdrones.arguments import (
+    Count,
+    Hertz,
+    NonNegativeInt,
+    Seconds,
+    Switch,
+    checked,
+    choice,
+    choices,
+    number,
+    sequence,
+    whole,
+)
+from jaxdrones.checks import bind, check_choice, check_function, check_number, short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
@@ -78,6 +89,7 @@ IMAGES = ("rgb", "depth", "segmentation")
 Drones = Annotated[int, whole("number of drones of {function}")]  # argument of a task
 Team = Annotated[int, whole("number of drones of {function}", 2)]
 _OF_A_WORLD = ("task", "world")
+_OBSERVATION = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
 
 
 @checked
@@ -102,7 +114,7 @@ class ObservationTerm:
     """Distance from which on a row has no effect, m."""
 
     def __post_init__(self):
-        _check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
+        check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
             check_number("bound of an observation", bound, above=0, infinite=True)
 
@@ -120,15 +132,13 @@ class Task:
 
     name: str
     summary: str
-    drones: int
+    drones: Annotated[int, whole("number of drones of a task")]
     duration: Seconds
     """Time after which an episode is truncated, s."""
     start: Callable[..., tuple[State, Any]]
     """(key, params) -> initial state of the team, and the task's variables. Optional parameters are `scene` and
     `progress`, the progress of training in [0, 1], which is 1 outside of training."""
-    target: Annotated[
-        Callable[[Any, Array], Setpoint], functools.partial(_check_function, arguments=("variables", "time"))
-    ]
+    target: Callable[[Any, Array], Setpoint]
     """(variables, time in s) -> set-points of the team; the time may be in the future."""
     rewards: Mapping[str, tuple[float, Term]]
     """Name -> (scale, term); the reward is the sum of scale times term."""
@@ -147,16 +157,16 @@ class Task:
     """(metrics over an episode (T, n), control period) -> (n,): success of every drone. Metrics keep their last values
     after the end of an episode. An episode that ends by a failure is no success. With `ends="team"` a success is one of
     all drones."""
-    success_terminations: tuple[str, ...] = ()
+    success_terminations: Annotated[tuple[str, ...], sequence("'reached'")] = ()
     """Names of the terminations that are no failure, such as a reached goal. Every other termination, and every
     truncation but that of the time, is a failure."""
     observations: Mapping[str, ObservationTerm] = dataclasses.field(default_factory=dict)
     """Observation terms of this task by name."""
-    randomize: tuple[Callable[[jax.Array, Params], Params], ...] = ()
+    randomize: Annotated[tuple[Callable[[jax.Array, Params], Params], ...], sequence("scaled('mass', 0.9, 1.1)")] = ()
     """Randomizations of the task: (key, params) of one drone -> its parameters in an episode."""
-    effects: tuple[Effect, ...] = ()
+    effects: Annotated[tuple[Effect, ...], sequence("jaxdrones.cable")] = ()
     """Effects of the task's physics, in addition to those of `jaxdrones.make`."""
-    models: tuple[Model, ...] = ()
+    models: Annotated[tuple[Model, ...], sequence("jaxdrones.payload()")] = ()
     """Models of the task's physics, in addition to those of `jaxdrones.make`."""
     equip: Callable[[Params], Params] = lambda params: params
     """(parameters of the team) -> the same with constants of the task's models, such as a load."""
@@ -178,7 +188,7 @@ class Task:
     """Names of the default pair effects."""
     action: str = "rpm"
     """Name of the default action type."""
-    observation: tuple[str, ...] = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
+    observation: Annotated[tuple[str, ...], sequence("'position_error'")] = _OBSERVATION
     """Names of the default observation terms."""
     extra_steps: NonNegativeInt = 0
     """Control steps of an episode after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
@@ -188,38 +198,35 @@ class Task:
         for (name, kind), what in zip(kinds.items(), ("string", "string", "Camera"), strict=True):
             if not isinstance(x := getattr(self, name), kind) or x == "":
                 raise UserError(f"{name} of the task is {short_repr(x)}; give a {what}")
-        check_whole(f"number of drones of {self.name}", self.drones)
-        self._check_functions()
-        check_sequence("effects", self.effects, "jaxdrones.cable")
-        check_sequence("models", self.models, "jaxdrones.payload()")
-        for name in check_sequence("success_terminations", self.success_terminations, "'reached'"):
+        for field, function, arguments in self._functions():
+            check_function(field, function, arguments)
+        for name in self.success_terminations:
             check_choice("success termination", name, self.terminations)
-        check_sequence("observation", self.observation, "'position_error'")
         for name, term in _mapping("observations", self.observations, "an ObservationTerm").items():
             if not isinstance(term, ObservationTerm):
                 raise UserError(f"observations[{name!r}] is {short_repr(term)}; give an ObservationTerm")
 
-    def _check_functions(self) -> None:
-        """Raise unless the task's functions take the right number of arguments."""
-        _check_function("start", bind(self.start, scene=None, progress=1.0), ("key", "params"))
-        _check_function("equip", self.equip, ("params",))
-        _check_function("target", self.target, ("variables", "time"))
-        _check_function("advance", self.advance, _OF_A_WORLD)
-        _check_function("success", self.advance if self.success is None else self.success, ("metrics", "dt"))
+    def _functions(self) -> Iterator[tuple[str, Any, tuple[str, ...]]]:
+        """Name, value and arguments of every function of the task."""
+        yield "start", bind(self.start, scene=None, progress=1.0), ("key", "params")
+        yield "equip", self.equip, ("params",)
+        yield "target", self.target, ("variables", "time")
+        yield "advance", self.advance, _OF_A_WORLD
+        if self.success is not None:
+            yield "success", self.success, ("metrics", "dt")
+        if not isinstance(self.scene, Scene):
+            yield "scene", self.scene, ("key",)
+        yield from (("randomize", function, ("key", "params")) for function in self.randomize)
         for name, entry in _mapping("rewards", self.rewards, "(scale, function of (task, world))").items():
             if not (isinstance(entry, tuple | list) and len(entry) == 2):
                 raise UserError(f"rewards[{name!r}] is {short_repr(entry)}; give (scale, function of (task, world))")
             check_number(f"scale of the reward {name!r}", entry[0])
-            _check_function(f"rewards[{name!r}]", entry[1], _OF_A_WORLD)
+            yield f"rewards[{name!r}]", entry[1], _OF_A_WORLD
         if not self.rewards:
             raise UserError("rewards is empty; give at least one, name: (scale, function of (task, world))")
         for field in "terminations", "truncations", "metrics":
             for name, function in _mapping(field, getattr(self, field), "a function of (task, world)").items():
-                _check_function(f"{field}[{name!r}]", function, _OF_A_WORLD)
-        for function in check_sequence("randomize", self.randomize, "scaled('mass', 0.9, 1.1)"):
-            _check_function("randomize", function, ("key", "params"))
-        if not isinstance(self.scene, Scene):
-            _check_function("scene", self.scene, ("key",))
+                yield f"{field}[{name!r}]", function, _OF_A_WORLD
 
     def begin(self, key: jax.Array, params: Params, scene: Scene, progress: Any = 1.0) -> tuple[State, Any]:
         """Initial state of the team in a scene, and the task's variables."""
@@ -259,13 +266,6 @@ def _mapping(field: str, value: Any, example: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
         raise UserError(f"{field} is {short_repr(value)}; give a dictionary of names, {{'name': {example}}}")
     return value
-
-
-def _check_function(field: str, value: Any, arguments: tuple[str, ...]) -> None:
-    """Raise unless a field is a function of these arguments."""
-    if not callable(value) or isinstance(value, type):
-        raise UserError(f"{field} is {short_repr(value)}; give a function of ({', '.join(arguments)})")
-    check_arguments(field, value, arguments)
 
 
 Term = Callable[[Task, World], Float[Array, " n"]]

@@ -12,7 +12,7 @@ from jaxdrones.checks import check_choice
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.named_tasks import task_function
 from jaxdrones.errors import UserError
-from jaxdrones.limits import LARGEST_COUNT, check_at_most, check_memory
+from jaxdrones.limits import check_memory
 from jaxdrones.tasks.task import Task
 from jaxdrones.training import user_files
 from jaxdrones.training.algorithms import learner
@@ -68,8 +68,6 @@ class Recipe:
         _, config = checked_preset(function, algorithm, realistic, user_files.options_of(options, vehicle))
         settings = {name: convert_setting(name, x, getattr(config, name)) for name, x in settings.items()}
         config = dataclasses.replace(config, **settings)
-        for name in ("updates", "worlds", "horizon"):
-            check_at_most(name, getattr(config, name), LARGEST_COUNT)
         return cls(task, algorithm, realistic, options, config, files | vehicle)
 
     def env(self, practice: bool = False, **options: Any) -> Env:

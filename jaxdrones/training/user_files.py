@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import user_code
-from jaxdrones.checks import check_callable, check_choice
+from jaxdrones.checks import check_choice
 from jaxdrones.envs import TASKS
+from jaxdrones.envs.named_tasks import check_task_function
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
 from jaxdrones.urdf import parse_params
@@ -44,9 +45,7 @@ def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
         check_choice("task", task, TASKS)
         return task
     file, name = user_code.split_reference(task)
-    function = user_code.definition(file.name, _text(file.name, files), name)
-    check_callable(task, function, "a function that returns a jaxdrones.tasks.Task")
-    return function
+    return check_task_function(task, user_code.definition(file.name, _text(file.name, files), name))
 
 
 def options_of(options: dict[str, Any], files: Mapping[str, str]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from jaxdrones import user_code
-from jaxdrones.checks import check_arguments
+from jaxdrones.checks import check_function
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.functions import check_policy
 from jaxdrones.errors import UserError
@@ -60,11 +60,14 @@ class UserPolicy:
                 f"{self.reference} is {policy!r:.60}; give a function from observations {sizes[0]} to actions "
                 f"{sizes[1]}, or a recurrent policy"
             )
+        functions: dict[str, tuple[Any, tuple[str, ...]]] = {"": (policy, ("obs",))}
         if recurrent:
-            check_arguments(f"{self.reference}.initial_hidden_state", policy.initial_hidden_state, ("batch",))
-            check_arguments(f"{self.reference}.act", policy.act, ("hidden_state", "obs"))
-        else:
-            check_arguments(self.reference, policy, ("obs",))
+            functions = {
+                ".initial_hidden_state": (policy.initial_hidden_state, ("batch",)),
+                ".act": (policy.act, ("hidden_state", "obs")),
+            }
+        for name, (function, arguments) in functions.items():
+            check_function(self.reference + name, function, arguments)
         obs, _ = jax.eval_shape(env.reset, jax.random.key(0))
         check_policy(self.reference, policy, obs, sizes[1])
         return policy

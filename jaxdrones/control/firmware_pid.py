@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.arguments import checked
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import (
     Gains,
@@ -25,7 +26,7 @@ from jaxdrones.control.firmware_loops import (
     velocity_loop,
 )
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -84,7 +85,7 @@ class PerAxis(PyTreeNode):
     """() whether `thrust` is used, and z is not followed."""
 
 
-AnySetpoint = Setpoint | Velocity | Attitude | Rates | PerAxis
+AnySetpoint = OneSetpoint | Velocity | Attitude | Rates | PerAxis
 
 
 def gains(params: Params | None = None, propellers: str = "2.1+") -> Gains:
@@ -148,8 +149,9 @@ def reset(memory: Memory) -> Memory:
     return memory.replace(**{name: jnp.zeros_like(getattr(memory, name)) for name in names})
 
 
+@checked
 def control(
-    gains: Gains, params: Params, memory: Memory, state: State, setpoint: AnySetpoint, *, dt: float
+    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: AnySetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
@@ -158,15 +160,15 @@ def control(
     setpoint is a `Setpoint` (only pos and yaw are used), `Velocity`, `Attitude`, `Rates` or `PerAxis`; `dt` is 0.002 s
     on the vehicle.
     """
-    check_single(params, state)
     memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
     return memory, motors.rotor_speeds(gains.motor, params, thrust, torque)
 
 
+@checked
 def pwm(
     gains: Gains,
     memory: Memory,
-    state: State,
+    state: OneState,
     setpoint: AnySetpoint,
     battery: Float[Array, ""] | float | None = None,
     *,
@@ -186,7 +188,6 @@ def _fly(
     gains: Gains, memory: Memory, state: State, setpoint: AnySetpoint, dt: float
 ) -> tuple[Memory, Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
     """Memory, desired attitude (degrees), thrust and torque (16 bit)."""
-    check_single(None, state, setpoint if isinstance(setpoint, Setpoint) else None)
     memory = _first_measured(gains, memory, state, dt)
     if isinstance(setpoint, PerAxis):
         return _fly_per_axis(gains, memory, state, setpoint, dt)

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.arguments import checked
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
-from jaxdrones.params import Params
+from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.state import State
 
 
 class Gains(PyTreeNode):
@@ -44,8 +42,9 @@ def init() -> None:
     """Empty memory."""
 
 
+@checked
 def control(
-    gains: Gains, params: Params, memory: Any, state: State, setpoint: Setpoint, *, dt: float
+    gains: Gains, params: OneParams, memory: Any, state: OneState, setpoint: OneSetpoint, *, dt: float
 ) -> tuple[Any, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`.
 
@@ -54,8 +53,6 @@ def control(
 
     All of pos, vel, acc, yaw and omega of the setpoint are used. See `jaxdrones.control`.
     """
-    check_single(params, state, setpoint)
-
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
     acc = acc + vector.along_z(params.gravity)
     axes = rotation.axes(state.quat)

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.arguments import checked
 from jaxdrones.control import attitude
 from jaxdrones.control import firmware_motors as motors
 from jaxdrones.control.firmware_loops import degrees, low_pass, settled
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -114,23 +115,24 @@ def init() -> Memory:
     return Memory(zero, zero, zero, jnp.zeros((2, 3)), jnp.zeros(()), jnp.zeros(()))
 
 
+@checked
 def control(
-    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
+    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm`, for the thrusts of the firmware; see `jaxdrones.control`.
 
     All of pos, vel, acc, yaw and omega of the setpoint are used; `dt` is 0.002 s on the vehicle.
     """
-    check_single(params, state)
     memory, _, thrust, torque = _fly(gains, memory, state, setpoint, dt)
     return memory, motors.rotor_speeds(gains.motor, params, thrust, torque)
 
 
+@checked
 def pwm(
     gains: Gains,
     memory: Memory,
-    state: State,
-    setpoint: Setpoint,
+    state: OneState,
+    setpoint: OneSetpoint,
     battery: Float[Array, ""] | float | None = None,
     *,
     dt: float = 0.002,
@@ -150,7 +152,6 @@ def _fly(
     gains: Gains, memory: Memory, state: State, setpoint: Setpoint, dt: float
 ) -> tuple[Memory, attitude.Axes, Float[Array, ""], Float[Array, "3"]]:
     """Memory, desired body axes, thrust and torque (16 bit)."""
-    check_single(None, state, setpoint)
     first = memory.running == 0
 
     pos_error = setpoint.pos - state.pos

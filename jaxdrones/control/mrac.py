@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation
+from jaxdrones.arguments import checked
 from jaxdrones.checks import check_number, is_concrete
 from jaxdrones.control import pid
-from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -112,8 +112,9 @@ def init() -> Memory:
     return Memory(jnp.zeros((12, 4)), jnp.zeros((4, 4)), jnp.zeros(12), jnp.zeros(()))
 
 
+@checked
 def control(
-    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
+    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 
@@ -121,7 +122,6 @@ def control(
 
     Of the setpoint, pos, vel, yaw and omega (as body rates) are used, acc is not. See `jaxdrones.control`.
     """
-    check_single(params, state, setpoint)
     x = _state(state)
     model = jnp.where(memory.running > 0, memory.model, x)
     yaw = jnp.zeros(3).at[2].set(setpoint.yaw)

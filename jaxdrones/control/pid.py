@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.arguments import checked
 from jaxdrones.control import attitude
 from jaxdrones.control.allocation import mixer
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -117,14 +118,14 @@ def init() -> Memory:
     return Memory(jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
 
 
+@checked
 def control(
-    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
+    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 9,440 and 21,666 and no more than `max_rpm`.
 
     Of the setpoint, pos, vel, yaw and omega (as Euler rates) are used, acc is not. See `jaxdrones.control`.
     """
-    check_single(params, state, setpoint)
     memory, thrust, target = position_loop(gains, params, memory, state, setpoint, dt)
     memory, torque = attitude_loop(gains, memory, state, target, setpoint.omega, dt)
     return memory, rotor_speeds(params, thrust, torque)

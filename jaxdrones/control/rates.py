@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.arguments import checked
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -55,11 +56,11 @@ def control(
     return memory, follow(gains, params, state, collective, omega)
 
 
+@checked
 def command(
-    gains: Gains, params: Params, state: State, setpoint: Setpoint
+    gains: Gains, params: OneParams, state: OneState, setpoint: OneSetpoint
 ) -> tuple[Float[Array, ""], Float[Array, "3"]]:
     """Outer loop: collective thrust per mass (m/s^2, body z) and body rates (rad/s) towards a setpoint."""
-    check_single(params, state, setpoint)
     acc = setpoint.acc + gains.pos * (setpoint.pos - state.pos) + gains.vel * (setpoint.vel - state.vel)
     acc = acc + vector.along_z(params.gravity)
     collective = vector.dot(acc, rotation.z_axis(state.quat))

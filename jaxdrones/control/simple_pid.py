@@ -9,12 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.arguments import checked
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
-from jaxdrones.params import Params
+from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.state import State
 from jaxdrones.vector import atan2, safe_sqrt
 
 _MAX_TILT = jnp.pi / 6  # rad, of the roll and pitch targets
@@ -67,8 +65,9 @@ def init() -> Memory:
     return Memory(jnp.zeros(3), jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
 
 
+@checked
 def control(
-    gains: Gains, params: Params, memory: Memory, state: State, setpoint: Setpoint, *, dt: float
+    gains: Gains, params: OneParams, memory: Memory, state: OneState, setpoint: OneSetpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, up to `max_rpm` (unlimited in gym-pybullet-drones).
 
@@ -78,8 +77,6 @@ def control(
 
     See `jaxdrones.control`.
     """
-    check_single(params, state, setpoint)
-
     pos_error = setpoint.pos - state.pos
     pos_integral = memory.pos_integral + pos_error * dt
     pos_rate = (pos_error - memory.pos_error) / dt

@@ -1,22 +1,26 @@
-"""Validation of controller arguments for one drone."""
+"""Annotations of arguments that are those of one drone, which a team would broadcast."""
+
+from typing import Annotated, Any
 
 from jaxdrones.checks import check_shape
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    **{"state.pos": (3,), "state.quat": (4,), "state.vel": (3,), "state.omega": (3,), "params.mass": ()},
-    **{"setpoint.pos": (3,), "setpoint.vel": (3,), "setpoint.acc": (3,), "setpoint.yaw": (), "setpoint.omega": (3,)},
+_SHAPES: dict[type, dict[str, tuple[int, ...]]] = {
+    Params: {"mass": ()},
+    State: {"pos": (3,), "quat": (4,), "vel": (3,), "omega": (3,)},
+    Setpoint: {"pos": (3,), "vel": (3,), "acc": (3,), "yaw": (), "omega": (3,)},
 }
 
 
-def check_single(params: Params | None, state: State, setpoint: Setpoint | None = None) -> None:
-    """Raise `ValueError` unless the arrays are those of one drone, which a team would broadcast; skip `None`."""
-    given = {"params": params, "state": state, "setpoint": setpoint}
-    for name, shape in _SHAPES.items():
-        owner, field = name.split(".")
-        if given[owner] is not None:
-            check_shape(
-                name, getattr(given[owner], field), shape, "a controller is of one drone; use jax.vmap for a team"
-            )
+def _of_one_drone(name: str, value: Any) -> None:
+    for kind, shapes in _SHAPES.items():
+        for field, shape in shapes.items() if isinstance(value, kind) else ():
+            meaning = "a controller is of one drone; use jax.vmap for a team"
+            check_shape(f"{name}.{field}", getattr(value, field), shape, meaning)
+
+
+OneParams = Annotated[Params, _of_one_drone]
+OneState = Annotated[State, _of_one_drone]
+OneSetpoint = Annotated[Setpoint, _of_one_drone]

@@ -4,18 +4,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
+from jaxdrones.arguments import checked
 from jaxdrones.checks import check_shape
 from jaxdrones.control import pid
 from jaxdrones.control.setpoint import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.params import Params
 from jaxdrones.state import State
 
 SPEED_SHARE = 0.03  # speed at magnitude 1 over the vehicle's highest speed
 
 
+@checked
 def control(
-    gains: pid.Gains, params: Params, memory: pid.Memory, state: State, action: Float[Array, "4"], *, dt: float
+    gains: pid.Gains, params: OneParams, memory: pid.Memory, state: OneState, action: Float[Array, "4"], *, dt: float
 ) -> tuple[pid.Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone by the PID, RPM; see `jaxdrones.control`.
 
@@ -23,7 +25,6 @@ def control(
     ignored. The position target is the position of the drone and the yaw target its heading, so only the velocity error
     acts.
     """
-    check_single(params, state)
     check_shape("action", action, (4,), "direction and magnitude of one drone; use jax.vmap for a team")
     return pid.control(gains, params, memory, state, setpoint(params, state, action), dt=dt)
 

@@ -13,13 +13,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.arguments import checked
 from jaxdrones.control import Setpoint
+from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.box_qp import box_qp, solve_free
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
 from jaxdrones.optimal.problem import (
     Reference,
     Weights,
+    check_period,
     check_plan,
     hover,
     reference,
@@ -95,11 +98,12 @@ def init(settings: Settings, params: Params, state: State) -> Memory:
     return Memory(correction, regulator, jnp.zeros((), bool), hover(params, state).rpm, status_of(always, always))
 
 
+@checked
 def control(
     settings: Settings,
-    params: Params,
+    params: OneParams,
     memory: Memory,
-    state: State,
+    state: OneState,
     setpoints: Setpoint,
     *,
     dt: float,
@@ -110,7 +114,8 @@ def control(
     The guess is the previous plan, shifted by one step, and at first a flight with the regulator of `lqr`. See
     `jaxdrones.optimal` for arguments and errors.
     """
-    check_plan(settings, params, memory, state, setpoints, dt, on_failure)
+    check_period(settings.step, dt)
+    check_plan(settings.horizon, setpoints, on_failure, params, memory, state)
     valid = is_finite((state, setpoints))
     state, setpoints = replaced_unless(valid, params, state, setpoints)
     target = reference(params, setpoints, state.aux, dt)

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.arguments import checked
 from jaxdrones.control import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.dynamics.rotors import limited
 from jaxdrones.optimal.coordinates import command_unit, linearize_step, single, tracking_error
 from jaxdrones.optimal.problem import Weights, check_period, hover, reference
@@ -55,11 +56,11 @@ def init(settings: Settings, params: Params, state: State) -> Memory:
     return Memory(gain(a, b, r, value), value)
 
 
+@checked
 def control(
-    settings: Settings, params: Params, memory: Memory, state: State, setpoints: Setpoint, *, dt: float
+    settings: Settings, params: OneParams, memory: Memory, state: OneState, setpoints: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
     """Rotor speeds of one drone, RPM, between 0 and `max_rpm`, with three setpoints; see `jaxdrones.optimal`."""
-    check_single(params, state)
     check_period(settings.step, dt)
     target = reference(params, setpoints, state.aux, dt)
     return memory, feedback(params, memory.gain, state, jax.tree.map(lambda x: x[0], target.state), target.rpm[0])

@@ -11,16 +11,16 @@ import numpy as np
 from jaxdrones.arguments import checked, choice
 from jaxdrones.checks import check_shape
 from jaxdrones.control import Setpoint
-from jaxdrones.control.single import check_single
+from jaxdrones.control.single import OneState
 from jaxdrones.optimal.coordinates import tracking_error
 from jaxdrones.optimal.interpreter import on_symbols
 from jaxdrones.optimal.primitives import casadi
-from jaxdrones.optimal.problem import Weights, reference
+from jaxdrones.optimal.problem import Weights, check_plan, reference
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.optimal.twin import CasadiModel
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.status import PlanningError, Status, check_on_failure, is_finite
+from jaxdrones.status import PlanningError, Status, is_finite
 
 SOLVERS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-6, "max_iter": 100, "mu_init": 1e-3}},
@@ -141,8 +141,9 @@ class Mpc:
         k4 = rate(x + dt * k3)
         return casadi.Function("advance", [x, u, model.p], [x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)])
 
+    @checked
     def __call__(
-        self, state: State, setpoints: Setpoint, params: Params | None = None, *, on_failure: str = "hold"
+        self, state: OneState, setpoints: Setpoint, params: Params | None = None, *, on_failure: str = "hold"
     ) -> np.ndarray:
         """Commanded rotor speeds of one drone, (4,) RPM, between 0 and `max_rpm`.
 
@@ -158,9 +159,7 @@ class Mpc:
             PlanningError: there is no new plan, and `on_failure` is `raise`.
         """
         n = len(self._kept)
-        check_single(self.model.params, state)
-        check_shape("setpoints.pos", setpoints.pos, (self.horizon + 1, 3), "this and the next H control steps")
-        check_on_failure(on_failure, params, state, setpoints)
+        check_plan(self.horizon, setpoints, on_failure, params, state)
         if _is_flyable(state, setpoints):
             self._plan = self._solved(state, setpoints, params)
             self.status = Status.NOT_CONVERGED if self._plan is None else Status.OK

@@ -15,13 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones.arguments import checked
 from jaxdrones.control import Setpoint
 from jaxdrones.control.allocation import mixer
+from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
 from jaxdrones.optimal.problem import (
     Reference,
     Weights,
+    check_period,
     check_plan,
     hover,
     reference,
@@ -105,11 +108,12 @@ def init(settings: Settings, params: Params, state: State, key: Array) -> Memory
     return Memory(key, correction, regulator, hover(params, state).rpm, status_of(always, always))
 
 
+@checked
 def control(
     settings: Settings,
-    params: Params,
+    params: OneParams,
     memory: Memory,
-    state: State,
+    state: OneState,
     setpoints: Setpoint,
     *,
     dt: float,
@@ -119,7 +123,8 @@ def control(
 
     See `jaxdrones.optimal` for arguments and errors.
     """
-    check_plan(settings, params, memory, state, setpoints, dt, on_failure)
+    check_period(settings.step, dt)
+    check_plan(settings.horizon, setpoints, on_failure, params, memory, state)
     valid = is_finite((state, setpoints))
     state, setpoints = replaced_unless(valid, params, state, setpoints)
     next_key, noise_key = jax.random.split(memory.key)

@@ -13,7 +13,6 @@ from jaxdrones import rotation
 from jaxdrones.checks import check_shape
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.control.single import check_single
 from jaxdrones.errors import UserError
 from jaxdrones.optimal.coordinates import command_unit, tracking_error
 from jaxdrones.params import Params
@@ -120,14 +119,10 @@ def replaced_unless(
     return jax.tree.map(lambda x, safe: jnp.where(valid, x, safe), (state, setpoints), (rest, zero))
 
 
-def check_plan(
-    settings: Any, params: Params, memory: Any, state: State, setpoints: Setpoint, dt: float, on_failure: str
-) -> None:
-    """Raise `ValueError` on the arrays of a team, a wrong number of setpoints, another period or `on_failure`."""
-    check_single(params, state)
-    check_period(settings.step, dt)
-    check_shape("setpoints.pos", setpoints.pos, (settings.horizon + 1, 3), "this and the next H control steps")
-    check_on_failure(on_failure, params, memory, state, setpoints)
+def check_plan(horizon: int, setpoints: Setpoint, on_failure: str, *given: Any) -> None:
+    """Raise `ValueError` on a wrong number of setpoints, or another `on_failure` than those for the given arguments."""
+    check_shape("setpoints.pos", setpoints.pos, (horizon + 1, 3), "this and the next H control steps")
+    check_on_failure(on_failure, setpoints, *given)
 
 
 def check_period(step: Any, dt: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -18,7 +18,6 @@ from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps,
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards
-from jaxdrones.learning.settings import check_config
 
 S = TypeVar("S", bound=result.TrainState)
 
@@ -86,18 +85,7 @@ def gradient_step(
     return state, metrics | measured
 
 
-def train(
-    key: jax.Array,
-    env: Env,
-    config: Config,
-    *,
-    network: Any = None,
-    callback: result.Callback | Sequence[result.Callback] = (),
-    state: result.TrainState | None = None,
-) -> result.Result:
-    """Make all updates; see `learning.result.run_training`."""
-    check_config(config, Config)
-    return result.run_training(init, update, key, env, config, network=network, callback=callback, state=state)
+train = result.make_train(Config, init, update)
 
 
 def _optimizer(config: Config) -> optax.GradientTransformation:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -21,7 +20,6 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import bptt, collect, result
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.normalize import state_vector
-from jaxdrones.learning.settings import check_config
 
 
 @checked
@@ -92,15 +90,4 @@ def against(past: Policy, policy: Policy) -> collect.Act:
     return jax.tree_util.Partial(act, policy, jax.lax.stop_gradient(past))
 
 
-def train(
-    key: jax.Array,
-    env: Env,
-    config: Config,
-    *,
-    network: Any = None,
-    callback: result.Callback | Sequence[result.Callback] = (),
-    state: TrainState | None = None,
-) -> result.Result:
-    """Make all updates; see `learning.result.run_training`."""
-    check_config(config, Config)
-    return result.run_training(init, update, key, env, config, network=network, callback=callback, state=state)
+train = result.make_train(Config, init, update)

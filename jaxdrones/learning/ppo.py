@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -23,7 +22,6 @@ from jaxdrones.learning.critic import discounted_value, init_critic
 from jaxdrones.learning.exploration import HALF_LOG_2_PI, explore, log_prob
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.settings import check_config
 
 _MAX_LOG_RATIO = 10.0  # far beyond the clipping range, with a finite exponential
 
@@ -153,18 +151,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     return TrainState(state.step + 1, key, policy, opt_state, after, log_std, critic, learning_rate), metrics
 
 
-def train(
-    key: jax.Array,
-    env: Env,
-    config: Config,
-    *,
-    network: Any = None,
-    callback: result.Callback | Sequence[result.Callback] = (),
-    state: TrainState | None = None,
-) -> result.Result:
-    """Make all updates; see `learning.result.run_training`."""
-    check_config(config, Config)
-    return result.run_training(init, update, key, env, config, network=network, callback=callback, state=state)
+train = result.make_train(Config, init, update)
 
 
 def loss(config: Config, policy: Policy, log_std: Array, critic: Any, batch: Batch) -> tuple[Array, dict[str, Array]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.settings import Config
+from jaxdrones.learning.settings import Config, check_config
 from jaxdrones.pytree import PyTreeNode
 
 MAX_CALL = 64
@@ -45,6 +45,7 @@ class TrainState(PyTreeNode):
     worlds: collect.Worlds
 
 
+Settings = TypeVar("Settings", bound=Config, contravariant=True)
 Callback = Callable[[int, dict[str, float], Any], Any]
 """(updates made, metrics of the newest update, training state) -> True to stop the training."""
 
@@ -69,64 +70,82 @@ def init_policy(key: jax.Array, env: Env, config: Config, network: Any) -> Polic
     return Policy.init(key, env, config.hidden_sizes, config.per_agent, *sizes)
 
 
-@checked
-def run_training(
-    init: Callable,
-    update: Callable,
-    key: Key,
-    env: Env,
-    config: Any,
-    *,
-    network: Any = None,
-    callback: Callback | Sequence[Callback] = (),
-    state: Any = None,
-) -> Result:
-    """Make all updates of a learner.
+class Train(Protocol[Settings]):
+    """The `train` of a learner; see `make_train`."""
 
-    Inside `jax.jit` or `jax.vmap`, or with traced settings, the updates become part of that function. Otherwise the
-    program is compiled and cached for equal settings and the same environment.
+    def __call__(
+        self,
+        key: jax.Array,
+        env: Env,
+        config: Settings,
+        *,
+        network: Any = None,
+        callback: Callback | Sequence[Callback] = (),
+        state: Any = None,
+    ) -> Result:
+        """Make all updates."""
 
-    Args:
-        init: the learner's `init(key, env, config, network)`.
-        update: the learner's `update(env, config, state)`.
-        key: random key; unused with a `state`.
-        env: environment.
-        config: settings of the learner.
-        network: a flax linen, flax nnx or equinox module in place of the network of the settings; see
-            `learning.networks.OwnNetwork`.
-        callback: function, or several, called after every update; see `Callback`.
-        state: state to continue from, the `train_state` of a result; up to `config.updates` updates in total.
 
-    Raises:
-        ValueError: no random key, or a state without updates left.
-        Diverged: gradients that are not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised; see
-            `history["nonfinite_gradients"]`.
-    """
-    callbacks = (callback,) if callable(callback) else tuple(callback)
-    if compilation.is_tracing() or not all(map(is_concrete, (key, *vars(config).values()))):
-        if callbacks:
-            raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
-        state = init(key, env, config, network) if state is None else state
-        return _scan_updates(update, env, config, state)
-    start, program = _programs(init, update, env, config)
-    if state is None:
-        state = start(key) if network is None else init(key, env, config, network)
-    total, step = int(config.updates), int(state.step)
-    if step >= total:
-        raise UserError(f"state has made {step} updates; give more updates, config.updates is {total}")
-    rows, streak, stop = [], 0, False
-    while step < total and not stop:
-        count = 1 if callbacks else min(MAX_CALL, total - step)
-        state, metrics = program(state, jnp.asarray(count, jnp.int32), jnp.asarray(total, jnp.int32))
-        rows.append({name: x[:count] for name, x in metrics.items()})
-        step += count
-        nonfinite = rows[-1]["nonfinite_gradients"]
-        if is_concrete(nonfinite):  # not so when an environment with traced parameters is mapped
-            streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak)
-        values = {name: x[0].item() for name, x in rows[-1].items()} if callbacks else {}
-        stop = any([call(step, values, state) is True for call in callbacks])
-    history = {name: jnp.concatenate([row[name] for row in rows]) for name in rows[0]}
-    return Result(state.policy, state, history)
+def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[Settings]:
+    """Build the `train` of a learner from its settings, `init(key, env, config, network)` and `update`."""
+
+    def train(
+        key: Key,
+        env: Env,
+        config: Settings,
+        *,
+        network: Any = None,
+        callback: Callback | Sequence[Callback] = (),
+        state: Any = None,
+    ) -> Result:
+        """Make all updates.
+
+        Inside `jax.jit` or `jax.vmap`, or with traced settings, the updates become part of that function. Otherwise the
+        program is compiled and cached for equal settings and the same environment.
+
+        Args:
+            key: random key; unused with a `state`.
+            env: environment.
+            config: settings of the learner.
+            network: a flax linen, flax nnx or equinox module in place of the network of the settings; see
+                `learning.networks.OwnNetwork`.
+            callback: function, or several, called after every update; see `Callback`.
+            state: state to continue from, the `train_state` of a result; up to `config.updates` updates in total.
+
+        Raises:
+            ValueError: no random key, the settings of another learner, or a state without updates left.
+            Diverged: gradients that are not finite in `PATIENCE` updates in a row. Inside `jax.jit` nothing is raised;
+                see `history["nonfinite_gradients"]`.
+        """
+        check_config(config, kind)
+        callbacks = (callback,) if callable(callback) else tuple(callback)
+        if compilation.is_tracing() or not all(map(is_concrete, (key, *vars(config).values()))):
+            if callbacks:
+                raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
+            state = init(key, env, config, network) if state is None else state
+            return _scan_updates(update, env, config, state)
+        start, program = _programs(init, update, env, config)
+        if state is None:
+            state = start(key) if network is None else init(key, env, config, network)
+        total, step = int(config.updates), int(state.step)
+        if step >= total:
+            raise UserError(f"state has made {step} updates; give more updates, config.updates is {total}")
+        rows, streak, stop = [], 0, False
+        while step < total and not stop:
+            count = 1 if callbacks else min(MAX_CALL, total - step)
+            state, metrics = program(state, jnp.asarray(count, jnp.int32), jnp.asarray(total, jnp.int32))
+            rows.append({name: x[:count] for name, x in metrics.items()})
+            step += count
+            nonfinite = rows[-1]["nonfinite_gradients"]
+            if is_concrete(nonfinite):  # not so when an environment with traced parameters is mapped
+                streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak)
+            values = {name: x[0].item() for name, x in rows[-1].items()} if callbacks else {}
+            stop = any([call(step, values, state) is True for call in callbacks])
+        history = {name: jnp.concatenate([row[name] for row in rows]) for name in rows[0]}
+        return Result(state.policy, state, history)
+
+    train.__module__, train.__qualname__ = kind.__module__, "train"
+    return checked(train)
 
 
 def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, total: Array) -> tuple[Any, dict]:

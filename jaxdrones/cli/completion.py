@@ -34,7 +34,6 @@ def add(commands, root: argparse.ArgumentParser) -> None:
         "  bash   source <(jaxdrones completion bash)     in ~/.bashrc\n"
         "  zsh    jaxdrones completion zsh > ~/.zfunc/_jaxdrones     with ~/.zfunc in $fpath before compinit\n"
         "  fish   jaxdrones completion fish > ~/.config/fish/completions/jaxdrones.fish",
-        allow_abbrev=False,
     )
     parser.add_argument("shell", metavar="SHELL", help=", ".join(SHELLS))
     parser.set_defaults(run=functools.partial(_completion, root))

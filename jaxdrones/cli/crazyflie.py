@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jaxdrones.arguments import number, whole
 from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, print_error
-from jaxdrones.cli.options import add_json, add_output, add_vehicle
+from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.firmware.crazyflie import Crazyflie, Server, Vehicle
 from jaxdrones.firmware.crazyflie.server import PORT
@@ -27,7 +27,6 @@ def add(commands) -> None:
         f"{_EXAMPLE}\n\n"
         "There are parameters, log blocks, set-points of all kinds, the high-level commander with uploaded\n"
         "trajectories, arming and emergency stops. Ctrl-C ends the flight and writes its log.",
-        allow_abbrev=False,
     )
     add_vehicle(parser, "cf2x")
     parser.add_argument("--port", type=int, default=PORT, metavar="PORT", help=f"UDP port, on 127.0.0.1 ({PORT})")
@@ -36,7 +35,6 @@ def add(commands) -> None:
         "--speed", type=float, default=1.0, metavar="X", help="real-time factor (1); scripts keep their own clock"
     )
     add_output(parser, "folder of the log (runs/crazyflie)", Path("runs") / "crazyflie")
-    add_json(parser)
     parser.set_defaults(run=_run)
 
 

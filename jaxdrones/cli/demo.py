@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxdrones import assets
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import check_writable, folder
-from jaxdrones.cli.options import add_json, add_output
+from jaxdrones.cli.options import add_output
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import as_json
 from jaxdrones.visualization.viewer.gallery import Exhibit, gallery, read_exhibits
@@ -24,7 +24,6 @@ def add(commands) -> None:
         description="Open a page in the browser that plays recorded flights of the bundled policies: through a forest, "
         "through gates, in a crowd, and others. One drone is simulated in the page; push it. It needs no network.",
         epilog="`jaxdrones fly --policy forest --live` flies one of them now, `jaxdrones eval forest` evaluates it.",
-        allow_abbrev=False,
     )
     parser.add_argument("flight", nargs="?", default=_FIRST, metavar="FLIGHT", help=f"flight to show first ({_FIRST})")
     parser.add_argument(
@@ -35,7 +34,6 @@ def add(commands) -> None:
     )
     add_output(parser, "path of the page (runs/demo.html)", metavar="FILE")
     parser.add_argument("--no-open", action="store_true", help="write the page and do not open it")
-    add_json(parser)
     parser.set_defaults(run=_demo)
 
 

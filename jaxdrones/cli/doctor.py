@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli.options import add_json
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError, install
 
@@ -29,9 +28,7 @@ def add(commands) -> None:
         help="check versions, devices, extras, and run a self-test",
         description="Print versions, devices and installed extras, and fly a self-test with a closed-form solution. "
         "Missing extras are no problem.",
-        allow_abbrev=False,
     )
-    add_json(parser)
     parser.set_defaults(run=_doctor)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from jaxdrones import arguments
 from jaxdrones.arguments import choice, number
 from jaxdrones.cli.common import DIVERGED, check_options, folder, print_error
-from jaxdrones.cli.options import add_backend, add_drones, add_json, add_set, add_vehicle
+from jaxdrones.cli.options import add_backend, add_drones, add_set, add_vehicle
 from jaxdrones.cli.policies import is_user_policy, open_policy, team_of_run
 from jaxdrones.cli.report import as_json, described, evaluation_table, percent
 from jaxdrones.cli.settings import add_realistic, asked_settings
@@ -24,7 +24,6 @@ def add(commands) -> None:
         help="evaluate a trained policy over many episodes",
         description="Fly many episodes with the best policy of a run, your own policy (file.py:name), or one for all "
         "vehicles. Print the success rate with its 95 % interval over distinct episodes, errors, and ends of episodes.",
-        allow_abbrev=False,
     )
     parser.add_argument(
         "policy",
@@ -47,7 +46,6 @@ def add(commands) -> None:
         "--fail-below", type=float, metavar="RATE", help="exit code 1 if the success rate is lower, for example 0.9"
     )
     evaluation.add_argument("--last", action="store_true", help="evaluate the newest policy instead of the best")
-    add_json(evaluation)
     parser.set_defaults(run=_evaluate)
 
 

@@ -2,7 +2,7 @@
 
 import argparse
 
-from jaxdrones.cli.options import add_backend, add_drones, add_json, add_set, add_vehicle
+from jaxdrones.cli.options import add_backend, add_drones, add_set, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.envs import TASKS, explain, make
@@ -15,7 +15,6 @@ def add(commands) -> None:
         help="describe the observation, action, rewards, terminations and physics of a task",
         description="Print a table of every entry of observation and action (name, unit, frame, range, meaning of -1, "
         "0 and 1), the rewards, the terminations, and the simulation of an environment.",
-        allow_abbrev=False,
     )
     parser.add_argument("task", metavar="TASK", help=f"{', '.join(TASKS)}, or file.py:function")
     add_drones(parser)
@@ -23,7 +22,6 @@ def add(commands) -> None:
     add_realistic(parser)
     add_backend(parser)
     add_set(parser, "option of the environment (action, observation, period, ...)")
-    add_json(parser)
     parser.set_defaults(run=_explain)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from jaxdrones.arguments import choice
 from jaxdrones.cli.common import check_options, folder, run_folder
-from jaxdrones.cli.options import add_drones, add_json, add_output, add_set, add_vehicle
+from jaxdrones.cli.options import add_drones, add_output, add_set, add_vehicle
 from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder
 from jaxdrones.cli.report import as_json, described
 from jaxdrones.cli.settings import add_realistic, asked_settings
@@ -21,7 +21,6 @@ def add(commands) -> None:
         description="Write the best policy of a run, with its normalization, for use without jaxdrones: a C99 header "
         "for a flight controller, an ONNX model, a program of jax.export, or an ES module. Each describes its inputs "
         "and outputs: order, unit, frame and range.",
-        allow_abbrev=False,
     )
     parser.add_argument(
         "policy",
@@ -40,7 +39,6 @@ def add(commands) -> None:
     add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
     parser.add_argument("--name", default="policy", help="name of the files, and prefix of the names in C (policy)")
     parser.add_argument("--last", action="store_true", help="the newest policy of the run instead of the best")
-    add_json(parser)
     parser.set_defaults(run=_export)
 
 

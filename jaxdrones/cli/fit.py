@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxdrones.cli.common import check_writable, folder, print_warning
-from jaxdrones.cli.options import add_json, add_no_figure, add_output, add_vehicle
+from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import install
 
@@ -22,7 +22,6 @@ def add(commands) -> None:
         "t, pos, quat, vel, omega and rpm (or pwm and vbat), or bags of ROS 2. Print each with its standard error, "
         "and write a folder with vehicle.urdf, report.json and a figure. "
         "Other commands take vehicle.urdf as --vehicle; `jaxdrones score` takes the folder.",
-        allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="flights to fit")
     model = parser.add_argument_group("model and data")
@@ -44,7 +43,6 @@ def add(commands) -> None:
     add_log_options(model)
     add_output(files, "folder of the fit, without an earlier fit (runs/fit)", Path("runs/fit"))
     add_no_figure(files)
-    add_json(files)
     parser.set_defaults(run=_fit)
 
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import arguments
-from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import check_options, check_writable, folder, print_error
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, progress, warn
 from jaxdrones.cli.live import add_live, live_server
-from jaxdrones.cli.options import add_backend, add_json, add_no_figure, add_output, add_set
+from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set
 from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder, team_of_run
 from jaxdrones.cli.report import as_json, summary, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
@@ -50,7 +49,6 @@ def add(commands) -> None:
         epilog="Every example has its own defaults. `jaxdrones list` shows the names to choose from.\n\n"
         "A flight has diverged if at its end a drone is upside down, or its error is 1 m (or 1 m/s) larger than at\n"
         "the start. Files of an earlier flight in --output are replaced.",
-        allow_abbrev=False,
     )
     parser.add_argument("flight", metavar="FLIGHT", nargs="?", help=", ".join(FLIGHTS))
     add_conditions(parser)
@@ -91,7 +89,6 @@ def add(commands) -> None:
     files.add_argument("--csv", action="store_true", help="write the log as CSV too")
     files.add_argument("--pwm", action="store_true", help="log the Crazyflie's PWM signals too (cf2x, cf2p)")
     add_no_figure(files)
-    add_json(files)
     parser.set_defaults(run=functools.partial(_fly, parser))
 
 
@@ -129,7 +126,6 @@ def _refuse(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Non
 
 
 def _fly_example(options: argparse.Namespace) -> int:
-    check_choice("flight", options.flight, FLIGHTS)
     if options.pwm:
         check_pwm(options.vehicle)
     output = options.output or Path("runs") / options.flight
@@ -229,8 +225,7 @@ def _report(
 def _check_files(options: argparse.Namespace, output: Path) -> None:
     """Raise before the flight if an output file cannot be written."""
     names = ["log.npz", *["log.csv"] * options.csv, *["flight.png"] * (not options.no_figure)]
-    for name in names:
-        check_writable(output / name)
+    check_writable(*(output / name for name in names))
     if options.cameras:
         (output / "cameras").mkdir(exist_ok=True)
     if options.video:

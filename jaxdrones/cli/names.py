@@ -4,7 +4,6 @@ import argparse
 import json
 
 from jaxdrones import assets
-from jaxdrones.cli.options import add_json
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
@@ -15,10 +14,7 @@ from jaxdrones.training.algorithms import ALGORITHMS
 
 def add(commands) -> None:
     """Add the command."""
-    parser = commands.add_parser(
-        "list", help="print the names of vehicles, effects, tasks, actions, ...", allow_abbrev=False
-    )
-    add_json(parser)
+    parser = commands.add_parser("list", help="print the names of vehicles, effects, tasks, actions, ...")
     parser.set_defaults(run=_list)
 
 

@@ -37,8 +37,3 @@ def add_output(group, text: str, default: Path | None = None, metavar: str = "DI
 def add_no_figure(group) -> None:
     """Add --no-figure."""
     group.add_argument("--no-figure", action="store_true", help="write no figure; needs no matplotlib")
-
-
-def add_json(group) -> None:
-    """Add --json."""
-    group.add_argument("--json", action="store_true", help="print one JSON object and nothing else on stdout")

@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxdrones.arguments import choice, number, whole
 from jaxdrones.cli.common import DIVERGED, INTERRUPTED, check_options, folder, print_error, print_warning
-from jaxdrones.cli.options import add_backend, add_drones, add_json, add_vehicle
+from jaxdrones.cli.options import add_backend, add_drones, add_vehicle
 from jaxdrones.cli.report import as_json
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
@@ -33,7 +33,7 @@ _OF_REPLAY = ("bag", "speed", "json", "run", "debug")
 
 def add(commands) -> None:
     """Add the command."""
-    parser = commands.add_parser("ros2", help="fly a team on the topics of ROS 2", allow_abbrev=False)
+    parser = commands.add_parser("ros2", help="fly a team on the topics of ROS 2")
     team = parser.add_argument_group("team")
     add_drones(team, 1)
     add_vehicle(team, "cf2x")
@@ -58,14 +58,13 @@ def add(commands) -> None:
     watch.add_argument("--wait", type=float, default=30.0, metavar="S", help="the same before the first command (30)")
     watch.add_argument("--failsafe", default="hover", metavar="NAME", help=f"{', '.join(ACTIONS)} (hover)")
     wire.add_argument("--record", type=folder, metavar="BAG", help="write all messages to this new folder, as MCAP")
-    add_json(wire)
     parser.set_defaults(run=_run)
     commands = parser.add_subparsers(metavar="[replay]", title="commands")
-    replay = commands.add_parser("replay", help="publish the messages of a bag", allow_abbrev=False)
+    replay = commands.add_parser("replay", help="publish the messages of a bag")
     replay.add_argument("bag", type=folder, metavar="BAG", help="folder of a bag; nothing is simulated")
     replay.add_argument("--speed", type=float, default=1.0, metavar="X", help="real-time factor (1)")
-    add_json(replay)
-    replay.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
+    for name in ("--json", "--debug"):  # as before `replay`
+        replay.add_argument(name, action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     replay.set_defaults(run=functools.partial(_replay, parser))
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 from jaxdrones.cli.common import bar, check_writable, folder
 from jaxdrones.cli.fit import add_log_options, load_logs
-from jaxdrones.cli.options import add_json
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
 
@@ -22,7 +21,6 @@ def add(commands) -> None:
         description="Simulate a vehicle from every state of flight logs on the recorded inputs (open loop), and print "
         "its errors after 0.1, 0.25 and 0.5 s, beside those of a constant state and of the nominal vehicle. A log with "
         "set-points is also simulated as a whole, with the firmware's PID (closed loop).",
-        allow_abbrev=False,
     )
     parser.add_argument("logs", nargs="+", type=folder, metavar="FLIGHT", help="logs, see `jaxdrones fit`")
     parser.add_argument(
@@ -36,7 +34,6 @@ def add(commands) -> None:
     )
     add_log_options(parser)
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw recorded and simulated paths (.png or .pdf)")
-    add_json(parser)
     parser.set_defaults(run=_score)
 
 

@@ -13,7 +13,7 @@ from jaxdrones.cli import machine
 from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS
-from jaxdrones.cli.options import add_drones, add_json, add_no_figure, add_output, add_set, add_vehicle
+from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic, user_mistakes
 from jaxdrones.cli.train_output import (
@@ -63,7 +63,6 @@ def add(commands) -> None:
         "A run with your own task or vehicle keeps the text of its file, and executes that text when it is resumed,\n"
         "evaluated or flown: open only runs that you trust.",
         epilog=_HOSTS_HELP,
-        allow_abbrev=False,
     )
     parser.add_argument(
         "task", metavar="TASK", help=f"{', '.join(TASKS)}; or file.py:function, a function that returns a task"
@@ -125,7 +124,6 @@ def add(commands) -> None:
     )
     add_live(files, "show learning curve and an episode in the browser after every evaluation")
     add_no_figure(files)
-    add_json(files)
     several.add_argument("--hosts", type=int, metavar="N", help="number of processes (1)")
     several.add_argument("--host", type=int, metavar="I", help="number of this process, from 0")
     several.add_argument("--coordinator", metavar="ADDRESS:PORT", help="address and free port of host 0")

@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxdrones.arguments import choice, whole
 from jaxdrones.cli.common import check_options, check_writable, folder
-from jaxdrones.cli.options import add_json, add_output
+from jaxdrones.cli.options import add_output
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import as_json, described
 from jaxdrones.errors import UserError
@@ -28,7 +28,6 @@ def add(commands) -> None:
         help="write a page with a 3D player of recorded flights",
         description="Write one HTML page that plays logs of `jaxdrones fly` in 3D, with drones, obstacles, targets and "
         "plots. It needs no network. Several logs are shown together.",
-        allow_abbrev=False,
     )
     parser.add_argument(
         "flights",
@@ -48,7 +47,6 @@ def add(commands) -> None:
     )
     page.add_argument("--title", help="title of the page (the conditions of the first flight)")
     page.add_argument("--open", action="store_true", help="open the page in the browser")
-    add_json(page)
     filmed.add_argument("--video", type=folder, metavar="FILE", help="film of the page, .mp4 or .gif; needs Chromium")
     filmed.add_argument("--camera", default="orbit", metavar="NAME", help=f"{', '.join(CAMERAS)} (orbit)")
     filmed.add_argument("--size", default="1280x720", metavar="WxH", help="size, pixels (1280x720)")
@@ -62,12 +60,11 @@ def _view(options: argparse.Namespace) -> int:
     given, skipped = _flights(options.flights)
     names, logs = [*map(str, given)], [*given.values()]
     output = options.output or logs[0].with_name("flight.html")
-    check_writable(output)
     size = _size(options.size)
     check_options(options, camera=choice("camera", CAMERAS), fps=whole())
     if options.video:
         video.check_video(options.video)
-        check_writable(options.video)
+    check_writable(output, options.video)
     if skipped:
         print(f"skipped, as no flights: {', '.join(map(str, skipped))}", file=sys.stderr)
     flights = logs[0] if len(logs) == 1 else dict(zip(names, logs, strict=True))

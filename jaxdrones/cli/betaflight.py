@@ -105,7 +105,7 @@ def _run(options: argparse.Namespace) -> int:
             process=process,
             lockstep=not options.real_time,
             wait=options.wait,
-            on_row=lambda t, now, sticks: recorder.add(t, *now[:5], target() if target else None),
+            on_row=lambda t, now, sticks: recorder.add(t, now, target() if target else None),
             warn=print_warning,
         )
         try:

@@ -51,7 +51,7 @@ def _run(options: argparse.Namespace) -> int:
             server.run(
                 options.duration,
                 options.speed,
-                lambda t, now, target: recorder.add(t, now.pos, now.quat, now.vel, now.omega, now.rpm),
+                lambda t, now, target: recorder.add(t, now),
             )
         except KeyboardInterrupt:
             interrupted = True

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdrones.firmware.drone import Sample
 from jaxdrones.flights.log import FlightLog, LoggedConditions
 from jaxdrones.params import Params, repeat
 
@@ -23,10 +24,10 @@ class Recorder:
         """Number of rows."""
         return len(self._rows)
 
-    def add(self, t: float, pos: Any, quat: Any, vel: Any, omega: Any, rpm: Any, target: Any = None) -> None:
-        """Add a row: time (s), state of the drone (see `State`) and target position (3,) (m, world), if it has one."""
+    def add(self, t: float, now: Sample, target: Any = None) -> None:
+        """Add a row: time (s), sample of the drone and target position (3,) (m, world), if it has one."""
         unknown = np.full(3, np.nan)
-        arrays = (pos, quat, vel, omega, rpm, unknown if target is None else target)
+        arrays = (now.pos, now.quat, now.vel, now.omega, now.rpm, unknown if target is None else target)
         self._rows.append((t, *(np.array(x, np.float32) for x in arrays)))
 
     def log(self, params: Params, conditions: dict[str, Any], about: str) -> FlightLog:

@@ -10,6 +10,7 @@ import pytest
 from jaxdrones import rotation
 from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight import BetaflightLost, Flight, Flip, Hover, Link, Process, Simulation, find_program
+from jaxdrones.firmware.drone import Sample
 from jaxdrones.firmware.recorder import Recorder
 
 try:
@@ -160,7 +161,8 @@ def test_a_second_simulator_is_refused(link):
 def test_a_recorded_flight_is_a_log():
     recorder, params = Recorder(), Simulation("racer").params
     for k in range(3):
-        recorder.add(0.01 * k, [0, 0, k], [0, 0, 0, 1], np.zeros(3), np.zeros(3), np.ones(4), TARGET)
+        zero = np.zeros(3)
+        recorder.add(0.01 * k, Sample(np.array([0, 0, k]), np.eye(4)[3], zero, zero, np.ones(4), zero), TARGET)
     log = recorder.log(params, {"vehicle": "racer"}, "a flight")
     assert log.pos.shape == (3, 1, 3) and log.has("target_pos", "rpm") and str(log.conditions) == "a flight"
     np.testing.assert_allclose(log.error[:, 0, 0], [1.5, 0.5, 0.5])

@@ -1,5 +1,6 @@
 """Ports of the simulated Crazyflie, packet by packet; test_cflib.py has the real client."""
 
+import dataclasses
 import math
 import struct
 from types import SimpleNamespace
@@ -244,7 +245,7 @@ def test_invalid_set_points_are_ignored(data):
 
 
 def plan(commander, kind, form, *values, t=0.0):
-    return commander.plan(struct.pack("<BB" + form, kind, 0, *values), t, SAMPLE._replace(pos=np.zeros(3)))
+    return commander.plan(struct.pack("<BB" + form, kind, 0, *values), t, dataclasses.replace(SAMPLE, pos=np.zeros(3)))
 
 
 def test_a_stream_ends_a_plan_and_a_plan_waits_for_the_end_of_a_stream():

@@ -15,7 +15,8 @@ from jaxdrones.firmware.betaflight.link import Link, connect_msp
 from jaxdrones.firmware.betaflight.packets import Sticks, rc_packet, state_packet
 from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
 from jaxdrones.firmware.betaflight.process import Process
-from jaxdrones.firmware.betaflight.simulation import Sample, Simulation
+from jaxdrones.firmware.betaflight.simulation import Simulation
+from jaxdrones.firmware.drone import Sample
 from jaxdrones.firmware.pace import LATE, Pace
 
 _SILENT, _SILENT_IN_LOCKSTEP = 0.5, 3.0  # s of real time without motors after which Betaflight is lost

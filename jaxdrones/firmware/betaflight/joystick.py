@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight.packets import Sticks
-from jaxdrones.firmware.betaflight.simulation import Sample
+from jaxdrones.firmware.drone import Sample
 
 _EVENT = struct.Struct("<IhBB")  # time in ms, value, kind, number
 _AXIS = 2

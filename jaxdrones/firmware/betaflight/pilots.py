@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxdrones.control import Setpoint, rates
 from jaxdrones.firmware.betaflight.packets import Sticks
 from jaxdrones.firmware.betaflight.settings import MAX_RATE
-from jaxdrones.firmware.betaflight.simulation import Sample
+from jaxdrones.firmware.drone import Sample
 from jaxdrones.params import Params
 from jaxdrones.state import State
 

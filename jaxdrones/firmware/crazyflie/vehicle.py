@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +17,8 @@ from jaxdrones.control.firmware_loops import Gains, Memory, rpy
 from jaxdrones.control.firmware_motors import FULL
 from jaxdrones.control.firmware_pid import PerAxis
 from jaxdrones.control.pid import VEHICLES
-from jaxdrones.dynamics.aero import drag
-from jaxdrones.dynamics.contact import ground_contact, rim
-from jaxdrones.dynamics.rigid_body import specific_force
-from jaxdrones.dynamics.rotors import lagging_rotors
-from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
+from jaxdrones.firmware import drone
 from jaxdrones.params import Params, repeat
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
@@ -59,21 +56,10 @@ class OnBoard(PyTreeNode):
     """() desired heading, rad."""
 
 
-class Sample(NamedTuple):
-    """Measurements of the vehicle; no noise."""
+@dataclasses.dataclass(frozen=True)
+class Sample(drone.Sample):
+    """Measurements of the vehicle."""
 
-    pos: np.ndarray
-    """(3,) m, world."""
-    quat: np.ndarray
-    """(4,) x, y, z, w, body to world."""
-    vel: np.ndarray
-    """(3,) m/s, world."""
-    omega: np.ndarray
-    """(3,) rad/s, body."""
-    rpm: np.ndarray
-    """(4,) rotor speeds, RPM."""
-    acc: np.ndarray
-    """(3,) specific force, m/s^2, body: 9.8 upwards at rest."""
     rpy: np.ndarray
     """(3,) roll, pitch, yaw, degrees, with the firmware's signs: pitch is positive nose up."""
     motors: np.ndarray
@@ -88,10 +74,9 @@ class Vehicle:
         self.params = load_params(vehicle)
         self.gains = firmware_pid.gains(None if vehicle in VEHICLES else self.params)
         self._team = repeat(self.params, 1)
-        step = make_step((drag, ground_contact), rotors=lagging_rotors, dt=_DT / _SUBSTEPS, substeps=_SUBSTEPS)
+        step = drone.make_physics(_DT, _SUBSTEPS)
         self._advance = jax.jit(functools.partial(_advance, step))
-        self._height = float(rim(self.params)[0] - self.params.collision_offset)  # at which it touches the ground
-        start = step.init(self._team, State.at_rest([[0.0, 0.0, self._height]]))
+        start = step.init(self._team, drone.on_ground(self.params))
         self._board = OnBoard(start, firmware_pid.init(), jnp.zeros(()))
         self.sample = self.advance(motors_off())
 
@@ -103,9 +88,7 @@ class Vehicle:
 
     def set_upright(self) -> None:
         """Set the vehicle on the ground below it, upright and at rest."""
-        x, y, _ = self.sample.pos
-        at_rest = State.at_rest([[float(x), float(y), self._height]])
-        state = self._board.state.replace(**{name: getattr(at_rest, name) for name in ("pos", "quat", "vel", "omega")})
+        state = drone.set_upright(self.params, self._board.state)
         self._board = OnBoard(state, firmware_pid.init(), jnp.zeros(()))
 
 
@@ -172,10 +155,8 @@ def _advance(
     dtype = board.heading.dtype
     target = jax.tree.map(lambda x: x if x.dtype == bool else jnp.asarray(x, dtype), target)
     board, rpm = jax.lax.scan(tick, board, None, length=_TICKS)
-    state = _one(board.state)
-    acc = specific_force(params, state, _one(step.rate(team, board.state, rpm[-1:])).vel)
     motors = jnp.minimum(params.kf * rpm[-1] ** 2 / gains.motor.max_thrust, 1) * FULL
-    return board, (state.pos, state.quat, state.vel, state.omega, state.rpm, acc, rpy(state.quat), motors)
+    return board, (*drone.measured(step, team, board.state, rpm[-1:]), rpy(board.state.quat[0]), motors)
 
 
 def _one(state: State) -> State:

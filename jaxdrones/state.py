@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from jaxdrones.checks import check_finite, check_shape
+from jaxdrones.checks import check_shape
 from jaxdrones.pytree import PyTreeNode
 
 
@@ -41,12 +41,10 @@ class State(PyTreeNode):
             ValueError: a wrong shape, no drone, or a number that is not finite.
         """
         pos = jnp.asarray(pos, float)
-        check_shape("pos", pos, ("n", 3), "one row (x, y, z) per drone, at least one drone")
+        check_shape("pos", pos, ("n", 3), "one row (x, y, z) per drone, at least one drone", finite=True)
         n = len(pos)
         yaw = jnp.zeros(n) if yaw is None else jnp.asarray(yaw, float)
-        check_shape("yaw", yaw, (n,), "one heading per drone")
-        check_finite("pos", pos)
-        check_finite("yaw", yaw)
+        check_shape("yaw", yaw, (n,), "one heading per drone", finite=True)
         zero = jnp.zeros_like(yaw)
         quat = jnp.stack([zero, zero, jnp.sin(yaw / 2), jnp.cos(yaw / 2)], axis=-1)
         return cls(pos, quat, jnp.zeros((n, 3)), jnp.zeros((n, 3)), jnp.zeros((n, 4)))

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_finite, check_shape
+from jaxdrones.checks import check_shape
 
 
 class Box:
@@ -80,6 +80,5 @@ def of_gymnasium(space: gymnasium.Space, spaces: Spaces) -> Any:
 def action_table(discrete_actions: Any, size: int) -> Float[Array, "k a"]:
     """Validated table of discrete actions, one a row."""
     table = np.asarray(discrete_actions, np.float32)
-    check_shape("discrete_actions", table, ("k", size), "one row for every discrete action")
-    check_finite("discrete_actions", table)
+    check_shape("discrete_actions", table, ("k", size), "one row for every discrete action", finite=True)
     return jnp.asarray(table)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones import rotation, vector
 from jaxdrones.arguments import Count, Switch, checked, number
-from jaxdrones.checks import check_finite, check_shape, is_concrete
+from jaxdrones.checks import check_shape, is_concrete
 from jaxdrones.dynamics.model import Model, PointMass, constants
 from jaxdrones.dynamics.needs import Needs, declare
 from jaxdrones.errors import UserError
@@ -84,8 +84,7 @@ def with_payload(
     Raises:
         ValueError: a number out of range, or a cable so stiff that a physics step of 1/100 s would be unstable.
     """
-    check_shape("anchor of the cable", anchor, (3,), "x, y, z from the center of mass, m, body")
-    check_finite("anchor of the cable", anchor)
+    check_shape("anchor of the cable", anchor, (3,), "x, y, z from the center of mass, m, body", finite=True)
     dtype = jnp.result_type(params.mass)
     mass, length, anchor = (jnp.asarray(x, dtype) for x in (mass, length, anchor))
     share = mass / cables

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked, choice, number
-from jaxdrones.checks import check_finite, check_shape, is_concrete, short_repr
+from jaxdrones.checks import check_shape, is_concrete, short_repr
 from jaxdrones.dynamics.model import constants
 from jaxdrones.dynamics.power import battery_voltage
 from jaxdrones.dynamics.rotors import lagging_rotors
@@ -57,8 +57,8 @@ def cubic_motors(coefficients: ArrayLike, supply: Supply = 3.7) -> Motors:
         ValueError: a wrong shape, numbers that are not finite, a curve that does not rise everywhere, or a supply
             voltage that is not positive.
     """
-    check_shape("coefficients of the thrust curve", coefficients, (4,), "those of the powers 0 to 3 of the voltage")
-    check_finite("coefficients of the thrust curve", coefficients)
+    meaning = "those of the powers 0 to 3 of the voltage"
+    check_shape("coefficients of the thrust curve", coefficients, (4,), meaning, finite=True)
     if is_concrete(coefficients):
         _, b, c, d = np.asarray(coefficients, float)
         if not (d > 0 and c * c < 3 * b * d):

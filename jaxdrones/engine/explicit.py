@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.accelerate.shared import recomputed
 from jaxdrones.arguments import Count, Seconds, checked
+from jaxdrones.checks import check_params, check_quaternion
 from jaxdrones.dynamics.integrators import Integrator, semi_implicit_euler
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
@@ -21,7 +22,7 @@ from jaxdrones.engine.clearance import NearObstacles
 from jaxdrones.engine.neighbors import NeighborGrid
 from jaxdrones.engine.physics import Contact, Physics, Rotors, check_functions
 from jaxdrones.engine.step import Step, is_traced
-from jaxdrones.engine.team import check_command, check_values
+from jaxdrones.engine.team import check_team
 from jaxdrones.engine.wrenches import Effect, Pair, TeamEffect, describe
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
@@ -157,7 +158,8 @@ class ExplicitStep(Step):
         derivative = _derivative_of(physics)
 
         def step(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
-            command = check_command(params, state, rpm)
+            command = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
+            check_team(params, state, command)
             state = state.replace(rpm=jax.vmap(limited)(params, state.rpm))
             near = NearObstacles(physics.contacts("obstacles"), state, scene) if physics.touches(scene) else None
 
@@ -175,7 +177,8 @@ class ExplicitStep(Step):
             return jax.lax.scan(lambda state, _: (substep(state, command), None), state, length=substeps)[0]
 
         def rate(params: Params, state: State, rpm: ArrayLike, scene: Scene) -> State:
-            command = check_command(params, state, rpm)
+            command = jnp.asarray(rpm, state.rpm.dtype)
+            check_team(params, state, command)
             return derivative(params, physics.at_speed(params, state, command), command, scene)
 
         self._step, self._rate = jax.jit(step, inline=True), jax.jit(rate, inline=True)
@@ -185,7 +188,8 @@ class ExplicitStep(Step):
     def __call__(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None = None) -> State:
         """Advance a team by one control step; see `make_step`."""
         if params is not self._params or state.quat is not self._quat:
-            check_values(params, state)
+            check_params(params, finite=False)
+            check_quaternion("state.quat", state.quat)
         state = self._step(params, state, rpm, self._given(scene))
         if not is_traced(state.quat):
             self._params, self._quat = params, state.quat

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.arguments import Count, checked, function
-from jaxdrones.checks import check_arrays, check_finite, check_params, check_quaternion, short_repr
+from jaxdrones.checks import check_params, short_repr
 from jaxdrones.engine.step import HostStep, Step, is_traced
+from jaxdrones.engine.team import check_state
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -52,10 +53,7 @@ def rollout(
             length.
     """
     check_params(params)
-    check_arrays("state", state)
-    check_finite("state", state)
-    check_quaternion("state.quat", state.quat)
-
+    check_state(state)
     state = step.init(params, state) if isinstance(step, Step) else state
     if isinstance(step, HostStep) and checkpoint is not None:
         raise UserError("checkpoint is given and the bullet backend has no backward pass; leave it out")

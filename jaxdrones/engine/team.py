@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_arrays, check_params, check_quaternion, check_shape, short_repr
+from jaxdrones.checks import check_arrays, check_finite, check_quaternion, check_shape, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -31,27 +30,22 @@ _STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3, "rpm": 4}
 _CONSTANTS = [field.name for field in dataclasses.fields(Params) if field.name != "aux"]
 
 
-def check_command(params: Params, state: State, rpm: ArrayLike) -> Float[Array, "n 4"]:
-    """Validated commanded rotor speeds in the precision of the state."""
-    command = jnp.asarray(rpm, state.rpm.dtype)  # whole numbers too: a rotor speed is real, and squared
-    check_team(params, state, command)
-    return command
-
-
 def check_team(params: Params, state: State, rpm: Any) -> None:
     """Raise `ValueError` unless the arrays are those of one team of n drones."""
     check_arrays("state", state)
     check_arrays("params", params)
     check_shape("state.pos", state.pos, ("n", 3), "one row per drone, at least one drone; for many worlds use jax.vmap")
     n = len(state.pos)
-    for name, width in _STATE.items():
-        check_shape(f"state.{name}", getattr(state, name), (n, width), f"state.pos has {n} drones")
+    drones, team = f"state.pos has {n} drones", "make a team with jaxdrones.repeat or jaxdrones.stack"
+    expected: list[tuple[str, Any, tuple[int, ...], str]] = [
+        (f"state.{name}", getattr(state, name), (width,), drones) for name, width in _STATE.items()
+    ]
     for name in _CONSTANTS:
-        hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
-        check_shape(f"params.{name}", getattr(params, name), (n, *_SHAPES.get(name, ())), hint)
+        expected.append((f"params.{name}", getattr(params, name), _SHAPES.get(name, ()), f"{drones}; {team}"))
+    for name, array, of_one, meaning in (*expected, ("rpm", rpm, (4,), f"four rotor speeds for each of {n} drones")):
+        check_shape(name, array, (n, *of_one), meaning)
     for name, aux in ("state.aux", state.aux), ("params.aux", params.aux):
         _check_aux(name, aux, n)
-    check_shape("rpm", rpm, (n, 4), f"four rotor speeds for each of {n} drones")
 
 
 def _check_aux(name: str, aux: Any, n: int) -> None:
@@ -65,10 +59,10 @@ def _check_aux(name: str, aux: Any, n: int) -> None:
             raise UserError(f"{where} holds {jnp.result_type(leaf)}; give floating-point numbers")
 
 
-def check_values(params: Params, state: State) -> None:
-    """Raise `ValueError` for concrete constants and attitudes with values that cannot fly."""
-    check_params(params, finite=False)
+def check_state(state: State) -> None:
+    """Raise `ValueError` for concrete states that cannot fly."""
     check_arrays("state", state)
+    check_finite("state", state)
     check_quaternion("state.quat", state.quat)
 
 

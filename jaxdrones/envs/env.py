@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxdrones.checks import check_finite, check_key, check_shape
+from jaxdrones.checks import check_key, check_shape
 from jaxdrones.engine.step import HostStep, Step
 from jaxdrones.envs import episode, randomize
 from jaxdrones.envs.actions import Action
@@ -221,8 +221,8 @@ class Env:
             ValueError: no random key, a wrong shape, or numbers that are not finite (unless traced).
         """
         check_key("key", key)
-        check_shape("action", action, (self.drones, self.action_size), "one row of the action type's size per drone")
-        check_finite("action", action)
+        shape = self.drones, self.action_size
+        check_shape("action", action, shape, "one row of the action type's size per drone", finite=True)
         # A program without random keys can be a single kernel.
         key_of_draws = key if self.noise or self.disturbance or self.sensors else None
         world, rpm = self.compiled(episode.command)(key_of_draws, world, action)

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
 from jaxdrones.arguments import checked, choice, number
-from jaxdrones.checks import POSITIVE, check_function, check_number, check_sequence, short_repr
+from jaxdrones.checks import POSITIVE, check_function, check_number, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -28,8 +28,8 @@ Noise = Callable[[jax.Array, State], State]
 
 
 def _check_range(field: str, low: float, high: float) -> None:
-    check_number(f"lower bound of {field}", low)
-    check_number(f"upper bound of {field}", high)
+    for bound, value in ("lower", low), ("upper", high):
+        check_number(f"{bound} bound of {field}", value)
     if not low <= high:
         raise UserError(f"the range of {field} is ({low}, {high}); give the lower bound first")
 
@@ -112,21 +112,14 @@ def scaling_params(randomize: Sequence[Randomization], drawn: Params, nominal: P
     return drawn if any(isinstance(one, AnyVehicle) for one in randomize) else nominal
 
 
-_EXAMPLE = "scaled('mass', 0.9, 1.1)"
-
-
 def all_randomizations(
     any_vehicle: bool, task: Sequence[Randomization], given: Sequence[Randomization], vehicle: Any
 ) -> tuple[Randomization, ...]:
     """All randomizations of an environment, whole vehicles first."""
     preset: list[Randomization] = [AnyVehicle()] if any_vehicle else []
-    chosen: list[Randomization] = [
-        *preset,
-        *task,
-        *check_sequence("randomize", given, _EXAMPLE),
-    ]
-    for function in chosen:
-        check_function("randomize", function, example=_EXAMPLE)
+    for function in given:
+        check_function("randomize", function, example="scaled('mass', 0.9, 1.1)")
+    chosen = [*preset, *task, *given]
     whole = [one for one in chosen if isinstance(one, AnyVehicle)]
     rest = [one for one in chosen if not isinstance(one, AnyVehicle)]
     if len(whole) > 1 or (whole and vehicle is not None):

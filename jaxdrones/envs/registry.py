@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-from jaxdrones.arguments import Count, Hertz, checked, choice, function
-from jaxdrones.checks import check_choice, check_finite, check_params, check_sequence, check_switch, short_repr
+from jaxdrones.arguments import Count, Hertz, checked, choice, function, sequence
+from jaxdrones.checks import check_choice, check_finite, check_switch, short_repr
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.dynamics.aero import external_force
 from jaxdrones.dynamics.contact import drone_contact, ground_contact, obstacle_contact
@@ -56,19 +56,19 @@ def make(
     backend: Annotated[str, choice("backend", BACKENDS)] = "explicit",
     vehicle: str | os.PathLike | Params | None = None,
     action: str | Action | None = None,
-    observation: Sequence[str | ObservationTerm] | None = None,
-    vision: Sequence[str] | None = None,
+    observation: Annotated[Sequence[str | ObservationTerm] | None, sequence("'position_error'")] = None,
+    vision: Annotated[Sequence[str] | None, sequence("'depth'")] = None,
     camera: Camera | None = None,
     realistic: Annotated[bool | str, functools.partial(check_switch, others=("any",))] = False,
-    effects: Sequence[str | Callable] | None = None,
-    pairs: Sequence[str | Callable] | None = None,
+    effects: Annotated[Sequence[str | Callable] | None, sequence("'drag'")] = None,
+    pairs: Annotated[Sequence[str | Callable] | None, sequence("'downwash'")] = None,
     team_effects: Sequence[TeamEffect] = (),
     models: Sequence[Model] = (),
     rotors: str | None = None,
     integrator: str = "semi_implicit_euler",
     control_hz: Hertz | None = None,
     substeps: Count | None = None,
-    randomize: Sequence[Randomization] | None = None,
+    randomize: Annotated[Sequence[Randomization] | None, sequence("scaled('mass', 0.9, 1.1)")] = None,
     noise: Annotated[Noise | None, function("sensor_noise()")] = None,
     disturbance: Annotated[Disturbance | None, function("random_pushes(0.3)")] = None,
     delay: float | tuple[float, float] | None = None,
@@ -125,7 +125,6 @@ def make(
     vehicle = "cf2x" if vehicle is None else vehicle
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
     check_finite("vehicle", nominal)
-    check_params(nominal)
     nominal = task.equip(nominal_params(randomize, nominal))
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
@@ -197,8 +196,7 @@ _OWN_OPTIONS = {name for name in inspect.signature(make).parameters if name not 
 
 
 def _terms(observation: Sequence[str | ObservationTerm], known: dict[str, ObservationTerm]) -> tuple:
-    names = check_sequence("observation", observation, "'position_error'")
-    terms = tuple(_named("observation", term, known) for term in names)
+    terms = tuple(_named("observation", term, known) for term in observation)
     if not terms:
         raise UserError("observation is empty; name at least one observation term")
     for term in terms:
@@ -218,7 +216,6 @@ def _name(vehicle: str | os.PathLike | Params, randomize: Sequence[Randomization
 
 def _all_named(kind: str, values, table: dict, others: dict) -> list:
     """Functions by name from a table; a name of the table of `others` is an error with a hint."""
-    values = check_sequence(kind, values, repr(next(iter(table))))
     for value in values:
         if isinstance(value, str) and value not in table and value in others:
             other = "pairs" if kind == "effects" else "effects"
@@ -264,7 +261,7 @@ def _vision(
     scene: Scene | DrawScene,
 ) -> Vision | None:
     """Vision of an environment; `None` without images."""
-    images = check_sequence("vision", task.vision if images is None else images, "'depth'")
+    images = task.vision if images is None else images
     if images:
         return make_vision(step, images, camera or task.camera or Camera(), dt, scene)
     if camera is not None:

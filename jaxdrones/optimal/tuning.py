@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,10 @@ import optax
 from jaxtyping import Array, Float
 
 from jaxdrones import control, rotation
-from jaxdrones.checks import check_choice, check_params, check_shape, check_whole, short_repr
+from jaxdrones.arguments import checked, whole
+from jaxdrones.checks import check_choice, check_params, short_repr
 from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, mellinger, pid, rates, simple_pid
+from jaxdrones.control.single import OneParams
 from jaxdrones.dynamics.aero import drag
 from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import make_step
@@ -61,7 +63,14 @@ _MAX_GRAD_NORM = 3.0  # largest norm of the gradient of a flight
 _EFFORT_WEIGHT = 1e-5  # m s^2; of the squared rate of the rotor speeds over hover speed
 
 
-def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500, iterations: int = 40) -> Any:
+@checked
+def tune(
+    params: OneParams,
+    controller: str | ModuleType,
+    *,
+    control_hz: Annotated[int, whole(minimum=100)] = 500,
+    iterations: int = 40,
+) -> Any:
     """Tune the gains of a controller for a vehicle, in steps, a turn, a tilted start and three curves.
 
     The optimization starts from two sets of gains: the controller's own, scaled to the vehicle, and the best of several
@@ -86,8 +95,6 @@ def tune(params: Params, controller: str | ModuleType, *, control_hz: int = 500,
     """
     module = _tunable(controller)
     check_params(params)
-    check_shape("params.mass", params.mass, (), "tune takes the parameters of a single drone")
-    check_whole("control_hz", control_hz, 100)
     gains, error = _descend(module, control_hz, iterations, params, start(module, params))
     if not jnp.isfinite(error):
         raise UserError(f"{_name(module)} cannot fly this vehicle with any gains that were tried; use 'geometric'")

@@ -13,14 +13,14 @@ import numpy.typing as npt
 from jax.typing import ArrayLike
 
 from jaxdrones.accelerate.small import jit_small
-from jaxdrones.checks import check_finite, check_params, check_quaternion
+from jaxdrones.checks import check_finite, check_params
 from jaxdrones.engine.bullet import arrays
 from jaxdrones.engine.bullet.camera import drone_pictures, photo, views
 from jaxdrones.engine.bullet.client import Client
 from jaxdrones.engine.bullet.contacts import Contact, contacts_of_last_step
 from jaxdrones.engine.physics import Physics
 from jaxdrones.engine.step import HostStep, is_traced
-from jaxdrones.engine.team import Layout, check_team, columns, pack
+from jaxdrones.engine.team import Layout, check_state, check_team, columns, pack
 from jaxdrones.params import Params
 from jaxdrones.sensing import Camera, Images, Scene
 from jaxdrones.sensing.camera import check_camera
@@ -85,7 +85,6 @@ class BulletStep(HostStep):
 
     def _flown(self, params: Params, state: State, rpm: ArrayLike, scene: Scene | None, substeps: int) -> State:
         if is_traced((state, rpm, scene)) or (params is not self._params and is_traced(params)):
-            self.client.check_open()
             check_team(params, state, rpm)
             flown = _refuse_gradients(functools.partial(self._traced, substeps))
             return flown(params, state, rpm, self._given(scene))
@@ -94,7 +93,8 @@ class BulletStep(HostStep):
         for k in range(substeps):
             loads = self._loads_on(team, aux, acting)
             if k == 0 and loads[:, arrays.SUSPECT].any():
-                _check(state, rpm)
+                check_state(state)
+                check_finite("rpm", rpm)
             team = _following(np, self.client.advance(team, loads), team, loads)
         return _unpack(team.astype(self._flat_params.dtype), aux)
 
@@ -102,7 +102,7 @@ class BulletStep(HostStep):
         """Contacts in the next physics step, with the rotors held at `state.rpm`."""
         acting = self._set_scene(self._given(scene))
         team = self._pack(params, state, state.rpm)
-        _check(state, state.rpm)
+        check_state(state)
         self.client.advance(team, self._loads_on(team, Layout.of(state.aux), acting))
         return contacts_of_last_step(self.client, self.dt)
 
@@ -116,7 +116,6 @@ class BulletStep(HostStep):
         check_camera("camera", camera)
         scene = self._given(scene)
         if is_traced((params, state, scene)):
-            self.client.check_open()
             check_team(params, state, state.rpm)
             return self._traced_camera(params, state, camera, scene)
         self._set_scene(scene)
@@ -144,6 +143,7 @@ class BulletStep(HostStep):
 
     def _given(self, scene: Scene | None) -> Scene:
         """Scene of a call; by default that of `make_step`."""
+        self.client.check_open()
         if scene is None:
             return self._scene
         check_scene(scene, files=True)
@@ -151,7 +151,6 @@ class BulletStep(HostStep):
 
     def _set_scene(self, scene: Scene) -> Scene:
         """Place the bodies of a concrete scene; return the part of it that wrenches depend on."""
-        self.client.check_open()
         self.client.set_scene(scene if scene is self._scene else jax.device_get(scene))
         return self._acting(scene)
 
@@ -160,7 +159,7 @@ class BulletStep(HostStep):
 
     def _place(self, params: Params, state: State) -> np.ndarray:
         team = self._pack(params, state, state.rpm)
-        _check(state, state.rpm)
+        check_state(state)
         self.client.place(team)
         return team
 
@@ -170,7 +169,6 @@ class BulletStep(HostStep):
 
     def _pack(self, params: Params, state: State, rpm: ArrayLike) -> np.ndarray:
         """Validate the shapes of concrete arguments, set the team's bodies, and pack the call into one array."""
-        self.client.check_open()
         n = len(state.pos)
         shapes = [np.shape(x) for x in (*jax.tree.leaves(state), rpm)]
         if params is not self._params or shapes != self._shapes:
@@ -229,13 +227,6 @@ class BulletStep(HostStep):
         self._params = None
         self.client.set_scene(self._scene if scene is None else jax.tree.map(np.asarray, scene))
         self.client.set_team(np.asarray(bodies, float))
-
-
-def _check(state: State, rpm: ArrayLike) -> None:
-    """Raise unless all numbers are finite and quaternions of unit length."""
-    check_finite("state", state)
-    check_finite("rpm", rpm)
-    check_quaternion("state.quat", state.quat)
 
 
 def _following(xnp: Any, body: Any, team: Any, loads: Any) -> Any:

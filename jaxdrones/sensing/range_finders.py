@@ -7,7 +7,7 @@ light only.
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -137,19 +137,20 @@ def range_finder(
     return Sensor(name, measure, bound=max_range, rate=rate, entries=entries)
 
 
-def multi_ranger(max_range: float = 4.0, rate: float | None = 10.0, noise: float = 0.0, dropout: float = 0.0) -> Sensor:
+def multi_ranger(max_range: float = 4.0, rate: float | None = 10.0, **others: Any) -> Sensor:
     """Ranges (5,) to the front, back, left, right and up, m: the Multi-ranger deck of the Crazyflie, five VL53L1x.
 
-    Arguments are as for `range_finder`; the deck's driver reads at 10 Hz.
+    Other arguments are those of `range_finder`; the deck's driver reads at 10 Hz.
     """
-    return range_finder("multi_ranger", _MULTI_RANGER, max_range=max_range, rate=rate, noise=noise, dropout=dropout)
+    return range_finder("multi_ranger", _MULTI_RANGER, max_range=max_range, rate=rate, **others)
 
 
-def downward_range(
-    max_range: float = 4.0, rate: float | None = 40.0, noise: float = 0.0, dropout: float = 0.0
-) -> Sensor:
-    """Range (1,) along the body's -z axis, m: the VL53L1x of the Crazyflie's Z-ranger and Flow decks."""
-    return range_finder("downward_range", _DOWN, max_range=max_range, rate=rate, noise=noise, dropout=dropout)
+def downward_range(max_range: float = 4.0, rate: float | None = 40.0, **others: Any) -> Sensor:
+    """Range (1,) along the body's -z axis, m: the VL53L1x of the Crazyflie's Z-ranger and Flow decks.
+
+    Other arguments are those of `range_finder`.
+    """
+    return range_finder("downward_range", _DOWN, max_range=max_range, rate=rate, **others)
 
 
 @checked
@@ -157,27 +158,15 @@ def lidar(
     beams: Annotated[int, whole("{argument} of a lidar")] = 360,
     max_range: float = 12.0,
     rate: float | None = 10.0,
-    noise: float = 0.0,
-    dropout: float = 0.0,
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    orientation: tuple[float, float, float, float] = _IDENTITY,
+    **others: Any,
 ) -> Sensor:
     """Lidar; its reading (beams,) are ranges in its x-y plane, counterclockwise from its x axis, m.
 
-    A scan is instantaneous. Arguments are as for `range_finder`.
+    A scan is instantaneous. Other arguments are those of `range_finder`.
     """
     angle = 2 * np.pi / beams * np.arange(beams)
     around = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
-    return range_finder(
-        "lidar",
-        around,
-        max_range=max_range,
-        rate=rate,
-        noise=noise,
-        dropout=dropout,
-        offset=offset,
-        orientation=orientation,
-    )
+    return range_finder("lidar", around, max_range=max_range, rate=rate, **others)
 
 
 @checked
@@ -186,29 +175,17 @@ def time_of_flight(
     field_of_view: Annotated[float, number("degrees", above=0, below=180)] = 45.0,
     max_range: float = 4.0,
     rate: float | None = 15.0,
-    noise: float = 0.0,
-    dropout: float = 0.0,
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    orientation: tuple[float, float, float, float] = _IDENTITY,
+    **others: Any,
 ) -> Sensor:
     """Ranges (zones, zones), rows from top to bottom and columns from left to right, m: the VL53L5CX.
 
     The zones have equal angles over the field of view (degrees), and each is measured by the ray in its middle. Other
-    arguments are as for `range_finder`; the device looks forward.
+    arguments are those of `range_finder`; the device looks forward.
     """
     slope = np.tan(np.radians(field_of_view) * ((zones - 1) / 2 - np.arange(zones)) / zones)
     up, left = np.meshgrid(slope, slope, indexing="ij")
     rays = np.stack([np.ones_like(left), left, up], axis=-1)
-    return range_finder(
-        "time_of_flight",
-        rays,
-        max_range=max_range,
-        rate=rate,
-        noise=noise,
-        dropout=dropout,
-        offset=offset,
-        orientation=orientation,
-    )
+    return range_finder("time_of_flight", rays, max_range=max_range, rate=rate, **others)
 
 
 def optical_flow(rate: float | None = 100.0, noise: float = 0.0, dropout: float = 0.0) -> Sensor:

@@ -42,9 +42,6 @@ def wrap(env: envs.Env, team_reward: str = "sum") -> BraxEnv:
     Args:
         env: environment.
         team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
-
-    Raises:
-        ValueError: another `team_reward`.
     """
     return BraxEnv(env, team_reward)
 

@@ -70,9 +70,6 @@ def lithium_polymer(
         slow_time: time constant of the slow voltage drop, s.
         efficiency: ideal rotor power over electrical power of a motor at the same thrust.
         idle_power: power of the electronics, W.
-
-    Raises:
-        ValueError: a number out of range.
     """
     numbers = capacity, cells, resistance, slow_resistance, slow_time, efficiency, idle_power
     return Battery(*(jnp.asarray(x, float) for x in numbers))

@@ -53,11 +53,7 @@ class Loads(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Physics:
-    """Effects, models and rotors of a team, shared by both `make_step`.
-
-    Raises:
-        ValueError: an entry that is not a function, two models of one name, or an invalid neighbor grid.
-    """
+    """Effects, models and rotors of a team, shared by both `make_step`."""
 
     effects: Sequence[Effect] = ()
     pairs: Sequence[Pair] = ()
@@ -166,11 +162,7 @@ class Physics:
 
 
 def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable, ...]:
-    """Validated functions of an argument of `make_step`.
-
-    Raises:
-        ValueError: not a sequence of functions, or a function with the wrong parameters.
-    """
+    """Validated functions of an argument of `make_step`."""
     example = f"jaxdrones.{_EXAMPLE[name]}" if name in _EXAMPLE else "a function (params, state) -> Wrench of the team"
     if callable(functions):
         raise UserError(f"{name} is a single function, {functions!r}; give a sequence, for example ({example},)")

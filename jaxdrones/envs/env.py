@@ -178,9 +178,6 @@ class Env:
         Args:
             key: random key.
             progress: progress of training in [0, 1], for a task with a curriculum.
-
-        Raises:
-            ValueError: `key` is not one random key.
         """
         obs, world = self.begin(key, progress)
         if self.vision:

@@ -77,9 +77,6 @@ class AnyVehicle:
 
     Starts and actions are scaled by the drawn vehicle, so an action of 0 hovers; with other randomizations they are
     scaled by the nominal vehicle. In `jaxdrones.make` the median vehicle is the nominal one.
-
-    Raises:
-        ValueError: masses out of range, or the heaviest first.
     """
 
     lightest: float = vehicles.LIGHTEST

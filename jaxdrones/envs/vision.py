@@ -143,9 +143,6 @@ def make_vision(
         camera: on every drone.
         dt: control period, s.
         scene: of the environment; a Bullet step was built with it unless it is random.
-
-    Raises:
-        ValueError: an unknown image, an invalid camera, or more images than control steps.
     """
     every = 1 if camera.rate is None else 1 / (camera.rate * dt)
     if every < 1 - 1e-6:

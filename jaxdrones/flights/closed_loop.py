@@ -142,9 +142,6 @@ def simulate_closed_loop(
         vehicle: the vehicle to simulate.
         motors: motors of the vehicle.
         gains: gains of the firmware.
-
-    Raises:
-        ValueError: see `rows_after_climb`.
     """
     rows, begin = rows_after_climb(log), motor_start_row(log)
     ref_pos, _, recorded_pwm, _ = closed_loop_columns(log)

@@ -31,11 +31,7 @@ _VARIANTS = ("_2021", "_world_axes")  # suffixes of the names of other models of
 @checked
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """Options of a flight; `None` is replaced by the default of the flight.
-
-    Raises:
-        ValueError: an unknown name or a number out of range.
-    """
+    """Options of a flight; `None` is replaced by the default of the flight."""
 
     flight: Annotated[str, choice("flight", FLIGHTS)]
     """`circle`, `velocity`, `ground-effect` or `downwash`."""

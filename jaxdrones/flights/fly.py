@@ -39,9 +39,6 @@ def fly(
         progress: function of the completed fraction of the flight, called at most a hundred times.
         watch: function `(leg, end)`, called with each 1/30 s of the flight and the end time of the flight, s.
         options: other fields of `Conditions`.
-
-    Raises:
-        ValueError: an unknown name or a number out of range.
     """
     conditions = Conditions(flight, **options)
     example, n, dt, steps = FLIGHTS[flight], conditions.drones, conditions.dt, conditions.steps

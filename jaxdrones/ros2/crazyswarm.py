@@ -60,9 +60,6 @@ class Backend:
             node: server, a node of rclpy; its parameters configure the backend, and it publishes the clock.
             names: of the drones.
             states: initial states of the drones; the same objects are updated and returned by `step`.
-
-        Raises:
-            ValueError: a parameter out of range or an unknown vehicle.
         """
         self.names, self._states, self._steps = names, list(states), 0
         self.dt = float(_parameter(node, "dt", 0.0005))

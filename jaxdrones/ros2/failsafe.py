@@ -25,11 +25,7 @@ class PeerLost(RuntimeError):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Failsafe:
-    """Timeouts of commands, and action after them.
-
-    Raises:
-        ValueError: an unknown action, or a time that is not positive.
-    """
+    """Timeouts of commands, and action after them."""
 
     action: Annotated[str, choice("failsafe", ACTIONS)] = "hover"
     """`hover`: hold the last commanded position, or else the present one. `land`: sink to the ground there and stop the

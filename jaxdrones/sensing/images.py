@@ -104,9 +104,6 @@ def view(
         target: (3,) center of the picture, m, world.
         camera: lens of the camera; its mounting is ignored.
         colors: red, green and blue of every drone, 0 to 1; rear rotors are lighter. By default all drones look alike.
-
-    Raises:
-        ValueError: a wrong shape, something else than a camera, or a mesh or URDF file in the scene.
     """
     _check(scene, params, state, camera)
     eye, target = (jnp.asarray(x, state.pos.dtype) for x in (eye, target))

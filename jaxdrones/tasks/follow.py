@@ -59,9 +59,6 @@ def follow(
         size: amplitude of the leader's curve, a Lissajous figure, m.
         period: period of that curve, s.
         duration: duration of an episode, s; of 2 s or less there is no criterion of success.
-
-    Raises:
-        ValueError: a number out of range.
     """
 
     def leader(variables: dict[str, Array], t: Array) -> Setpoint:

@@ -65,9 +65,6 @@ def forest(
         length: distance of the goal, m.
         width: width of the forest, m; leaving it to the side ends the episode.
         duration: duration of an episode, s; by default twice the time at the commanded speed plus 1 s.
-
-    Raises:
-        ValueError: a number out of range.
     """
     check_number("width", width, "m", above=_SPACING * (drones + 1))
     if duration is None:

@@ -48,9 +48,6 @@ def hover(
         tilt: largest initial tilt, degrees.
         height: height of the goal, m; at most 1,000.
         duration: duration of an episode, s; of 2 s or less there is no criterion of success.
-
-    Raises:
-        ValueError: a number out of range.
     """
 
     def start(key: jax.Array, params: Params) -> tuple[State, Array]:

@@ -197,9 +197,6 @@ def preset(
             policy observes its last action and commands `throttle`, which depend on no parameter of the vehicle.
         practice: whether to make the environment of training, possibly with easier starts than that of flight.
         **options: options of `jaxdrones.make`.
-
-    Raises:
-        ValueError: an unknown task or algorithm.
     """
     config = learner(algorithm).Config()
     if realistic and task in ("hover", "recovery", "landing"):

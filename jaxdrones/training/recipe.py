@@ -54,9 +54,6 @@ class Recipe:
             algorithm: a name of `jaxdrones.training.algorithms.ALGORITHMS`.
             realistic: see `presets.preset`.
             **changes: settings of the learner (worlds, horizon, ...), and options of `jaxdrones.make` (period, ...).
-
-        Raises:
-            ValueError: an unknown name, or a value of the wrong type.
         """
         task, files = user_files.take_task(task)
         function = user_files.task_of(task, files)

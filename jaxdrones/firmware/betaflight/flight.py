@@ -91,11 +91,7 @@ class Flight:
         self._begin = self._due = self._heard = self._last = time.monotonic()
 
     def run(self, duration: float | None = None) -> Flown:
-        """Arm and fly for a time with motors armed (s), by default until it is interrupted; then disarm.
-
-        Raises:
-            BetaflightLost: see `wait`.
-        """
+        """Arm and fly for a time with motors armed (s), by default until it is interrupted; then disarm."""
         self._begin = self._due = self._heard = self._last = time.monotonic()
         try:
             while duration is None or self.flown.armed_s < duration - 1e-9:

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import NonNegativeInt, Switch, checked, number
-from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.quantity import described, quantities
+from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.tasks import racetrack, shaping
@@ -85,26 +84,9 @@ def gates(
         }
         return hovering(params, pos), variables | lap | {"lap_time": jnp.zeros(n, dtype)}
 
-    def target(variables, t) -> Setpoint:
-        """Center of the next gate."""
-        return Setpoint.at(_gate(variables)[:, :3])
-
-    def crashed(task: Task, world: World):
-        """A drone touches a gate or a pole, or falls below the ground."""
-        fell = world.drones.pos[:, 2] < standing_height(world.params) - 0.01
-        return world.variables["hit"] | fell
-
     def finished(task: Task, world: World):
         """All drones have passed all gates."""
         return jnp.broadcast_to(jnp.all(world.variables["index"] >= len(GATES)), (drones,))
-
-    def passed(task: Task, world: World):
-        """One in the step in which the drone passes its next gate."""
-        return world.variables["index"] - world.variables["before"]
-
-    def as_number(condition):
-        number = lambda task, world: condition(task, world).astype(world.drones.pos.dtype)  # noqa: E731
-        return described(condition.__doc__, number)
 
     return Task(
         name="gates",
@@ -112,25 +94,22 @@ def gates(
         drones=drones,
         duration=duration,
         start=start,
-        target=target,
+        target=racetrack.target,
         rewards={
             "progress": (10.0, shaping.variable("progress", "Approach to the next gate in the last step, m.")),
-            "passed": (5.0, as_number(passed)),
-            "crashed": (-10.0, as_number(crashed)),
+            "passed": (5.0, racetrack.passed),
+            "crashed": (-10.0, racetrack.crash),
             "omega": (-0.002, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
         },
-        terminations={"finished": finished, "crashed": crashed} | out_of_control(ARENA, center=MIDDLE),
+        terminations={"finished": finished, "crashed": racetrack.crashed} | out_of_control(ARENA, center=MIDDLE),
         advance=_advance,
-        metrics={
-            "gates": shaping.variable("index", "Number of gates passed so far."),
-            "lap_time": shaping.variable("lap_time", "Time until the last gate was passed, or so far, s."),
-        },
+        metrics=racetrack.METRICS,
         success=_finished,
         success_terminations=("finished",),
         randomize=racetrack.randomization_of(level),
         observations={
-            "gates": ObservationTerm(_observe_gates, 20.0, entries=racetrack.GATE_ENTRIES),
+            "gates": racetrack.OBSERVATION,
             "poles": ObservationTerm(_observe_poles, _SIGHT, entries=_POLE_ENTRIES),
         },
         scene=scene,
@@ -152,24 +131,13 @@ def _advance(task: Task, world: World) -> dict[str, Array]:
     racing = index < len(GATES)
     target = task.target_now(world).pos  # before the gate is passed
     return variables | {
-        "index": index + (racing & racetrack.passes(_gate(variables), variables["pos"], pos)),
+        "index": index + (racing & racetrack.passes(racetrack.next_gate(variables), variables["pos"], pos)),
         "before": index,
         "hit": touches(world, variables["pos"], world.scene.replace(ground=False)).scene,
         "pos": pos,
         "progress": racing * (norm(variables["pos"] - target) - norm(pos - target)),
         "lap_time": jnp.where(racing, world.time, variables["lap_time"]),
     }
-
-
-def _gate(variables: dict[str, Array]) -> Float[Array, "n 4"]:
-    """Next gate of every drone."""
-    return racetrack.gates_ahead(variables["gates"], variables["index"])[:, 0]
-
-
-def _observe_gates(task: Task, world: World) -> Float[Array, "n 12"]:
-    """Center relative to the drone (m) and direction of the next gate and of the one after it, world axes."""
-    ahead = racetrack.gates_ahead(world.variables["gates"], world.variables["index"])
-    return racetrack.seen_gates(ahead, world.drones.pos)
 
 
 def _observe_poles(task: Task, world: World) -> Float[Array, "n 8"]:

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdrones.arguments import NonNegativeInt, Switch, checked, number, whole
-from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
-from jaxdrones.quantity import described, quantities
+from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.tasks import centerline, crossing, racetrack, shaping
@@ -101,10 +100,6 @@ def race(
             "lap_time": zero,
         }
 
-    def target(variables, t) -> Setpoint:
-        """Center of the next gate."""
-        return Setpoint.at(_gate(variables)[:, :3])
-
     def advance(task: Task, world: World) -> dict[str, Any]:
         """Gates passed, progress, contacts and order of the drones after a step."""
         variables, pos, active = world.variables, world.drones.pos, world.active
@@ -113,7 +108,8 @@ def race(
         earlier, along = jax.vmap(_step_along)(_near(variables), before, pos)
         lead, overtakes = _order(variables["lead"], along, racing)
         return variables | {
-            "index": index + (racing & racetrack.passes(_gate(variables), before, pos, OPENING if contact else _WIDE)),
+            "index": index
+            + (racing & racetrack.passes(racetrack.next_gate(variables), before, pos, OPENING if contact else _WIDE)),
             "before": index,
             "pos": pos,
             "progress": jnp.where(racing, along - earlier, 0),
@@ -123,11 +119,6 @@ def race(
             "overtakes": variables["overtakes"] + overtakes,
             "lap_time": jnp.where(racing, world.time, variables["lap_time"]),
         }
-
-    def crashed(task: Task, world: World) -> Bool[Array, " n"]:
-        """A drone touches a gate or a pole, or falls below the ground."""
-        fell = world.drones.pos[:, 2] < standing_height(world.params) - 0.01
-        return world.variables["hit"] | fell
 
     def finished(task: Task, world: World) -> Bool[Array, " n"]:
         """A drone has passed all gates."""
@@ -143,25 +134,24 @@ def race(
         drones=drones,
         duration=_LAP_SECONDS * laps,
         start=start,
-        target=target,
+        target=racetrack.target,
         rewards={
             "progress": (10.0, shaping.variable("progress", "Way along the centerline in the last step, m.")),
             "velocity": (-1.0, _velocity),
-            "passed": (2.0, _passed),
-            "crashed": (-10.0, described("A drone crashes.", _as_number(crashed))),
+            "passed": (2.0, racetrack.passed),
+            "crashed": (-10.0, racetrack.crash),
             "clearance": (-30.0, _clearance),
             "approach": (-4.0, crossing.REWARDS["approach"][1]),
             "omega": (-0.01, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
         },
         terminations={"finished": finished}
-        | ({"crashed": crashed} if contact else {})
+        | ({"crashed": racetrack.crashed} if contact else {})
         | out_of_control(ARENA, center=MIDDLE),
         ends="drone",
         advance=advance,
-        metrics={
-            "gates": shaping.variable("index", "Number of gates passed so far."),
-            "lap_time": shaping.variable("lap_time", "Time until the last gate was passed, or so far, s."),
+        metrics=racetrack.METRICS
+        | {
             "touched": shaping.variable("touched", "One if the drone has touched another one."),
             "overtakes": shaping.variable("overtakes", "Number of times that the drone went past another one."),
         },
@@ -169,7 +159,7 @@ def race(
         success_terminations=("finished",),
         randomize=racetrack.randomization_of(level),
         observations={
-            "gates": ObservationTerm(_observe_gates, 20.0, entries=racetrack.GATE_ENTRIES),
+            "gates": racetrack.OBSERVATION,
             "line": ObservationTerm(_observe_line, 20.0, entries=_LINE_ENTRIES),
         },
         scene=scene,
@@ -214,11 +204,6 @@ def _course(gates: Float[Array, "g 4"], laps: int) -> Float[Array, "p 4"]:
     ahead = jnp.concatenate([racetrack.direction(gates[-1]), jnp.zeros(1, gates.dtype)])
     behind = [gates[-1:] + (k * _FINISH * ahead)[None] for k in (1, 2)]
     return jnp.concatenate([*[gates] * laps, *behind])
-
-
-def _gate(variables: dict[str, Any], later: int = 0) -> Float[Array, "n 4"]:
-    """Next gate of every drone, or the one `later` gates ahead."""
-    return variables["gates"][jnp.minimum(variables["index"] + later, len(variables["gates"]) - 1)]
 
 
 def _near(variables: dict[str, Any]) -> centerline.Centerline:
@@ -277,23 +262,8 @@ def _order(lead: Array, along: Float[Array, " n"], racing: Bool[Array, " n"]) ->
     return now, jnp.sum((now == 1) & (lead == -1), axis=1).astype(along.dtype)
 
 
-def _passed(task: Task, world: World) -> Float[Array, " n"]:
-    """One in the step in which the drone passes its next gate."""
-    return (world.variables["index"] - world.variables["before"]).astype(world.drones.pos.dtype)
-
-
-def _as_number(condition):
-    return lambda task, world: condition(task, world).astype(world.drones.pos.dtype)
-
-
 def _clearance(task: Task, world: World) -> Float[Array, " n"]:
     """Smoothed penetration of a margin of 6 cm about gates and poles, m."""
     obstacles = world.scene.replace(ground=False)
     gap = jax.vmap(obstacles.distance)(world.drones.pos) - world.params.collision_radius
     return _SOFTNESS * jax.nn.softplus((_MARGIN - gap) / _SOFTNESS)
-
-
-def _observe_gates(task: Task, world: World) -> Float[Array, "n 12"]:
-    """Center relative to the drone (m) and direction of the next gate and of the one after it, world axes."""
-    gates = jnp.stack([_gate(world.variables, later) for later in (0, 1)], axis=1)
-    return racetrack.seen_gates(gates, world.drones.pos)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,14 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxdrones.checks import short_repr
+from jaxdrones.control import Setpoint
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.sensing import BEAMS, Cylinder, Scene, gate, track
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.starts import standing_height
+from jaxdrones.tasks.task import ObservationTerm, Task, World
 from jaxdrones.vector import atan2
 
 # x, y, z (m) and crossing heading (rad) of each gate, in this order
@@ -34,7 +39,7 @@ _POLE_RANGE = 0.15  # m
 _NOWHERE = 100.0  # m: outside the arena
 _INERTIA_RANGE = 0.2  # share: level 1 on
 
-GATE_ENTRIES = tuple(
+_GATE_ENTRIES = tuple(
     entry
     for gate in ("next gate", "gate after it")
     for entry in (
@@ -99,15 +104,47 @@ def passes(
     return crosses & (y < opening / 2) & (z < opening / 2)
 
 
-def seen_gates(gates: Float[Array, "n 2 4"], pos: Float[Array, "n 3"]) -> Float[Array, "n 12"]:
-    """Center relative to the drone (m) and direction of two gates of every drone, world axes."""
-    seen = jnp.concatenate([gates[..., :3] - pos[:, None], direction(gates)], axis=-1)
-    return seen.reshape(len(pos), -1)
-
-
 def gates_ahead(gates: Float[Array, "g 4"], index: Int[Array, " n"]) -> Float[Array, "n 2 4"]:
     """Gates of the indices and those after them, at most the last one."""
     return jnp.stack([gates[jnp.minimum(index + later, len(gates) - 1)] for later in (0, 1)], axis=1)
+
+
+def next_gate(variables: dict[str, Any]) -> Float[Array, "n 4"]:
+    """Next gate of every drone."""
+    return gates_ahead(variables["gates"], variables["index"])[:, 0]
+
+
+def target(variables: dict[str, Any], t: Array) -> Setpoint:
+    """Center of the next gate."""
+    return Setpoint.at(next_gate(variables)[:, :3])
+
+
+def crashed(task: Task, world: World) -> Bool[Array, " n"]:
+    """A drone touches a gate or a pole, or falls below the ground."""
+    return world.variables["hit"] | (world.drones.pos[:, 2] < standing_height(world.params) - 0.01)
+
+
+def passed(task: Task, world: World) -> Float[Array, " n"]:
+    """One in the step in which the drone passes its next gate."""
+    return (world.variables["index"] - world.variables["before"]).astype(world.drones.pos.dtype)
+
+
+def crash(task: Task, world: World) -> Float[Array, " n"]:
+    """One if a drone touches a gate or a pole, or falls below the ground."""
+    return crashed(task, world).astype(world.drones.pos.dtype)
+
+
+def _observe_gates(task: Task, world: World) -> Float[Array, "n 12"]:
+    """Center relative to the drone (m) and direction of the next gate and of the one after it, world axes."""
+    gates, pos = gates_ahead(world.variables["gates"], world.variables["index"]), world.drones.pos
+    return jnp.concatenate([gates[..., :3] - pos[:, None], direction(gates)], axis=-1).reshape(len(pos), -1)
+
+
+OBSERVATION = ObservationTerm(_observe_gates, 20.0, entries=_GATE_ENTRIES)
+METRICS = {
+    "gates": shaping.variable("index", "Number of gates passed so far."),
+    "lap_time": shaping.variable("lap_time", "Time until the last gate was passed, or so far, s."),
+}
 
 
 def _scene(level: int, key: jax.Array | None = None) -> Scene:

@@ -165,12 +165,14 @@ def check_function(
     if not callable(value):
         remedy = f"give for example {example}" if example else wanted
         raise UserError(f"{name}: {short_repr(value)} is not a function; {remedy}")
+    if arguments is None:
+        return
     try:
         signature = inspect.signature(value)
     except (TypeError, ValueError):
         return
     try:
-        signature.bind(*signature.parameters if arguments is None else arguments)
+        signature.bind(*arguments)
     except TypeError:
         called = getattr(value, "__name__", repr(value))
         raise UserError(f"{name}: {called} takes {signature}; {wanted}{hint}") from None

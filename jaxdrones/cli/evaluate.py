@@ -1,16 +1,15 @@
 """`jaxdrones eval`."""
 
 import argparse
-import functools
 from typing import Any
 
 from jaxdrones import arguments
 from jaxdrones.arguments import choice, number
-from jaxdrones.cli.common import DIVERGED, check_options, folder, print_error
-from jaxdrones.cli.options import add_backend, add_drones, add_set, add_vehicle
-from jaxdrones.cli.policies import is_user_policy, open_policy, team_of_run
-from jaxdrones.cli.report import as_json, described, evaluation_table, percent
-from jaxdrones.cli.settings import add_realistic, asked_settings
+from jaxdrones.cli.common import DIVERGED, check_options, print_error
+from jaxdrones.cli.options import add_backend, add_drones
+from jaxdrones.cli.policies import add_policy, open_policy, policy_of, team_of_run
+from jaxdrones.cli.report import as_json, evaluation_table, percent
+from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
 
@@ -25,19 +24,8 @@ def add(commands) -> None:
         description="Fly many episodes with the best policy of a run, your own policy (file.py:name), or one for all "
         "vehicles. Print the success rate with its 95 % interval over distinct episodes, errors, and ends of episodes.",
     )
-    parser.add_argument(
-        "policy",
-        type=folder,
-        metavar="RUN",
-        help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); "
-        "any-vehicle or raptor; or file.py:name, whose code is executed",
-    )
-    own = parser.add_argument_group("your own policy", "only with file.py:name, any-vehicle or raptor")
+    add_policy(parser, "any-vehicle or raptor; ")
     evaluation = parser.add_argument_group("evaluation")
-    own.add_argument("--task", metavar="TASK", help="task to fly, as for `jaxdrones train`")
-    add_vehicle(own)
-    add_realistic(own)
-    add_set(own, "option of the environment (action, observation, ...)")
     add_drones(evaluation)
     add_backend(evaluation)
     evaluation.add_argument("--episodes", type=int, default=1000, metavar="N", help="number of episodes (1000)")
@@ -60,16 +48,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     settings = asked_settings(options)
     team = team_of_run(options, settings)
     run = open_policy(options.policy, options.task, options.realistic, settings, options.last)
-    about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed, "backend": options.backend}
-    if is_user_policy(options.policy):
-        recipe, make_policy = run.recipe(), run.policy
-        title = described(recipe)
-    else:
-        name = "last" if options.last else "best"
-        recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
-        make_policy = functools.partial(run.policy, name)
-        title = f"{described(recipe)}: policy of update {update}"
-        about |= {"policy": name, "update": update}
+    recipe, title, make_policy, place = policy_of(run, options)
+    about: dict[str, Any] = {"run": str(options.policy), "seed": options.seed, "backend": options.backend, **place}
     title += f", on the {options.backend} backend" * (options.backend != "explicit")
     key = jax.random.key(_FIRST_SEED + options.seed)
     with recipe.env(backend=options.backend, **team) as env:

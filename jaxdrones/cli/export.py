@@ -4,11 +4,11 @@ import argparse
 from typing import Any
 
 from jaxdrones.arguments import choice
-from jaxdrones.cli.common import check_options, folder, run_folder
-from jaxdrones.cli.options import add_drones, add_output, add_set, add_vehicle
-from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder
-from jaxdrones.cli.report import as_json, described
-from jaxdrones.cli.settings import add_realistic, asked_settings
+from jaxdrones.cli.common import check_options, run_folder
+from jaxdrones.cli.options import add_drones, add_output
+from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
+from jaxdrones.cli.report import as_json
+from jaxdrones.cli.settings import asked_settings
 
 TARGETS = ("c", "onnx", "stablehlo", "js")
 
@@ -22,20 +22,8 @@ def add(commands) -> None:
         "for a flight controller, an ONNX model, a program of jax.export, or an ES module. Each describes its inputs "
         "and outputs: order, unit, frame and range.",
     )
-    parser.add_argument(
-        "policy",
-        type=folder,
-        metavar="RUN",
-        help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); or "
-        "file.py:name, whose code is executed",
-    )
+    add_drones(add_policy(parser))
     parser.add_argument("--to", required=True, metavar="TARGET", help=", ".join(TARGETS))
-    own = parser.add_argument_group("your own policy", "only with file.py:name")
-    own.add_argument("--task", metavar="TASK", help="task of the policy, as for `jaxdrones train`")
-    add_drones(own)
-    add_vehicle(own)
-    add_realistic(own)
-    add_set(own, "option of the environment (action, observation, ...)")
     add_output(parser, "folder of the files (RUN/export, or runs/TASK/export for a policy of your own)")
     parser.add_argument("--name", default="policy", help="name of the files, and prefix of the names in C (policy)")
     parser.add_argument("--last", action="store_true", help="the newest policy of the run instead of the best")
@@ -47,16 +35,11 @@ def _export(options: argparse.Namespace) -> int:
 
     check_options(options, to=choice("target", TARGETS))
     run = open_policy(options.policy, options.task, options.realistic, asked_settings(options), options.last)
-    if is_user_policy(options.policy):
-        recipe = run.recipe()
-        title, place = described(recipe), run_folder(options.task, "/export")
-    else:
-        name = "last" if options.last else "best"
-        recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
-        title, place = f"{described(recipe)}, policy of update {update}", output_folder(options.policy, "export")
+    recipe, title, make_policy, _ = policy_of(run, options)
+    own = is_user_policy(options.policy)
+    place = run_folder(options.task, "/export") if own else output_folder(options.policy, "export")
     with recipe.env() as env:
-        policy = run.policy(env) if is_user_policy(options.policy) else run.policy(name, env)
-        exported = save(policy, env, options.to, options.output or place, options.name, title)
+        exported = save(make_policy(env), env, options.to, options.output or place, options.name, title)
     if options.json:
         about: dict[str, Any] = {"policy": str(options.policy), "to": options.to}
         files = [vars(x) | {"files": [*map(str, x.files)]} for x in exported]

@@ -1,13 +1,18 @@
 """Policies on the command line: of a run of `jaxdrones train`, of a user's file, bundled or published ones."""
 
 import argparse
+import functools
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from jaxdrones import assets
 from jaxdrones.checks import hint
-from jaxdrones.cli.common import run_folder
+from jaxdrones.cli.common import folder, run_folder
+from jaxdrones.cli.options import add_set, add_vehicle
+from jaxdrones.cli.report import described
+from jaxdrones.cli.settings import add_realistic
 from jaxdrones.errors import UserError
 from jaxdrones.user_code import is_reference
 
@@ -29,6 +34,33 @@ def output_folder(policy: Path, what: str) -> Path:
     if is_bundled(policy):
         return Path("runs") / f"bundled-{policy}" / what
     return run_folder(str(policy)) if is_user_policy(policy) else policy / what
+
+
+def add_policy(parser: argparse.ArgumentParser, others: str = "") -> argparse._ArgumentGroup:
+    """Add the argument RUN, which may be `others`, too; return the group of options for a policy that is no run."""
+    parser.add_argument(
+        "policy",
+        type=folder,
+        metavar="RUN",
+        help="folder of `jaxdrones train`, for example runs/hover; a task with a bundled policy (`jaxdrones list`); "
+        f"{others}or file.py:name, whose code is executed",
+    )
+    own = parser.add_argument_group("your own policy", "only for a policy that is no run")
+    own.add_argument("--task", metavar="TASK", help="task of the policy, as for `jaxdrones train`")
+    add_vehicle(own)
+    add_realistic(own)
+    add_set(own, "option of the environment (action, observation, ...)")
+    return own
+
+
+def policy_of(run: Any, options: argparse.Namespace) -> tuple[Any, str, Callable[[Any], Any], dict[str, Any]]:
+    """Recipe and title of an opened policy, a function of its environment that returns it, and its place in a run."""
+    if is_user_policy(options.policy):
+        return run.recipe(), described(run.recipe()), run.policy, {}
+    name = "last" if options.last else "best"
+    recipe, update = run.recipe(name), run.sidecar_entry(name, "update")
+    title = f"{described(recipe)}: policy of update {update}"
+    return recipe, title, functools.partial(run.policy, name), {"policy": name, "update": update}
 
 
 def team_of_run(options: argparse.Namespace, settings: dict[str, Any]) -> dict[str, Any]:

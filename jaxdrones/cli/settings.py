@@ -22,7 +22,7 @@ REALISTIC_KINDS = ("any",)
 """Arguments of --realistic."""
 
 
-def add_realistic(parser: argparse.ArgumentParser, where: str = "") -> None:
+def add_realistic(parser: argparse._ActionsContainer, where: str = "") -> None:
     """Add --realistic, with the optional argument `any`; `where` is a prefix of its help."""
     parser.add_argument(
         "--realistic",

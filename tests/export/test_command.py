@@ -67,7 +67,7 @@ class Leaky(nn.Module):
 def test_the_command_writes_the_best_policy_into_the_folder_of_the_run(run, capsys):
     assert main(["export", str(run), "--to", "c"]) == 0
     said = capsys.readouterr().out
-    assert "hover by bptt, policy of update 3" in said and f"wrote {run}/export/policy.h" in said
+    assert "hover by bptt: policy of update 3" in said and f"wrote {run}/export/policy.h" in said
     assert "311 multiply-adds, 1,412 bytes of weights (flash), 124 bytes of RAM" in said
     best = (run / "export" / "policy.h").read_text()
     assert main(["export", str(run), "--to", "c", "--last", "-o", str(run / "last"), "--json", "--name", "hover"]) == 0

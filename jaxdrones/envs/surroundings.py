@@ -70,11 +70,8 @@ def encounters(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2
 def obstacles(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2) -> ObservationTerm:
     """Observation term of the nearest obstacles as a set, with the rows of `encounters`.
 
-    An obstacle is represented by its nearest point, at rest; the ground is one of them.
-
-    Args:
-        count: number of obstacles; in scenes with fewer the remaining rows are beyond `reach`.
-        reach: distance at which an obstacle is out of sight, m.
+    An obstacle is represented by its nearest point, at rest; the ground is one of them. Arguments are as for
+    `encounters`.
     """
 
     def observe(task: Task, world: World) -> Array:

@@ -36,13 +36,9 @@ class Normal(NamedTuple):
 def levenberg_marquardt(
     normal: Callable[[np.ndarray], Normal], x: np.ndarray, steps: int, min_decrease: float = 0.0
 ) -> tuple[np.ndarray, Normal]:
-    """Minimize a sum of squares; return the best coordinates and their normal equations.
+    """Minimize a sum of squares from x (n,); return the best coordinates and their normal equations.
 
-    Args:
-        normal: function of coordinates (n,) for the normal equations.
-        x: (n,) initial coordinates.
-        steps: largest number of steps, rejected ones included.
-        min_decrease: relative decrease of the loss at which to stop.
+    It takes `steps`, rejected ones included, or stops at a relative decrease of the loss below `min_decrease`.
     """
     best, damping = normal(x), _INITIAL_DAMPING
     for _ in range(steps):

@@ -114,12 +114,7 @@ def residuals(predicted: State, logged: State) -> Float[Array, "4 3"]:
 
 
 def open_loop_errors(log: FlightLog, vehicle: Vehicle, motors: Motors) -> np.ndarray:
-    """Mean prediction errors of a vehicle over all windows of a log.
-
-    Args:
-        log: log of the flight.
-        vehicle: the vehicle to simulate.
-        motors: motors of the vehicle, for a log of PWM.
+    """Mean prediction errors of a vehicle over all windows of a log; the motors are for a log of PWM.
 
     Returns:
         (horizons, 4) mean norms of the errors of position (m), velocity (m/s), attitude (angle, rad) and angular

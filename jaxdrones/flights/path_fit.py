@@ -51,18 +51,11 @@ def fit_path(
     gains: firmware_pid.Gains,
     progress: Callable[[str], None],
 ) -> tuple[Vehicle, dict[str, float]]:
-    """Estimate parameters of a vehicle from flights on set-points.
+    """Estimate parameters of a vehicle from flights on set-points, with PWM and battery voltage.
 
     `mass` and `unfelt_sag` come first, from the balance of vertical forces in every second of the flights. The
     parameters of the horizontal motion come second: the path of the closed-loop simulation is fitted to the recorded
-    one.
-
-    Args:
-        logs: flights with set-points, PWM and battery voltage.
-        start: the vehicle with the initial values.
-        motors: motors of the vehicle.
-        gains: gains of the recorded firmware.
-        progress: called with a line after each of the two fits.
+    one. `gains` are those of the recorded firmware.
 
     Returns:
         The fitted vehicle, and the standard error of each parameter's coordinate x.

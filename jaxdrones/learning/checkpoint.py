@@ -24,12 +24,9 @@ from jaxdrones.pytree import as_tuple
 
 
 def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
-    """Write `path`.msgpack and `path`.json, both or none.
+    """Write a policy to `path`.msgpack and `path`.json, both or none; missing folders are created.
 
-    Args:
-        path: path without a suffix; missing folders are created.
-        policy: policy to save.
-        **about: entries of the sidecar, such as task, algorithm and settings: JSON values or dataclasses.
+    `about` are entries of the sidecar, such as task, algorithm and settings: JSON values or dataclasses.
 
     Raises:
         ValueError: a parameter is not finite.
@@ -40,11 +37,7 @@ def save(path: str | os.PathLike, policy: Policy, **about: Any) -> None:
 
 
 def load(path: str | os.PathLike, network: Any = None) -> Policy:
-    """Load a policy of `save`, bit for bit.
-
-    Args:
-        path: path without a suffix.
-        network: the user's network of the policy, see `learning.networks.OwnNetwork`.
+    """Load a policy of `save`, bit for bit; `network` is the user's, see `learning.networks.OwnNetwork`.
 
     Raises:
         FileNotFoundError: there is no checkpoint.

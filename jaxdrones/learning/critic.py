@@ -46,12 +46,9 @@ def critic_observation(
 ) -> Obs:
     """Observations of the critic, normalized.
 
-    Args:
-        policy: policy of the critic.
-        obs: (*batch, n, d) observations of the policy, or a dictionary with images.
-        hidden_state: (*batch, n, ...) hidden state of the policy after `obs`; `None` without one.
-        privileged: privileged observation, in place of the vector of `obs`.
-        action: (*batch, n, a) actions of all drones for a centralized critic, see `centralized_input`.
+    The hidden state (*batch, n, ...) is that after the observations (*batch, n, d), or a dictionary with images; a
+    privileged observation replaces their vector. The actions (*batch, n, a) of all drones are those of a centralized
+    critic, see `centralized_input`.
     """
     vector = state_vector(obs) if privileged is None else privileged.obs
     x = policy.obs_stats.normalize(vector)

@@ -17,12 +17,8 @@ HALF_LOG_2_PI = math.log(2 * math.pi) / 2
 def explore(policy: Policy, log_std: Array, noise: Array, hidden_state: Any, obs: Obs) -> tuple[Any, Array, Array]:
     """Actions around those of a policy in many worlds, for `collect.collect`.
 
-    Args:
-        policy: policy.
-        log_std: (a,) or (n, a), logarithm of the standard deviation of actions.
-        noise: (w, n, a) standard normal noise.
-        hidden_state: (w, n, ...) hidden state of the policy before the observations; `None` without one.
-        obs: (w, n, d) observations, or a dictionary with images.
+    `log_std` (a,) or (n, a) is the logarithm of the standard deviation of actions, and the noise (w, n, a) is standard
+    normal. The hidden state is that before the observations (w, n, d), or a dictionary with images.
 
     Returns:
         The hidden state after the observations, the actions (w, n, a), and their log probability density (w, n).

@@ -195,14 +195,8 @@ def make_network(
 ) -> MLP | Network:
     """Network for the given observations, with a CNN for the resolution of the images.
 
-    Args:
-        obs: observations (*batch, d), or a dictionary of such an array and of images.
-        hidden_sizes: sizes of the hidden layers.
-        output_size: number of outputs.
-        output_scale: scale of the initial outputs.
-        recurrent_size: size of the hidden state of a GRU; 0 for none.
-        sets: sets in the observation.
-        set_sizes: sizes of the layers that encode a row of a set.
+    A `recurrent_size` of 0 is that of no GRU; `set_sizes` are those of the layers that encode a row of the sets in the
+    observation.
     """
     channels: tuple[int, ...] = ()
     strides: tuple[int, ...] = ()

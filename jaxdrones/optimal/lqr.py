@@ -83,16 +83,10 @@ def gain(
 def riccati(
     a: Float[Array, "d d"], b: Float[Array, "d m"], q: Float[Array, "d d"], r: Float[Array, "m m"]
 ) -> Float[Array, "d d"]:
-    """Stabilizing solution P of the discrete algebraic Riccati equation.
+    """Stabilizing solution P of the discrete algebraic Riccati equation for z' = A z + B u, weights Q and R.
 
     P = Q + A' P A - A' P B (R + B' P B)^-1 B' P A, by the structure-preserving doubling algorithm (Chu, Fan, Lin, Wang
     2004): iteration k has the cost of 2^k steps, so it converges quadratically.
-
-    Args:
-        a: (d, d) A of z' = A z + B u, stabilizable.
-        b: (d, m) B.
-        q: (d, d) weight of z, symmetric, not negative.
-        r: (m, m) weight of u, symmetric, positive.
     """
     eye = jnp.eye(len(a), dtype=a.dtype)
 

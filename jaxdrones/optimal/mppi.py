@@ -80,13 +80,9 @@ def settings(
 ) -> Settings:
     """Settings of a planner, with the weights of the errors, by default `problem.weights()`.
 
-    Args:
-        step: of a team, over one control period: that of the simulation, or a simpler one.
-        weights: of the errors.
-        horizon: planned control steps. The terminal cost is that of the regulator of `lqr`.
-        samples: samples per call.
-        temperature: in standard deviations of the samples' costs; a lower value favors the best sample.
-        hold: control steps between samples of the noise: noise at every step hardly moves a drone.
+    The terminal cost after `horizon` control steps is that of the regulator of `lqr`. The temperature is in standard
+    deviations of the costs of the samples; a lower value favors the best sample. `hold` control steps lie between
+    samples of the noise: noise at every step hardly moves a drone.
     """
     noise = jnp.array([0.05, 0.02, 0.02, 0.02])
     return Settings(

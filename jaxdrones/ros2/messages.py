@@ -108,10 +108,8 @@ def __getattr__(name: str) -> Any:
 def encode(message: Message, class_of: Callable[[str], Any], array: Callable[[Field, Any], Any]) -> Any:
     """Convert a message to a class of another library.
 
-    Args:
-        message: the message.
-        class_of: name of a message type -> class of the other library, with the fields as keywords.
-        array: (field, tuple or bytes) -> array of the other library.
+    `class_of` is a function from the name of a message type to that class, with the fields as keywords; `array` one
+    from a field and a tuple or bytes to an array of the other library.
     """
     own = fields(message.NAME)
     return class_of(message.NAME)(**{f.name: _encode(f, getattr(message, f.name), class_of, array) for f in own})

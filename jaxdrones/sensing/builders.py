@@ -98,21 +98,8 @@ def room(
 ) -> Scene:
     """Room centered at the origin: four walls, a ceiling, random pillars and clutter.
 
-    Pillars and clutter within `clearance` of a point of `keep_free` are left out.
-
-    Args:
-        size: inner length, width and height, m.
-        key: random key of pillars and clutter; needed only for these. The same key gives the same room.
-        pillars: number of pillars from floor to ceiling.
-        spheres: number of balls, of radius U(0.2, 0.5) m.
-        boxes: number of boxes, with edges of U(0.3, 1) m and any heading.
-        radius: of the pillars, U(first, second), m.
-        keep_free: (k, 3) points to keep free of pillars and clutter, m.
-        clearance: smallest distance of pillars and clutter from those points, m.
-        wall: thickness of walls and ceiling, m.
-
-    Raises:
-        ValueError: pillars or clutter without a key.
+    `size` is the inner length, width and height, `wall` the thickness of walls and ceiling, m. Pillars reach from floor
+    to ceiling; they and the clutter need a random key. Other arguments are those of `forest`.
     """
     x, y, z = size
     shell = Box(
@@ -142,11 +129,8 @@ def room(
 def track(gates: ArrayLike, opening: float = 0.4, frame: float = 0.16, depth: float = 0.05) -> Scene:
     """Gates at given poses, four boxes each, in the order of the poses.
 
-    Args:
-        gates: (k, 4) x, y, z of the center of the opening (m) and heading in which it is crossed (rad).
-        opening: edge of the openings, m.
-        frame: width of the beams, m.
-        depth: of the beams along the heading, m.
+    A pose is x, y, z of the center of the opening (m) and the heading in which it is crossed (rad); other arguments are
+    those of `gate`.
     """
     gates = jnp.asarray(gates, float)
     check_shape("gates of a track", gates, ("k", 4), "x, y, z (m) and heading (rad) of every gate")

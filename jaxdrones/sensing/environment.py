@@ -31,10 +31,7 @@ EUROPE = (0.0, 21.5, -43.0)
 def barometer(errors: Noise = BMP388, rate: float = 50.0, name: str = "barometer") -> Sensor:
     """Barometer; its reading (1,) is the height above the origin by air pressure, m.
 
-    Args:
-        errors: in m; 1 Pa is 0.083 m at sea level. Wind and rotors disturb a real barometer by more.
-        rate: measurements per second; the control rate of the environment is a multiple of it.
-        name: name of the reading in observation terms.
+    The errors are in m; 1 Pa is 0.083 m at sea level. Wind and rotors disturb a real barometer by more.
     """
     entries = (Quantity("height measured", "m", "world"),)
     return _noisy(name, errors, rate, 1, lambda state: state.pos[2:], entries)
@@ -48,11 +45,7 @@ def magnetometer(
 ) -> Sensor:
     """Magnetometer; its reading (3,) is the magnetic field in body axes, uT.
 
-    Args:
-        errors: in uT.
-        field: (3,) magnetic field, uT, world.
-        rate: measurements per second; the control rate of the environment is a multiple of it.
-        name: name of the reading in observation terms.
+    The `field` (3,) is in uT, world, and the errors are in uT, too.
     """
 
     def true(state: State) -> jax.Array:

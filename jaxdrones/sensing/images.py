@@ -96,14 +96,9 @@ def view(
 ) -> Images:
     """Upright images of a team from a fixed point in the world, without an axis over drones.
 
-    Args:
-        scene: of one world.
-        params: of a team of n drones.
-        state: of the team; only its poses matter.
-        eye: (3,) position of the camera, m, world; not right above or below the target.
-        target: (3,) center of the picture, m, world.
-        camera: lens of the camera; its mounting is ignored.
-        colors: red, green and blue of every drone, 0 to 1; rear rotors are lighter. By default all drones look alike.
+    The camera is at `eye` (3,), not right above or below `target` (3,), the center of the picture, m, world; its
+    mounting is ignored. The colors are red, green and blue of every drone, 0 to 1; rear rotors are lighter. By default
+    all drones look alike. Other arguments and errors are those of `render`.
     """
     _check(scene, params, state, camera)
     eye, target = (jnp.asarray(x, state.pos.dtype) for x in (eye, target))

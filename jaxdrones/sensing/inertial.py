@@ -60,13 +60,7 @@ def imu(
     """Inertial measurement unit; its reading is `acc` (3,), specific force, m/s^2, and `gyro` (3,), rad/s, body.
 
     Readings are instantaneous, without the unit's low-pass filter: white noise has the density of the part and the
-    standard deviation density times sqrt(`rate`).
-
-    Args:
-        part: the errors.
-        rate: measurements per second; the control rate of the environment is a multiple of it.
-        offset: (3,) of the unit from the center of mass, m, body.
-        name: name of the reading in observation terms.
+    standard deviation density times sqrt(`rate`). The unit has an offset (3,) from the center of mass, m, body.
     """
     at_center = not np.any(np.asarray(offset))
 

@@ -57,10 +57,6 @@ def motion_capture(system: MotionCaptureSystem = VICON, name: str = "motion_capt
 
     `fresh` () is true where a pose arrived; otherwise the last pose stays. A delay that is not a multiple of the period
     reads a mean of two measured poses. Before the start the drone rests at its initial pose.
-
-    Args:
-        system: rate, delay, dropouts and noise; the control rate of the environment is a multiple of its rate.
-        name: name of the reading in observation terms.
     """
     periods = system.delay * system.rate
     late = math.ceil(periods - 1e-6)

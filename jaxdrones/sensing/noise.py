@@ -95,12 +95,9 @@ class Noise:
         return errors, jnp.clip(reading, -self.limit, self.limit)
 
     def allan_deviation(self, time: ArrayLike) -> np.ndarray:
-        """Theoretical Allan deviation of the readings at rest, u.
+        """Theoretical Allan deviation of the readings at rest over averaging times (...), s.
 
         White noise, Gauss-Markov process and random walk add in quadrature (IEEE 952, annex C).
-
-        Args:
-            time: (...) averaging times, s.
         """
         t = np.asarray(time, float)
         ratio = self.correlation / t

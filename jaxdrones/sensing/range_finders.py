@@ -191,14 +191,10 @@ def time_of_flight(
 def optical_flow(rate: float | None = 100.0, noise: float = 0.0, dropout: float = 0.0) -> Sensor:
     """Optical flow sensor, the PMW3901; its reading (2,) is the flow backward and to the right, rad/s.
 
-    With the velocity v and the body rates w, in body axes, and the range d along the body's -z axis, the flow is
-    (v_x / d - w_y, v_y / d + w_x); ranges are clamped to at least 0.08 m. Times 35 pixels / 0.717 rad it is the
-    Crazyflie's count per second (its `mm_flow.c`).
-
-    Args:
-        rate: measurements per second; by default one every control step.
-        noise: standard deviation, rad/s.
-        dropout: fraction of missing measurements, which read zero.
+    With the velocity v and the body rates w, in body axes, and the range d along the body's -z axis, the flow is (v_x /
+    d - w_y, v_y / d + w_x); ranges are clamped to at least 0.08 m. Times 35 pixels / 0.717 rad it is the Crazyflie's
+    count per second (its `mm_flow.c`). `noise` is a standard deviation, rad/s, and `dropout` the fraction of missing
+    measurements, which read zero.
     """
 
     def measure(key: jax.Array, params: Params, state: State, rate: State, scene: Scene, memory: None):

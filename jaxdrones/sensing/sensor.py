@@ -128,14 +128,8 @@ def measure_sensors(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Memories and readings by name after one measurement of every sensor of a team of n drones, each with n rows.
 
-    Args:
-        sensors: with unique names.
-        key: a random key.
-        params: of the team.
-        state: of the team.
-        rate: the time derivative of `state`, as `step.rate` returns it.
-        scene: of the world.
-        memories: by sensor name, from `init_sensors` or the previous measurement.
+    The rate is the time derivative of the state, as `step.rate` returns it; the memories are those by name from
+    `init_sensors` or the previous measurement.
     """
     n = len(params.mass)
     keys = jax.random.split(key, (len(sensors), n))

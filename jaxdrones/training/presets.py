@@ -13,26 +13,13 @@ from jaxdrones.learning.adaptive import OBSERVED
 from jaxdrones.tasks.task import Task
 from jaxdrones.training.algorithms import learner
 
-_DELAYED_OBSERVATION = (
-    "position_error",
-    "rotation_matrix",
-    "velocity_error",
-    "omega",
-    "rotor_speed",
-    last_actions(5),
-)
+_DELAYED_OBSERVATION = (*OBSERVED, "rotor_speed", last_actions(5))
 """Additional observations with rotor lag and a delay of up to four control steps."""
 
 _ANY_VEHICLE = {"action": "throttle", "observation": (*OBSERVED, last_actions(1))}
 """Nothing that depends on the parameters of the vehicle."""
 
-_ONE_D = {
-    "worlds": 64,
-    "horizon": 120,
-    "updates": 150,
-    "obs_stats_freeze": 0.5,
-    "restart_fraction": 0.3,
-}
+_ONE_D = dict(worlds=64, horizon=120, updates=150, obs_stats_freeze=0.5, restart_fraction=0.3)
 _ONE_D_PPO = {
     "updates": 800,
     "worlds": 64,
@@ -80,19 +67,14 @@ _CROSSING = dict(
 )
 """Two seconds of flight of teams, in which drones meet and avoid each other."""
 
-_RACE = dict(
+_RACE = _CROSSING | dict(
     updates=400,
     worlds=64,
     horizon=60,
-    hidden_sizes=(64, 64),
     obs_stats_freeze=0.15,
-    gradient="decay",
     gradient_decay=0.94,
-    outlier_gradient=10.0,
     learning_rate=5e-3,
-    adam_b2=0.99,
     max_grad_norm=1.0,
-    restart_fraction=0.35,
 )
 """One second of flight, in which a drone passes a gate."""
 

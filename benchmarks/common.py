@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import jax
 
-from jaxdrones.cli import throughput as timing
 from jaxdrones.cli.machine import processor, versions
 from jaxdrones.cli.throughput import seconds as seconds
 
@@ -36,7 +35,9 @@ def compiled(function, *arguments, options: dict | None = None):
 def first_call(function, *arguments) -> float:
     """Seconds of the first call, in which a function compiles itself, the compilation cache switched off."""
     jax.config.update("jax_enable_compilation_cache", False)
-    return timing.first_call(function, *arguments)
+    start = time.perf_counter()
+    jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - start
 
 
 def success_rate(success: float | None, interval: tuple[float, float] | None) -> str:

@@ -36,16 +36,6 @@ _COLORED = 4  # axes of color images of a team
 _NEXT = np.uint32(2**32 - 1)  # fold for the key of the next episode, above the number of steps of any episode
 
 
-def wrap(env: envs.Env, team_reward: str = "sum") -> BraxEnv:
-    """Wrap an environment for brax's trainers.
-
-    Args:
-        env: environment.
-        team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
-    """
-    return BraxEnv(env, team_reward)
-
-
 class BraxEnv(base.Env):
     """One world with one agent: actions and observations of the drones are concatenated.
 
@@ -57,8 +47,8 @@ class BraxEnv(base.Env):
     of all drones as channels.
     """
 
-    def __init__(self, env: envs.Env, team_reward: str = "sum"):
-        """Wrap an environment; the arguments are those of `wrap`."""
+    def __init__(self, env: envs.Env, *, team_reward: str = "sum"):
+        """Wrap an environment; the reward of a team is the `sum` or the `mean` of the rewards of its drones."""
         self.env, self._rewarding = env, rewarding(team_reward)
 
     @property
@@ -113,6 +103,10 @@ class BraxEnv(base.Env):
     def _metrics(self, info: dict[str, Any]) -> dict[str, jax.Array]:
         rewards = {f"reward_{name}": _float(self._rewarding(x)) for name, x in info["rewards"].items()}
         return rewards | {name: _float(jnp.mean(x)) for name, x in info["metrics"].items()}
+
+
+wrap = BraxEnv
+"""Wrap an environment for brax's trainers."""
 
 
 class _Training(base.Wrapper):

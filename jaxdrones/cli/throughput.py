@@ -81,13 +81,6 @@ def episodes(env: Env, worlds: int, length: int) -> tuple[Callable[[Any, Array],
     return fly, begun
 
 
-def first_call(function: Callable, *arguments: Any) -> float:
-    """Duration of the first call, with compilation, s."""
-    start = time.perf_counter()
-    jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - start
-
-
 def seconds(program: Callable, *arguments: Any, repeats: int) -> dict[str, float]:
     """Median and best duration of a call after warm-up, s; short calls are timed in groups."""
 

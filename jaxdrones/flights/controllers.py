@@ -67,16 +67,20 @@ def _gains(module: ModuleType, vehicle: str) -> Any:
     return module.gains()
 
 
-def _optimal(conditions: Conditions) -> Controller:
-    """Optimal controller with the step of the flight as its model, for each drone alone."""
-    n, module = conditions.drones, optimal.CONTROLLERS[conditions.controller]
-    step = make_step(
+def physics_of(conditions: Conditions) -> dict[str, Any]:
+    """Arguments of `make_step` of either backend for a flight, without the effects between drones."""
+    return dict(
         effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
         rotors=ROTORS[conditions.rotors],
-        integrator=INTEGRATORS[conditions.integrator],
         dt=conditions.dt / conditions.substeps,
         substeps=conditions.substeps,
     )
+
+
+def _optimal(conditions: Conditions) -> Controller:
+    """Optimal controller with the step of the flight as its model, for each drone alone."""
+    n, module = conditions.drones, optimal.CONTROLLERS[conditions.controller]
+    step = make_step(**physics_of(conditions), integrator=INTEGRATORS[conditions.integrator])
     settings = module.settings(step)
     one = functools.partial(module.control, settings, dt=conditions.dt)
 

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdrones.control import Setpoint, velocity
-from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
+from jaxdrones.dynamics import INTEGRATORS, PAIRS
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.rollout import Control, leg_length, legs
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import Conditions
-from jaxdrones.flights.controllers import controller_of
+from jaxdrones.flights.controllers import controller_of, physics_of
 from jaxdrones.flights.examples import FLIGHTS, Flight
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.params import Params, repeat
@@ -93,13 +93,8 @@ def _flown(
 ) -> Iterator[State]:
     """Trajectory on the chosen backend, whole or in legs."""
     length = conditions.steps if whole else leg_length(conditions.dt)
-    common: dict[str, Any] = dict(
-        effects=[EFFECTS[effect] for effect in conditions.effects if effect in EFFECTS],
-        pairs=[PAIRS[effect] for effect in conditions.effects if effect in PAIRS],
-        rotors=ROTORS[conditions.rotors],
-        dt=conditions.dt / conditions.substeps,
-        substeps=conditions.substeps,
-    )
+    pairs = [PAIRS[effect] for effect in conditions.effects if effect in PAIRS]
+    common = physics_of(conditions) | {"pairs": pairs}
     if conditions.backend == "explicit":
         if gui:
             raise UserError("a window is requested; only the bullet backend has one")

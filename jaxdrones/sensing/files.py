@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdrones import rotation
 from jaxdrones.arguments import checked, number
-from jaxdrones.checks import check_finite, check_quaternion
+from jaxdrones.checks import check_quaternion, check_shape
 from jaxdrones.errors import UserError
 from jaxdrones.sensing.shapes import GREY, LENGTHS, Box
 
@@ -30,10 +30,8 @@ class File:
 
     def __post_init__(self):
         for name in "pos", "quat", "color":
-            value, what = np.asarray(getattr(self, name), float), f"{name} of {type(self).__name__}"
-            if value.shape != (LENGTHS[name],):
-                raise UserError(f"{what} has shape {value.shape}; give {LENGTHS[name]} numbers")
-            check_finite(what, value)
+            value = np.asarray(getattr(self, name), float)
+            check_shape(f"{name} of {type(self).__name__}", value, (LENGTHS[name],), "of one body", finite=True)
             object.__setattr__(self, name, tuple(value.tolist()))
         check_quaternion(f"quat of {type(self).__name__}", self.quat)
         if not Path(self.path).is_file():

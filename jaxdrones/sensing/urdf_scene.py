@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxdrones import rotation
-from jaxdrones.checks import check_finite, check_quaternion, short_repr
+from jaxdrones.checks import check_quaternion, check_shape
 from jaxdrones.errors import UserError
 from jaxdrones.sensing.files import Mesh
 from jaxdrones.sensing.scene import Scene
@@ -47,9 +47,7 @@ def from_urdf(
     if not file.is_file():
         raise UserError(f"{file}: there is no such file; give the path of a URDF that exists")
     for name, value, length in ("pos", pos, 3), ("quat", quat, 4):
-        if np.shape(value) != (length,):
-            raise UserError(f"{name} of the root link is {short_repr(value)}; give {length} numbers")
-        check_finite(f"{name} of the root link", value)
+        check_shape(f"{name} of the root link", value, (length,), "of one link", finite=True)
     check_quaternion("quat of the root link", quat)
     try:
         robot = ET.parse(file).getroot()

@@ -20,20 +20,20 @@ _ALL_GROUPS = 0
 _IN_MEMORY, _POLYNOMIALS = 1, 0
 _LEAST_DURATION = 0.01  # s
 
-_FORMATS = {  # command -> name and format of its data
-    0: ("set_group_mask", "B"),
-    1: ("takeoff_legacy", "Bff"),
-    2: ("land_legacy", "Bff"),
-    3: ("stop", "B"),
-    4: ("go_to", "B?fffff"),
-    5: ("start_trajectory_legacy", "B??Bf"),
-    6: ("define_trajectory", "BBBIB"),
-    7: ("takeoff", "Bff?f"),
-    8: ("land", "Bff?f"),
-    9: ("takeoff_with_velocity", "Bf?f?f"),
-    10: ("land_with_velocity", "Bf?f?f"),
-    12: ("go_to_2", "B??fffff"),
-    13: ("start_trajectory", "B???Bf"),
+_FORMATS: dict[int, tuple[str, str, dict[int, float]]] = {  # command -> name, format, and places of missing values
+    0: ("set_group_mask", "B", {}),
+    1: ("takeoff", "Bff", {2: 0.0, 3: False}),
+    2: ("land", "Bff", {2: 0.0, 3: False}),
+    3: ("stop", "B", {}),
+    4: ("go_to", "B?fffff", {2: False}),
+    5: ("start_trajectory", "B??Bf", {2: False}),
+    6: ("define_trajectory", "BBBIB", {}),
+    7: ("takeoff", "Bff?f", {}),
+    8: ("land", "Bff?f", {}),
+    9: ("takeoff_with_velocity", "Bf?f?f", {}),
+    10: ("land_with_velocity", "Bf?f?f", {}),
+    12: ("go_to", "B??fffff", {}),
+    13: ("start_trajectory", "B???Bf", {}),
 }
 
 
@@ -51,10 +51,12 @@ class HighLevel:
 
     def command(self, data: bytes, t: float, now: Goal) -> bytes:
         """Execute the payload of a packet at time t (s), from the vehicle at rest; the answer has its error number."""
-        name, form = _FORMATS.get(data[0] if data else -1, ("", ""))
+        name, form, missing = _FORMATS.get(data[0] if data else -1, ("", "", {}))
         if not name or len(data) != 1 + struct.calcsize("<" + form):
             return data[:3].ljust(3, b"\0") + bytes([ENOEXEC])
-        values: tuple[Any, ...] = struct.unpack("<" + form, data[1:])
+        values: list[Any] = list(struct.unpack("<" + form, data[1:]))
+        for place, value in missing.items():
+            values.insert(place, value)
         group = name != "define_trajectory" and name != "set_group_mask"
         error = 0
         if not all(math.isfinite(x) for x in values):
@@ -99,12 +101,6 @@ class HighLevel:
         self._landing = True
         return 0
 
-    def _takeoff_legacy(self, t: float, start: Goal, height: float, duration: float) -> int:
-        return self._takeoff(t, start, height, 0.0, False, duration)
-
-    def _land_legacy(self, t: float, start: Goal, height: float, duration: float) -> int:
-        return self._land(t, start, height, 0.0, False, duration)
-
     def _takeoff_with_velocity(
         self, t: float, start: Goal, height: float, relative: bool, yaw: float, keep_yaw: bool, velocity: float
     ) -> int:
@@ -122,11 +118,6 @@ class HighLevel:
         return 0
 
     def _go_to(
-        self, t: float, start: Goal, relative: bool, x: float, y: float, z: float, yaw: float, duration: float
-    ) -> int:
-        return self._go_to_2(t, start, relative, False, x, y, z, yaw, duration)
-
-    def _go_to_2(
         self,
         t: float,
         start: Goal,
@@ -146,11 +137,6 @@ class HighLevel:
             return ENOEXEC
         self._defined[number] = offset, n
         return 0
-
-    def _start_trajectory_legacy(
-        self, t: float, start: Goal, relative: bool, backwards: bool, number: int, scale: float
-    ) -> int:
-        return self._start_trajectory(t, start, relative, False, backwards, number, scale)
 
     def _start_trajectory(
         self, t: float, start: Goal, relative: bool, relative_yaw: bool, backwards: bool, number: int, scale: float

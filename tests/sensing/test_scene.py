@@ -127,7 +127,7 @@ def test_what_a_single_obstacle_holds_as_numbers_is_mapped_as_an_array():
         (lambda: Scene.of(Sphere(pos=np.zeros((3, 3)), radius=[1, 2])), r"do not fit together: pos \(3, 3\)"),
         (lambda: Mesh(pos=(0, 0, 0), path="missing.obj"), r"missing\.obj: there is no such file"),
         (lambda: Urdf(pos=(0, 0, 0), path="missing.urdf"), r"missing\.urdf: there is no such file"),
-        (lambda: Urdf(pos=(0, 0), path="missing.urdf"), r"pos of Urdf has shape \(2,\); give 3 numbers"),
+        (lambda: Urdf(pos=(0, 0), path="missing.urdf"), r"pos of Urdf has shape \(2,\); expected \(3,\)"),
         (lambda: Scene.of(Sphere(pos=(0, 0, 0), quat=(0, 0, 0, 0), radius=1)), "quat of Sphere has length 0"),
         (lambda: Scene.of(BALL.replace(active=0.5)), "active of Sphere is 0.5; give True or False"),
         (lambda: Scene.of(BALL, BALL).padded(spheres=1), "has 2 spheres and the array holds 1; give spheres=2 or more"),

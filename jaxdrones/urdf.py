@@ -260,7 +260,6 @@ class _Urdf:
             raise UserError(f"{self.name}: <{path}> {attribute} is {short_repr(values)}; {remedy}")
 
     def _tag(self, path: str) -> ET.Element | None:
-        """Unique tag at a path; `None` if missing."""
         tag = self._root
         for part in path.split("/"):
             found = tag.findall(part)

@@ -93,7 +93,6 @@ def _said(error: BaseException) -> str:
 
 @functools.cache
 def _executed(file: str, text: str) -> types.ModuleType:
-    """Module of the text of a file."""
     digest = hashlib.sha256(text.encode()).hexdigest()[:12]
     module = types.ModuleType(f"{Path(file).stem}_{digest}")
     module.__file__ = file

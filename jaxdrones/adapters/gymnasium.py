@@ -208,7 +208,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.env.close()
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
-        """Seed of every world."""
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=None if seed is None else int(seed))
             first = int(self.np_random.integers(SEEDS)) if seed is None else int(seed)

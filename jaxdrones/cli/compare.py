@@ -94,7 +94,6 @@ def _cases(options: argparse.Namespace) -> tuple[str, dict[str, tuple[argparse.N
 
 
 def _names(option: str, text: str) -> list[str]:
-    """Comma-separated names."""
     names = [name.strip() for name in text.split(",")]
     if len(set(names)) < len(names):
         raise UserError(f"--{option} is {text!r}; give two different ones, or more")

@@ -58,7 +58,6 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _own(policy: Path) -> Exhibit:
-    """Simulation with a policy of the user."""
     from jaxdrones.export import simulation
 
     run = open_policy(policy, None, False, {})

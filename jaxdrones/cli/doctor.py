@@ -146,13 +146,11 @@ def _devices(wrong: list[str]) -> list[str]:
 
 
 def _kept_programs(folder: Path) -> dict[str, Any]:
-    """Folder and size of the compiled programs that JAX keeps."""
     sizes = [path.stat().st_size for path in folder.glob("*-cache")]
     return {"folder": str(folder), "files": len(sizes), "bytes": sum(sizes)}
 
 
 def _notes(devices: list[str]) -> list[str]:
-    """Hints beside problems."""
     if devices and shutil.which("nvidia-smi") and all(device.startswith("cpu") for device in devices):
         return ['an NVIDIA driver is there, but jax computes on the CPU; pip install "jax[cuda12]" for the GPU']
     return []

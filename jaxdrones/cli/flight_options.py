@@ -54,7 +54,6 @@ def check_conditions(options: argparse.Namespace, **more) -> None:
 
 
 def _conditions(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of `Conditions`."""
     names = ("vehicle", "drones", "controller", "feedforward", "control_hz", "duration", "rotors", "integrator", "seed")
     return {name: getattr(options, name) for name in names} | {"effects": _names(options.effects)}
 

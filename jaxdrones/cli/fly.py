@@ -238,7 +238,6 @@ def _check_files(options: argparse.Namespace, output: Path) -> None:
 def _write(
     record: FlightLog, options: argparse.Namespace, output: Path, title: str, panels: Sequence[str]
 ) -> list[Path]:
-    """Write log, figure, film and pictures; return their paths."""
     files = [output / "log.npz"]
     save_npz(record, files[0], options.pwm)
     if options.csv:

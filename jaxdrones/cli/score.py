@@ -93,7 +93,6 @@ def _score(options: argparse.Namespace) -> int:
 
 
 def _check_figure(file: Path, has_paths: bool) -> None:
-    """Raise unless there are paths to draw, into a picture that can be written."""
     if not has_paths:
         raise UserError("no log has set-points, so there are no paths to draw; leave --figure out")
     if file.suffix not in _PICTURES:

@@ -74,7 +74,6 @@ def with_config(arguments: list[str]) -> list[str]:
 
 
 def _listed(values: list[Any]) -> str:
-    """Values in the syntax of --sweep."""
     return ",".join(map(str, values))
 
 

@@ -108,7 +108,6 @@ class ProgressDisplay(contextlib.ExitStack):
 
 
 def _training_return(now: dict[str, float]) -> str:
-    """Mean return in training, if measured."""
     if "return" not in now:
         return ""
     return "no episode ended yet" if math.isnan(now["return"]) else f"in training {now['return']:.1f}"
@@ -182,7 +181,6 @@ def show_results(request: Request, runs: dict) -> int:
 
 
 def _early(run, report: dict[str, Any]) -> str:
-    """Phrase for an early stop at the success rate."""
     if not report["stopped_at_success"]:
         return ""
     return f"; stopped at update {report['updates']}, success {run.recipe('last').stop_at:g} was reached"

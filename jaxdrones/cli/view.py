@@ -78,7 +78,6 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _view_history(options: argparse.Namespace) -> int:
-    """Write the page of a training."""
     if len(options.flights) > 1 or options.video:
         raise UserError("--history shows one run and makes no film; give one folder, without --video")
     output = options.output or options.flights[0] / "history.html"

@@ -213,7 +213,6 @@ def _body(params: Params, state: State, pos: Float[Array, "3"]) -> _Body:
 
 
 def _velocity(body: _Body, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Velocity of a point of a body."""
     return body.vel + cross(body.omega, point - body.pos)
 
 
@@ -283,5 +282,4 @@ def _tilting_mass(params: Params) -> Float[Array, ""]:
 
 
 def _series_mass(a: Array, b: Array) -> Array:
-    """Reduced mass of two masses."""
     return a * b / (a + b)

@@ -134,7 +134,6 @@ def make_step(
 
 
 def _check_stable(physics: Physics, dt: float, substeps: int) -> None:
-    """Raise for a physics step with which an effect is unstable."""
     functions = (*physics.effects, *physics.pairs, *physics.team_effects)
     largest = min((needs_of(f).largest_step for f in functions), default=math.inf)
     if dt > largest * (1 + 1e-6):

@@ -116,7 +116,6 @@ def _advance(
 
 
 def _commanded(control: Control, params: Params, memory: Any, state: State, k: Any) -> tuple[Any, jax.Array]:
-    """Validated memory and rotor speeds of a controller."""
     answer = control(params, memory, state, k)
     if not (isinstance(answer, tuple | list) and len(answer) == 2):
         given = (

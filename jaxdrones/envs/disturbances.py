@@ -174,7 +174,6 @@ def _next(along: float, up: float, memory: dict[str, Array], noise: Float[Array,
 
 
 def _decayed(z: Float[Array, "2"], step: float) -> Float[Array, "2"]:
-    """Decayed states of a chain after a step, without noise."""
     return math.exp(-step) * jnp.stack([z[0], z[1] + step * z[0]])
 
 

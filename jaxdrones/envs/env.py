@@ -267,7 +267,6 @@ class Env:
 
     @functools.cached_property
     def _drawn(self) -> list[bool]:
-        """Mask of the random leaves of the parameters."""
         return randomize.drawn_leaves(self.draws, self.params)
 
 

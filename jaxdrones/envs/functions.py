@@ -195,7 +195,6 @@ def _check_one_each(what: str, function: Callable, n: int, arguments: tuple, kin
 
 
 def _check_like(where: str, what: str, given: Any, wanted: Any) -> None:
-    """Raise unless the fields of two pytrees have equal shapes."""
     for field, like in vars(wanted).items():
         if field == "aux" or like is None:
             continue
@@ -218,7 +217,6 @@ def _check_kept(where: str, what: str, before: Any, after: Any) -> None:
 
 
 def _check_arrays(what: str, tree: Any) -> None:
-    """Raise unless all leaves of a tree are arrays or numbers."""
     for leaf in jax.tree.leaves(tree):
         if _shape(leaf) is None:
             raise UserError(f"{what} that hold {short_repr(leaf)}; give arrays and numbers")
@@ -232,7 +230,6 @@ def _shape(x: Any) -> tuple[int, ...] | None:
 
 
 def _kind(x: Any) -> str:
-    """Description of a value for error messages."""
     shape = _shape(x)
     if isinstance(x, jax.Array | np.ndarray) and shape is not None:
         return f"an array {shape} of {x.dtype}"

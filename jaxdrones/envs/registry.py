@@ -208,7 +208,6 @@ def _terms(observation: Sequence[str | ObservationTerm], known: dict[str, Observ
 
 
 def _name(vehicle: str | os.PathLike | Params, randomize: Sequence[Randomization]) -> str:
-    """Name of the vehicle for messages."""
     if any(isinstance(one, AnyVehicle) for one in randomize):
         return "any vehicle"
     return "drones of own parameters" if isinstance(vehicle, Params) else Path(vehicle).stem
@@ -260,7 +259,6 @@ def _vision(
     dt: float,
     scene: Scene | DrawScene,
 ) -> Vision | None:
-    """Vision of an environment; `None` without images."""
     images = task.vision if images is None else images
     if images:
         return make_vision(step, images, camera or task.camera or Camera(), dt, scene)

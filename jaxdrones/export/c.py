@@ -190,7 +190,6 @@ static inline void {name}_reset(float hidden[{name.upper()}_HIDDEN_SIZE])
 
 
 def _step(graph: Graph, program: Program, name: str) -> str:
-    """Function that computes an action from the inputs."""
     parameters = [_parameter(x, name) for x in graph.inputs] + [f"float act[{name.upper()}_ACT_SIZE]"]
     lines = [f"float work[{program.work_size}];", "", *(_text(call, name) for call in program.calls)]
     body = "\n".join(f"    {line}".rstrip() for line in lines)

@@ -81,8 +81,6 @@ def _constant(layer: Layer, name: str) -> str:
 
 
 def _calls(layer: Layer, inputs: Sequence[Span], output: Span) -> list[Call]:
-    """Calls of one layer, on the spans of its inputs and output."""
-
     def constant(name: str) -> str | None:
         return _constant(layer, name) if name in layer.constants else None
 

@@ -134,7 +134,6 @@ def _check(policy: Policy, env: Env) -> None:
 
 
 def _numbers(tree: Any) -> list[float]:
-    """Entries of a tree, leaf after leaf."""
     return [float(x) for leaf in jax.tree.leaves(tree) for x in np.ravel(leaf)]
 
 

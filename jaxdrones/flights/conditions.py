@@ -139,7 +139,6 @@ class Conditions:
 
 
 def _check_once(effects: tuple[str, ...]) -> None:
-    """Raise for duplicate effects."""
     seen: dict[str, str] = {}
     for effect in effects:
         kind = effect

@@ -59,7 +59,6 @@ def setpoints(conditions: Conditions, t: jax.Array) -> Any:
 
 
 def _gains(module: ModuleType, vehicle: str) -> Any:
-    """Gains of a controller for a vehicle."""
     if module in (pid, velocity):
         return pid.gains(vehicle)
     if module is mrac or (module in _SCALED and vehicle not in pid.VEHICLES):

@@ -96,7 +96,6 @@ def divergence(log: FlightLog, other: FlightLog, rows: int = 12) -> list[dict[st
 
 
 def _counted_from(log: FlightLog, after: float) -> float:
-    """Start of the evaluation, s."""
     return after if after < log.t[-1] else float(log.t[-1]) / 2
 
 

@@ -118,7 +118,6 @@ def _restore(path: Path, sidecar: dict[str, Any]) -> Any:
 
 
 def _check_shapes(path: Path, sidecar: dict[str, Any], tree: Any) -> None:
-    """Raise unless a tree has the saved shapes and dtypes."""
     expected, found = _shapes(tree), sidecar.get("shapes", {})
     for name in expected | found:
         if expected.get(name) != found.get(name):

@@ -123,7 +123,6 @@ def _compiled_outcomes(env: Env) -> Callable:
 
 
 def _outcomes(env: Env, policy: AnyPolicy, keys: jax.Array) -> dict:
-    """Outcomes of one episode per key, along a leading axis."""
     on_host = isinstance(env.physics, HostStep)  # which flies the worlds sequentially, and rebuilds the scene of each
     chunk = None if on_host else min(_CHUNK, len(keys))
     return jax.lax.map(functools.partial(_outcome, env, policy), keys, batch_size=chunk)

@@ -93,7 +93,6 @@ def _sidecar_digest(sidecar: dict[str, Any]) -> str:
 
 
 def _read(file: Path) -> bytes | None:
-    """Content of a file; `None` for a missing file."""
     try:
         return file.read_bytes()
     except FileNotFoundError:

@@ -166,7 +166,6 @@ def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, t
 
 
 def _programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple[Callable, Callable]:
-    """Compiled `init` and `advance` of an environment and settings."""
     try:
         return _cached_programs(init, update, env, config)
     except TypeError:  # settings that cannot be hashed, such as arrays

@@ -139,7 +139,6 @@ def _at(chosen: Array, trajectory: collect.Trajectory) -> collect.Trajectory:
 
 
 def _final_observation(policy: Policy, trajectory: collect.Trajectory) -> Obs:
-    """Observations of the critic after the steps of a trajectory."""
     hidden_state, _ = policy.act(trajectory.hidden_state, trajectory.final_obs)
     return critic_observation(policy, trajectory.final_obs, hidden_state, trajectory.final_privileged)
 

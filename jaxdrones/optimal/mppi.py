@@ -182,7 +182,6 @@ def cost(
 
 
 def _noise(key: Array, settings: Settings, params: Params, like: Float[Array, "H 4"]) -> Float[Array, "k H 4"]:
-    """Sampled corrections of the commands."""
     knots = -(-settings.horizon // settings.hold)
     drawn = jax.random.normal(key, (settings.samples, knots, 4), like.dtype) * settings.noise[None, None]
     held = jnp.repeat(drawn, settings.hold, axis=1)[:, : settings.horizon]

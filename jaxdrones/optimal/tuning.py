@@ -117,7 +117,6 @@ def start(module: ModuleType, params: Params) -> Any:
 
 
 def _tunable(controller: str | ModuleType) -> ModuleType:
-    """Module of a tunable controller."""
     if isinstance(controller, str):
         check_choice("controller", controller, control.CONTROLLERS)
         controller = control.CONTROLLERS[controller]

@@ -134,7 +134,6 @@ def _as_double(leaf: Any) -> Any:
 
 
 def _names(tree: Any) -> tuple[str, ...]:
-    """Name of every entry of a pytree."""
     names = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         name = ".".join(str(getattr(key, "name", getattr(key, "key", key))) for key in path)

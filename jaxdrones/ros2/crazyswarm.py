@@ -108,7 +108,6 @@ def thrust_of(rpm: np.ndarray) -> np.ndarray:
 
 
 def _parameter(node: Any, name: str, default: Any) -> Any:
-    """Parameter of the server, or its default."""
     name = f"sim.jaxdrones.{name}"
     return node.get_parameter(name).value if node.has_parameter(name) else default
 

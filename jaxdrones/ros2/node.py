@@ -123,7 +123,6 @@ class Node:
         return self.flown
 
     def _has(self, name: str) -> bool:
-        """Whether the team has this output."""
         if name.startswith("camera/"):
             return self._camera is not None
         return name != "battery" or self._flight.has_battery
@@ -151,7 +150,6 @@ class Node:
         return True, f"{seconds}.{ns:09d}"
 
     def _await_stepper(self) -> None:
-        """Wait for calls of the step service."""
         self._transport.spin(max(self._stepper.remaining(self._clock()), 0))
         if self._stepper.lose(self._clock()):
             self.flown.lost += 1
@@ -221,7 +219,6 @@ class Node:
                     self._send(topics.output(i, name), message)
 
     def _image_is_due(self, camera: Camera) -> bool:
-        """Whether an image is due at this control step."""
         if camera.rate is None or camera.rate >= self._flight.control_hz:
             return True
         per_step, k = camera.rate / self._flight.control_hz, self._flight.steps

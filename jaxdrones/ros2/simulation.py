@@ -91,7 +91,6 @@ class Simulation:
         self.steps += 1
 
     def _control_team(self) -> tuple[commands.Memory, jax.Array]:
-        """Memory of the controllers after this step, and commanded rotor speeds."""
         dtype = self.state.pos.dtype
         team = jax.tree.map(
             lambda *x: np.stack(x).astype(np.int32 if x[0].dtype == np.int32 else dtype), *self.commands

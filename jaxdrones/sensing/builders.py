@@ -210,7 +210,6 @@ def _trunks(
 
 
 def _spheres(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Sphere:
-    """Balls at random places between two corners."""
     place_key, radius_key = jax.random.split(key)
     low, high = _SPHERE_RADIUS
     return Sphere(
@@ -222,7 +221,6 @@ def _spheres(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Sphere
 
 
 def _boxes(key: jax.Array, count: int, corners: Float[Array, "2 3"]) -> Box:
-    """Boxes of any heading at random places between two corners."""
     place_key, size_key, yaw_key = jax.random.split(key, 3)
     low, high = _BOX_EDGE
     return Box(
@@ -244,8 +242,6 @@ def _level(yaw: Float[Array, " k"]) -> Float[Array, "k 4"]:
 
 
 def _is_free(solids: Obstacle, points: Float[Array, "k 3"], clearance: float) -> Bool[Array, " n"]:
-    """Whether each obstacle of a kind is far enough from all points."""
-
     def gap(solid: Obstacle, point: Array) -> Array:
         return solid.distance(solid.to_local(point))
 

@@ -104,8 +104,6 @@ def as_floats(x: ArrayLike) -> Array:
 
 
 def _distances(kind: Obstacle, point: Point) -> Array:
-    """Signed distances of a point from all obstacles of a kind, m."""
-
     def one(obstacle: Obstacle) -> Number:
         return jnp.where(obstacle.active, obstacle.distance(obstacle.to_local(point)), jnp.inf)
 

@@ -206,13 +206,11 @@ def check_scene(scene: Any, files: bool = False) -> None:
 
 
 def _as_arrays(obstacles: Obstacle, dtype: DTypeLike) -> Obstacle:
-    """Obstacles with arrays of this type and a mask."""
     active = jnp.asarray(_mask(obstacles), bool)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), obstacles.replace(active=None)).replace(active=active)
 
 
 def _mask(obstacles: Obstacle) -> Any:
-    """Mask of the active obstacles."""
     return jnp.ones(len(obstacles.pos), bool) if obstacles.active is None else obstacles.active
 
 

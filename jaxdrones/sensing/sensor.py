@@ -100,7 +100,6 @@ def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[S
 
 
 def _check_clocks(sensors: Sequence[Sensor], dt: float) -> None:
-    """Raise unless the rates of all clocked sensors divide that of the control steps."""
     for sensor in sensors:
         steps = 1 / (sensor.rate * dt) if sensor.clocked and sensor.rate else 1.0
         if round(steps) < 1 or abs(steps - round(steps)) > _ROUNDING * steps:
@@ -168,7 +167,6 @@ def hold_between(
 
 
 def _checked(sensor: Sensor, memory: Any, result: Any) -> tuple[Any, Any]:
-    """Validated memory and reading of a sensor of one drone."""
     called = f"measure of sensor {sensor.name!r}"
     if not isinstance(result, tuple) or len(result) != 2:
         raise UserError(f"{called} returned {short_repr(result)}; return the two values (memory, reading)")

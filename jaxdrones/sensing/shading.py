@@ -72,7 +72,6 @@ def _number(color: Sequence[Array]) -> Array:
 
 
 def _mixed(a: tuple[float, float, float], b: tuple[float, float, float], share: Float[Array, "h w"]) -> list[Array]:
-    """Linear interpolation between colors a and b."""
     return [x + share * (y - x) for x, y in zip(a, b, strict=True)]
 
 

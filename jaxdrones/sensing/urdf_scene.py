@@ -71,7 +71,6 @@ def from_urdf(
 
 
 def _places(file: Path, robot: ET.Element, links: dict[str, ET.Element], root: Pose) -> dict[str, Pose]:
-    """Pose of every link in the world."""
     joints: dict[str, tuple[str, Pose]] = {}
     for joint in robot.findall("joint"):
         ends = [end.get("link", "") for tag in ("parent", "child") if (end := joint.find(tag)) is not None]
@@ -95,7 +94,6 @@ def _places(file: Path, robot: ET.Element, links: dict[str, ET.Element], root: P
 
 
 def _obstacle(file: Path, collision: ET.Element, pose: Pose, color: tuple[float, ...]) -> Any:
-    """Obstacle of one collision element."""
     shape = next(iter(geometry), None) if (geometry := collision.find("geometry")) is not None else None
     common: dict[str, Any] = dict(pos=pose[0], quat=pose[1], color=color)
 
@@ -137,7 +135,6 @@ def _in_parent(parent: Pose, pose: Pose) -> Pose:
 
 
 def _numbers(file: Path, element: ET.Element | None, name: str, count: int, default: str | None) -> list[float]:
-    """Numbers of an attribute."""
     text = default if element is None else element.get(name, default)
     try:
         numbers = [float(word) for word in (text or "").split()]

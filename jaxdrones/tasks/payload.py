@@ -102,7 +102,6 @@ class _Carrying:
     """Whether all drones carry one load."""
 
     def task(self, name: str, summary: str, duration: float) -> Task:
-        """Task of the team."""
         shared = ("place",) if self.shared else ()
         return Task(
             name=name,
@@ -135,7 +134,6 @@ class _Carrying:
         )
 
     def equip(self, params: Params) -> Params:
-        """Parameters of the team with those of the loads."""
         mass = self.load * (jnp.sum(params.mass) if self.shared else params.mass[0])
         return with_payload(params, mass, self.length, cables=self.drones if self.shared else 1)
 

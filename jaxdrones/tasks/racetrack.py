@@ -168,7 +168,6 @@ def _random_track(u: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
 
 
 def _solids(gates: ArrayLike, poles: ArrayLike | None = None) -> Scene:
-    """Scene of gates (4, 4) and poles (k, 2)."""
     if poles is None:
         return track(gates, OPENING, FRAME)
     gates, poles = jnp.asarray(gates, float), jnp.asarray(poles, float)

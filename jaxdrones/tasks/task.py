@@ -262,7 +262,6 @@ class Task:
 
 
 def _mapping(field: str, value: Any, example: str) -> Mapping[str, Any]:
-    """Validated mapping by name."""
     if not isinstance(value, Mapping) or not all(isinstance(name, str) for name in value):
         raise UserError(f"{field} is {short_repr(value)}; give a dictionary of names, {{'name': {example}}}")
     return value

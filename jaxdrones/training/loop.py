@@ -82,7 +82,6 @@ def check_resumable(trainer: Trainer, run: Run) -> None:
 
 
 def _load(trainer: Trainer, run: Run) -> Any:
-    """Training state of a run with checked files."""
     state = run.load_state(trainer.shapes)
     if not _is_finite(state):
         raise UserError(f"{run.folder / 'state'} holds numbers that are not finite; train again with --overwrite")
@@ -94,7 +93,6 @@ class _Loop:
     """State and results of the training of one seed."""
 
     def __init__(self, trainer: Trainer, run: Run, seed: int, deadline: float | None, keep_history: bool):
-        """Start a training, or continue that of the run."""
         self.trainer, self.run, self.seed = trainer, run, seed
         self.keeps_history = keep_history or bool(run.kept)
         self.key = jax.random.key(seed)
@@ -120,7 +118,6 @@ class _Loop:
             self._set_updates(max(self.updates, self.update + 1))  # until an update was timed
 
     def run_updates(self, on_progress: OnProgress, loggers: Sequence[Callback]) -> None:
-        """Run all remaining updates."""
         saved, length = self.seconds, 1
         with Progress(self.run, self._columns(), self.update, loggers) as progress:
             while self.update < self.updates:
@@ -191,7 +188,6 @@ class _Loop:
         return results
 
     def save(self) -> None:
-        """Write the newest policy and the training state."""
         state = sharding.gather(self.trainer.mesh, self.state)
         about = self._about(self.update)
         self.run.save_policy("last", state.policy, **about)
@@ -214,7 +210,6 @@ class _Loop:
 
     @property
     def updates(self) -> int:
-        """Number of updates of the whole training."""
         return self.trainer.recipe.config.updates
 
     def _set_updates(self, updates: int) -> None:

@@ -207,7 +207,6 @@ def settings_known(task: str, algorithm: str, any_vehicle: bool = False) -> bool
 
 
 def _settings(task: str, algorithm: str, realistic: bool | str) -> dict[str, Any]:
-    """Settings of a learner that differ from its defaults."""
     known = _CONFIGS.get((task, algorithm), {})
     known = known | (_REALISTIC_CONFIGS.get((task, algorithm), {}) if realistic else {})
     return known | (_ANY_VEHICLE_CONFIGS.get((task, algorithm), {}) if realistic == "any" else {})

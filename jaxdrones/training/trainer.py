@@ -69,7 +69,6 @@ class Trainer:
         return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
 
     def _trace_updates(self) -> Any:
-        """Traced program of `_updates`."""
         count = jnp.zeros((), jnp.int32)
         state, same = sharding.state_sharding(self.mesh, self.shapes), sharding.replicated(self.mesh)
         shardings = {"in_shardings": (state, same, same), "out_shardings": (state, same)}
@@ -78,7 +77,6 @@ class Trainer:
             return updates.trace(self.shapes, count, count)
 
     def _check_memory(self) -> None:
-        """Raise if the trajectories of an update do not fit in memory."""
         config, env = self.recipe.config, self.env
         actions = config.worlds * env.drones * env.action_size * jnp.zeros(()).dtype.itemsize
         step = actions + size_of((self.shapes.worlds.obs, self.shapes.worlds.hidden_state))

@@ -142,7 +142,6 @@ class BulletStep(HostStep):
         return photo(self.client, eye, target, camera)
 
     def _given(self, scene: Scene | None) -> Scene:
-        """Scene of a call; by default that of `make_step`."""
         self.client.check_open()
         if scene is None:
             return self._scene
@@ -236,7 +235,6 @@ def _following(xnp: Any, body: Any, team: Any, loads: Any) -> Any:
 
 
 def _unpack(team: Any, aux: Layout) -> State:
-    """State of a team from its array."""
     fields = {name: team[:, place] for name, place in arrays.COLUMNS.items()}
     return State(**fields, aux=aux.unpack(team, arrays.AUX.start))
 

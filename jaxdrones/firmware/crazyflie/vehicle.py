@@ -160,7 +160,6 @@ def _advance(
 
 
 def _one(state: State) -> State:
-    """State of the drone of a team of one."""
     return jax.tree.map(lambda x: x[0], state)
 
 

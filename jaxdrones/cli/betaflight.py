@@ -14,17 +14,7 @@ from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import as_json
 from jaxdrones.errors import UserError
-from jaxdrones.firmware.betaflight import (
-    BetaflightLost,
-    Flight,
-    Flip,
-    Hover,
-    Link,
-    Process,
-    Simulation,
-    TakeOff,
-    find_program,
-)
+from jaxdrones.firmware import betaflight
 from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import AXES, Joystick
 from jaxdrones.firmware.betaflight.link import connect_msp
@@ -79,7 +69,7 @@ def _run(options: argparse.Namespace) -> int:
     say: Callable[[str], None] = (lambda text: None) if options.json else (lambda text: print(text, flush=True))
     if options.build:
         there = options.if_missing and _is_built()
-        say(f"{find_program()} is there" if there else f"built {build(say)}")
+        say(f"{betaflight.find_program()} is there" if there else f"built {build(say)}")
         return 0
     if options.if_missing:
         raise UserError("--if-missing is given without --build; give both or none")
@@ -88,17 +78,17 @@ def _run(options: argparse.Namespace) -> int:
     check_writable(file)
     interrupted, lost = False, None
     running = connect_msp()
-    program = None if running else find_program()
+    program = None if running else betaflight.find_program()
     if running:
         running.close()
     with contextlib.ExitStack() as stack:
-        link = stack.enter_context(Link())
-        simulation = Simulation(options.vehicle, options.physics_hz)
+        link = stack.enter_context(betaflight.Link())
+        simulation = betaflight.Simulation(options.vehicle, options.physics_hz)
         pilot, target = _pilot(options, simulation, stack)
         say("a running Betaflight is joined" if program is None else f"{program} is started")
-        process = None if program is None else stack.enter_context(Process(program))
+        process = None if program is None else stack.enter_context(betaflight.Process(program))
         recorder = Recorder()
-        flight = Flight(
+        flight = betaflight.Flight(
             simulation,
             link,
             pilot,
@@ -112,7 +102,7 @@ def _run(options: argparse.Namespace) -> int:
             flight.run(options.duration)
         except KeyboardInterrupt:
             interrupted = True
-        except BetaflightLost as error:
+        except betaflight.BetaflightLost as error:
             lost = str(error)
     report: dict[str, Any] = vars(flight.flown) | {"real_time_factor": round(flight.flown.real_time_factor, 3)}
     if len(recorder):
@@ -147,7 +137,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _is_built() -> bool:
     try:
-        find_program()
+        betaflight.find_program()
     except UserError:
         return False
     return True
@@ -164,7 +154,7 @@ def _numbers(name: str, text: str, count: int, kind: Callable[[str], Any]) -> tu
 
 
 def _pilot(
-    options: argparse.Namespace, simulation: Simulation, stack: contextlib.ExitStack
+    options: argparse.Namespace, simulation: betaflight.Simulation, stack: contextlib.ExitStack
 ) -> tuple[Pilot, Callable[[], np.ndarray] | None]:
     """Pilot, and the function that returns its target position; `None` for a joystick."""
     if options.joystick is not None:
@@ -178,17 +168,17 @@ def _pilot(
             raise UserError(f"the policy flies {env.vehicle}, not {options.vehicle}; give --vehicle {env.vehicle}")
         policy = PolicyPilot(env, run.policy(env=env))
         x, y, z = map(float, policy.target)
-        pilot = TakeOff(_hover(simulation, (x, y, z)), policy, _TAKE_OFF)  # policies were trained in the air
+        pilot = betaflight.TakeOff(_hover(simulation, (x, y, z)), policy, _TAKE_OFF)  # policies were trained in the air
         return _with_flip(options, simulation, pilot), lambda: policy.target
     hover = _hover(simulation, options.target)
     return _with_flip(options, simulation, hover), lambda: np.array(options.target)
 
 
-def _hover(simulation: Simulation, target: tuple[float, float, float]) -> Pilot:
-    hover = Hover(simulation.params, target)
+def _hover(simulation: betaflight.Simulation, target: tuple[float, float, float]) -> Pilot:
+    hover = betaflight.Hover(simulation.params, target)
     hover(0.0, simulation.sample)  # compiles it
     return hover
 
 
-def _with_flip(options: argparse.Namespace, simulation: Simulation, pilot: Pilot) -> Pilot:
-    return pilot if options.flip is None else Flip(simulation.params, pilot, options.flip)
+def _with_flip(options: argparse.Namespace, simulation: betaflight.Simulation, pilot: Pilot) -> Pilot:
+    return pilot if options.flip is None else betaflight.Flip(simulation.params, pilot, options.flip)

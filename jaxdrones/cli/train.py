@@ -9,22 +9,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jaxdrones.cli import machine
+from jaxdrones.cli import machine, train_output
 from jaxdrones.cli.common import INTERRUPTED, print_error, print_warning, run_folder
 from jaxdrones.cli.live import LiveTraining, add_live, live_server
 from jaxdrones.cli.names import ALGORITHMS
 from jaxdrones.cli.options import add_drones, add_no_figure, add_output, add_set, add_vehicle
 from jaxdrones.cli.report import described
 from jaxdrones.cli.settings import add_realistic, user_mistakes
-from jaxdrones.cli.train_output import (
-    Deadlines,
-    ProgressDisplay,
-    draw_curves,
-    quiet,
-    remaining_best,
-    show_results,
-    warn_of_unknown_settings,
-)
 from jaxdrones.cli.train_request import Request, remaining
 from jaxdrones.envs import TASKS
 from jaxdrones.errors import UserError
@@ -192,10 +183,10 @@ def _train_row(request: Request, begin: float) -> int:
                     loop.check_resumable(trainer, run)
             for run in (*runs.values(), Run(request.output)):
                 trainer.prepare(run)
-        return _train_runs(request, runs, trainer, Deadlines(request, begin))
+        return _train_runs(request, runs, trainer, train_output.Deadlines(request, begin))
 
 
-def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines) -> int:
+def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_output.Deadlines) -> int:
     """Train every run in its locked folder, and print the results."""
     from jaxdrones.learning import Diverged
     from jaxdrones.learning.loggers import named_loggers
@@ -203,9 +194,9 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
     from jaxdrones.training.presets import settings_known
     from jaxdrones.training.run import Run
 
-    recipe, print_line = trainer.recipe, quiet if request.json else print
+    recipe, print_line = trainer.recipe, train_output.quiet if request.json else print
     if not request.resume and not settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any"):
-        warn_of_unknown_settings(recipe)
+        train_output.warn_of_unknown_settings(recipe)
     config, what = recipe.config, described(recipe) + f", {request.row}" * bool(request.row)
     print_line(f"{what}: {config.worlds} worlds x {config.horizon} control steps an update; compiling")
     loggers = {seed: named_loggers(request.log, run.folder) for seed, run in runs.items()}
@@ -223,7 +214,7 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
     with live_server(request.live, request.json) as live:
         for seed, run in remaining(runs, config.updates, request.seconds).items():
             label = f"seed {seed}" if len(runs) > 1 else "training"
-            display = ProgressDisplay(total, label, trainer.episodes, print_line)
+            display = train_output.ProgressDisplay(total, label, trainer.episodes, print_line)
             on_progress = display.update
             if live:
                 title = what + f", seed {seed}" * (len(runs) > 1)
@@ -234,13 +225,15 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: Deadlines
             except KeyboardInterrupt:
                 if not (run.folder / "last.json").exists():
                     return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
-                draw_curves(request, {seed: run}, run.folder)
-                where = f"interrupted at update {run.sidecar_entry('last', 'update')}; {remaining_best(run)}"
+                train_output.draw_curves(request, {seed: run}, run.folder)
+                where = (
+                    f"interrupted at update {run.sidecar_entry('last', 'update')}; {train_output.remaining_best(run)}"
+                )
                 return print_error(where + f"; continue with: {request.again}" * run.started, INTERRUPTED)
             except Diverged as error:
-                draw_curves(request, {seed: run}, run.folder)
-                advice = f"{error}, for example --set learning_rate=1e-3; {remaining_best(run)}"
+                train_output.draw_curves(request, {seed: run}, run.folder)
+                advice = f"{error}, for example --set learning_rate=1e-3; {train_output.remaining_best(run)}"
                 return print_error(f"training diverged: {advice}", 1)
-    code = show_results(request, runs)
+    code = train_output.show_results(request, runs)
     deadlines.warn_if_missed()
     return code

@@ -12,19 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import checked
+from jaxdrones.control import firmware_loops as loops
 from jaxdrones.control import firmware_motors as motors
-from jaxdrones.control.firmware_loops import (
-    Gains,
-    Memory,
-    attitude_loop,
-    degrees,
-    in_heading_frame,
-    position_loop,
-    rate_loop,
-    rpy,
-    settled,
-    velocity_loop,
-)
+from jaxdrones.control.firmware_loops import Gains, Memory
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.errors import UserError
@@ -196,17 +186,17 @@ def _fly(
         attitude, thrust = jnp.append(memory.tilt, jnp.rad2deg(setpoint.yaw)), memory.thrust
     elif isinstance(setpoint, Attitude | Rates):
         memory = memory.replace(age=jnp.minimum(memory.age, _SLOW))  # the slow loops run at once afterwards
-        attitude, thrust = rpy(state.quat), jnp.clip(setpoint.thrust, 0, motors.FULL)
+        attitude, thrust = loops.rpy(state.quat), jnp.clip(setpoint.thrust, 0, motors.FULL)
     else:
         raise UserError(
             f"setpoint is a {type(setpoint).__name__}; give a Setpoint, Velocity, Attitude, Rates or PerAxis"
         )
     if isinstance(setpoint, Attitude):
-        attitude = degrees(setpoint.rpy)
+        attitude = loops.degrees(setpoint.rpy)
     if isinstance(setpoint, Rates):
-        memory, target = memory.replace(rpy=attitude), degrees(setpoint.omega)
+        memory, target = memory.replace(rpy=attitude), loops.degrees(setpoint.omega)
     else:
-        memory, target = attitude_loop(gains, memory, state, attitude, dt)
+        memory, target = loops.attitude_loop(gains, memory, state, attitude, dt)
     return _with_torque(gains, memory, state, attitude, thrust, target, dt)
 
 
@@ -214,7 +204,7 @@ def _with_torque(
     gains: Gains, memory: Memory, state: State, attitude: Array, thrust: Array, target: Array, dt: float
 ) -> tuple[Memory, Float[Array, "3"], Float[Array, ""], Float[Array, "3"]]:
     """Memory, desired attitude, thrust and the torque towards target rates; none while the motors are off."""
-    memory, torque = rate_loop(gains, memory, state, target, dt)
+    memory, torque = loops.rate_loop(gains, memory, state, target, dt)
     memory = jax.tree.map(lambda kept, empty: jnp.where(thrust > 0, kept, empty), memory, reset(memory))
     return memory, attitude, thrust, jnp.where(thrust > 0, torque, 0)
 
@@ -229,19 +219,19 @@ def _fly_per_axis(
         pos_integral=jnp.where(unused | ~setpoint.by_pos, 0, memory.pos_integral),
         vel_integral=jnp.where(unused, 0, memory.vel_integral),
     )
-    given = degrees(setpoint.rpy)
+    given = loops.degrees(setpoint.rpy)
     attitude = jnp.append(jnp.where(setpoint.tilt_given, given[:2], memory.tilt), given[2])
     thrust = jnp.where(setpoint.thrust_given, jnp.clip(setpoint.thrust, 0, motors.FULL), memory.thrust)
-    memory, target = attitude_loop(gains, memory, state, attitude, dt)
+    memory, target = loops.attitude_loop(gains, memory, state, attitude, dt)
     by_rates = jnp.append(jnp.repeat(setpoint.tilt_given & setpoint.rates_given, 2), False)
-    target = jnp.where(by_rates, degrees(setpoint.omega), target)
+    target = jnp.where(by_rates, loops.degrees(setpoint.omega), target)
     return _with_torque(gains, memory, state, attitude, thrust, target, dt)
 
 
 def _first_measured(gains: Gains, memory: Memory, state: State, dt: float) -> Memory:
     """Memory with zero derivatives at the first call: past attitude and rates are the present ones."""
-    measured = degrees(state.omega)
-    start = dict(rpy=rpy(state.quat), rates=measured, gyro=settled(measured, gains.gyro_cutoff, dt))
+    measured = loops.degrees(state.omega)
+    start = dict(rpy=loops.rpy(state.quat), rates=measured, gyro=loops.settled(measured, gains.gyro_cutoff, dt))
     first = jnp.isinf(memory.age)
     return memory.replace(**{name: jnp.where(first, value, getattr(memory, name)) for name, value in start.items()})
 
@@ -253,11 +243,11 @@ def _slow_loops(
     period = jnp.maximum(_SLOW, dt)
     ran, vel = memory, jnp.zeros(3)
     if isinstance(setpoint, Setpoint | PerAxis):
-        ran, vel = position_loop(gains, memory, state, setpoint.pos, period)
+        ran, vel = loops.position_loop(gains, memory, state, setpoint.pos, period)
     if isinstance(setpoint, Velocity | PerAxis):
-        given = in_heading_frame(state.quat, setpoint.vel)
+        given = loops.in_heading_frame(state.quat, setpoint.vel)
         vel = jnp.where(setpoint.by_pos, vel, given) if isinstance(setpoint, PerAxis) else given
-    ran, tilt, thrust = velocity_loop(gains, ran, state, vel, period)
+    ran, tilt, thrust = loops.velocity_loop(gains, ran, state, vel, period)
     age = jnp.where(jnp.isinf(memory.age), 0, memory.age - period)
     ran = ran.replace(tilt=tilt, thrust=thrust, age=age)
     due = memory.age > period - dt / 2

@@ -8,23 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxdrones.export.layers import (
-    Activation,
-    AddToRows,
-    Color,
-    Concatenate,
-    Convolution,
-    Dense,
-    Flatten,
-    Gates,
-    Graph,
-    Layer,
-    Nearness,
-    Normalize,
-    Slice,
-    SumOfRows,
-    Tensor,
-)
+from jaxdrones.export import layers
+from jaxdrones.export.layers import Graph, Layer, Tensor
 from jaxdrones.learning.layers import FADE, SMALL_SQUARE
 
 _BYTES = 4  # of a number
@@ -87,35 +72,35 @@ def _calls(layer: Layer, inputs: Sequence[Span], output: Span) -> list[Call]:
     size, shape = layer.output.size, layer.inputs[0].shape
     arguments: tuple[Any, ...]
     match layer:
-        case Normalize():
+        case layers.Normalize():
             function = "normalize"
             arguments = size, inputs[0], constant("mean"), constant("scale"), layer.clip, output
-        case Dense():
+        case layers.Dense():
             function = "dense"
             arguments = layer.rows, shape[-1], layer.output.shape[-1], inputs[0]
             arguments += constant("kernel"), constant("bias"), output
-        case Convolution():
+        case layers.Convolution():
             (top, _), (left, _) = layer.margin
             rows, columns, outputs = layer.output.shape
             function = "convolution"
             arguments = *shape, rows, columns, outputs, layer.stride, top, left
             arguments += inputs[0], constant("kernel"), constant("bias"), output
-        case Activation():  # in place
+        case layers.Activation():  # in place
             function, arguments = f"apply_{layer.function}", (size, output)
-        case Gates():  # in place: the last input is the hidden state
+        case layers.Gates():  # in place: the last input is the hidden state
             function, arguments = "gates", (size, *inputs[:2], output)
-        case Nearness():
+        case layers.Nearness():
             function, arguments = "nearness", (size, inputs[0], layer.depth_scale, output)
-        case Color():
+        case layers.Color():
             function, arguments = "color", (size // 3, inputs[0], output)
-        case AddToRows():  # in place
+        case layers.AddToRows():  # in place
             function, arguments = "add_to_rows", (*shape, inputs[1], output)
-        case SumOfRows():
+        case layers.SumOfRows():
             function = "sum_of_rows"
             arguments = *shape, layer.inputs[1].shape[1], *inputs, FADE, 1 / layer.reach, SMALL_SQUARE, output
-        case Concatenate():
+        case layers.Concatenate():
             return _copies(layer, inputs, output)
-        case Flatten() | Slice():
+        case layers.Flatten() | layers.Slice():
             return []
         case _:
             raise AssertionError(layer)
@@ -155,11 +140,11 @@ def _spans(graph: Graph) -> tuple[dict[Tensor, Span], int]:
 def _inside(layer: Layer, root: dict[Tensor, tuple[Tensor, int]]) -> tuple[Tensor, int] | None:
     """Tensor that a layer overwrites, or that its output is a part of, and the offset in it."""
     match layer:
-        case Activation() | AddToRows() | Flatten():
+        case layers.Activation() | layers.AddToRows() | layers.Flatten():
             return root[layer.inputs[0]]
-        case Gates():
+        case layers.Gates():
             return root[layer.inputs[-1]]
-        case Slice():
+        case layers.Slice():
             outer, offset = root[layer.inputs[0]]
             return outer, offset + layer.start
     return None

@@ -9,23 +9,8 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.errors import UserError, install
-from jaxdrones.export.layers import (
-    Activation,
-    AddToRows,
-    Color,
-    Concatenate,
-    Convolution,
-    Dense,
-    Flatten,
-    Gates,
-    Graph,
-    Layer,
-    Nearness,
-    Normalize,
-    Slice,
-    SumOfRows,
-    Tensor,
-)
+from jaxdrones.export import layers
+from jaxdrones.export.layers import Graph, Layer, Tensor
 from jaxdrones.export.text import Description
 from jaxdrones.learning.layers import FADE, SMALL_SQUARE
 
@@ -56,47 +41,47 @@ class _Nodes:
         constants = {
             name: self.constant(f"{y}_{name}", x)
             for name, x in layer.constants.items()
-            if not isinstance(layer, Convolution)
+            if not isinstance(layer, layers.Convolution)
         }
         match layer:
-            case Normalize():
+            case layers.Normalize():
                 shifted = self.node("Sub", [*inputs, constants["mean"]], f"{y}_shifted")
                 scaled = self.node("Mul", [shifted, constants["scale"]], f"{y}_scaled")
                 low = self.constant(f"{y}_low", np.float32(-layer.clip))
                 self.node("Clip", [scaled, low, self.constant(f"{y}_high", np.float32(layer.clip))], y)
-            case Dense() if len(layer.output.shape) > 1:
+            case layers.Dense() if len(layer.output.shape) > 1:
                 product = self.node("MatMul", [*inputs, constants["kernel"]], f"{y}_product")
                 self.node("Add", [product, constants["bias"]], y)
-            case Dense():
+            case layers.Dense():
                 self.node("Gemm", [*inputs, *constants.values()], y)
-            case Convolution():
+            case layers.Convolution():
                 self.convolution(layer)
-            case Activation(function="silu"):
+            case layers.Activation(function="silu"):
                 self.node("Mul", [*inputs, self.node("Sigmoid", inputs, f"{y}_sigmoid")], y)
-            case Activation():
+            case layers.Activation():
                 self.node(_ACTIVATIONS[layer.function], inputs, y)
-            case Gates():
+            case layers.Gates():
                 self.gates(inputs, y)
-            case Nearness():
+            case layers.Nearness():
                 scale = self.constant(f"{y}_scale", np.float32(layer.depth_scale))
                 ahead = self.node("Max", [*inputs, self.constant("zero", np.float32(0))], f"{y}_ahead")
                 near = self.node("Div", [scale, self.node("Add", [ahead, scale], f"{y}_sum")], f"{y}_near")
                 self.node("Unsqueeze", [near, self.constant("last_axis", np.array([-1]))], y)
-            case Color():
+            case layers.Color():
                 floats = self.node("Cast", inputs, f"{y}_float", to=self.onnx.TensorProto.FLOAT)
                 rgb = self.slice(floats, f"{y}_rgb", 0, 3)
                 self.node("Div", [rgb, self.constant(f"{y}_largest", np.float32(255))], y)
-            case Slice():
+            case layers.Slice():
                 part = self.slice(inputs[0], f"{y}_part", layer.start, layer.start + layer.output.size)
                 self.node("Reshape", [part, self.constant(f"{y}_shape", np.array([-1, *layer.output.shape]))], y)
-            case AddToRows():
+            case layers.AddToRows():
                 one_row = self.node("Unsqueeze", [inputs[1], self.constant("second_axis", np.array([1]))], f"{y}_row")
                 self.node("Add", [inputs[0], one_row], y)
-            case SumOfRows():
+            case layers.SumOfRows():
                 self.sum_of_rows(layer)
-            case Concatenate():
+            case layers.Concatenate():
                 self.node("Concat", inputs, y, axis=-1)
-            case Flatten():
+            case layers.Flatten():
                 self.node("Reshape", [*inputs, self.constant(f"{y}_shape", np.array([-1, layer.output.size]))], y)
             case _:
                 raise AssertionError(layer)
@@ -106,7 +91,7 @@ class _Nodes:
         ends = [self.constant(f"{output}_{name}", np.array([i])) for name, i in (("start", start), ("end", end))]
         return self.node("Slice", [x, *ends, self.constant("last_axis", np.array([-1]))], output)
 
-    def sum_of_rows(self, layer: SumOfRows) -> None:
+    def sum_of_rows(self, layer: layers.SumOfRows) -> None:
         y, (features, rows) = layer.output.name, (x.name for x in layer.inputs)
         scalars = {"fade": FADE, "inverse": 1 / layer.reach, "small": SMALL_SQUARE, "low": 0, "high": 1}
         names = {name: self.constant(f"{y}_{name}", np.float32(x)) for name, x in scalars.items()}
@@ -120,7 +105,7 @@ class _Nodes:
         weighted = self.node("Mul", [weight, features], f"{y}_weighted")
         self.node("ReduceSum", [weighted, self.constant("second_axis", np.array([1]))], y, keepdims=0)
 
-    def convolution(self, layer: Convolution) -> None:
+    def convolution(self, layer: layers.Convolution) -> None:
         y, stride = layer.output.name, layer.stride
         square = layer.constants["kernel"].reshape(stride, stride, layer.inputs[0].shape[-1], -1)
         kernel = self.constant(f"{y}_kernel", np.ascontiguousarray(np.transpose(square, (3, 2, 0, 1))))

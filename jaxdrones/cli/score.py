@@ -42,13 +42,7 @@ def _score(options: argparse.Namespace) -> int:
 
     from jaxdrones.control import firmware_pid
     from jaxdrones.dynamics.propulsion import crazyflie_motors
-    from jaxdrones.flights import (
-        errors_as_dict,
-        hold_errors,
-        load_vehicle,
-        open_loop_errors,
-        simulate_closed_loop,
-    )
+    from jaxdrones.flights import errors_as_dict, hold_errors, load_vehicle, open_loop_errors, simulate_closed_loop
     from jaxdrones.visualization.residuals import save_paths
 
     motors = crazyflie_motors(options.propellers)

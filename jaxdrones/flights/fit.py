@@ -16,24 +16,10 @@ from jaxdrones.checks import short_repr
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import Motors, crazyflie_motors
 from jaxdrones.errors import UserError
+from jaxdrones.flights import parameters
 from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, normal_equations, standard_errors
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.flights.open_loop import (
-    HORIZONS,
-    Windows,
-    cut_windows,
-    hold_errors,
-    open_loop_errors,
-    window_starts,
-)
-from jaxdrones.flights.parameters import (
-    PARAMETERS,
-    default_parameters,
-    scale_of,
-    select_parameters,
-    value_of,
-    with_parameters,
-)
+from jaxdrones.flights.open_loop import HORIZONS, Windows, cut_windows, hold_errors, open_loop_errors, window_starts
 from jaxdrones.flights.path_fit import fit_path
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.vehicle import Vehicle
@@ -126,7 +112,7 @@ def fit(
     motors = motors or crazyflie_motors()
     if not named and all(log.has("target_pos", "pwm") for log in logs):
         return _fit_paths(logs, params, validate, motors, gains or firmware_pid.gains(), progress)
-    names = select_parameters(names) if named else default_parameters(kinds.pop())
+    names = parameters.select_parameters(names) if named else parameters.default_parameters(kinds.pop())
     return _Problem(logs, params, names, motors).solve(validate, named, progress)
 
 
@@ -149,7 +135,7 @@ def _fit_paths(
 
 def _estimate(vehicle: Vehicle, name: str, error: float) -> Estimate:
     """Estimate of a parameter from the standard error of its coordinate x."""
-    value, scale = value_of(vehicle, name), scale_of(vehicle, name)
+    value, scale = parameters.value_of(vehicle, name), parameters.scale_of(vehicle, name)
     std_error = error * scale
     limit = scale if name in _RATIOS else _MAX_RELATIVE_ERROR * abs(value)
     return Estimate(value, std_error, bool(std_error < limit))
@@ -162,8 +148,8 @@ class _Problem:
         self.logs, self.start = logs, Vehicle.of(params)
         self.motors = motors
         self.pwm_motors = None if logs[0].has("rpm") else motors
-        self.shared = tuple(name for name in names if not PARAMETERS[name].per_flight)
-        self.per_flight = tuple(name for name in names if PARAMETERS[name].per_flight)
+        self.shared = tuple(name for name in names if not parameters.PARAMETERS[name].per_flight)
+        self.per_flight = tuple(name for name in names if parameters.PARAMETERS[name].per_flight)
         self.names, self.flights = self.shared + self.per_flight, [log.name for log in logs]
         starts = [window_starts(log, _STRIDE) for log in logs]
         longest = max(map(len, starts))
@@ -172,7 +158,7 @@ class _Problem:
         self.size = len(self.shared) + len(logs) * len(self.per_flight)
         names = self.shared + self.per_flight * len(logs)
         self.prior = np.array(
-            [_LOG_PRIOR_PRECISION if PARAMETERS[n].scale is None else _PRIOR_PRECISION for n in names]
+            [_LOG_PRIOR_PRECISION if parameters.PARAMETERS[n].scale is None else _PRIOR_PRECISION for n in names]
         )
 
     def indices(self, flight: int) -> np.ndarray:
@@ -200,7 +186,7 @@ class _Problem:
     def vehicle(self, x: np.ndarray) -> Vehicle:
         """Vehicle with the shared parameters and the medians of the per-flight parameters."""
         per_flight = x[len(self.shared) :].reshape(len(self.flights), len(self.per_flight))
-        return with_parameters(
+        return parameters.with_parameters(
             self.start, self.names, list(np.concatenate([x[: len(self.shared)], np.median(per_flight, axis=0)]))
         )
 
@@ -249,7 +235,7 @@ class _Problem:
         unidentifiable = [
             f"{name} ({short_repr(e.value)} +- {e.std_error:.2g})"
             for name, e in estimates.items()
-            if not e.identifiable and e.std_error >= scale_of(vehicle, name)
+            if not e.identifiable and e.std_error >= parameters.scale_of(vehicle, name)
         ]
         if unidentifiable and named:
             raise UserError(
@@ -257,8 +243,8 @@ class _Problem:
             )
         values = {}
         for i, flight in enumerate(self.flights):
-            flown = with_parameters(self.start, self.names, list(x[self.indices(i)]))
-            values[flight] = {name: value_of(flown, name) for name in self.per_flight}
+            flown = parameters.with_parameters(self.start, self.names, list(x[self.indices(i)]))
+            values[flight] = {name: parameters.value_of(flown, name) for name in self.per_flight}
         open_loop = {log.name: open_loop_errors(log, vehicle, self.motors) for log in (*self.logs, *validate)}
         return Report(vehicle, estimates, values, losses, open_loop)
 

@@ -13,14 +13,7 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation
 from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
-from jaxdrones.flights.closed_loop import (
-    ClosedLoopInputs,
-    closed_loop_columns,
-    closed_loop_inputs,
-    motor_start_row,
-    rows_after_climb,
-    simulate,
-)
+from jaxdrones.flights import closed_loop
 from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, standard_errors
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.flights.parameters import with_parameters
@@ -83,12 +76,12 @@ def _balance_data(log: FlightLog) -> tuple[np.ndarray, ...]:
     Duty cycles (n, rows, 4), 0 to 1; voltage (n, rows), V; sag at take-off (n, 1), V; vertical component of the thrust
     direction (n, rows); mean vertical acceleration (n,), m/s^2.
     """
-    air = rows_after_climb(log)
+    air = closed_loop.rows_after_climb(log)
     starts = np.arange(air.start, air.stop - _BALANCE_ROWS, _BALANCE_ROWS)
     rows = starts[:, None] + np.arange(_BALANCE_ROWS)
     up = np.asarray(jax.vmap(rotation.z_axis)(jnp.asarray(log.quat[:, 0], float)))[:, 2]
     acc = (log.vel[starts + _BALANCE_ROWS, 0, 2] - log.vel[starts, 0, 2]) / (_BALANCE_ROWS * PERIOD)
-    _, _, pwm, vbat = closed_loop_columns(log)
+    _, _, pwm, vbat = closed_loop.closed_loop_columns(log)
     return pwm[rows] / FULL_PWM, vbat[rows], np.full((len(starts), 1), log.sag), up[rows], acc
 
 
@@ -101,16 +94,16 @@ def _balance_residuals(
     return (lift / (vehicle.params.mass * (vehicle.params.gravity + acc)) - 1) / _FORCE_STD
 
 
-def _path_data(logs: Sequence[FlightLog]) -> tuple[ClosedLoopInputs, Array, Array]:
+def _path_data(logs: Sequence[FlightLog]) -> tuple[closed_loop.ClosedLoopInputs, Array, Array]:
     """Inputs of equal length, the recorded horizontal paths (flights, points, 2), m, and a mask (flights, points).
 
     The mask is 1 at compared points, 0 elsewhere.
     """
-    inputs = [closed_loop_inputs(log) for log in logs]
+    inputs = [closed_loop.closed_loop_inputs(log) for log in logs]
     rows = max(len(each.battery) for each in inputs)
     recorded, mask = np.zeros((len(logs), rows, 2)), np.zeros((len(logs), rows))
     for i, log in enumerate(logs):
-        air, begin = rows_after_climb(log), motor_start_row(log)
+        air, begin = closed_loop.rows_after_climb(log), closed_loop.motor_start_row(log)
         recorded[i, air.start - begin : air.stop - begin] = log.pos[air, 0, :2]
         mask[i, air.start - begin : air.stop - begin] = 1
 
@@ -129,13 +122,13 @@ def _path_residuals(
     start: Vehicle,
     motors: Motors,
     gains: firmware_pid.Gains,
-    inputs: ClosedLoopInputs,
+    inputs: closed_loop.ClosedLoopInputs,
     recorded: Array,
     mask: Array,
     x: Array,
 ) -> Array:
     vehicle = with_parameters(start, PATH_PARAMETERS, list(x))
-    sim, _ = jax.vmap(lambda each: simulate(vehicle, motors, gains, each))(inputs)
+    sim, _ = jax.vmap(lambda each: closed_loop.simulate(vehicle, motors, gains, each))(inputs)
     return ((sim.pos[:, ::_STRIDE, :2] - recorded) / _PATH_STD * mask[..., None]).reshape(-1)
 
 

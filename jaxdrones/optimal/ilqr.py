@@ -19,15 +19,7 @@ from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.box_qp import box_qp, solve_free
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import (
-    Reference,
-    Weights,
-    check_period,
-    check_plan,
-    hover,
-    reference,
-    replaced_unless,
-)
+from jaxdrones.optimal.problem import Reference, Weights, check_period, check_plan, hover, reference, replaced_unless
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode

@@ -21,15 +21,7 @@ from jaxdrones.control.allocation import mixer
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
-from jaxdrones.optimal.problem import (
-    Reference,
-    Weights,
-    check_period,
-    check_plan,
-    hover,
-    reference,
-    replaced_unless,
-)
+from jaxdrones.optimal.problem import Reference, Weights, check_period, check_plan, hover, reference, replaced_unless
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode

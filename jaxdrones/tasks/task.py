@@ -12,20 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxdrones import rotation, vector
-from jaxdrones.arguments import (
-    Count,
-    Hertz,
-    NonNegativeInt,
-    Seconds,
-    Switch,
-    checked,
-    choice,
-    choices,
-    number,
-    sequence,
-    whole,
-)
+from jaxdrones import arguments, rotation, vector
+from jaxdrones.arguments import checked
 from jaxdrones.checks import bind, check_choice, check_function, check_number, short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.dynamics.model import Model
@@ -84,10 +72,12 @@ Entries = tuple[Quantity, ...] | Callable[[int, tuple[Quantity, ...]], tuple[Qua
 """Quantities, or a function (number of drones, quantities of an action) -> quantities."""
 Effect = Callable[..., Wrench]
 """Effect on one drone, `(params, state) -> Wrench`."""
+Randomization = Callable[[jax.Array, Params], Params]
+"""(key, params) of one drone -> its parameters in an episode."""
 CONTACTS = ("ground", "drones", "obstacles")
 IMAGES = ("rgb", "depth", "segmentation")
-Drones = Annotated[int, whole("number of drones of {function}")]  # argument of a task
-Team = Annotated[int, whole("number of drones of {function}", 2)]
+Drones = Annotated[int, arguments.whole("number of drones of {function}")]  # argument of a task
+Team = Annotated[int, arguments.whole("number of drones of {function}", 2)]
 _OF_A_WORLD = ("task", "world")
 _OBSERVATION = ("position_error", "rotation_matrix", "velocity_error", "omega", "last_action")
 
@@ -101,16 +91,16 @@ class ObservationTerm:
     """(task, world with the measured state) -> entries of every drone."""
     bound: float | tuple[float, ...]
     """Largest magnitude, of all entries or of each, for clipping."""
-    history: Annotated[int, whole("history of an observation")] = 2
+    history: Annotated[int, arguments.whole("history of an observation")] = 2
     """Number of past actions in the term."""
     entries: Entries = ()
     """Description of each entry of a drone, for `jaxdrones.explain`; optional."""
     name: str = ""
     """Name of the term, set by `jaxdrones.make`."""
-    rows: NonNegativeInt = 0
+    rows: arguments.NonNegativeInt = 0
     """Number of rows of equal length, side by side, of a set whose order has no meaning; 0 for a vector. A row begins
     with a position relative to the drone, m."""
-    reach: Annotated[float, number("m", above=0, infinite=True)] = math.inf
+    reach: Annotated[float, arguments.number("m", above=0, infinite=True)] = math.inf
     """Distance from which on a row has no effect, m."""
 
     def __post_init__(self):
@@ -132,8 +122,8 @@ class Task:
 
     name: str
     summary: str
-    drones: Annotated[int, whole("number of drones of a task")]
-    duration: Seconds
+    drones: Annotated[int, arguments.whole("number of drones of a task")]
+    duration: arguments.Seconds
     """Time after which an episode is truncated, s."""
     start: Callable[..., tuple[State, Any]]
     """(key, params) -> initial state of the team, and the task's variables. Optional parameters are `scene` and
@@ -146,7 +136,7 @@ class Task:
     """Name -> condition that terminates the episode in a state without future value."""
     truncations: Mapping[str, Condition] = dataclasses.field(default_factory=dict)
     """Name -> condition that truncates the episode."""
-    ends: Annotated[str, choice("ends", ("team", "drone"))] = "team"
+    ends: Annotated[str, arguments.choice("ends", ("team", "drone"))] = "team"
     """Whose episode a condition ends: that of the `team`, or of the `drone` alone, which leaves the world while the
     others continue."""
     advance: Callable[[Task, World], Any] = lambda task, world: world.variables
@@ -157,40 +147,40 @@ class Task:
     """(metrics over an episode (T, n), control period) -> (n,): success of every drone. Metrics keep their last values
     after the end of an episode. An episode that ends by a failure is no success. With `ends="team"` a success is one of
     all drones."""
-    success_terminations: Annotated[tuple[str, ...], sequence("'reached'")] = ()
+    success_terminations: Annotated[tuple[str, ...], arguments.sequence("'reached'")] = ()
     """Names of the terminations that are no failure, such as a reached goal. Every other termination, and every
     truncation but that of the time, is a failure."""
     observations: Mapping[str, ObservationTerm] = dataclasses.field(default_factory=dict)
     """Observation terms of this task by name."""
-    randomize: Annotated[tuple[Callable[[jax.Array, Params], Params], ...], sequence("scaled('mass', 0.9, 1.1)")] = ()
+    randomize: Annotated[tuple[Randomization, ...], arguments.sequence("scaled('mass', 0.9, 1.1)")] = ()
     """Randomizations of the task: (key, params) of one drone -> its parameters in an episode."""
-    effects: Annotated[tuple[Effect, ...], sequence("jaxdrones.cable")] = ()
+    effects: Annotated[tuple[Effect, ...], arguments.sequence("jaxdrones.cable")] = ()
     """Effects of the task's physics, in addition to those of `jaxdrones.make`."""
-    models: Annotated[tuple[Model, ...], sequence("jaxdrones.payload()")] = ()
+    models: Annotated[tuple[Model, ...], arguments.sequence("jaxdrones.payload()")] = ()
     """Models of the task's physics, in addition to those of `jaxdrones.make`."""
     equip: Callable[[Params], Params] = lambda params: params
     """(parameters of the team) -> the same with constants of the task's models, such as a load."""
-    control_hz: Hertz = 100.0
+    control_hz: arguments.Hertz = 100.0
     """Default control steps per second."""
-    substeps: Count = 5
+    substeps: arguments.Count = 5
     """Default physics steps per control step."""
     scene: Scene | Callable[[jax.Array], Scene] = dataclasses.field(default_factory=Scene)
     """Obstacles and ground, or a function `(key) -> Scene` that draws them for every episode."""
-    obstacles_terminate: Switch = False
+    obstacles_terminate: arguments.Switch = False
     """Whether a hit of an obstacle terminates the episode, so that contact forces are not needed."""
     camera: Camera | None = None
     """Default camera of every drone; `None` for `Camera()`."""
-    vision: Annotated[tuple[str, ...], choices("image", IMAGES, "'depth'")] = ()
+    vision: Annotated[tuple[str, ...], arguments.choices("image", IMAGES, "'depth'")] = ()
     """Names of the default images."""
-    contact: Annotated[tuple[str, ...], choices("contact", CONTACTS, "'ground'")] = ()
+    contact: Annotated[tuple[str, ...], arguments.choices("contact", CONTACTS, "'ground'")] = ()
     """Contact forces of the explicit backend: `ground`, `drones`, `obstacles` (unless `obstacles_terminate`)."""
     pairs: tuple[str, ...] = ()
     """Names of the default pair effects."""
     action: str = "rpm"
     """Name of the default action type."""
-    observation: Annotated[tuple[str, ...], sequence("'position_error'")] = _OBSERVATION
+    observation: Annotated[tuple[str, ...], arguments.sequence("'position_error'")] = _OBSERVATION
     """Names of the default observation terms."""
-    extra_steps: NonNegativeInt = 0
+    extra_steps: arguments.NonNegativeInt = 0
     """Control steps of an episode after `duration`; 2 in gym-pybullet-drones, which reads its clock late."""
 
     def __post_init__(self):
@@ -198,8 +188,8 @@ class Task:
         for (name, kind), what in zip(kinds.items(), ("string", "string", "Camera"), strict=True):
             if not isinstance(x := getattr(self, name), kind) or x == "":
                 raise UserError(f"{name} of the task is {short_repr(x)}; give a {what}")
-        for field, function, arguments in self._functions():
-            check_function(field, function, arguments)
+        for field, function, names in self._functions():
+            check_function(field, function, names)
         for name in self.success_terminations:
             check_choice("success termination", name, self.terminations)
         for name, term in _mapping("observations", self.observations, "an ObservationTerm").items():

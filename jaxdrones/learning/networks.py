@@ -142,14 +142,9 @@ class Policy(PyTreeNode):
     ) -> Policy:
         """Create a policy with actions near zero, which is hover in most action types.
 
-        Args:
-            key: random key.
-            env: environment.
-            hidden_sizes: sizes of the hidden layers.
-            per_agent: whether every drone has its own network; otherwise all drones share one.
-            recurrent_size: size of the hidden state of a GRU; 0 for none.
-            network: user-defined network in place of these sizes, see `OwnNetwork`.
-            set_sizes: sizes of the layers that encode a row of a set in the observation.
+        With `per_agent` every drone has its own network; otherwise all drones share one. A `recurrent_size` of 0 is
+        that of no GRU, and `set_sizes` are those of the layers that encode a row of a set in the observation. A
+        user-defined network replaces these sizes, see `OwnNetwork`.
 
         Raises:
             ValueError: a network with the wrong input or output for the environment.

@@ -10,7 +10,6 @@ from types import ModuleType
 import numpy as np
 
 from jaxdrones.engine.bullet.arrays import NEAR, START_OMEGA, reach
-from jaxdrones.engine.bullet.frames import in_body
 from jaxdrones.engine.bullet.surroundings import Surroundings, quiet
 from jaxdrones.errors import UserError, install
 from jaxdrones.sensing import Scene
@@ -219,3 +218,11 @@ class Client:
 def _disconnect(p: ModuleType, client: int) -> None:
     with contextlib.suppress(p.error):
         p.disconnect(client)
+
+
+def in_body(quat: tuple, vector: tuple) -> tuple[float, float, float]:
+    """R^T v: a vector from the world frame to the body frame, v + w t + t x u with t = 2 v x u and q = (u, w)."""
+    x, y, z, w = quat
+    a, b, c = vector
+    tx, ty, tz = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    return a + w * tx + ty * z - tz * y, b + w * ty + tz * x - tx * z, c + w * tz + tx * y - ty * x

@@ -109,18 +109,11 @@ def target(
     yaw: float | None = None,
     yaw_rate: float = 0.0,
 ) -> Target:
-    """Set-point from what a command gives; every axis has one source.
+    """Set-point from what a command gives, in SI units, world axes; every axis has one source.
 
-    Args:
-        pos: position, m, world; by default the drone follows `vel`.
-        vel: velocity, m/s, world, or along the heading if `in_heading`.
-        height: m, world; replaces z of `vel`.
-        in_heading: see `vel`.
-        rpy: roll, pitch (and an unused yaw), rad, right-handed; replaces x and y.
-        rates: roll and pitch rates (and an unused yaw rate), rad/s; replaces x and y.
-        thrust: thrust of each motor, 16 bit; replaces z.
-        yaw: heading, rad.
-        yaw_rate: rad/s, without `yaw`.
+    By default the drone follows `vel`, which is along the heading if `in_heading`. `pos` replaces it, and `height` its
+    z; roll and pitch of `rpy`, or roll and pitch `rates`, right-handed, replace x and y; the `thrust` of each motor, 16
+    bit, replaces z. `yaw_rate` is used without `yaw`.
     """
     by_pos = [pos is not None, pos is not None, pos is not None or height is not None]
     place = np.zeros(3) if pos is None else np.asarray(pos, float)

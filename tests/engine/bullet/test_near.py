@@ -10,7 +10,7 @@ import pytest
 import jaxdrones as jd
 from jaxdrones import State, rotation
 from jaxdrones.engine import bullet
-from jaxdrones.engine.bullet.frames import in_body
+from jaxdrones.engine.bullet.client import in_body
 from jaxdrones.sensing import Box, Scene, Sphere, Urdf
 
 pytestmark = pytest.mark.needs("pybullet")

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxdrones import user_code
-from jaxdrones.checks import check_choice
-from jaxdrones.envs import TASKS
 from jaxdrones.envs.named_tasks import check_task_function
 from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task
@@ -42,7 +40,6 @@ def take_vehicle(options: dict[str, Any], kept: Mapping[str, str] | None = None)
 def task_of(task: str, files: Mapping[str, str]) -> str | Callable[..., Task]:
     """Task of a recipe for `jaxdrones.make`: a name, or the function of a file."""
     if not user_code.is_reference(task):
-        check_choice("task", task, TASKS)
         return task
     file, name = user_code.split_reference(task)
     return check_task_function(task, user_code.definition(file.name, _text(file.name, files), name))

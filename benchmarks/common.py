@@ -81,14 +81,14 @@ def _seconds(program: Program, calls: int) -> float:
     return (time.perf_counter() - start) / calls
 
 
-def loglog(path: str, curves: Mapping[str, Sequence[tuple[float, float]]], x: str, y: str) -> None:
-    """Write a PNG with a line for every curve, points (x, y)."""
-    from matplotlib.figure import Figure  # only if a figure is asked for
+def loglog(path: str, curves: Mapping[str, Sequence[tuple[float, float]]], x: str, y: str, dashed: str = "") -> None:
+    """Write a PNG with a line for every curve, points (x, y); the curve named `dashed` is extrapolated."""
+    from jaxdrones.visualization import style  # only if a figure is asked for
 
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.add_subplot(xscale="log", yscale="log", xlabel=x, ylabel=y)
-    for name, points in curves.items():
-        axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=name)
-    axes.grid(which="both", alpha=0.2)
-    axes.legend(frameon=False)
-    figure.savefig(path, dpi=120)
+    with style.figure(9, 6) as figure:
+        axes = figure.add_subplot(xscale="log", yscale="log", xlabel=x, ylabel=y)
+        for name, points in curves.items():
+            look = {"linestyle": "--", "label": f"{name}, extrapolated"} if name == dashed else {"label": name}
+            axes.plot(*zip(*points, strict=True), marker="o", markersize=5, **look)
+        axes.legend(frameon=False)
+        style.save(figure, path)

@@ -22,6 +22,7 @@ REACH = 2.0  # m
 FEW = 30  # drones of the timed loop
 MOST_PAIRS = 2**22  # tried by `all pairs`, so that a benchmark ends
 STEPS = 5
+NAMES = ("all pairs", "cells", "gym-pybullet-drones")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,18 +37,22 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
 
     a_pair = gym_pybullet_drones_pair(options.repeats)
     rows = [measure(n, options.repeats) | {"gym-pybullet-drones": a_pair * n * (n - 1)} for n in options.drones]
-    names = ("all pairs", "cells", "gym-pybullet-drones")
     lines = []
     lines.append("ms per step of the world; cells over N log N, us; gym-pybullet-drones over our faster one")
     for row in rows:
-        n, ours = row["drones"], min(row[name] for name in names[:2] if name in row)
+        n, ours = row["drones"], min(row[name] for name in NAMES[:2] if name in row)
         cells = "          " if "cells" not in row else f"{1e6 * row['cells'] / (n * math.log2(max(n, 2))):10.3f}"
-        taken = " | ".join(f"{name} {1e3 * row[name]:10.3f}" for name in names if name in row)
-        lines.append(f"{n:5} drones | {taken} | {cells} | {row[names[2]] / ours:8.1f}")
+        taken = " | ".join(f"{name} {1e3 * row[name]:10.3f}" for name in NAMES if name in row)
+        lines.append(f"{n:5} drones | {taken} | {cells} | {row[NAMES[2]] / ours:8.1f}")
     if options.figure:
-        curves = {name: [(row["drones"], row[name]) for row in rows if row.get(name)] for name in names}
-        loglog(options.figure, curves, "drones in a world", "s per step")
+        draw(rows, options.figure)
     return {"rows": rows}, lines
+
+
+def draw(rows: list[dict[str, float]], path: str) -> None:
+    """Draw the seconds of a step over the number of drones; those of gym-pybullet-drones are extrapolated."""
+    curves = {name: [(row["drones"], row[name]) for row in rows if row.get(name)] for name in NAMES}
+    loglog(path, curves, "drones in a world", "s per step", dashed=NAMES[2])
 
 
 def measure(n: int, repeats: int) -> dict[str, float]:

@@ -55,7 +55,7 @@ def _compare(options: argparse.Namespace) -> int:
     if logs and not options.no_figure:
         files.append(options.output / "compare.png")
         title = (" against " if len(cases) == 2 else ", ").join(cases)
-        comparison.save_comparison(records, files[-1], f"{options.flight}: {title}")
+        comparison.save_comparison(records, files[-1], f"{options.flight}: {title}", settling_time)
     diverged = {name: results.diverged(record) for name, record in records.items()}
     about: dict[str, Any] = {"flight": options.flight, kind: list(cases)}
     if kind == "backends":

@@ -21,7 +21,7 @@ from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.files import check_pwm, save_csv, save_npz
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.visualization import films, plots
+from jaxdrones.visualization import films, paths, plots
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
 _OF_EXAMPLES = (
@@ -213,7 +213,7 @@ def _report(
         print(as_json(about | {"results": rows, "diverged": diverged, "files": list(map(str, files))}))
     else:
         print(record.conditions)
-        print(table(rows if len(rows) <= plots.MOST_NAMED else summary(rows)))
+        print(table(rows if len(rows) <= paths.MOST_NAMED else summary(rows)))
         print(results.definitions(record, after))
         if end is not None:
             how = {True: "success", False: "no success", None: "done"}[end["success"]]

@@ -67,9 +67,14 @@ def _score(options: argparse.Namespace) -> int:
             name: [counted(simulate_closed_loop(log, vehicle, motors, gains)) for log in with_setpoints]
             for name, vehicle in vehicles.items()
         }
+    titles = {"nominal": f"{options.nominal} (nominal)", "vehicle": options.vehicle}
+
+    def named(models: dict[str, Any]) -> dict[str, Any]:
+        return {titles.get(name, name): found for name, found in models.items()}
+
     closed_loop = {name: [result.as_dict() for result in flights] for name, flights in simulated.items()}
     if options.figure:
-        save_paths(simulated["vehicle"], options.figure)
+        save_paths(named(simulated), options.figure)
     results: dict[str, Any] = {
         "vehicle": options.vehicle,
         "flights": [log.name for log in logs],
@@ -80,9 +85,9 @@ def _score(options: argparse.Namespace) -> int:
     if options.json:
         print(as_json(results))
     else:
-        print(open_loop_table(results["open_loop"]))
+        print(open_loop_table(named(results["open_loop"])))
         if with_setpoints:
-            print(closed_loop_table(closed_loop))
+            print(closed_loop_table(named(closed_loop)))
     return 0
 
 
@@ -96,22 +101,25 @@ def _check_figure(file: Path, has_paths: bool) -> None:
 
 def open_loop_table(models: dict[str, Any]) -> str:
     """Table of the open-loop errors of each model after each horizon."""
-    lines = ["model     after (s)  position (m)  velocity (m/s)  attitude (rad)  rates (rad/s)"]
+    width = max(map(len, (*models, "vehicle")))
+    lines = [f"{'vehicle':{width}}  after (s)  position (m)  velocity (m/s)  attitude (rad)  rates (rad/s)"]
     for model, horizons in models.items():
         for rows, e in horizons.items():
             numbers = f"{e['pos']:12.4f}  {e['vel']:14.3f}  {e['rot']:14.4f}  {e['omega']:13.3f}"
-            lines.append(f"{model:8}  {int(rows) / 100:9.2f}  {numbers}")
+            lines.append(f"{model:{width}}  {int(rows) / 100:9.2f}  {numbers}")
     return "\n".join(lines)
 
 
 def closed_loop_table(models: dict[str, list[dict[str, Any]]]) -> str:
     """Table of path distances, tracking errors and mean PWM of each vehicle in each flight."""
-    lines = ["model     flight                            xy (m)  xyz (m)  tracking real, sim (m)  PWM real, sim"]
+    width = max(map(len, (*models, "vehicle")))
+    lines = [
+        f"{'vehicle':{width}}  flight                            xy (m)  xyz (m)  tracking real, sim (m)  PWM real, sim"
+    ]
     for model, flights in models.items():
         for e in flights:
+            distances = f"{e['xy_rms_m']:6.3f}  {e['xyz_rms_m']:7.3f}"
             tracking = f"{e['tracking_real_m']:14.3f}, {e['tracking_sim_m']:6.3f}"
             pwm = f"{e['pwm_real']:7.0f}, {e['pwm_sim']:5.0f}{' (at its limit)' * e['saturated']}"
-            lines.append(
-                f"{model:8}  {e['flight'][:32]:32}  {e['xy_rms_m']:6.3f}  {e['xyz_rms_m']:7.3f}  {tracking}  {pwm}"
-            )
+            lines.append(f"{model:{width}}  {e['flight'][:32]:32}  {distances}  {tracking}  {pwm}")
     return "\n".join(lines)

@@ -44,7 +44,7 @@ def results(log: FlightLog, after: float) -> list[dict[str, float | str | None]]
     """
     difference, unit = log.difference()
     unit = unit.replace("/", "_")
-    counted, steady = log.t >= _counted_from(log, after), log.last_quarter
+    counted, steady = log.t >= counted_from(log, after), log.last_quarter
     with np.errstate(over="ignore", invalid="ignore"):  # where the state is not finite
         error, speed = np.linalg.norm(difference, axis=-1), np.linalg.norm(log.vel, axis=-1)
         columns = {
@@ -71,7 +71,7 @@ def definitions(log: FlightLog, after: float) -> str:
     return (
         f"steady: mean error from {log.t[log.last_quarter][0]:.2f} s on, the last quarter of the flight\n"
         f"settling time: first time after which the error stays within {band} of steady (-: in the last quarter)\n"
-        f"all other numbers count from {_counted_from(log, after):.2f} s on"
+        f"all other numbers count from {counted_from(log, after):.2f} s on"
     )
 
 
@@ -95,7 +95,8 @@ def divergence(log: FlightLog, other: FlightLog, rows: int = 12) -> list[dict[st
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def _counted_from(log: FlightLog, after: float) -> float:
+def counted_from(log: FlightLog, after: float) -> float:
+    """Start of the evaluation, s."""
     return after if after < log.t[-1] else float(log.t[-1]) / 2
 
 

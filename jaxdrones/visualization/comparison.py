@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 
+from jaxdrones.flights import results
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.visualization import paths, style
 from jaxdrones.visualization.palette import colors
 
 _COMMANDED: dict[str, Any] = style.TARGET | {"color": "#222222", "zorder": 4}
-_WIDEST, _NARROWEST = 3.6, 1.4  # lines: earlier ones are wider, to be visible below later ones
 _MOST_BANDED = 3  # flights with a band over the drones
 _SMALLEST = 0.01  # m or m/s: range of an axis
 _CELLS = 100  # cells along each side of a panel: commands are drawn once in each, to keep dashes
 
 
-def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str) -> None:
+def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str, after: float = 0.0) -> None:
     """Draw flights of the same example: a color for each flight, with commands dashed.
 
     Beside the paths are the errors of each flight over time, mean and range over its drones, and for two flights with
@@ -27,27 +27,25 @@ def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str) ->
         records: logs by name.
         path: path of the picture; its suffix chooses the format.
         title: title of the figure.
+        after: start of the panels over time, s, as in `jaxdrones.flights.results.results`.
     """
     tints = colors(len(records))
     flights = list(records.values())
     apart = len(flights) == 2 and np.array_equal(flights[0].t, flights[1].t)
+    start = results.counted_from(flights[0], after)
     with style.figure(13, 7.2) as figure:
         axes = figure.subplot_mosaic([["path", "error"], ["path", "apart" if apart else "error"]])
         _draw_paths(axes["path"], flights, tints)
-        _draw_errors(axes["error"], flights, tints)
+        _draw_errors(axes["error"], flights, tints, start)
         if apart:
-            _draw_distance(axes["apart"], *flights)
+            _draw_distance(axes["apart"], flights[0], flights[1], start)
             axes["error"].tick_params(labelbottom=False)
             figure.align_ylabels([axes["error"], axes["apart"]])
-        axes["apart" if apart else "error"].set_xlabel("t (s)")
+        axes["apart" if apart else "error"].set_xlabel("t (s)" if start == 0 else f"t (s), from {start:g} s on")
         figure.suptitle(title + "\n")
         handles = _handles(records, tints)
         figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)))
         style.save(figure, path)
-
-
-def _widths(count: int) -> np.ndarray:
-    return np.linspace(_WIDEST, _NARROWEST, count) if count > 1 else np.array([_NARROWEST])
 
 
 def _draw_paths(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> None:
@@ -56,7 +54,7 @@ def _draw_paths(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> 
     names = ["xyz"[k] for k in plane]
     for outline in paths.outlines(flights[0].scene, *np.eye(3)[plane]):
         axis.fill(*outline.T, **paths.OUTLINE)
-    for record, tint, width in zip(flights, tints, _widths(len(flights)), strict=True):
+    for record, tint, width in zip(flights, tints, style.widths(len(flights)), strict=True):
         for i in range(len(record.labels)):
             axis.plot(*record.pos[:, i, plane].T, color=tint, linewidth=width)
         axis.plot(*record.pos[-1][:, plane].T, color=tint, **paths.END)
@@ -86,30 +84,36 @@ def _once(lines: np.ndarray) -> list[np.ndarray]:
     return shown
 
 
-def _draw_errors(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> None:
+def _draw_errors(axis: Any, flights: list[FlightLog], tints: tuple[str, ...], start: float) -> None:
     """Draw mean and range over the drones of the distance to the target position, or of the difference in velocity."""
     ends = []
-    for record, tint, width in zip(flights, tints, _widths(len(flights)), strict=True):
+    for record, tint, width in zip(flights, tints, style.widths(len(flights)), strict=True):
         difference, unit = record.difference()
         with np.errstate(over="ignore", invalid="ignore"):
-            error = np.linalg.norm(difference.astype(float), axis=-1)
+            error = np.linalg.norm(difference.astype(float), axis=-1)[record.t >= start]
+        t = record.t[record.t >= start]
         if len(flights) <= _MOST_BANDED:
-            axis.fill_between(record.t, error.min(axis=1), error.max(axis=1), color=tint, alpha=0.2, linewidth=0)
-        axis.plot(record.t, error.mean(axis=1), color=tint, linewidth=width)
+            axis.fill_between(t, error.min(axis=1), error.max(axis=1), color=tint, alpha=0.2, linewidth=0)
+        axis.plot(t, error.mean(axis=1), color=tint, linewidth=width)
         ends.append(style.limits(error, _SMALLEST))
     axis.set_ylim(max(min(low for low, _ in ends), -0.02 * ends[0][1]), max(high for _, high in ends))
     what = "distance to the target" if unit == "m" else "difference to the commanded velocity"
     axis.set(title=what, ylabel=f"error ({unit})")
 
 
-def _draw_distance(axis: Any, first: FlightLog, second: FlightLog) -> None:
-    """Draw the distance between equal drones of two flights, largest over the drones, on a logarithmic axis."""
+def _draw_distance(axis: Any, first: FlightLog, second: FlightLog, start: float) -> None:
+    """Draw the distance between equal drones of two flights, largest over the drones, on a logarithmic axis.
+
+    The axis begins at the rounding of the logged positions.
+    """
     from matplotlib.ticker import LogLocator, NullFormatter
 
     with np.errstate(over="ignore", invalid="ignore"):
         apart = np.linalg.norm(first.pos.astype(float) - second.pos, axis=-1).max(axis=1)
-    axis.plot(first.t, np.where(apart > 0, apart, np.nan), color="#222222")
-    seen = apart[np.isfinite(apart) & (apart > 0)]
+        rounding = np.spacing(np.float32(np.nanmax(np.abs(first.pos[np.isfinite(first.pos)]), initial=0)))
+    counted = first.t >= start
+    axis.plot(first.t[counted], np.where(apart > rounding, apart, np.nan)[counted], color="#222222")
+    seen = apart[counted & np.isfinite(apart) & (apart > rounding)]
     if seen.size:
         axis.set_yscale("log")
         axis.set_ylim(10 ** np.floor(np.log10(seen.min())), 10 ** np.ceil(np.log10(1.01 * seen.max())))
@@ -123,7 +127,7 @@ def _handles(records: Mapping[str, FlightLog], tints: tuple[str, ...]) -> list[A
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    widths = _widths(len(records))
+    widths = style.widths(len(records))
     handles: list[Any] = [
         Line2D([], [], color=tint, linewidth=width, label=name)
         for name, tint, width in zip(records, tints, widths, strict=True)

@@ -13,6 +13,7 @@ from jaxdrones.sensing.files import File
 from jaxdrones.visualization import style
 
 _SMALLEST = 0.2  # m, range of a panel
+MOST_NAMED = 12  # drones with a line in the legend each; paths of more are thin
 _MOST_OBSTACLES = 400
 _CORNERS = 180  # of the outline of an obstacle
 OUTLINE: dict[str, Any] = {"facecolor": "#c9ced3", "edgecolor": "#9aa1a8", "linewidth": 0.8, "zorder": 0}
@@ -47,12 +48,9 @@ def draw_plane(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
         axis.fill(*outline.T, **OUTLINE)
     if record.scene.ground and plane[1] == 2:
         axis.axhline(0, color="#9aa1a8", linewidth=1.2, zorder=0)
+    crowded = len(colors) > MOST_NAMED
     for i, color in enumerate(colors):
-        axis.plot(*record.target_pos[:, i, plane].T, color=color, **style.TARGET)
-        axis.plot(*record.pos[:, i, plane].T, color=color)
-        axis.plot(*record.target_pos[-1, i, plane].T, color=color, **_GOAL)
-        axis.plot(*record.pos[0, i, plane].T, color=color, **START)
-        axis.plot(*record.pos[-1, i, plane].T, color=color, **END)
+        _draw_path(axis, record.pos[:, i, plane], record.target_pos[:, i, plane], color, crowded)
     set_equal(axis, *np.array(ranges(record, plane))[:, None])
     axis.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
 
@@ -75,14 +73,13 @@ def draw_space(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
     """Draw the paths in three dimensions, with projections on the floor of the panel."""
     spaces = ranges(record, [0, 1, 2])
     floor = spaces[2][0]
+    crowded = len(colors) > MOST_NAMED
     for i, color in enumerate(colors):
-        x, y, z = _inside(record.pos[:, i], spaces).T
-        axis.plot(x, y, np.full_like(z, floor), color="#c3c8cd", linewidth=1.2)
-        axis.plot(*_inside(record.target_pos[:, i], spaces).T, color=color, **style.TARGET)
-        axis.plot(x, y, z, color=color)
-        axis.plot(*record.target_pos[-1:, i].T, color=color, **_GOAL)
-        axis.plot(*record.pos[:1, i].T, color=color, **START)
-        axis.plot(*record.pos[-1:, i].T, color=color, **END)
+        path, target = _inside(record.pos[:, i], spaces), _inside(record.target_pos[:, i], spaces)
+        x, y, z = path.T
+        if not crowded:
+            axis.plot(x, y, np.full_like(z, floor), color="#c3c8cd", linewidth=1.2)
+        _draw_path(axis, path, target, color, crowded)
     axis.set(xlim=spaces[0], ylim=spaces[1], zlim=spaces[2], xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
     spans = np.ptp(spaces, axis=1)
     axis.set_box_aspect(np.maximum(spans, 0.5 * spans.max()), zoom=0.95)
@@ -94,12 +91,27 @@ def draw_space(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
     axis.set_title("path")
 
 
+def _draw_path(axis: Any, path: np.ndarray, target: np.ndarray, color: str, crowded: bool) -> None:
+    """Draw a path and its target (K, 2 or 3); of a crowd a thin path and its last point."""
+    if crowded:
+        axis.plot(*path.T, color=color, linewidth=0.8, alpha=0.6)
+        axis.plot(*path[-1:].T, color=color, marker="o", markersize=4, linestyle="none")
+        return
+    axis.plot(*target.T, color=color, **style.TARGET)
+    axis.plot(*path.T, color=color)
+    axis.plot(*target[-1:].T, color=color, **_GOAL)
+    axis.plot(*path[:1].T, color=color, **START)
+    axis.plot(*path[-1:].T, color=color, **END)
+
+
 def legend_handles(record: FlightLog) -> list[Any]:
     """Legend entries common to all drones of a figure."""
     from matplotlib.lines import Line2D
 
     looks = dict(ENDS)
-    if np.isfinite(record.target_pos).any():
+    if len(record.labels) > MOST_NAMED:
+        looks = {"end": END}
+    elif np.isfinite(record.target_pos).any():
         looks = {"commanded": style.TARGET, "last target": _GOAL} | looks
     elif np.isfinite(record.target_vel).any():
         looks = {"commanded": style.TARGET} | looks

@@ -33,7 +33,6 @@ PANELS = {
 ERROR = {"error": ("error", 0, "error (m)")}
 POLICY_PANELS = ("x", "rpm0", "y", "rpm1", "z", "rpm2", "vz", "rpm3", "error", "yaw")
 _SMALLEST = {"pos": 0.02, "vel": 0.02, "rpy": 0.02, "omega": 0.05, "rpm": 200.0, "error": 0.01}  # ranges of axes
-MOST_NAMED = 12  # drones with a line or a row each; more of them are summarized
 _BANDS = ((0.0, 1.0, 0.15), (0.05, 0.95, 0.3))  # lower and upper quantile, opacity
 _BAND = colors(1)[0]
 _WIDTH, _PATHS, _ROW = 13.0, 5.4, 1.6  # in
@@ -90,7 +89,7 @@ def _draw_signal(axis: Any, record: FlightLog, name: str, tints: Sequence[str]) 
     signal = np.asarray(getattr(record, array), float)[..., column]
     targets = {"pos": record.target_pos, "vel": record.target_vel}
     command = np.asarray(targets[array], float)[..., column] if array in targets else np.full_like(signal, np.nan)
-    if len(tints) > MOST_NAMED:
+    if len(tints) > paths.MOST_NAMED:
         _draw_bands(axis, record.t, signal)
     else:
         for i, tint in enumerate(tints):
@@ -127,8 +126,8 @@ def _handles(record: FlightLog, tints: Sequence[str]) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    if len(tints) > MOST_NAMED:
-        bands = [Patch(color=_BAND, alpha=a, label=f"{100 * (b - c):.0f} % of them") for c, b, a in _BANDS[::-1]]
+    if len(tints) > paths.MOST_NAMED:
+        bands = [Patch(color=_BAND, alpha=a, label=f"{100 * (b - c):.0f} % of the drones") for c, b, a in _BANDS[::-1]]
         return [
             Line2D([], [], color=_BAND, label=f"median of {len(tints)} drones"),
             *bands,

@@ -1,6 +1,6 @@
 """Figures of identification: open-loop errors by horizon, and recorded and simulated paths."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from jaxdrones.flights import HORIZONS, QUANTITIES, ClosedLoopResult
 from jaxdrones.flights.preparation import PERIOD
 from jaxdrones.visualization import style
-from jaxdrones.visualization.palette import COLORS, colors
+from jaxdrones.visualization.palette import colors
 
 _UNITS = {"pos": "position (m)", "vel": "velocity (m/s)", "rot": "attitude (rad)", "omega": "rates (rad/s)"}
 _COLUMNS = 4
@@ -32,24 +32,27 @@ def save_errors(errors: dict[str, np.ndarray], path: Path) -> None:
         style.save(figure, path)
 
 
-def save_paths(results: Sequence[ClosedLoopResult], path: Path) -> None:
+def save_paths(simulated: Mapping[str, Sequence[ClosedLoopResult]], path: Path) -> None:
     """Draw the recorded and simulated horizontal paths of flights and their set-points.
 
     Args:
-        results: closed-loop simulations of the flights.
+        simulated: closed-loop simulations of the same flights by each vehicle.
         path: path of the picture.
     """
-    columns = min(len(results), _COLUMNS)
-    rows = -(-len(results) // columns)
-    with style.figure(5 * columns, 5 * rows + 0.5) as figure:
+    flights = list(zip(*simulated.values(), strict=True))
+    columns = min(len(flights), _COLUMNS)
+    rows = -(-len(flights) // columns)
+    recorded, *tints = colors(1 + len(simulated))
+    widths = style.widths(len(simulated))
+    with style.figure(max(5 * columns, 9), 5 * rows + 0.5) as figure:
         axes = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axis, result in zip(axes, results, strict=False):
-            axis.plot(*result.ref_pos[:, :2].T, color="#b4bac1", label="set-points")
-            axis.plot(*result.pos[:, :2].T, color=COLORS[0], label="recorded")
-            axis.plot(*result.sim_pos[:, :2].T, color=COLORS[1], label="simulated")
-            axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=result.flight.removesuffix(".npz"))
-        for axis in axes[len(results) :]:
+        for axis, results in zip(axes, flights, strict=False):
+            axis.plot(*results[0].ref_pos[:, :2].T, color="#b4bac1", linewidth=4, label="set-points")
+            axis.plot(*results[0].pos[:, :2].T, color=recorded, label="recorded")
+            for name, result, tint, width in zip(simulated, results, tints, widths, strict=True):
+                axis.plot(*result.sim_pos[:, :2].T, color=tint, linewidth=width, label=f"{name}, simulated")
+            axis.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=results[0].flight.removesuffix(".npz"))
+        for axis in axes[len(flights) :]:
             axis.set_axis_off()
-        entries_in_a_row = 1 if columns == 1 else 3  # all three are wider than one panel
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=entries_in_a_row)
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
         style.save(figure, path)

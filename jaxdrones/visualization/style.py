@@ -14,6 +14,7 @@ from jaxdrones.writing import replaced
 DPI = 110
 TARGET: dict[str, Any] = {"linestyle": (0, (4, 2)), "linewidth": 1.3, "alpha": 0.75}
 """Style of a target, in the color of its drone."""
+_WIDEST, _NARROWEST = 3.6, 1.4  # points
 _KEPT = 0.95  # fraction of the samples of each line in view
 _FLATTENED = 3.0  # largest ratio of the whole range to that of these samples
 _LOOK: dict[str, Any] = {
@@ -44,6 +45,11 @@ def figure(width: float, height: float) -> Iterator[Any]:
     look: Any = _LOOK | {"axes.prop_cycle": cycler(color=COLORS)}
     with matplotlib.rc_context(look):
         yield Figure(figsize=(width, height), layout="constrained")
+
+
+def widths(count: int) -> np.ndarray:
+    """(count,) widths of lines, points: earlier ones are wider, to be visible below later ones."""
+    return np.linspace(_WIDEST, _NARROWEST, count) if count > 1 else np.array([_NARROWEST])
 
 
 def save(figure: Any, path: str | os.PathLike) -> None:

@@ -219,6 +219,9 @@ def test_a_recorded_flight_is_simulated_in_closed_loop(capsys, tmp_path):
     assert flight["pwm_sim"] < 0.9 * flight["pwm_real"]
     assert abs(flight["tracking_sim_m"] / flight["tracking_real_m"] - 1) < 0.12
     assert figure.stat().st_size > 1e4
+    assert main(["score", NANOBENCH, "--vehicle", "cf2x", "--nominal", "hb"]) == 0
+    named = {line.split("  ")[0] for line in capsys.readouterr().out.splitlines()}
+    assert named == {"vehicle", "hold", "hb (nominal)", "cf2x"}
 
 
 @pytest.mark.slow

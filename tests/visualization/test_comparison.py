@@ -65,6 +65,21 @@ def test_a_spike_of_one_flight_does_not_flatten_the_errors(record, tmp_path, fig
     assert figures[0].axes[1].get_ylim()[1] < 1.0
 
 
+def test_the_panels_over_time_leave_out_the_transient_and_rounding(record, tmp_path, figures):
+    pos = record.pos.copy()
+    pos[:10] += 0.5  # a transient
+    pos[10:] += np.float32(1e-3)
+    pos[40] = record.pos[40] + np.float32(1e-20)
+    other = dataclasses.replace(record, pos=pos)
+    start = float(record.t[10])
+    comparison.save_comparison({"one": record, "other": other}, tmp_path / "compare.png", "a title", after=start)
+    _, error, apart = figures[0].axes
+    for axis in (error, apart):
+        assert axis.lines[0].get_xdata()[0] == pytest.approx(start)
+    assert error.get_ylim()[1] < 0.5 and apart.get_ylim()[0] >= 1e-4
+    assert apart.get_xlabel() == f"t (s), from {start:g} s on"
+
+
 def test_what_is_commanded_to_many_drones_on_one_path_is_drawn_once():
     t = np.linspace(0, 2 * np.pi, 400)
     circles = np.stack([np.stack([np.cos(t + k), np.sin(t + k)], axis=-1) for k in range(4)], axis=1)

@@ -72,12 +72,14 @@ def test_a_team_of_many_drones_is_a_median_with_bands(record, tmp_path, figures)
     crowd = dataclasses.replace(record, **many, labels=tuple(f"drone {i}" for i in range(30)))
     plots.save_flight(crowd, tmp_path / "flight.png", "a title", ("z",))
     named = [text.get_text() for text in figures[0].legends[0].get_texts()]
-    assert named[:3] == ["median of 30 drones", "90 % of them", "100 % of them"]
+    assert named[:3] == ["median of 30 drones", "90 % of the drones", "100 % of the drones"]
     axis, height = figures[0].axes[-1], crowd.pos[..., 2]
     np.testing.assert_allclose(axis.lines[0].get_ydata(), np.median(height, axis=1), rtol=1e-6)
     edges = [band.get_paths()[0].vertices[:, 1] for band in axis.collections]
     assert edges[0].max() == pytest.approx(height.max()) and edges[0].min() == pytest.approx(height.min())
     assert height.min() < edges[1].min() < edges[1].max() < height.max()
+    path = figures[0].axes[1]
+    assert len([line for line in path.lines if len(line.get_xdata()) > 2]) == 30 and "commanded" not in named
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """The pages name what there is, and what is written on them runs."""
 
 import ast
+import importlib
+import json
 import re
 
 import pytest
@@ -53,3 +55,20 @@ def test_every_result_of_a_training_is_on_the_page_of_a_task():
     named = [re.match(r"\| `([\w-]+)`[ ,]", row) for row in table.splitlines()[2:]]
     assert len(named) > 10
     assert {match and match[1] for match in named} <= TASKS.keys()
+
+
+def test_the_page_of_a_task_names_the_best_pilots_of_the_leaderboard(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "website")
+    records = importlib.import_module("records")
+
+    def row(pilot, low, seconds):
+        return {"pilot": pilot, "success": low, "interval": (low, 1.0), "seconds to obtain": seconds}
+
+    rows = [row("slow", 0.9, 9.0), row("elsewhere", 0.9, 0.0), row("fast", 0.9, 1.0), row("worse", 0.8, 0.5)]
+    assert [found["pilot"] for found in records.best(rows)] == ["fast", "slow", "elsewhere"]
+    assert records.best([row("never", 0.0, 1.0)]) == []
+    rows = json.loads((ROOT / "benchmarks" / "results" / "leaderboard.json").read_text())["rows"]
+    highest = max(row["success"] for row in rows if row["scenario"] == "eight-3")
+    (shown,) = [line for line in records.section(ROOT, "tracking").splitlines() if line.startswith("| `eight-3`")]
+    assert f"| {100 * highest:.1f} % of " in shown
+    assert records.section(ROOT, "forest") == ""

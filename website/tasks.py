@@ -1,8 +1,10 @@
-"""Task pages, from `jd.explain` and the table of results in docs/training.md."""
+"""Task pages, from `jd.explain`, the table of results in docs/training.md, and the results of the leaderboard."""
 
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+import records
 
 import jaxdrones as jd
 from jaxdrones import assets
@@ -19,10 +21,13 @@ def pages(root: Path) -> dict[str, str]:
     """Path -> Markdown."""
     results = (root / "docs" / "training.md").read_text()
     pictures = {path.stem: path.name for path in (root / "docs" / "images" / "tasks").iterdir()}
-    return {f"tasks/{name}.md": _page(name, pictures.get(name), results) for name in TASKS}
+    return {
+        f"tasks/{name}.md": _page(name, pictures.get(name), _measured(name, results), records.section(root, name))
+        for name in TASKS
+    }
 
 
-def _page(name: str, picture: str | None, results: str) -> str:
+def _page(name: str, picture: str | None, measured: str, record: str) -> str:
     with jd.make(name) as env:
         table = jd.explain(env)
     team = [(key, text) for key, text in table.task.items() if key not in ("name", "summary") and text]
@@ -33,7 +38,8 @@ def _page(name: str, picture: str | None, results: str) -> str:
         *([f"![{_shown(picture)}](../images/tasks/{picture})"] if picture else []),
         _table(["", ""], team),
         f"```sh\njaxdrones explain {name}\n{_training(name)}\n{_flight(name)}```",
-        f"## What was measured\n\n{_bundled(name)}{_measured(name, results)}",
+        f"## What was measured\n\n{_bundled(name)}{measured}",
+        *([f"## Records\n\n{record}"] if record else []),
         f"## Observation: {observation}\n\n{_ONE_DRONE} {_NUMBERS}\n\n{_entries(table.observation)}",
         *([f"## Images\n\n{_table(['image', ''], table.images.items())}"] if table.images else []),
         f"## Action: {action}\n\n{_ONE_DRONE}\n\n{_entries(table.action)}",

@@ -1,10 +1,11 @@
 """How many frames per second does the viewer's page draw without a graphics processor?
 
 Crazyflies on circles, 1,000 rows at 100 Hz, played at normal speed in a headless Chromium that draws in software, in a
-window of 1,100 x 720 pixels. The page lowers the resolution of the view while frames take longer than 1/32 s; `share`
-is what is left of it along each side. `CPU ms` is the processor time of all processes of the browser for a frame at
-half of the resolution along each side; other programs on the cores hardly change it. Beside it the size of the page and
-the seconds to make and to load it.
+window of 1,100 x 720 pixels. `simulated` ones are not recorded: the page computes their physics at 500 Hz and the
+policy of hover at 100 Hz. The page lowers the resolution of the view while frames take longer than 1/32 s; `share` is
+what is left of it along each side. `CPU ms` is the processor time of all processes of the browser for a frame at half
+of the resolution along each side; other programs on the cores hardly change it. Beside it the size of the page and the
+seconds to make and to load it.
 """
 
 import argparse
@@ -35,7 +36,7 @@ DRAW = """(() => {
 })()"""
 
 
-def page_of(drones: int, rows: int) -> tuple[Page, float]:
+def recorded_page(drones: int, rows: int) -> tuple[Page, float]:
     """A page of so many drones on circles around places of a grid, and the seconds that it takes to make it."""
     side = int(np.ceil(np.sqrt(drones)))
     places = 0.5 * np.stack([np.arange(drones) % side, np.arange(drones) // side, np.zeros(drones)], axis=-1)
@@ -49,6 +50,16 @@ def page_of(drones: int, rows: int) -> tuple[Page, float]:
     flight = jd.State(pos, quat, vel, np.zeros_like(vel), rpm)
     start = time.perf_counter()
     page = jd.show(flight, params, dt=DT)
+    return page, time.perf_counter() - start
+
+
+def simulated_page(drones: int) -> tuple[Page, float]:
+    """A page that simulates so many drones, and the seconds that it takes to make it."""
+    from jaxdrones.export import simulation  # which needs casadi
+
+    start = time.perf_counter()
+    with jd.make("hover") as env:
+        page = simulation.page(jd.make_policy("hover", env), env, "simulated", drones)
     return page, time.perf_counter() - start
 
 
@@ -68,18 +79,17 @@ def processor_seconds() -> float:
     return sum(seconds[process] for process in seconds if is_ours(process)) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(drones: int, rows: int) -> dict:
-    """Frames per second, and what belongs to them: half of the flight lets the page settle, a third is counted."""
-    page, made = page_of(drones, rows)
+def measure(page: Page, seconds: float) -> dict:
+    """Frames per second, and what belongs to them: half of the time lets the page settle, a third is counted."""
     with tempfile.TemporaryDirectory() as folder, open_tab() as tab:
         file = page.save(Path(folder) / "page.html")
         start = time.perf_counter()
         tab.open(file, 1100, 720)
         loaded = time.perf_counter() - start
-        tab.run("jaxdrones.player.toggle()")
-        time.sleep(rows * DT / 2)
+        tab.run("jaxdrones.player.playing || jaxdrones.player.toggle()")
+        time.sleep(seconds / 2)
         begun, first = time.perf_counter(), tab.run("jaxdrones.player.frames")
-        time.sleep(rows * DT / 3)
+        time.sleep(seconds / 3)
         last, ended = tab.run("jaxdrones.player.frames"), time.perf_counter()
         share = tab.run("jaxdrones.player.stage.share")
         tab.run(DRAW.replace("COUNT", "5"))
@@ -87,27 +97,42 @@ def measure(drones: int, rows: int) -> dict:
         tab.run(DRAW.replace("COUNT", str(FRAMES)))
         spent = processor_seconds() - before
         return {
-            "drones": drones,
-            "rows": rows,
             "frames/s": (last - first) / (ended - begun),
             "share": share,
             "CPU ms": 1000 * spent / FRAMES,
             "MB": file.stat().st_size / 1e6,
-            "made (s)": made,
             "loaded (s)": loaded,
         }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--drones", type=int, nargs="+", default=[4, 100, 1000])
+    parser.add_argument("--drones", type=int, nargs="+", default=[1, 20, 100, 1000])
+    parser.add_argument(
+        "--simulated", type=int, nargs="*", default=[1, 20], metavar="DRONES", help="of pages that simulate"
+    )
     parser.add_argument("--rows", type=int, default=1000)
+
+
+def line(row: dict) -> str:
+    """One row of the table."""
+    drawn = f"{row['frames/s']:8.1f}  {100 * row['share']:8.0f} %  {row['CPU ms']:7.1f}"
+    cost = f"{row['MB']:7.2f}  {row['made (s)']:6.2g}  {row['loaded (s)']:8.2g}"
+    return f"{row['flight']:9}  {row['drones']:6,}  {drawn}  {cost}"
 
 
 def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if find_browser() is None:
         raise SystemExit("there is no Chromium")
-    drones, rows = ([4], 200) if options.quick else (options.drones, options.rows)
-    measured = [measure(count, rows) for count in drones]
-    lines = []
-    lines += ["  ".join(f"{name} {value:.4g}" for name, value in row.items()) for row in measured]
-    return {"rows": measured}, lines
+    if options.quick:
+        options.drones, options.simulated, options.rows = [4], [], 200
+    cases = [("recorded", count, lambda n=count: recorded_page(n, options.rows)) for count in options.drones]
+    cases += [("simulated", count, lambda n=count: simulated_page(n)) for count in options.simulated]
+    rows = []
+    for kind, count, make in cases:
+        page, made = make()
+        rows.append({"flight": kind, "drones": count} | measure(page, options.rows * DT) | {"made (s)": made})
+    lines = ["flight     drones  frames/s  resolution   CPU ms  page MB  made s  loaded s"]
+    lines += [line(row) for row in rows]
+    facts = {"cores": len(os.sched_getaffinity(0)), "load": os.getloadavg()[0]}
+    lines.append(f"load {facts['load']:.1f}")
+    return {"about": facts, "rows": rows}, lines

@@ -2,8 +2,8 @@
 
     python website/demo.py [NAME ...]
 
-They are an episode of every bundled policy, a thousand drones, a recorded flight beside its simulation, and a drone
-that is simulated in the page. It needs the extra casadi.
+They are an episode of every bundled policy, a thousand drones, a recorded flight beside its simulation, and drones
+that are simulated in the page. It needs the extra casadi.
 """
 
 import dataclasses
@@ -49,7 +49,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
     "hover": {},
 }
 """Task -> options."""
-_OWN, _REAL, _WORD = "fly it yourself", "real flight", "thousand drones"
+_OWN, _TWENTY, _REAL, _WORD = "fly it yourself", "fly twenty", "real flight", "thousand drones"
 _RECORDED = "B10_lissajous_slow_rep1"
 _WORD_RATE = 1.5  # rows per second
 
@@ -57,7 +57,7 @@ _WORD_RATE = 1.5  # rows per second
 def main() -> None:
     """Make the named flights, by default all."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    made = {_OWN: _simulation, _REAL: _reality, _WORD: _word}
+    made = {_OWN: _simulation, _TWENTY: _twenty, _REAL: _reality, _WORD: _word}
     for name in sys.argv[1:] or (*made, *FLIGHTS):
         _write(made[name]() if name in made else _exhibit(name, FLIGHTS[name]))
 
@@ -70,13 +70,27 @@ def _write(exhibit: Exhibit) -> None:
 
 def _simulation() -> Exhibit:
     """The policy of hover, simulated in the page."""
-    with jd.make("hover") as env:
-        page = simulation.page(jd.make_policy("hover", env), env, _OWN)
     about = (
         "A drone that is simulated in this page. Push it, make it heavier, weaken a rotor, delay its commands, and "
         "compare the policy with three controllers."
     )
-    return Exhibit(_OWN, about, "jaxdrones demo --policy runs/hover", page.payload)
+    return _simulated(_OWN, about, 1)
+
+
+def _twenty() -> Exhibit:
+    """The same for twenty drones."""
+    about = (
+        "Twenty drones that are simulated in this page, without influence on each other. Drag one of them; the kick, "
+        "the arrow keys and the conditions are for all."
+    )
+    return _simulated(_TWENTY, about, 20)
+
+
+def _simulated(name: str, about: str, drones: int) -> Exhibit:
+    with jd.make("hover") as env:
+        page = simulation.page(jd.make_policy("hover", env), env, name, drones)
+    team = f" --drones {drones}" if drones > 1 else ""
+    return Exhibit(name, about, f"jaxdrones demo --policy runs/hover{team}", page.payload)
 
 
 def _reality() -> Exhibit:

@@ -7,9 +7,10 @@ from pathlib import Path
 from jaxdrones import assets
 from jaxdrones.checks import check_choice
 from jaxdrones.cli.common import check_writable, folder
-from jaxdrones.cli.options import add_output
+from jaxdrones.cli.options import add_drones, add_output
 from jaxdrones.cli.policies import open_policy
 from jaxdrones.cli.report import as_json
+from jaxdrones.errors import UserError
 from jaxdrones.visualization.viewer.gallery import Exhibit, gallery, read_exhibits
 from jaxdrones.writing import write
 
@@ -22,7 +23,8 @@ def add(commands) -> None:
         "demo",
         help="open a page of flights by bundled policies",
         description="Open a page in the browser that plays recorded flights of the bundled policies: through a forest, "
-        "through gates, in a crowd, and others. One drone is simulated in the page; push it. It needs no network.",
+        "through gates, in a crowd, and others. One drone is simulated in the page, in another flight twenty; push "
+        "them. It needs no network.",
         epilog="`jaxdrones fly --policy forest --live` flies one of them now, `jaxdrones eval forest` evaluates it.",
     )
     parser.add_argument("flight", nargs="?", default=_FIRST, metavar="FLIGHT", help=f"flight to show first ({_FIRST})")
@@ -30,8 +32,9 @@ def add(commands) -> None:
         "--policy",
         type=folder,
         metavar="RUN",
-        help="simulate the drone with this policy instead: a run of hover for one drone; needs casadi",
+        help="simulate --drones drones with this policy first: a run of hover for one drone; needs casadi",
     )
+    add_drones(parser, 1)
     add_output(parser, "path of the page (runs/demo.html)", metavar="FILE")
     parser.add_argument("--no-open", action="store_true", help="write the page and do not open it")
     parser.set_defaults(run=_demo)
@@ -40,8 +43,10 @@ def add(commands) -> None:
 def _demo(options: argparse.Namespace) -> int:
     exhibits = {exhibit.name: exhibit for exhibit in read_exhibits(assets.folder() / "demo")}
     check_choice("flight", options.flight, exhibits)
+    if options.drones != 1 and options.policy is None:
+        raise UserError(f"--drones {options.drones} is given without --policy; 'fly twenty' simulates twenty drones")
     if options.policy is not None:
-        own = _own(options.policy)
+        own = _own(options.policy, options.drones)
         exhibits = {own.name: own} | exhibits
         options.flight = own.name
     output = options.output or Path("runs") / "demo.html"
@@ -57,11 +62,11 @@ def _demo(options: argparse.Namespace) -> int:
     return 0
 
 
-def _own(policy: Path) -> Exhibit:
+def _own(policy: Path, drones: int) -> Exhibit:
     from jaxdrones.export import simulation
 
     run = open_policy(policy, None, False, {})
     with run.recipe().env() as env:
-        page = simulation.page(run.policy(env=env), env, str(policy))
-    about = f"A drone that is simulated in this page, and flown by the policy of {policy}. Push it."
+        page = simulation.page(run.policy(env=env), env, str(policy), drones)
+    about = f"Simulated in this page, and flown by the policy of {policy}. Push it."
     return Exhibit(str(policy), about, f"jaxdrones fly --policy {policy} --live", page.payload)

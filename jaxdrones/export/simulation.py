@@ -1,8 +1,9 @@
-"""Simulation of one drone in a web page: physics, controllers and a policy as JavaScript, without a server."""
+"""Simulation of drones in a web page: physics, controllers and a policy as JavaScript, without a server."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones.checks import check_whole
 from jaxdrones.control import CONTROLLERS, Setpoint
 from jaxdrones.dynamics import drag, ground_contact
 from jaxdrones.dynamics.rotors import instant_rotors
@@ -22,7 +24,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.export.equations import javascript
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.learning.networks import Policy, initial_hidden_state
-from jaxdrones.params import Params
+from jaxdrones.params import Params, repeat
 from jaxdrones.rotation import rotate_inverse
 from jaxdrones.state import State
 from jaxdrones.visualization.viewer.page import Page
@@ -34,6 +36,7 @@ _CONTROLLERS = {"cf2": ("pid", "geometric", "mellinger"), "": ("geometric",)}
 """Beginning of a vehicle's name -> controllers whose gains fit."""
 _HZ = 240  # rate of the controllers
 _START = 1.0  # m, height
+_SPACING = 0.6  # m, between goals
 _SPAN = 20.0  # s of flight until the plots start anew
 
 
@@ -63,16 +66,16 @@ class Simulation:
     pilots: tuple[Pilot, ...]
     """The policy first."""
     state: list[float]
-    """First state."""
-    goal: list[float]
-    """Place to hover at, m, world."""
+    """First state of a drone whose goal is the first."""
+    goals: list[list[float]]
+    """Places to hover at, a drone each, m, world."""
     mass: float
     """kg"""
     dt: float
     """Physics step, s."""
 
 
-def simulation(policy: Policy, env: Env) -> Simulation:
+def simulation(policy: Policy, env: Env, drones: int = 1) -> Simulation:
     """Simulation of the nominal vehicle of an environment, flown by a policy or by controllers.
 
     The physics are a rigid body with instant rotors, drag and the ground, in a wind (m/s), with any mass (kg), and an
@@ -81,15 +84,18 @@ def simulation(policy: Policy, env: Env) -> Simulation:
     Args:
         policy: policy that flies one drone to a target and stays.
         env: its environment.
+        drones: number of drones, which fly without influence on each other, each at its own goal.
 
     Raises:
         ValueError: a team, images, sensors, a delay, other rotors, or a policy with memory.
         ImportError: without casadi (extra `casadi`).
     """
+    check_whole("number of drones", drones)
     _check(policy, env)
     params = jax.tree.map(lambda x: x[0], env.params)
     dt, zero = env.physics.dt, jnp.zeros(3)
-    start = State.at_rest(jnp.array([[0.0, 0.0, _START]]))
+    goals = _grid(drones)
+    start = State.at_rest(jnp.asarray(goals[:1]))
     state = jax.tree.map(lambda x: x[0], start).replace(rpm=jnp.full(4, params.hover_rpm))
     inputs: dict[str, Any] = {"state": state, "rpm": state.rpm, "wind": zero, "mass": params.mass, "push": zero}
     parts, pilots = [javascript("physics", _physics(params, dt), **inputs)], []
@@ -103,21 +109,30 @@ def simulation(policy: Policy, env: Env) -> Simulation:
     for name in next(names for beginning, names in _CONTROLLERS.items() if env.vehicle.startswith(beginning)):
         controller = CONTROLLERS[name]
         add(name, _controller(name, params, period * dt), period, controller.gains(), controller.init())
-    return Simulation(
-        "\n\n".join(parts), tuple(pilots), _numbers(state), _numbers(state.pos), float(params.mass), float(dt)
-    )
+    return Simulation("\n\n".join(parts), tuple(pilots), _numbers(state), goals.tolist(), float(params.mass), float(dt))
 
 
-def page(policy: Policy, env: Env, title: str) -> Page:
-    """Page in which anyone can push a drone that a policy flies; arguments and errors as for `simulation`."""
-    made = simulation(policy, env)
-    params = jax.tree.map(np.asarray, jax.device_get(env.params))
-    pos, quat, vel, omega, rpm = np.split(np.array([[made.state]]), (3, 7, 10, 13), axis=2)
-    goal, labels = np.array([[made.goal]]), (env.vehicle,)
-    record = FlightLog(np.zeros(1), pos, quat, vel, omega, rpm, target_pos=goal, params=params, labels=labels)
+def page(policy: Policy, env: Env, title: str, drones: int = 1) -> Page:
+    """Page in which anyone can push drones that a policy flies; arguments and errors as for `simulation`."""
+    made = simulation(policy, env, drones)
+    one = jax.tree.map(lambda x: x[0], env.params)
+    params = jax.tree.map(np.asarray, jax.device_get(repeat(one, drones)))
+    state = np.tile(made.state, (1, drones, 1))
+    goals = np.array([made.goals])
+    _, quat, vel, omega, rpm = np.split(state, (3, 7, 10, 13), axis=2)
+    labels = (env.vehicle,) if drones == 1 else tuple(f"drone {i}" for i in range(drones))
+    record = FlightLog(np.zeros(1), goals, quat, vel, omega, rpm, target_pos=goals, params=params, labels=labels)
     live = {"running": True, "rows": 1, "end": _SPAN}
     about = dataclasses.asdict(made) | {"span": _SPAN}
     return Page(title, encode([record], [title], title, layout="alone", live=live, simulation=about, **looks([record])))
+
+
+def _grid(drones: int) -> np.ndarray:
+    """(drones, 3) places of a square grid about the origin, m, world."""
+    side = math.ceil(math.sqrt(drones))
+    x, y = np.divmod(np.arange(drones), side)
+    places = np.stack([_SPACING * x, _SPACING * y, np.full(drones, _START)], axis=-1)
+    return places - [places[:, 0].mean(), places[:, 1].mean(), 0.0]
 
 
 def _check(policy: Policy, env: Env) -> None:

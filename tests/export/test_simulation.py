@@ -185,14 +185,43 @@ def test_a_drone_in_the_page_is_pushed_and_recovers(env, made, tmp_path):
         expected = flown_by_the_environment(env, start_of(made), len(found))
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
         tab.run("jaxdrones.simulation.kick()")
-        plant = "jaxdrones.simulation.plant"
+        plant = "jaxdrones.simulation.plants[0]"
         away = f"Math.hypot(...{plant}.goal.map((x, i) => x - {plant}.state[i]))"
         tab.wait(f"{away} > 0.2")
         tab.wait(f"{away} < 0.05")
-        x, y = tab.run("jaxdrones.player.stage.project(jaxdrones.simulation.place())")
+        x, y = tab.run("jaxdrones.player.stage.project(jaxdrones.simulation.place(jaxdrones.simulation.plants[0]))")
         for event, dx in (("mousePressed", 0), ("mouseMoved", 150)):
             tab.call("Input.dispatchMouseEvent", type=event, x=x + dx, y=y, button="left", clickCount=1)
         tab.wait(f"{away} > 0.1")
         tab.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 150, y=y, button="left", clickCount=1)
         tab.wait(f"{away} < 0.05")
+        assert tab.problems == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")
+def test_one_of_several_drones_is_pulled_and_all_are_kicked(env, tmp_path):
+    from jaxdrones.export.simulation import page
+
+    file = page(jd.make_policy("hover"), env, "push us", drones=3).save(tmp_path / "page.html")
+    with browser.open_tab() as tab:
+        tab.open(file)
+        plants = "jaxdrones.simulation.plants"
+        away = f"{plants}.map(({{ goal, state }}) => Math.hypot(...goal.map((x, i) => x - state[i])))"
+        goals = np.array(tab.run(f"{plants}.map(({{ goal }}) => goal)"))
+        apart = np.linalg.norm(goals[:, None] - goals, axis=-1)
+        assert apart[~np.eye(3, dtype=bool)].min() > 0.5
+        tab.wait(f"{plants}[0].steps > 500")
+        shown = np.array(tab.run("jaxdrones.player.fleet.positions(0)"))
+        np.testing.assert_allclose(shown, goals, atol=0.03)
+        x, y = tab.run(f"jaxdrones.player.stage.project(jaxdrones.simulation.place({plants}[1]))")
+        for event, dx in (("mousePressed", 0), ("mouseMoved", 150)):
+            tab.call("Input.dispatchMouseEvent", type=event, x=x + dx, y=y, button="left", clickCount=1)
+        tab.wait(f"{away}[1] > 0.1")
+        others = tab.run(away)
+        assert max(others[0], others[2]) < 0.03
+        tab.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 150, y=y, button="left", clickCount=1)
+        tab.run("jaxdrones.simulation.kick()")
+        tab.wait(f"Math.min(...{away}) > 0.2")
+        tab.wait(f"Math.max(...{away}) < 0.05")
         assert tab.problems == []

@@ -149,7 +149,8 @@ def test_names_find_places_wherever_their_drones_are(view):
     tab = view(page_of(np.stack([np.arange(12.0), np.zeros(12), np.ones(12)], axis=-1)))
     boxes = """(() => {
         const { names } = jaxdrones.player, random = (k) => Math.sin(k * k), found = [];
-        const place = ({ element: { style }, width }) => [parseFloat(style.left), parseFloat(style.top), width];
+        const pixels = ({ style }) => style.transform.match(/-?[\\d.]+/g).slice(0, 2).map(Number);
+        const place = ({ element, width }) => [...pixels(element), width];
         for (let seed = 0; seed < 1000; seed++) {
             names.place(({ drone }) => [300 + 90 * random(seed + drone), 70 * random(seed + drone + 100)]);
             found.push(names.labels.map(place));

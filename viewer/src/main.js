@@ -22,7 +22,7 @@ import { Trail } from "./trails.js";
 const STILL = 200; // ms without a change after which the picture is drawn in full resolution
 const BEHIND = 0.4; // s, how far a flight that is running may be ahead of what is shown
 const ROOM = 0.2; // share of its extent that a flight that is running may grow to every side before the camera moves
-const REPAINT = 200; // ms between two paintings of the plots of a flight that is running
+const REPAINT = 200, SELDOM = 600; // ms between two paintings of the plots of a flight that is running, the latter without a graphics processor
 const find = (id) => document.getElementById(id);
 
 class Player {
@@ -104,7 +104,7 @@ class Player {
     this.span = Math.max(this.span, this.end);
     for (const trail of this.trails) trail.extend();
     if (!this.within(rows.pos)) this.arranged = null; // the camera has to see more
-    if (this.arranged === null || performance.now() > (this.painted ?? 0) + REPAINT) {
+    if (this.arranged === null || performance.now() > (this.painted ?? 0) + (this.stage.hurried ? SELDOM : REPAINT)) {
       this.painted = performance.now();
       this.changed();
     }

@@ -28,7 +28,8 @@ export class Names {
       const covers = (other) => Math.abs(x - other.x) < (width + other.width) / 2 + 2 && Math.abs(y - other.y) < HEIGHT - 0.5; // pixels, beyond rounding
       for (let other; (other = taken.find(covers)); ) y = other.y - HEIGHT;
       taken.push({ x, y, width });
-      [element.style.left, element.style.top] = [`${x}px`, `${y - 4}px`];
+      const transform = `translate(${Math.round(x)}px, ${Math.round(y - 4)}px) translate(-50%, -100%)`;
+      if (element.style.transform !== transform) element.style.transform = transform;
     }
   }
 }

@@ -41,6 +41,8 @@ export const SIGNALS = [
 export class Plot {
   constructor(box, signal, onSeek) {
     this.canvas = box.querySelector("canvas");
+    this.context = this.canvas.getContext("2d", { willReadFrequently: true }); // drawn by the processor, which is faster without a graphics processor
+    this.cursor = box.querySelector("i");
     this.select = box.querySelector("select");
     this.readout = box.querySelector("output");
     SIGNALS.forEach(({ name, unit }, k) => this.select.add(new Option(unit ? `${name} (${unit})` : name, k)));
@@ -49,7 +51,6 @@ export class Plot {
     const seek = (event) => event.buttons & 1 && onSeek(this.timeAt(event.offsetX));
     this.canvas.addEventListener("pointerdown", (event) => { this.canvas.setPointerCapture(event.pointerId); seek(event); });
     this.canvas.addEventListener("pointermove", seek);
-    this.image = document.createElement("canvas");
     this.stale = true;
   }
 
@@ -67,19 +68,13 @@ export class Plot {
     const { clientWidth: width, clientHeight: height } = this.canvas, ratio = window.devicePixelRatio;
     if (!width || !height) return;
     const pixels = [Math.round(width * ratio), Math.round(height * ratio)];
-    if (this.stale || this.image.width !== pixels[0] || this.image.height !== pixels[1]) {
-      [this.image.width, this.image.height] = [this.canvas.width, this.canvas.height] = pixels;
+    if (this.stale || this.canvas.width !== pixels[0] || this.canvas.height !== pixels[1]) {
+      [this.canvas.width, this.canvas.height] = pixels;
       this.paint(width, height, ratio);
       this.stale = false;
     }
-    const context = this.canvas.getContext("2d");
-    context.setTransform(1, 0, 0, 1, 0, 0);
-    context.clearRect(0, 0, ...pixels);
-    context.drawImage(this.image, 0, 0);
-    context.scale(ratio, ratio);
     const x = MARGIN.left + ((width - MARGIN.left - MARGIN.right) * Math.min(time, this.end)) / this.end;
-    context.fillStyle = theme.ink;
-    context.fillRect(x - 0.75, MARGIN.top, 1.5, height - MARGIN.top - MARGIN.bottom);
+    this.cursor.style.transform = `translateX(${x - 0.75}px)`;
     this.read(time);
   }
 
@@ -92,7 +87,7 @@ export class Plot {
   }
 
   paint(width, height, ratio) {
-    const context = this.image.getContext("2d");
+    const { context } = this;
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
     const curves = this.curves(width);

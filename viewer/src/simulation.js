@@ -1,5 +1,5 @@
-// A drone that is simulated in the page: its physics, controllers and policy are functions made from the JAX program
-// (see export/simulation.py). The user pushes it, and changes wind, mass, a rotor and the delay.
+// Drones that are simulated in the page: their physics, controllers and policy are functions made from the JAX program
+// (see export/simulation.py). The user pushes them, and changes wind, mass, a rotor and the delay.
 
 import { Vector3 } from "three";
 
@@ -11,12 +11,17 @@ const LARGEST = 12; // N/kg
 const NEAR = 60; // pixels from the drone within which a pointer takes hold of it
 const find = (id) => document.getElementById(id);
 
-/** Physics and pilots without a page: what is tested against JAX. */
+/** The functions that were made from the JAX program, by name. */
+function compiled({ script, pilots }) {
+  const names = ["physics", ...pilots.map(({ name }) => name)];
+  return new Function(`${script}\nreturn { ${names} };`)();
+}
+
+/** Physics and pilots of one drone without a page: what is tested against JAX. */
 export class Plant {
-  constructor({ script, pilots, state, goal, mass, dt }) {
-    const names = ["physics", ...pilots.map(({ name }) => name)];
-    this.functions = new Function(`${script}\nreturn { ${names} };`)();
-    Object.assign(this, { pilots, goal: [...goal], dt, first: state, nominal: mass });
+  constructor(simulation, goal = simulation.goals[0], functions = compiled(simulation)) {
+    const { pilots, state, mass, dt } = simulation;
+    Object.assign(this, { functions, pilots, goal: [...goal], dt, first: [...goal, ...state.slice(3)], nominal: mass });
     this.conditions = { wind: [0, 0, 0], mass: [mass], push: [0, 0, 0], rotor: 1, delay: 0, gain: 1 };
     this.reset();
     this.choose(pilots[0].name);
@@ -53,14 +58,15 @@ export class Plant {
   }
 }
 
-/** Flies a plant in real time, shows it, and lets the user disturb it. */
+/** Flies plants in real time, shows them, and lets the user disturb them. */
 export class Simulation {
   constructor(player, header) {
     this.player = player;
     this.header = header;
-    this.plant = new Plant(header.simulation);
+    const functions = compiled(header.simulation);
+    this.plants = header.simulation.goals.map((goal) => new Plant(header.simulation, goal, functions));
     this.held = new Set();
-    this.pulled = null;
+    this.pulled = null; // { plant, at }: by a pointer at these pixels
     this.last = performance.now();
     this.owed = 0;
     player.playing = true;
@@ -70,25 +76,28 @@ export class Simulation {
   }
 
   controls() {
-    const { plant } = this, { conditions } = plant;
+    const { plants } = this, [{ pilots, nominal }] = plants;
     find("simulation").hidden = false;
-    for (const { name } of plant.pilots) find("pilot").add(new Option(name, name));
+    for (const { name } of pilots) find("pilot").add(new Option(name, name));
     find("pilot").addEventListener("change", ({ target }) => {
-      plant.choose(target.value);
+      for (const plant of plants) plant.choose(target.value);
       find("gain").disabled = target.value === "policy";
     });
     find("gain").disabled = true;
-    const slider = (id, unit, apply) => {
+    const slider = (id, unit, condition) => {
       const input = find(id), output = input.nextElementSibling;
-      const read = () => (apply(Number(input.value)), (output.value = `${input.value} ${unit}`));
+      const read = () => {
+        for (const { conditions } of plants) conditions[id] = condition(Number(input.value));
+        output.value = `${input.value} ${unit}`;
+      };
       input.addEventListener("input", read);
       read();
     };
-    slider("wind", "m/s", (x) => (conditions.wind = [0, x, 0]));
-    slider("mass", "%", (x) => (conditions.mass = [(plant.nominal * x) / 100]));
-    slider("rotor", "%", (x) => (conditions.rotor = x / 100));
-    slider("delay", "ms", (x) => (conditions.delay = x / 1000));
-    slider("gain", "%", (x) => (conditions.gain = x / 100));
+    slider("wind", "m/s", (x) => [0, x, 0]);
+    slider("mass", "%", (x) => [(nominal * x) / 100]);
+    slider("rotor", "%", (x) => x / 100);
+    slider("delay", "ms", (x) => x / 1000);
+    slider("gain", "%", (x) => x / 100);
     find("again").addEventListener("click", () => this.again());
     find("kick").addEventListener("click", () => this.kick());
     addEventListener("keydown", (event) => {
@@ -101,40 +110,52 @@ export class Simulation {
     addEventListener("blur", () => this.held.clear());
     const canvas = find("view");
     canvas.addEventListener("pointerdown", (event) => {
-      const at = this.player.stage.project(this.place());
-      if (!at || Math.hypot(event.offsetX - at[0], event.offsetY - at[1]) > NEAR) return;
-      this.pulled = [event.offsetX, event.offsetY];
+      const plant = this.nearest(event.offsetX, event.offsetY);
+      if (!plant) return;
+      this.pulled = { plant, at: [event.offsetX, event.offsetY] };
       canvas.setPointerCapture(event.pointerId);
       event.stopImmediatePropagation(); // the camera stays
     }, true);
-    canvas.addEventListener("pointermove", (event) => this.pulled && (this.pulled = [event.offsetX, event.offsetY]), true);
+    canvas.addEventListener("pointermove", (event) => this.pulled && (this.pulled.at = [event.offsetX, event.offsetY]), true);
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => (this.pulled = null), true);
   }
 
-  place() { return new Vector3(...this.plant.state.slice(0, 3)); }
+  place(plant) { return new Vector3(...plant.state.slice(0, 3)); }
+
+  /** The plant nearest to a pixel, if one is near. */
+  nearest(x, y) {
+    let found = null, least = NEAR;
+    for (const plant of this.plants) {
+      const at = this.player.stage.project(this.place(plant)), away = at ? Math.hypot(x - at[0], y - at[1]) : Infinity;
+      if (away <= least) [found, least] = [plant, away];
+    }
+    return found;
+  }
 
   /** A velocity of 3 m/s in a random horizontal direction. */
   kick() {
-    const angle = 2 * Math.PI * Math.random();
-    this.plant.state[7] += 3 * Math.cos(angle);
-    this.plant.state[8] += 3 * Math.sin(angle);
+    for (const { state } of this.plants) {
+      const angle = 2 * Math.PI * Math.random();
+      state[7] += 3 * Math.cos(angle);
+      state[8] += 3 * Math.sin(angle);
+    }
   }
 
   again() {
-    this.plant.reset();
+    for (const plant of this.plants) plant.reset();
     this.restart();
   }
 
-  /** External force, N, world: of the keys and of the pointer. */
-  push() {
-    const { plant, player } = this, [mass] = plant.conditions.mass, force = new Vector3();
+  /** External force on a plant, N, world: of the keys and of the pointer. */
+  push(plant) {
+    const { player, pulled } = this, [mass] = plant.conditions.mass, force = new Vector3();
     for (const key of this.held) force.add(new Vector3(...KEYS[key], 0).multiplyScalar(LARGEST / 2));
-    const at = this.pulled && player.stage.project(this.place());
+    const at = pulled?.plant === plant && player.stage.project(this.place(plant));
     if (at) {
-      const { camera, canvas } = player.stage, away = camera.position.distanceTo(this.place());
+      const { camera, canvas } = player.stage, away = camera.position.distanceTo(this.place(plant));
       const metres = (2 * away * Math.tan((camera.fov * Math.PI) / 360)) / canvas.clientHeight; // of a pixel
       const across = new Vector3().setFromMatrixColumn(camera.matrixWorld, 0), up = new Vector3().setFromMatrixColumn(camera.matrixWorld, 1);
-      force.addScaledVector(across, PULL * metres * (this.pulled[0] - at[0])).addScaledVector(up, -PULL * metres * (this.pulled[1] - at[1]));
+      force.addScaledVector(across, PULL * metres * (pulled.at[0] - at[0])).addScaledVector(up, -PULL * metres * (pulled.at[1] - at[1]));
     }
     return force.clampLength(0, LARGEST).multiplyScalar(mass).toArray();
   }
@@ -145,34 +166,33 @@ export class Simulation {
     this.last = now;
     if (!this.player.playing) return;
     this.owed += passed * this.player.panel.speed;
-    this.plant.conditions.push = this.push();
+    for (const plant of this.plants) plant.conditions.push = this.push(plant);
     this.fly(Math.floor(this.owed * RATE));
     if (this.player.end > this.header.simulation.span) this.restart();
   }
 
   /** Fly some rows further, and show them. */
   fly(count) {
-    const { plant, player } = this, rows = { t: [], pos: [], quat: [], vel: [], omega: [], rpm: [], targets: [] };
+    const { plants, player } = this, rows = this.rows([]);
     for (let k = 1; k <= count; k++) {
-      for (let i = 0; i < Math.round(1 / RATE / plant.dt); i++) plant.step();
-      const { state } = plant;
+      for (const plant of plants) for (let i = 0; i < Math.round(1 / RATE / plant.dt); i++) plant.step();
       rows.t.push(player.end + k / RATE);
-      rows.pos.push(...state.slice(0, 3));
-      rows.quat.push(...state.slice(3, 7));
-      rows.vel.push(...state.slice(7, 10));
-      rows.omega.push(...state.slice(10, 13));
-      rows.rpm.push(...state.slice(13));
-      rows.targets.push(...plant.goal);
+      for (const [name, numbers] of Object.entries(this.rows(plants))) rows[name].push(...numbers);
     }
     this.owed -= count / RATE;
     if (count) player.append(rows);
   }
 
+  /** What the viewer shows of some plants, in one row. */
+  rows(plants) {
+    const of = (from, to) => plants.flatMap(({ state }) => state.slice(from, to));
+    return { t: [], pos: of(0, 3), quat: of(3, 7), vel: of(7, 10), omega: of(10, 13), rpm: of(13, 17), targets: plants.flatMap(({ goal }) => goal) };
+  }
+
   /** Begin the plots and the trail anew. */
   restart() {
-    const { state, goal } = this.plant, [world] = this.header.worlds;
-    const now = { t: [0], pos: state.slice(0, 3), quat: state.slice(3, 7), vel: state.slice(7, 10), omega: state.slice(10, 13), rpm: state.slice(13), targets: goal };
-    for (const [name, numbers] of Object.entries(now)) world[name] = Float32Array.from(numbers);
+    const [world] = this.header.worlds;
+    for (const [name, numbers] of Object.entries({ ...this.rows(this.plants), t: [0] })) world[name] = Float32Array.from(numbers);
     this.player.restart(this.header);
     this.player.playing = true;
   }

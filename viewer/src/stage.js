@@ -33,7 +33,9 @@ export class Stage {
   constructor(canvas) {
     this.canvas = canvas;
     this.software = drawnInSoftware();
-    this.renderer = new WebGLRenderer({ canvas, antialias: !this.software, powerPreference: "high-performance" });
+    const quick = { antialias: !this.software, desynchronized: this.software, powerPreference: "high-performance" };
+    const context = canvas.getContext("webgl2", { alpha: false, stencil: false, ...quick }); // opaque: no need to mix it with the page
+    this.renderer = new WebGLRenderer({ canvas, context });
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(45, 1, 0.01, 1000);
     this.camera.up.set(0, 0, 1);

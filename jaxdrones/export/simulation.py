@@ -38,6 +38,7 @@ _HZ = 240  # rate of the controllers
 _START = 1.0  # m, height
 _SPACING = 0.6  # m, between goals
 _SPAN = 20.0  # s of flight until the plots start anew
+_ROWS = 1100  # somewhat more than the page adds until then
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +123,7 @@ def page(policy: Policy, env: Env, title: str, drones: int = 1) -> Page:
     _, quat, vel, omega, rpm = np.split(state, (3, 7, 10, 13), axis=2)
     labels = (env.vehicle,) if drones == 1 else tuple(f"drone {i}" for i in range(drones))
     record = FlightLog(np.zeros(1), goals, quat, vel, omega, rpm, target_pos=goals, params=params, labels=labels)
-    live = {"running": True, "rows": 1, "end": _SPAN}
+    live = {"running": True, "rows": _ROWS, "end": _SPAN}
     about = dataclasses.asdict(made) | {"span": _SPAN}
     return Page(title, encode([record], [title], title, layout="alone", live=live, simulation=about, **looks([record])))
 

@@ -268,8 +268,8 @@ class Player {
     this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], this.fleet));
     this.jets.show(time, shown.jets, this.layout);
     stage.render();
-    this.placeNames();
     this.explain();
+    if (!stage.hurried || this.frames % 2 === 0) this.placeNames();
     if (!stage.hurried || this.frames % 4 === 0) {
       for (const plot of this.plots) plot.draw(time);
       this.images.show(this.worlds[panel.world], panel.drone, time);

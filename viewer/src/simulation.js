@@ -72,6 +72,7 @@ export class Simulation {
     player.playing = true;
     player.panel.set("trail", "3");
     this.controls();
+    player.changed();
     requestAnimationFrame((now) => this.frame(now));
   }
 
@@ -84,6 +85,7 @@ export class Simulation {
       find("gain").disabled = target.value === "policy";
     });
     find("gain").disabled = true;
+    find("names").checked = plants.length === 1;
     const slider = (id, unit, condition) => {
       const input = find(id), output = input.nextElementSibling;
       const read = () => {

@@ -32,7 +32,8 @@ def table(command: str, result: dict) -> str:
     """The text between the marks of a page."""
     about = result["about"]
     versions = f"commit {about['commit']}, jax {about['jax']}, Python {about['python']}"
-    source = f"`python -m benchmarks {command}` at {versions}, on {about['cores']} cores of {about['cpu']}:"
+    cores = "1 core" if about["cores"] == 1 else f"{about['cores']} cores"
+    source = f"`python -m benchmarks {command}` at {versions}, on {cores} of {about['cpu']}:"
     return "\n".join([source, "", "```text", *result["lines"], "```", ""])
 
 

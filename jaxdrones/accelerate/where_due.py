@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
+
+from jaxdrones.accelerate.where_needed import in_chosen_worlds
 
 Draw = Callable[..., Any]
 
@@ -45,10 +48,11 @@ def where_due(draw: Draw, chunk: int) -> Draw:
 
 def _selected(images: Callable, chunk: int) -> Callable:
     """`(due, real images, other images, real arguments, other arguments) -> real and other images`, lists each."""
+    of_due = functools.partial(in_chosen_worlds, chunk=lambda _: chunk)
 
     @jax.custom_vjp
     def select(due, real_before, other_before, real, other):
-        return _of_due(lambda args: images(*args), chunk)(due, (real_before, other_before), (real, other))
+        return of_due(lambda args: images(*args))(due, (real_before, other_before), (real, other))
 
     def forward(due, real_before, other_before, real, other):
         values = jax.tree.map(lambda x: x.value, (due, real_before, other_before, real, other))
@@ -69,45 +73,13 @@ def _selected(images: Callable, chunk: int) -> Callable:
 
         free = _split(moved, real)[0]
         zeros = [jnp.zeros(x.shape, x.dtype) for x in free]
-        to_free = _of_due(pulled_back, chunk)(due, zeros, (real, other, given))
+        to_free = of_due(pulled_back)(due, zeros, (real, other, given))
         to_real = _merge(moved, to_free, [None] * (len(moved) - len(to_free)))
         to_before = [jnp.where(due, jnp.zeros_like(x), x) for x in given]
         return None, to_before, None, to_real, None
 
     select.defvjp(forward, backward, symbolic_zeros=True)
     return select
-
-
-def _of_due(draw: Callable[[Any], Any], chunk: int) -> Callable:
-    """`(due, before, args) -> draw(args) where due, else before`, without gradients."""
-
-    @jax.custom_batching.custom_vmap
-    def one(due, before, args):
-        return jax.lax.cond(due, lambda: draw(args), lambda: before)
-
-    @one.def_vmap
-    def many(worlds, batched, due, before, args):
-        due_batched, before_batched, args_batched = batched
-        axes = jax.tree.map(lambda x: 0 if x else None, args_batched)
-        every = jax.vmap(draw, in_axes=(axes,), axis_size=worlds)
-        before = jax.tree.map(lambda x, b: x if b else jnp.broadcast_to(x, (worlds, *x.shape)), before, before_batched)
-        out_batched = jax.tree.map(lambda _: True, before)
-        if not due_batched:
-            return jax.lax.cond(due, lambda: every(args), lambda: before), out_batched
-        size = min(chunk, worlds)
-        count = jnp.sum(due)
-        index = jnp.nonzero(due, size=worlds + -worlds % size, fill_value=worlds)[0]
-
-        def of_chunk(i, images):
-            to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
-            at = jnp.minimum(to, worlds - 1)
-            chosen = jax.tree.map(lambda x, b: x[at] if b else x, args, args_batched)
-            drawn = jax.vmap(draw, in_axes=(axes,), axis_size=size)(chosen)
-            return jax.tree.map(lambda image, new: image.at[to].set(new, mode="drop"), images, drawn)
-
-        return jax.lax.fori_loop(0, -(-count // size), of_chunk, before), out_batched
-
-    return one
 
 
 def _split(mask: list[bool], leaves: list) -> tuple[list, list]:

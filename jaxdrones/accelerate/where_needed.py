@@ -29,41 +29,11 @@ def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[...
     function where it is needed, else zero; they are computed in every world.
     """
 
-    @jax.custom_batching.custom_vmap
-    def one(needed: Array, args: tuple[Any, ...]):
-        return function(*args)
-
-    @one.def_vmap
-    def many(worlds: int, batched: tuple[bool, Any], needed: Array, args: tuple[Any, ...]):
-        leaves, structure = jax.tree.flatten(args)
-        mapped = jax.tree.leaves(batched[1])
-        if not any(mapped):
-            return function(*args), jax.tree.map(lambda _: False, jax.eval_shape(function, *args))
-
-        def of(leaves: list[Array]) -> Any:
-            return function(*jax.tree.unflatten(structure, leaves))
-
-        every = jax.vmap(of, ([0 if m else None for m in mapped],))
-        needed = jnp.broadcast_to(needed, (worlds,))
-        count, size = jnp.sum(needed), max(worlds // one_in, 1)
-
-        def some(i: Array, found: Any, index: Array) -> Any:
-            to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
-            at = jnp.minimum(to, worlds - 1)
-            new = every([leaf[at] if m else leaf for leaf, m in zip(leaves, mapped, strict=True)])
-            return jax.tree.map(lambda all, x: all.at[to].set(x, mode="drop"), found, new)
-
-        def compute(zeros: Any) -> Any:
-            index = jnp.nonzero(needed, size=worlds + -worlds % size, fill_value=worlds)[0]
-            return jax.lax.fori_loop(0, -(-count // size), functools.partial(some, index=index), zeros)
-
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(every, leaves))
-        out = jax.lax.cond(count > 0, compute, lambda zeros: zeros, zeros)
-        return out, jax.tree.map(lambda _: True, out)
-
     @jax.custom_jvp
     def result(needed: Array, args: tuple[Any, ...]) -> Any:
-        return one(needed, args)
+        shapes = jax.eval_shape(function, *args)
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return in_chosen_worlds(lambda args: function(*args), lambda worlds: worlds // one_in)(needed, zeros, args)
 
     @result.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
@@ -72,3 +42,41 @@ def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[...
         return result(needed, args), jax.tree.map(lambda x: jnp.where(needed, x, jnp.zeros_like(x)), changes)
 
     return lambda needed, *args: result(needed, args)
+
+
+def in_chosen_worlds(function: Callable[[Any], Any], chunk: Callable[[int], int]) -> Callable[[Array, Any, Any], Any]:
+    """Build `(chosen, otherwise, args) -> function(args) if chosen else otherwise`, without derivatives.
+
+    Under `jax.vmap` the chosen worlds are gathered and computed in chunks; `chunk` returns their size for a number of
+    worlds. A condition would compute both of its branches in every world.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def one(chosen: Array, otherwise: Any, args: Any) -> Any:
+        return jax.lax.cond(chosen, lambda: function(args), lambda: otherwise)
+
+    @one.def_vmap
+    def many(worlds: int, batched: list, chosen: Array, otherwise: Any, args: Any) -> tuple[Any, Any]:
+        chosen_varies, otherwise_varies, args_vary = batched
+        axes = jax.tree.map(lambda x: 0 if x else None, args_vary)
+        otherwise = jax.tree.map(
+            lambda x, varies: x if varies else jnp.broadcast_to(x, (worlds, *x.shape)), otherwise, otherwise_varies
+        )
+        chosen = chosen if chosen_varies else jnp.broadcast_to(chosen, (worlds,))
+        count, size = jnp.sum(chosen), min(max(chunk(worlds), 1), worlds)
+
+        def of_chunk(i: Array, found: Any, index: Array) -> Any:
+            to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
+            at = jnp.minimum(to, worlds - 1)
+            inputs = jax.tree.map(lambda x, varies: x[at] if varies else x, args, args_vary)
+            new = jax.vmap(function, in_axes=(axes,), axis_size=size)(inputs)
+            return jax.tree.map(lambda all, x: all.at[to].set(x, mode="drop"), found, new)
+
+        def of_all(found: Any) -> Any:
+            index = jnp.nonzero(chosen, size=worlds + -worlds % size, fill_value=worlds)[0]
+            return jax.lax.fori_loop(0, -(-count // size), functools.partial(of_chunk, index=index), found)
+
+        out = jax.lax.cond(count > 0, of_all, lambda found: found, otherwise)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return one

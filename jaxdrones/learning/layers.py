@@ -195,7 +195,7 @@ def make_network(
 ) -> MLP | Network:
     """Network for the given observations, with a CNN for the resolution of the images.
 
-    A `recurrent_size` of 0 is that of no GRU; `set_sizes` are those of the layers that encode a row of the sets in the
+    `recurrent_size` is 0 without a GRU; `set_sizes` are those of the layers that encode a row of the sets in the
     observation.
     """
     channels: tuple[int, ...] = ()

@@ -142,9 +142,9 @@ class Policy(PyTreeNode):
     ) -> Policy:
         """Create a policy with actions near zero, which is hover in most action types.
 
-        With `per_agent` every drone has its own network; otherwise all drones share one. A `recurrent_size` of 0 is
-        that of no GRU, and `set_sizes` are those of the layers that encode a row of a set in the observation. A
-        user-defined network replaces these sizes, see `OwnNetwork`.
+        With `per_agent` every drone has its own network; otherwise all drones share one. `recurrent_size` is 0 without
+        a GRU, and `set_sizes` are those of the layers that encode a row of a set in the observation. A user-defined
+        network replaces these sizes, see `OwnNetwork`.
 
         Raises:
             ValueError: a network with the wrong input or output for the environment.
@@ -204,7 +204,7 @@ class Policy(PyTreeNode):
         return jnp.zeros((*batch, cast(Network, self.network).recurrent_size))
 
     def act(self, hidden_state: Any, obs: Obs) -> tuple[Any, Float[Array, "*batch n a"]]:
-        """Hidden state after the observations, or a dictionary with images, and actions in (-1, 1)."""
+        """Hidden state (*batch, n, ...) after the observations, which may have images, and actions in (-1, 1)."""
         x = map_state_vector(self.obs_stats.normalize, obs)
         hidden_state, output = apply(self.network, self.params, x, self.per_agent, hidden_state)
         return hidden_state, jnp.tanh(output)

@@ -78,7 +78,7 @@ class Parameters:
     """Parameters and their values, by the names `group.name` of the firmware."""
 
     def __init__(self, gains: Gains, changed: Callable[[Gains], None] = lambda gains: None):
-        """Start with default values, for gains with those given; `changed` is called with new gains."""
+        """Start with default values, those of the gains included; `changed` is called with new gains."""
         self._gains, self._changed = gains, changed
         self._entries = _parameters(gains)
         self.values = {name: entry.default for name, entry in self._entries.items()}

@@ -42,7 +42,7 @@ class Supervisor:
         self.locked |= self._watchdog is not None and t > self._watchdog
 
     def status(self, sample: Sample, planned: bool, finished: bool) -> int:
-        """State bits: whether the high-level commander flies, and whether its trajectory is finished."""
+        """State bits; `planned`: the high-level commander flies, `finished`: its trajectory has ended."""
         bits = {
             _CAN_BE_ARMED: not (self.locked or self.tumbled),
             _ARMED: self.armed,

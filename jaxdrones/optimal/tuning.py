@@ -15,9 +15,8 @@ from jaxtyping import Array, Float
 
 from jaxdrones import control, rotation
 from jaxdrones.arguments import checked, whole
-from jaxdrones.checks import check_choice, check_params, short_repr
+from jaxdrones.checks import check_choice, check_params, check_shape, short_repr
 from jaxdrones.control import Setpoint, firmware_pid, for_team, geometric, mellinger, pid, rates, simple_pid
-from jaxdrones.control.single import OneParams
 from jaxdrones.dynamics.aero import drag
 from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import make_step
@@ -65,7 +64,7 @@ _EFFORT_WEIGHT = 1e-5  # m s^2; of the squared rate of the rotor speeds over hov
 
 @checked
 def tune(
-    params: OneParams,
+    params: Params,
     controller: str | ModuleType,
     *,
     control_hz: Annotated[int, whole(minimum=100)] = 500,
@@ -95,6 +94,7 @@ def tune(
     """
     module = _tunable(controller)
     check_params(params)
+    check_shape("params.mass", params.mass, (), "tune takes the parameters of a single drone")
     gains, error = _descend(module, control_hz, iterations, params, start(module, params))
     if not jnp.isfinite(error):
         raise UserError(f"{_name(module)} cannot fly this vehicle with any gains that were tried; use 'geometric'")

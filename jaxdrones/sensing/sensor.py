@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.arguments import checked, number
-from jaxdrones.checks import check_function, check_sequence, short_repr
+from jaxdrones.checks import check_function, check_number, check_sequence, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import Quantity
@@ -26,7 +25,6 @@ def no_memory(key: jax.Array, params: Params) -> None:
     return None
 
 
-@checked
 @dataclasses.dataclass(frozen=True)
 class Sensor:
     """Sensor on every drone of a team, for example an IMU, a range finder or a barometer.
@@ -52,9 +50,9 @@ class Sensor:
     """
     init: Callable[..., Any] = no_memory
     """`init(key, params) -> memory`: memory of one drone at the start of an episode, a pytree of arrays."""
-    bound: Annotated[float, number(name="bound of a sensor", above=0, infinite=True)] = np.inf
+    bound: float = np.inf
     """Largest absolute value of a reading, in its units."""
-    rate: Annotated[float | None, number("1/s", "rate of a sensor", above=0)] = None
+    rate: float | None = None
     """Measurements per second; the reading is held in between. The default is one every control step."""
     entries: tuple[Quantity, ...] = ()
     """Description of each entry of the flattened reading, for `jaxdrones.explain`; optional."""
@@ -68,6 +66,9 @@ class Sensor:
         measured, begun = f"measure of sensor {self.name!r}", f"init of sensor {self.name!r}"
         check_function(measured, self.measure, ("key", "params", "state", "rate", "scene", "memory"))
         check_function(begun, self.init, ("key", "params"))
+        check_number(f"bound of sensor {self.name!r}", self.bound, above=0, infinite=True)
+        if self.rate is not None:
+            check_number(f"rate of sensor {self.name!r}", self.rate, "1/s", above=0)
         if self.clocked and self.rate is None:
             raise UserError(f"sensor {self.name!r} is clocked, but has no rate; give rate in measurements per second")
 

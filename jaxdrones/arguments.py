@@ -76,9 +76,9 @@ def function(example: str) -> Check:
     return lambda argument, value: checks.check_function(argument, value, example=example)
 
 
-def _check_whole_if_known(name: str, value: Any) -> None:
+def _count_if_known(name: str, value: Any) -> None:
     if is_concrete(value):
-        check_whole(name, value)
+        count(name, value)
 
 
 def _check_layers(name: str, sizes: Any) -> None:
@@ -100,7 +100,7 @@ Seconds = Annotated[float, number("s", above=0)]
 Hertz = Annotated[float, number("1/s", above=0)]
 count, seed = whole(limit=LARGEST_COUNT), whole(minimum=0, limit=LARGEST_SEED)
 Count = Annotated[int, count]
-TracedCount = Annotated[int | jax.Array, _check_whole_if_known]
+TracedCount = Annotated[int | jax.Array, _count_if_known]
 NonNegativeInt = Annotated[int, whole(minimum=0)]
 Switch = Annotated[bool, check_switch]
 HiddenSizes = Annotated[tuple[int, ...], _check_layers]

@@ -26,14 +26,11 @@ _IDLE = 0.055  # output of a motor at no throttle; Betaflight's default
 _MIN_CHECK = 0.05  # stick up to which the throttle is zero
 
 
-def sticks_for(params: Params, thrust: float, omega: ArrayLike, max_rate: float = MAX_RATE) -> Sticks:
-    """Sticks for a total thrust (N) and body rates (3,) (rad/s, x forward, y left, z up) of a drone.
-
-    `max_rate` is the rate at the end of a stick, degrees/s.
-    """
+def sticks_for(params: Params, thrust: float, omega: ArrayLike) -> Sticks:
+    """Sticks for a total thrust (N) and body rates (3,) (rad/s, x forward, y left, z up) of a drone."""
     output = math.sqrt(max(thrust, 0.0) / (4 * float(params.kf))) / float(params.max_rpm)
     share = min(max((output - _IDLE) / (1 - _IDLE), 0.0), 1.0)
-    roll, pitch, yaw = np.rad2deg(np.asarray(omega, float)) / max_rate
+    roll, pitch, yaw = np.rad2deg(np.asarray(omega, float)) / MAX_RATE
     return Sticks(float(roll), float(pitch), _MIN_CHECK + (1 - _MIN_CHECK) * share, float(-yaw))
 
 

@@ -65,7 +65,7 @@ class Status(NamedTuple):
     """Reasons against arming, of `FLAGS`."""
 
 
-def configure(client: msp.Client, hz: float, max_rate: int = MAX_RATE, reversed_yaw: bool = False) -> bool:
+def configure(client: msp.Client, hz: float, reversed_yaw: bool = False) -> bool:
     """Set AUX1 to arm, AUX2 to level (else acro), linear rates, a long failsafe and the direction of the motors.
 
     The rate of the control loop becomes twice that of the states, and the low-pass filters of the gyroscope, which has
@@ -75,7 +75,6 @@ def configure(client: msp.Client, hz: float, max_rate: int = MAX_RATE, reversed_
     Args:
         client: connection.
         hz: states per second.
-        max_rate: rate at the end of a stick about all axes, degrees/s.
         reversed_yaw: whether the motors turn in the opposite of Betaflight's default direction.
 
     Raises:
@@ -86,7 +85,7 @@ def configure(client: msp.Client, hz: float, max_rate: int = MAX_RATE, reversed_
     """
     for slot, mode in enumerate((_ARM, _ANGLE)):
         client.request(msp.SET_MODE_RANGE, mode_range(slot, mode, slot))
-    rates = rc_tuning(max_rate)
+    rates = rc_tuning()
     client.request(msp.SET_RC_TUNING, rates)
     client.request(msp.SET_MIXER, bytes([_QUAD_X, reversed_yaw]))
     failsafe = client.request(msp.FAILSAFE)  # whose clock jumps if this computer is busy
@@ -119,9 +118,9 @@ def mode_range(slot: int, mode: int, auxiliary: int) -> bytes:
     return bytes([slot, mode, auxiliary, *((pulse - 900) // 25 for pulse in _SWITCH_ON)])
 
 
-def rc_tuning(max_rate: int) -> bytes:
-    """Payload of linear rates (degrees/s at the end of a stick) and of a linear throttle."""
-    rate = max_rate // 10
+def rc_tuning() -> bytes:
+    """Payload of linear rates up to `MAX_RATE` and of a linear throttle."""
+    rate = MAX_RATE // 10
     limits = struct.pack("<3H", *[_RATE_LIMIT] * 3)
     throttle = bytes([0, 50, 0, 0, 0])  # no attenuation, middle, no expo, no breakpoint
     return bytes([rate, 0, rate, rate, rate]) + throttle + bytes([0, rate, rate, 0, 0, 100]) + limits + bytes([_ACTUAL])

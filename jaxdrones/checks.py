@@ -188,11 +188,6 @@ def takes(function: Callable, name: str) -> bool:
     return parameter is not None and parameter.kind in _BY_NAME and not is_bound
 
 
-def takes_scene(function: Callable) -> bool:
-    """Whether a function has a parameter named `scene`."""
-    return takes(function, "scene")
-
-
 def bind(function: Callable, **values: Any) -> Callable:
     """Bind those values to a function for which it has a parameter."""
     bound = {name: value for name, value in values.items() if takes(function, name)}

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Float
 
-from jaxdrones.checks import check_function, check_sequence, takes_scene, with_scene
+from jaxdrones.checks import check_function, check_sequence, takes, with_scene
 from jaxdrones.dynamics.model import Model
 from jaxdrones.dynamics.needs import needs_of
 from jaxdrones.dynamics.rotors import instant_rotors, rotor_reaction, rotor_wrench, with_rotor_speed
@@ -88,7 +88,7 @@ class Physics:
     @functools.cached_property
     def takes_scene(self) -> bool:
         """Whether an effect depends on obstacles."""
-        return any(takes_scene(effect) and not needs_of(effect).ground_only for effect in self.effects)
+        return any(takes(effect, "scene") and not needs_of(effect).ground_only for effect in self.effects)
 
     def seen(self, scene: Scene) -> Scene:
         """Part of a scene that effects depend on."""
@@ -170,7 +170,7 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
     for function in functions:
         given = with_scene(function, None) if name == "effects" else function
         check_function(name, given, _ARGUMENTS[name], example=example, hint=_ELSEWHERE.get(name, ""))
-        if needs_of(function).contact == "obstacles" and not takes_scene(function):
+        if needs_of(function).contact == "obstacles" and not takes(function, "scene"):
             raise UserError(
                 f"{name}: {describe([function])} has a scene of its own; give that to make_step(scene=...), and the "
                 "effect without it"

@@ -4,13 +4,15 @@
 # drone each, then one world with a thousand drones.
 
 # %%
-# Installs the package where it is missing, as on Colab.
+# Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
+# "jaxdrones[cli] @ git+https://..." with the address of a repository.
 import importlib.util
 import subprocess
 import sys
 
+PACKAGE = "jaxdrones[cli]"
 if importlib.util.find_spec("jaxdrones") is None:
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "jaxdrones[cli]"], check=True)
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", PACKAGE], check=True)
 
 # %%
 import functools

@@ -5,13 +5,15 @@
 # training only, has 25 inputs: both drones' observations and the other's action.
 
 # %%
-# Installs the package where it is missing, as on Colab.
+# Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
+# "jaxdrones[cli] @ git+https://..." with the address of a repository.
 import importlib.util
 import subprocess
 import sys
 
+PACKAGE = "jaxdrones[cli]"
 if importlib.util.find_spec("jaxdrones") is None:
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "jaxdrones[cli]"], check=True)
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", PACKAGE], check=True)
 
 # %%
 import time

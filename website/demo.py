@@ -109,7 +109,7 @@ def _reality() -> Exhibit:
         f"{100 * apart['tracking_real_m']:.0f} cm from its set-points, which its PID trails."
     )
     worlds = [dataclasses.replace(log, t=log.t - log.t[0]) for log in map(_thinned, (real, simulated))]
-    shown = looks(worlds) | {"signals": ["position x", "distance from target"]}
+    shown = looks(worlds) | {"signals": ["position x", "distance from target"], "error": True}
     payload = encode(worlds, ["real", "simulated"], _REAL, layout="ghosts", play=True, **shown)
     return Exhibit(_REAL, about, f"jaxdrones score {_RECORDED} --vehicle cf21", payload)
 

@@ -55,36 +55,32 @@ def add(commands) -> None:
 
 
 def _view(options: argparse.Namespace) -> int:
+    check_options(options, camera=choice("camera", CAMERAS), fps=whole())
+    options.size = _size(options.size)
+    if options.video:
+        video.check_video(options.video)
+        check_writable(options.video)
     if options.history:
         return _view_history(options)
     given, skipped = _flights(options.flights)
     names, logs = [*map(str, given)], [*given.values()]
     output = options.output or logs[0].with_name("flight.html")
-    size = _size(options.size)
-    check_options(options, camera=choice("camera", CAMERAS), fps=whole())
-    if options.video:
-        video.check_video(options.video)
-    check_writable(output, options.video)
+    check_writable(output)
     if skipped:
         print(f"skipped, as no flights: {', '.join(map(str, skipped))}", file=sys.stderr)
     flights = logs[0] if len(logs) == 1 else dict(zip(names, logs, strict=True))
     page = show(flights, others=options.others, title=options.title)
-    page.save(output)
-    files = [output]
-    if options.video:
-        film(page, options.video, options.fps, size, options.camera)
-        files.append(options.video)
-    return _finish(options, files, {"flights": names, "skipped": [*map(str, skipped)]})
+    return _write(options, page, output, {"flights": names, "skipped": [*map(str, skipped)]})
 
 
 def _view_history(options: argparse.Namespace) -> int:
-    if len(options.flights) > 1 or options.video:
-        raise UserError("--history shows one run and makes no film; give one folder, without --video")
+    if len(options.flights) > 1:
+        raise UserError("--history shows one run; give one folder")
     output = options.output or options.flights[0] / "history.html"
     run = open_policy(options.flights[0], None, False, {})
     check_writable(output)
-    _history_of(run, options.title).save(output)
-    return _finish(options, [output], {"run": str(run.folder), "policies": len(run.kept)})
+    page = _history_of(run, options.title)
+    return _write(options, page, output, {"run": str(run.folder), "policies": len(run.kept)})
 
 
 def _history_of(run: Any, title: str | None) -> Page:
@@ -103,8 +99,13 @@ def _history_of(run: Any, title: str | None) -> Page:
     )
 
 
-def _finish(options: argparse.Namespace, files: list[Path], about: dict[str, Any]) -> int:
-    """Open the first file if asked to, and print what was written."""
+def _write(options: argparse.Namespace, page: Page, output: Path, about: dict[str, Any]) -> int:
+    """Write the page and a film if asked to, open the page if asked to, and print what was written."""
+    page.save(output)
+    files = [output]
+    if options.video:
+        film(page, options.video, options.fps, options.size, options.camera)
+        files.append(options.video)
     if options.open:
         webbrowser.open(files[0].absolute().as_uri())
     if options.json:

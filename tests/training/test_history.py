@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from documents import ROOT
+from PIL import Image
 
 from jaxdrones.cli import main
 from jaxdrones.training.history import fly_history
@@ -71,8 +72,8 @@ def test_the_flights_of_a_history_begin_alike(runs):
 def test_a_run_without_history_is_refused_in_one_line(runs, capsys):
     assert main(["view", str(runs[1].folder), "--history"]) == 2
     assert "train with --keep-history" in capsys.readouterr().err
-    assert main(["view", str(runs[0].folder), "--history", "--video", "film.mp4"]) == 2
-    assert "leave" not in capsys.readouterr().out
+    assert main(["view", str(runs[0].folder), "--history", "--video", "film.avi"]) == 2
+    assert "film.avi" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -102,9 +103,25 @@ def test_the_page_plays_every_policy_and_can_be_scrubbed_by_update(runs, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.needs("imageio_ffmpeg")
+@pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")
+def test_a_film_of_a_training_shows_every_policy_in_full(runs, tmp_path):
+    run, _ = runs
+    film, page = tmp_path / "history.gif", tmp_path / "history.html"
+    small = ["--size", "320x240", "--fps", "2", "--output", str(page)]
+    assert main(["view", str(run.folder), "--history", "--video", str(film), *small]) == 0
+    worlds = decode(re.search(r'id="payload" type="text/plain">(.*?)</script>', page.read_text(), re.S)[1])["worlds"]
+    with Image.open(film) as frames:
+        assert frames.n_frames == sum(max(1, round(2 * float(world["t"][-1]))) for world in worlds)
+
+
+@pytest.mark.slow
+@pytest.mark.needs("imageio_ffmpeg")
+@pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")
 def test_the_commands_of_the_page_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "docs" / "viewer.md").read_text().split("## A training as a film")[1].split("\n## ")[0]
     for command in re.findall(r"^jaxdrones ([^#\n]*)", text, re.M):
-        assert main([*command.split(), *(SHORT.split() if command.startswith("train") else [])]) == 0
-    assert (tmp_path / "runs" / "film" / "history.html").exists()
+        more = SHORT if command.startswith("train") else "--fps 1"
+        assert main([*command.split(), *more.split()]) == 0
+    assert {"history.html", "history.mp4"} <= {file.name for file in (tmp_path / "runs" / "film").iterdir()}

@@ -184,3 +184,22 @@ def test_texts_stand_out_from_the_page(view, scheme):
         text = luminance(f"getComputedStyle(document.querySelector('{selector}')).color")
         contrast = (max(text, paper) + 0.05) / (min(text, paper) + 0.05)
         assert contrast >= 4.5  # WCAG 2.2, AA
+
+
+def test_the_error_between_two_flights_is_a_ribbon_from_one_to_the_other(view):
+    here, there = (at_rest([[x, 0.0, 1.0], [x, 1.0, 1.0]]) for x in (0.0, 0.2))
+    tab = view(show([here, there], jd.repeat(jd.load_params("cf2x"), 2), dt=0.1))
+    ribbon = "jaxdrones.player.ribbon.mesh"
+    assert not tab.run(f"{ribbon}.visible")
+    tab.press("e")
+    tab.run("jaxdrones.positionsAt(0.3)")
+    assert tab.run(f"{ribbon}.visible && {ribbon}.geometry.drawRange.count") == 6 * 2 * 2  # two legs of two drones
+    assert "20 cm between the two flights" in tab.run("document.getElementById('legend').textContent")
+    points = np.reshape(tab.run(f"[...{ribbon}.geometry.attributes.position.array]"), (3, 2, 2, 3))
+    expected = np.stack([here.pos, there.pos], axis=2)  # rows, drones, flights
+    np.testing.assert_allclose(points, expected, atol=1e-4)
+    tab.press("g")  # side by side
+    tab.run("jaxdrones.player.draw(0)")
+    assert not tab.run(f"{ribbon}.visible")
+    alone = view(page_of([[0.0, 0.0, 1.0]]))
+    assert alone.run("document.querySelector('.error').hidden")

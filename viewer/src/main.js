@@ -13,6 +13,7 @@ import { Names, named } from "./names.js";
 import { Panel } from "./panel.js";
 import { decode } from "./payload.js";
 import { Plot, short } from "./plots.js";
+import { comparable, ERROR, Ribbon } from "./ribbon.js";
 import { Plant, Simulation } from "./simulation.js";
 import { solids } from "./solids.js";
 import { Stage } from "./stage.js";
@@ -41,7 +42,9 @@ class Player {
     this.trails = this.worlds.map((world, w) => new Trail(this.stage, world, (i) => this.colors(w, i)));
     this.arrows = this.worlds.map((world, w) => new Arrows(this.stage, world, (i) => this.colors(w, i)));
     this.jets = new Jets(this.stage, this.worlds);
+    this.ribbon = comparable(this.worlds) ? new Ribbon(this.stage, this.worlds) : null;
     this.panel = new Panel(this, this);
+    find("error").checked = Boolean(header.error);
     this.history = header.history && new History(header.history, (w) => this.chooseWorld(w));
     const first = this.worlds[0];
     this.panel.set("trail", first.n > 60 ? "1" : "Infinity");
@@ -267,6 +270,7 @@ class Player {
     this.trails.forEach((trail, w) => trail.show(time, panel.trail, this.layout[w], stage));
     this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], this.fleet));
     this.jets.show(time, shown.jets, this.layout);
+    this.ribbon?.show(time, panel.trail, this.compared);
     stage.render();
     this.explain();
     if (!stage.hurried || this.frames % 2 === 0) this.placeNames();
@@ -278,12 +282,18 @@ class Player {
     this.frames++;
   }
 
+  /** Whether the error between two flights is shown: they are in the same place. */
+  get compared() {
+    return Boolean(this.ribbon) && this.panel.shown.error && this.panel.layout === "ghosts";
+  }
+
   /** Colors, the grid, and how much larger than they are drones are drawn. */
   explain() {
     const { panel } = this, rows = [];
     const row = (color, text) => rows.push(`<i style="background:${color}"></i>${text}`);
     if (panel.shown.thrust) row(THRUST, "thrust of a rotor");
     if (panel.shown.wrench) row(FORCE, "resultant force") && row(TORQUE, "resultant torque");
+    if (this.compared) row(ERROR, `${short(100 * this.ribbon.distance(this.time, panel.drone))} cm between the two flights`);
     if (panel.shown.jets) row(JET, "downwash, as wide as it has half the speed of its axis");
     if (this.stage.cell && this.surroundings.some((scene) => scene.ground)) rows.push(`squares of ${short(this.stage.cell)} m`);
     const times = Number(this.fleet.largest.toPrecision(2));

@@ -4,7 +4,7 @@ export const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
 const KEYS = [
   ["space", "play, pause"], ["← →", "one step back, forward; with shift ten"], ["home end", "start, end"], ["↑ ↓", "faster, slower"],
   ["1 2 3", "orbit, follow, on board"], ["n p", "next, previous drone"], ["w", "next world"], ["g", "other worlds: ghosts, side by side, hidden"],
-  ["t", "trail"], ["b", "size of the drones"], ["f", "thrust of the rotors"], ["r", "resultant force and torque"], ["d", "downwash"], ["o", "targets"], ["l", "names"],
+  ["t", "trail"], ["b", "size of the drones"], ["f", "thrust of the rotors"], ["r", "resultant force and torque"], ["d", "downwash"], ["e", "error between two flights"], ["o", "targets"], ["l", "names"],
   ["c", "camera back to the start"], ["?", "these keys"],
 ];
 
@@ -22,9 +22,10 @@ export class Panel {
     find("speed").value = 1;
     flight.worlds.forEach((world, w) => find("world").add(new Option(world.name, w)));
     for (const box of document.querySelectorAll(".worlds")) box.hidden = flight.worlds.length < 2;
+    document.querySelector(".error").hidden = !flight.ribbon;
     for (const box of document.querySelectorAll(".targets")) box.hidden = !flight.worlds.some((world) => world.targets);
     this.listDrones(flight.worlds[0]);
-    for (const id of ["speed", "drone", "layout", "trail", "size", "thrust", "wrench", "jets", "targets", "names"])
+    for (const id of ["speed", "drone", "layout", "trail", "size", "thrust", "wrench", "jets", "error", "targets", "names"])
       find(id).addEventListener("change", () => player.changed());
     find("world").addEventListener("change", () => {
       this.listDrones(flight.worlds[this.world]);
@@ -44,7 +45,7 @@ export class Panel {
   get size() { return Number(find("size").value); }
   get mode() { return document.querySelector('[data-mode][aria-pressed="true"]').dataset.mode; }
   get shown() {
-    return Object.fromEntries(["thrust", "wrench", "jets", "targets", "names"].map((id) => [id, find(id).checked]));
+    return Object.fromEntries(["thrust", "wrench", "jets", "error", "targets", "names"].map((id) => [id, find(id).checked]));
   }
 
   /** Show the title, the length of the time line, and whether the flight is running. */
@@ -90,7 +91,7 @@ export class Panel {
       1: () => this.setMode("orbit"), 2: () => this.setMode("follow"), 3: () => this.setMode("board"),
       n: () => this.cycle("drone", 1), p: () => this.cycle("drone", -1), w: () => this.cycle("world", 1), g: () => this.cycle("layout", 1),
       t: () => this.cycle("trail", 1), b: () => this.cycle("size", 1), f: () => find("thrust").click(), r: () => find("wrench").click(),
-      d: () => find("jets").click(), o: () => find("targets").click(), l: () => find("names").click(), c: () => this.player.home(), "?": () => this.help(),
+      d: () => find("jets").click(), e: () => find("error").click(), o: () => find("targets").click(), l: () => find("names").click(), c: () => this.player.home(), "?": () => this.help(),
       Escape: () => find("help").hidden || this.help(),
     };
     if (!(onButton && event.key === " ")) actions[" "] = () => this.player.toggle();

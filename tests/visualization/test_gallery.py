@@ -8,7 +8,7 @@ import pytest
 from documents import ROOT
 
 from jaxdrones import assets
-from jaxdrones.cli import main
+from jaxdrones.cli import live, main
 from jaxdrones.visualization import browser
 from jaxdrones.visualization.viewer.gallery import read_exhibits
 from jaxdrones.visualization.viewer.payload import decode
@@ -52,6 +52,30 @@ def test_the_page_begins_with_the_flight_that_was_asked_for(page):
 def test_an_unknown_flight_is_named(tmp_path, capsys):
     assert main(["demo", "forrest", "--no-open", "--output", str(tmp_path / "demo.html")]) == 2
     assert "unknown flight 'forrest'; did you mean 'forest'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["real flight", "--live"], "no bundled policy flies 'real flight'"),
+        (["forest", "--live", "--output", "page.html"], "leave out --policy and --output"),
+        (["--drones", "20"], "without --policy"),
+    ],
+)
+def test_options_that_contradict_each_other_are_named(arguments, message, capsys):
+    assert main(["demo", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.float32
+def test_a_flight_of_the_gallery_is_flown_now(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(live, "WAIT", 0.1)
+    assert main(["demo", "hover", "--live"]) == 0
+    said = capsys.readouterr().out
+    assert "open http://127.0.0.1:" in said and "success" in said
+    assert list(tmp_path.rglob("log.npz")) != []
 
 
 @pytest.mark.slow

@@ -222,7 +222,7 @@ def test_images_of_the_cameras_are_in_the_log_and_in_the_page(team, record, tmp_
     colors, grey = page["worlds"][0]["images"]
     assert (colors["name"], grey["name"]) == ("rgb", "depth")
     np.testing.assert_array_equal(colors["frames"], rgb)
-    np.testing.assert_array_equal(grey["frames"][..., 0], 0)  # what is farthest is black
+    np.testing.assert_array_equal(grey["frames"][..., 0], 0)  # what is farthest
     np.testing.assert_allclose(grey["t"], 0.01 * np.arange(1, 21), rtol=1e-6)
     images = {"rgb": ImageSequence(np.arange(3.0), rgb[:3, :2])}
     save_npz(dataclasses.replace(record, images=images), tmp_path / "log.npz")
@@ -233,10 +233,10 @@ def test_images_of_the_cameras_are_in_the_log_and_in_the_page(team, record, tmp_
         show(trajectory(team), team, dt=0.01, images={"depth": rgb})
 
 
-def test_near_is_bright_in_images_of_depth(team):
+def test_pixels_of_depth_are_of_its_share_of_the_farthest_up_to_ten_meters(team):
     depth = np.broadcast_to([[0.0, 2.5], [5.0, 1000.0]], (20, 3, 2, 2))
-    grey = header(show(trajectory(team), team, dt=0.01, images={"depth": depth}))["worlds"][0]["images"][0]["frames"]
-    assert grey[0, 0, ..., 0].tolist() == [[255, 191], [128, 0]]  # black from 10 m on
+    (images,) = header(show(trajectory(team), team, dt=0.01, images={"depth": depth}))["worlds"][0]["images"]
+    assert images["frames"][0, 0, ..., 0].tolist() == [[255, 191], [128, 0]] and images["farthest"] == 10
 
 
 def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(record, tmp_path, capsys):

@@ -59,24 +59,40 @@ def test_the_view_is_not_blank(tab):
     assert len(np.unique(view.reshape(-1, 3), axis=0)) > 1000
 
 
+CAMERA_PIXELS = """(() => {
+    const shown = document.querySelector("#cameras canvas"), copy = document.createElement("canvas");
+    [copy.width, copy.height] = [shown.width, shown.height];
+    copy.getContext("2d").drawImage(shown, 0, 0);
+    return [...copy.getContext("2d").getImageData(0, 0, copy.width, copy.height).data];
+})()"""
+
+
+def test_depth_is_yellow_where_it_is_near_and_darker_the_farther(record, tmp_path):
+    depth = np.broadcast_to(np.array([[0.0, 1.0], [2.0, 4.0]], np.float32), (2, 4, 2, 2))
+    images = {"depth": ImageSequence(np.array([0.0, 1.0]), depth)}
+    with browser.open_tab() as tab:
+        tab.open(show(dataclasses.replace(record, images=images)).save(tmp_path / "flight.html"))
+        tab.run("jaxdrones.positionsAt(0)")
+        shown = np.array(tab.run(CAMERA_PIXELS)).reshape(4, 4)[:, :3]
+        np.testing.assert_array_equal(shown[[0, 3]], [[0xFD, 0xE7, 0x25], [0x44, 0x01, 0x54]])
+        luminance = shown @ [0.2126, 0.7152, 0.0722]
+        assert (np.diff(luminance) < -10).all()
+        assert "0 (yellow) to 4 m" in tab.run("document.querySelector('#cameras figcaption').textContent")
+        assert tab.problems == []
+
+
 def test_images_of_the_cameras_are_shown_as_they_were_recorded(record, tmp_path):
     rgb = np.random.default_rng(0).integers(0, 256, (3, 4, 6, 8, 3), np.uint8)
     images = {"rgb": ImageSequence(np.array([0.0, 0.5, 1.0]), rgb)}
-    pixels = """(() => {
-        const shown = document.querySelector("#cameras canvas"), copy = document.createElement("canvas");
-        [copy.width, copy.height] = [shown.width, shown.height];
-        copy.getContext("2d").drawImage(shown, 0, 0);
-        return [...copy.getContext("2d").getImageData(0, 0, copy.width, copy.height).data];
-    })()"""
     with browser.open_tab() as tab:
         tab.open(show(dataclasses.replace(record, images=images)).save(tmp_path / "flight.html"))
         for time, frame in ((0.0, 0), (0.49, 0), (0.5, 1), (1.9, 2)):
             tab.run(f"jaxdrones.positionsAt({time})")
-            shown = np.array(tab.run(pixels)).reshape(6, 8, 4)
+            shown = np.array(tab.run(CAMERA_PIXELS)).reshape(6, 8, 4)
             np.testing.assert_array_equal(shown[..., :3], rgb[frame, 0])
         tab.press("n")
         tab.run("jaxdrones.positionsAt(0)")
-        np.testing.assert_array_equal(np.array(tab.run(pixels)).reshape(6, 8, 4)[..., :3], rgb[0, 1])
+        np.testing.assert_array_equal(np.array(tab.run(CAMERA_PIXELS)).reshape(6, 8, 4)[..., :3], rgb[0, 1])
         assert tab.problems == []
 
 

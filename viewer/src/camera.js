@@ -1,4 +1,13 @@
-// The images of the on-board cameras, where they were recorded.
+// The images of the on-board cameras, where they were recorded; depth in colors.
+
+import { short } from "./plots.js";
+
+const NEAR_TO_FAR = ["#fde725", "#7ad151", "#22a884", "#2a788e", "#414487", "#440154"]; // viridis
+const COLORS = Array.from({ length: 256 }, (_, level) => {
+  const place = ((255 - level) / 255) * (NEAR_TO_FAR.length - 1), k = Math.min(NEAR_TO_FAR.length - 2, Math.floor(place));
+  const [low, high] = [k, k + 1].map((i) => [1, 3, 5].map((at) => parseInt(NEAR_TO_FAR[i].slice(at, at + 2), 16)));
+  return low.map((x, c) => x + (place - k) * (high[c] - x));
+});
 
 export class CameraImages {
   constructor(box) {
@@ -17,7 +26,8 @@ export class CameraImages {
       if (figure.dataset.shown === key) return;
       figure.dataset.shown = key;
       paint(figure.firstChild, images.frames, Math.max(0, frame), drone);
-      const caption = `${images.name} of ${world.labels[drone]}`;
+      const range = images.farthest ? `, 0 (yellow) to ${short(images.farthest)} m` : "";
+      const caption = `${images.name} of ${world.labels[drone]}${range}`;
       figure.lastChild.textContent = caption;
       figure.firstChild.setAttribute("aria-label", `Image of the on-board camera: ${caption}`);
     });
@@ -38,7 +48,7 @@ function paint(canvas, { data, shape }, frame, drone) {
   const image = new ImageData(width, height);
   for (let i = 0; i < width * height; i++) {
     const at = start + channels * i;
-    for (let c = 0; c < 3; c++) image.data[4 * i + c] = data[at + (channels > 1 ? c : 0)];
+    for (let c = 0; c < 3; c++) image.data[4 * i + c] = channels > 1 ? data[at + c] : COLORS[data[at]][c];
     image.data[4 * i + 3] = 255;
   }
   [canvas.width, canvas.height] = [width, height];

@@ -23,7 +23,7 @@ from jaxdrones.visualization.palette import COLORS, as_rgb
 from jaxdrones.visualization.shots import only_shapes
 
 _LARGEST_ERROR = {"pos": 5e-5, "targets": 5e-5}  # m, of rounding to int16
-_FARTHEST = 10.0  # m: depth of a black pixel, if any is as far
+_FARTHEST = 10.0  # m: depth of the darkest pixel, if any is as far
 _LEVELS = 65535  # steps of an int16 beside the first
 _CONSTANTS = ("rotor_pos", "prop_radius", "rotor_spin", "kf", "mass", "inertia", "gravity")  # of the page
 
@@ -82,6 +82,7 @@ def encode(records: Sequence[FlightLog], names: Sequence[str], title: str, **loo
         world["vehicle"] = [_index(vehicles, vehicle) for vehicle in _vehicles(record.params)]
         world["images"] = [
             {"name": kind, "t": arrays.add(images.t), "frames": arrays.add_bytes(_pixels(kind, images.frames))}
+            | ({"farthest": _farthest(images.frames)} if kind == "depth" else {})
             for kind, images in record.images.items()
         ]
         world["scene"] = _index(scenes, scene_to_dict(only_shapes(record.scene)))
@@ -137,16 +138,21 @@ def _resolved(value: Any, data: bytes) -> Any:
 
 
 def _pixels(kind: str, frames: np.ndarray) -> np.ndarray:
-    """Images as uint8 (F, n, height, width, channels): depth in shades of gray, near is bright; 1, 3 or 4 channels."""
+    """Images as uint8 (F, n, height, width, channels): depth from 255 at the camera to 0; 1, 3 or 4 channels."""
     if kind == "depth":
-        seen = frames[np.isfinite(frames)]
-        farthest = max(1e-6, min(_FARTHEST, float(seen.max()))) if seen.size else 1.0
+        farthest = _farthest(frames)
         grey = 1 - np.clip(np.nan_to_num(frames, nan=np.inf), 0, farthest) / farthest
         return np.round(255 * grey).astype(np.uint8)[..., None]
     if kind == "segmentation":
         colors = np.array([as_rgb(color) for color in COLORS], np.uint8)
         return np.where(frames[..., None] < 0, np.uint8(255), colors[frames % len(colors)])
     return np.asarray(frames, np.uint8)
+
+
+def _farthest(frames: np.ndarray) -> float:
+    """Depth of the darkest pixel, m."""
+    seen = frames[np.isfinite(frames)]
+    return max(1e-6, min(_FARTHEST, float(seen.max()))) if seen.size else 1.0
 
 
 def _index(known: list[dict[str, Any]], entry: dict[str, Any]) -> int:

@@ -221,6 +221,7 @@ def test_one_of_several_drones_is_pulled_and_all_are_kicked(env, tmp_path):
         others = tab.run(away)
         assert max(others[0], others[2]) < 0.03
         tab.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 150, y=y, button="left", clickCount=1)
+        tab.wait(f"Math.max(...{away}) < 0.05")
         tab.run("jaxdrones.simulation.kick()")
         tab.wait(f"Math.min(...{away}) > 0.2")
         tab.wait(f"Math.max(...{away}) < 0.05")

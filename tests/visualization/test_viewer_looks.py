@@ -203,3 +203,18 @@ def test_the_error_between_two_flights_is_a_ribbon_from_one_to_the_other(view):
     assert not tab.run(f"{ribbon}.visible")
     alone = view(page_of([[0.0, 0.0, 1.0]]))
     assert alone.run("document.querySelector('.error').hidden")
+
+
+def test_vectors_along_a_path_are_arrows_whose_lengths_are_in_proportion(view):
+    flight = at_rest([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+    vectors = np.zeros((3, 2, 3))
+    vectors[:, 0], vectors[:, 1] = [0.0, 0.0, 2.0], [0.5, 0.0, 0.0]
+    tab = view(show(flight, jd.repeat(jd.load_params("cf2x"), 2), dt=0.1, arrows=vectors))
+    matrices = np.reshape(tab.run("[...jaxdrones.player.vectors[0].marks.mesh.instanceMatrix.array]"), (3, 2, 4, 4))
+    longest = 0.35 * tab.run("jaxdrones.player.stage.radius")
+    np.testing.assert_allclose(matrices[..., 3, :3], flight.pos, atol=1e-4)
+    np.testing.assert_allclose(matrices[:, 0, 2, :3], [[0, 0, longest]] * 3, atol=1e-5)  # along +z
+    np.testing.assert_allclose(matrices[:, 1, 2, :3], [[longest / 4, 0, 0]] * 3, atol=1e-5)
+    assert "vectors along the path" in tab.run("document.getElementById('legend').textContent")
+    with pytest.raises(ValueError, match=r"arrows have shape \(2, 3\)"):
+        show(flight, jd.repeat(jd.load_params("cf2x"), 2), dt=0.1, arrows=np.zeros((2, 3)))

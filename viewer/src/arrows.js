@@ -14,7 +14,7 @@ const FORCE_ARMS = 3; // of a resultant force that equals the weight
 const TORQUE_ARMS = 3; // of a resultant torque of a hundredth of weight times arm
 
 /** Instances that are set anew in every frame. */
-class Marks {
+export class Marks {
   constructor(stage, geometry, material, capacity) {
     this.mesh = new InstancedMesh(geometry, material, capacity);
     this.mesh.instanceMatrix.setUsage(DynamicDrawUsage);
@@ -40,7 +40,7 @@ class Marks {
   }
 }
 
-function pointer() {
+export function arrowShape() {
   const shaft = new CylinderGeometry(0.35, 0.35, 0.75, 8).translate(0, 0.375, 0);
   const head = new ConeGeometry(1, 0.3, 12).translate(0, 0.85, 0);
   return mergeGeometries([shaft, head]).rotateX(Math.PI / 2);
@@ -53,9 +53,9 @@ export class Arrows {
   constructor(stage, world, colors) {
     this.world = world;
     this.arms = world.kinds.map(armOf);
-    this.thrust = new Marks(stage, pointer(), arrowMaterial(THRUST), 4 * world.n);
-    this.force = new Marks(stage, pointer(), arrowMaterial(FORCE), world.n);
-    this.torque = new Marks(stage, pointer(), arrowMaterial(TORQUE), world.n);
+    this.thrust = new Marks(stage, arrowShape(), arrowMaterial(THRUST), 4 * world.n);
+    this.force = new Marks(stage, arrowShape(), arrowMaterial(FORCE), world.n);
+    this.torque = new Marks(stage, arrowShape(), arrowMaterial(TORQUE), world.n);
     this.targets = new Marks(stage, new OctahedronGeometry(1), new MeshBasicMaterial({ wireframe: true }), world.n);
     world.labels.forEach((_, i) => this.targets.mesh.setColorAt(i, new Color(colors(i))));
   }

@@ -19,6 +19,7 @@ import { solids } from "./solids.js";
 import { Stage } from "./stage.js";
 import { legible, theme } from "./theme.js";
 import { Trail } from "./trails.js";
+import { PathVectors, VECTOR } from "./vectors.js";
 
 const STILL = 200; // ms without a change after which the picture is drawn in full resolution
 const BEHIND = 0.4; // s, how far a flight that is running may be ahead of what is shown
@@ -42,6 +43,7 @@ class Player {
     this.trails = this.worlds.map((world, w) => new Trail(this.stage, world, (i) => this.colors(w, i)));
     this.arrows = this.worlds.map((world, w) => new Arrows(this.stage, world, (i) => this.colors(w, i)));
     this.jets = new Jets(this.stage, this.worlds);
+    this.vectors = this.worlds.filter(({ arrows }) => arrows).map((world) => new PathVectors(this.stage, world));
     this.ribbon = comparable(this.worlds) ? new Ribbon(this.stage, this.worlds) : null;
     this.panel = new Panel(this, this);
     find("error").checked = Boolean(header.error);
@@ -270,6 +272,7 @@ class Player {
     this.trails.forEach((trail, w) => trail.show(time, panel.trail, this.layout[w], stage));
     this.arrows.forEach((arrows, w) => arrows.show(time, shown, this.layout[w], this.fleet));
     this.jets.show(time, shown.jets, this.layout);
+    for (const vectors of this.vectors) vectors.show(this.layout[vectors.world.index]);
     this.ribbon?.show(time, panel.trail, this.compared);
     stage.render();
     this.explain();
@@ -293,6 +296,7 @@ class Player {
     const row = (color, text) => rows.push(`<i style="background:${color}"></i>${text}`);
     if (panel.shown.thrust) row(THRUST, "thrust of a rotor");
     if (panel.shown.wrench) row(FORCE, "resultant force") && row(TORQUE, "resultant torque");
+    if (this.vectors.length) row(VECTOR, "vectors along the path");
     if (this.compared) row(ERROR, `${short(100 * this.ribbon.distance(this.time, panel.drone))} cm between the two flights`);
     if (panel.shown.jets) row(JET, "downwash, as wide as it has half the speed of its axis");
     if (this.stage.cell && this.surroundings.some((scene) => scene.ground)) rows.push(`squares of ${short(this.stage.cell)} m`);

@@ -64,13 +64,16 @@ class _Arrays:
         return entry
 
 
-def encode(records: Sequence[FlightLog], names: Sequence[str], title: str, **looks: Any) -> str:
+def encode(
+    records: Sequence[FlightLog], names: Sequence[str], title: str, arrows: np.ndarray | None = None, **looks: Any
+) -> str:
     """Encode the payload of a page.
 
     Args:
         records: logs of the flights, one world each.
         names: of the worlds.
         title: of the page.
+        arrows: (K, n, 3) vectors along the paths of the first world.
         looks: further entries of the header.
     """
     arrays = _Arrays()
@@ -87,6 +90,8 @@ def encode(records: Sequence[FlightLog], names: Sequence[str], title: str, **loo
         ]
         world["scene"] = _index(scenes, scene_to_dict(only_shapes(record.scene)))
         worlds.append(world)
+    if arrows is not None:
+        worlds[0]["arrows"] = arrays.add(arrows)
     return _packed({"title": title, "worlds": worlds, "vehicles": vehicles, "scenes": scenes} | looks, arrays)
 
 

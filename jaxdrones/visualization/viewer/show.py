@@ -43,6 +43,7 @@ def show(
     targets: ArrayLike | None = None,
     labels: Sequence[str] | None = None,
     images: Mapping[str, ArrayLike] | None = None,
+    arrows: ArrayLike | None = None,
     others: Annotated[str, choice("layout of other worlds", LAYOUTS)] = "ghosts",
     title: str | None = None,
     height: Annotated[int, number("pixels", above=0)] = 600,
@@ -60,6 +61,8 @@ def show(
         labels: names of the drones of a trajectory; by default `drone 0`, ...
         images: camera images at every row of a trajectory of one world, by kind: `rgb`
             (K, n, height, width, 3 or 4) uint8, `depth` (K, n, height, width) m, or `segmentation`.
+        arrows: vectors (K, n, 3) at every row of one world, world axes, in any unit, such as the negative derivative of
+            a cost with respect to commanded positions; drawn along the paths.
         others: initial layout of the other worlds: `ghosts`, `side by side` or `hidden`.
         title: title of the page; by default the conditions of the flight.
         height: height in a notebook, pixels.
@@ -76,8 +79,15 @@ def show(
         check_scene(scene, files=True)
         records = [dataclasses.replace(record, scene=scene) for record in records]
     check_size(*(record.pos for record in records))
+    if arrows is not None and (len(records) > 1 or np.shape(arrows) != records[0].pos.shape):
+        raise UserError(
+            f"arrows have shape {np.shape(arrows)} beside {len(records)} worlds, the first of shape "
+            f"{records[0].pos.shape}; give one world, and as many vectors as positions"
+        )
+    arrows = None if arrows is None else np.nan_to_num(np.asarray(arrows, float))
     title = str(records[0].conditions) if title is None else title
-    return Page(title, encode(records, list(worlds), title, layout=LAYOUTS[others], **looks(records)), height)
+    payload = encode(records, list(worlds), title, arrows, layout=LAYOUTS[others], **looks(records))
+    return Page(title, payload, height)
 
 
 def looks(records: Sequence[FlightLog]) -> dict[str, Any]:

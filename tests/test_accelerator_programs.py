@@ -14,7 +14,7 @@ from jaxdrones.learning import compilation
 from jaxdrones.training import presets
 from jaxdrones.training.algorithms import ALGORITHMS, learner
 
-pytestmark = pytest.mark.float32
+pytestmark = [pytest.mark.float32, pytest.mark.slow]
 
 FOR_CPUS = ("xla_cpu", "inlineable", "custom_call", "callback")
 """Attributes of a single kernel and of stored results; calls of libraries or of Python."""

@@ -65,6 +65,7 @@ print(jax.device_count(), jax.config.jax_compilation_cache_dir)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("told", "devices", "folder"),
     [

@@ -391,6 +391,7 @@ def test_eval_prints_one_object(trained, capsys):
     assert set(printed["evaluation"]["final_error_percentiles"]) == {"50", "95", "99"}
 
 
+@pytest.mark.slow
 def test_eval_fails_below_the_success_rate_that_is_given(trained, capsys, monkeypatch):
     folder, _ = trained
     command = ["eval", str(folder), "--episodes", "8", "--fail-below"]

@@ -32,6 +32,7 @@ def rows():
     return flown
 
 
+@pytest.mark.slow
 def test_all_pilots_have_the_same_starts_and_few_starts_are_the_first_of_many():
     for pilot in ("firmware-pid", "lqr", "mpc", "bptt", "raptor"):
         np.testing.assert_array_equal(starts(pilot, SCORED), starts("pid", SCORED))
@@ -72,6 +73,7 @@ def test_a_share_is_never_rounded_up():
     assert leaderboard.percent(1.0) == "100.0"
 
 
+@pytest.mark.slow
 def test_a_controller_commands_the_rotor_speeds_that_its_module_computes():
     env = PILOTS["geometric"].env(SCENARIOS["hover"])
     obs, world = env.reset(jax.random.key(0))

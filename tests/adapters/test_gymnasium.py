@@ -160,6 +160,7 @@ def test_world_i_of_many_flies_as_one_that_is_reset_with_the_seed_plus_i(env_of,
     assert truncated.all()
 
 
+@pytest.mark.slow
 def test_the_next_episode_begins_in_the_step_in_which_one_ends(vector_of):
     envs = vector_of()
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP

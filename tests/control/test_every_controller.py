@@ -120,6 +120,7 @@ def test_values_and_gradients_are_finite_where_directions_are_lost(loop):
     assert_finite(gradients)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", [loop for loop in EVERY_CONTROLLER if loop not in MRAC], ids=repr)
 def test_a_call_and_its_gradient_can_be_a_single_kernel(loop):
     """Without one, `over_worlds` takes many times as long. The matrices of `mrac` are too large."""

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.float32
 MASS = 0.008  # kg
 ABOVE = np.array([[0.2, 0, 2], [-0.1, 0.173205, 2], [-0.1, -0.173205, 2]])
 INTEGRATORS = {"semi-implicit Euler": jd.semi_implicit_euler, "rk4": jd.rk4}
+shared_or_not = pytest.mark.parametrize("shared", [pytest.param(False, marks=pytest.mark.slow), True])
 each_integrator = pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
 
 
@@ -108,7 +109,7 @@ def test_a_load_below_a_fixed_drone_swings_with_the_period_of_a_pendulum(integra
 
 
 @each_integrator
-@pytest.mark.parametrize("shared", [False, True])
+@shared_or_not
 def test_momentum_of_drones_and_loads_is_constant_without_gravity(shared, integrator):
     params = weightless(jd.with_payload(team(3), MASS, 0.4, anchor=(0.01, 0, -0.01), cables=3 if shared else 1))
     step = make_step(shared, integrator)
@@ -124,7 +125,7 @@ def test_momentum_of_drones_and_loads_is_constant_without_gravity(shared, integr
     np.testing.assert_allclose(jax.vmap(momentum)(states), momentum(start)[None].repeat(250, 0), atol=1e-3 * exchanged)
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@shared_or_not
 def test_angular_momentum_of_drones_and_loads_is_constant_without_gravity(shared):
     """The pull at an anchor off the center of mass turns the drone by as much as it turns the load."""
     params = weightless(jd.with_payload(team(3), MASS, 0.4, anchor=(0.01, 0, -0.02), cables=3 if shared else 1))
@@ -144,7 +145,7 @@ def test_angular_momentum_of_drones_and_loads_is_constant_without_gravity(shared
 
 
 @each_integrator
-@pytest.mark.parametrize("shared", [False, True])
+@shared_or_not
 def test_damped_cables_never_add_energy(shared, integrator):
     """Of a fall, in which cables become taut and slack; 0.3 % of the kinetic energy for the order of the integrator."""
     params = jd.with_payload(team(3), MASS, 0.4, anchor=(0.005, 0, -0.01), cables=3 if shared else 1)
@@ -161,8 +162,10 @@ def test_damped_cables_never_add_energy(shared, integrator):
     assert still[-1] < still[0] - 0.01 * float(energy(weightless(params), start, shared))
 
 
-@pytest.mark.parametrize("integrator, least", [(jd.semi_implicit_euler, 0.8), (jd.rk4, 3.5)])
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(
+    "integrator, least", [(jd.semi_implicit_euler, 0.8), pytest.param(jd.rk4, 3.5, marks=pytest.mark.slow)]
+)
+@shared_or_not
 def test_energy_is_conserved_to_the_order_of_the_integrator_without_damping(shared, integrator, least):
     with jax.enable_x64(True):
         params = jd.with_payload(
@@ -196,7 +199,7 @@ def test_a_swing_keeps_its_amplitude_at_the_longest_step():
 
 
 @each_integrator
-@pytest.mark.parametrize("shared", [False, True])
+@shared_or_not
 def test_a_hovering_drone_carries_the_weight_of_its_load(shared, integrator):
     """Thrust for drone and load alone holds the height; without the load's share the team sinks."""
     mass = 3 * MASS if shared else MASS
@@ -245,7 +248,7 @@ def test_the_tension_is_that_of_the_formula_and_continuous_where_the_cable_becom
     np.testing.assert_allclose(c, 2 * 0.3 * np.sqrt(k * mu), rtol=1e-5)
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@shared_or_not
 def test_gradients_through_the_cables_are_those_of_central_differences(shared):
     params = jd.with_payload(team(3), MASS, 0.4, anchor=(0.005, 0, -0.01), cables=3 if shared else 1)
     step = make_step(shared)
@@ -284,7 +287,7 @@ def test_the_gradient_is_finite_for_a_load_at_its_anchor_and_at_the_end_of_a_sla
     assert np.all(np.isfinite([gradient(x) for x in (0.0, 0.5, 0.6)]))
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@shared_or_not
 def test_many_worlds_swing_as_one_does(shared):
     params = jd.with_payload(team(3), MASS, 0.4, cables=3 if shared else 1)
     step = make_step(shared)

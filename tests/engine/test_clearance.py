@@ -56,6 +56,7 @@ def test_worlds_that_are_near_and_worlds_that_are_not_fly_as_if_all_were_compute
         assert near / 2 <= pushed.sum() <= near
 
 
+@pytest.mark.slow
 def test_the_gradient_far_from_obstacles_is_that_of_a_flight_without_them():
     def end(scene, push):
         state = jd.State.at_rest(jnp.array([(0.0, 0, 50), (1, 0, 50)])).replace(vel=push)

@@ -64,6 +64,7 @@ def test_many_worlds_compute_near_pairs_or_all_pairs_and_not_both():
         assert_close(wrench, jit_unoptimized(alone)(params, state).force, 1e-13)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_all_pairs():
     params, state = team(8.0)
 

@@ -106,6 +106,7 @@ return places; }})()"""
     return in_node(text, own | {"state": made.state, "mass": made.mass}, GOAL, wind)
 
 
+@pytest.mark.slow
 def test_a_thousand_steps_in_javascript_are_those_of_the_environment(env, made):
     found = places(made, "policy", 1000, WIND)
     expected = flown_by_the_environment(env, start_of(made), len(found))

@@ -31,6 +31,7 @@ def test_the_first_drones_are_flown_by_the_policy_and_the_others_by_the_past_pol
     np.testing.assert_allclose(action[2:, 1:], scaled(policy, -3.0)(obs)[2:, 1:], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_league_of_single_drones_learns_what_bptt_learns():
     env = jd.make("hover")
     expected = bptt.train(KEY, env, bptt.Config(**SMALL))
@@ -38,6 +39,7 @@ def test_a_league_of_single_drones_learns_what_bptt_learns():
     assert_close(found.policy.params, expected.policy.params, 1e-6)
 
 
+@pytest.mark.slow
 def test_only_the_first_drone_learns_and_the_oldest_past_policy_is_replaced():
     env = jd.make("hover", drones=2)
     start = league.init(KEY, env, CONFIG)

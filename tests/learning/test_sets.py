@@ -57,6 +57,7 @@ def crowd(drones, count=3):
     return envs.make("crowd", drones=drones, observation=("goal", "velocity", encounters(count, REACH)))
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_one_policy_flies_teams_of_any_size():
     policy = Policy.init(KEY, crowd(4), (8,), set_sizes=(8, 8))
@@ -66,6 +67,7 @@ def test_one_policy_flies_teams_of_any_size():
         assert policy(obs).shape == (drones, env.action_size)
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_rows_are_not_normalized_and_all_else_is(tmp_path):
     env = crowd(4)

@@ -61,6 +61,7 @@ def test_a_disc_meets_what_is_on_its_way_and_nothing_else(solid):
     assert not hit[gap > 4e-3].any()
 
 
+@pytest.mark.slow
 def test_a_disc_that_turns_into_a_wall_beside_it_meets_it():
     """Its center rests; at first its flat side faces the wall, in the end its rim is in it, also after small turns."""
     kinds = Scene.of(Box(pos=(1.2, 0, 0), size=(2.0, 9.0, 9.0)), ground=False).shapes(float)  # its face is at x = 0.2 m

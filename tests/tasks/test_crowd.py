@@ -15,7 +15,9 @@ KEYS = jax.random.split(jax.random.key(0), 20)
 
 
 @pytest.mark.float32
-@pytest.mark.parametrize("drones, density", [(2, 1.0), (8, 1.0), (8, 4.0), (27, 1.0)])
+@pytest.mark.parametrize(
+    "drones, density", [(2, 1.0), (8, 1.0), (8, 4.0), pytest.param(27, 1.0, marks=pytest.mark.slow)]
+)
 def test_starts_and_goals_fill_a_cube_of_the_density_and_keep_their_distance(drones, density):
     env = make("crowd", drones=drones, density=density)
     _, worlds = jax.vmap(env.reset)(KEYS)
@@ -40,6 +42,7 @@ def test_random_boxes_are_narrow_or_long():
     assert 0.2 < np.mean(sides.max(axis=1) > 2.2) < 0.5 and sides.max() < 4
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_among_balls_starts_and_goals_are_free_and_a_ball_touches():
     env = make("crowd", drones=8, obstacles=1.0)

@@ -18,7 +18,13 @@ def load_of(worlds):
     return worlds.drones.aux["payload"]
 
 
-@pytest.mark.parametrize("task, drones", [("sling", 1), ("sling", 2), ("transport", 2), ("transport", 4)])
+@pytest.mark.parametrize(
+    "task, drones",
+    [
+        ("sling", 1),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in [("sling", 2), ("transport", 2), ("transport", 4)]),
+    ],
+)
 def test_loads_start_near_the_curve_below_their_drones_on_cables_that_are_not_stretched(task, drones):
     env = make(task, drones=drones)
     _, worlds = jax.vmap(env.reset)(KEYS)
@@ -46,6 +52,7 @@ def test_the_mass_of_a_load_is_the_share_of_its_drones(task, drones, mass):
     np.testing.assert_allclose(load.stiffness * load.onset, 0.5 * env.params.mass * 9.8, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_swing_is_the_angle_from_the_vertical_to_the_middle_of_the_team():
     for task, drones in (("sling", 1), ("transport", 3)):
         env = make(task, drones=drones)

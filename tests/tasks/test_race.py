@@ -127,6 +127,7 @@ def test_without_contact_a_gate_counts_also_beside_its_opening_and_its_frame_end
     assert after(*step)["hit"][0] and "crashed" not in ENV(contact=False).task.terminations
 
 
+@pytest.mark.slow
 def test_drones_start_on_the_ground_in_random_order_or_one_behind_the_other():
     keys = jax.random.split(jax.random.key(0), 200)
     grid = np.asarray(jit_unoptimized(jax.vmap(make("race", drones=3).reset))(keys)[1].drones.pos)
@@ -140,6 +141,7 @@ def test_drones_start_on_the_ground_in_random_order_or_one_behind_the_other():
     assert index.max() == 3 and index.min() == 0 and np.ptp(index, axis=1).max() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.float32
 def test_observations_and_their_gradients_are_finite_for_a_drone_that_left_the_world():
     env = make("race", drones=2)

@@ -12,7 +12,7 @@ from jaxdrones.tasks.wake import HEIGHT
 KEY = jax.random.key(0)
 
 
-@pytest.mark.parametrize("drones", [2, 5])
+@pytest.mark.parametrize("drones", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_all_cross_the_axis_at_once_at_their_altitudes(drones):
     env = make("wake", drones=drones, spacing=0.4, amplitude=0.7, period=4.0)
     _, world = env.reset(KEY)
@@ -31,6 +31,7 @@ def test_all_cross_the_axis_at_once_at_their_altitudes(drones):
     assert cosines.max() < 0.99  # no two lines are the same
 
 
+@pytest.mark.slow
 def test_the_drones_fly_in_the_wakes_of_each_other_unless_told_otherwise():
     """Two drones above each other: the lower one sinks."""
     falls = []

@@ -50,6 +50,7 @@ def test_a_training_learns_the_same_without_its_history_and_writes_nothing_more(
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_a_continued_training_goes_on_keeping_and_a_replaced_one_begins_anew(runs, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(runs[0].folder, folder)

@@ -36,8 +36,8 @@ MORE = {  # command of a page -> what makes it short
     "train hover --vehicle mine.urdf --resume --budget 50": RESUMED,
     "eval my_policy.py:policy --task hover --set action=position --set reach=0.5 --set tilt=20": "--episodes 4",
     "fly --policy my_policy.py:policy --task hover --set action=position --backend bullet": "--no-figure",
-    "eval any-vehicle --task hover --realistic any --set action=throttle": "--episodes 4",
-    "eval raptor --task hover --vehicle x500 --set rotors=lagging --set action=throttle": "--episodes 4",
+    "eval any-vehicle --task hover --realistic any": "--episodes 4",
+    "eval raptor --task hover --vehicle x500": "--episodes 4",
 }
 
 

@@ -17,6 +17,8 @@ from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 
 OBSERVED = ("position_error", "rotation_matrix", "velocity_error", "omega")
+OPTIONS = {"action": "throttle", "rotors": "lagging"}
+"""Options of `jaxdrones.make` for an environment like those of its training."""
 _CORNERS = np.array([(1, -1), (-1, -1), (-1, 1), (1, 1)])  # front right, rear right, rear left, front left
 _TURNS = (0.0, 90.0, 45.0, -45.0)  # degrees
 _CENTERED = 0.3  # of the largest coordinate of a rotor: below, it is on an axis

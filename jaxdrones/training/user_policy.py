@@ -12,6 +12,7 @@ from jaxdrones.checks import check_function
 from jaxdrones.envs import Env, make
 from jaxdrones.envs.functions import check_policy
 from jaxdrones.errors import UserError
+from jaxdrones.learning import adaptive
 from jaxdrones.learning.networks import AnyPolicy, Policy, RecurrentPolicy
 from jaxdrones.learning.policies import POLICIES, check_fits, make_policy
 
@@ -43,8 +44,9 @@ class UserPolicy:
         return self
 
     def env(self, **options: Any) -> Env:
-        """Environment; options of `jaxdrones.make` override those of the policy."""
-        return make(self.task, realistic=self.realistic, **self.options | options)
+        """Environment; options of `jaxdrones.make` override those of the policy, and its own those of a published one."""
+        own = adaptive.OPTIONS if self.reference in POLICIES else {}
+        return make(self.task, realistic=self.realistic, **own | self.options | options)
 
     def policy(self, env: Env) -> AnyPolicy:
         """Policy."""

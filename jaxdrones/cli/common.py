@@ -52,8 +52,10 @@ def print_error(message: str, code: int = MISTAKE) -> int:
 
 @contextlib.contextmanager
 def lasting_interrupts():
-    """Context that repeats a Ctrl-C dropped by Python, for example in a callback of its garbage collector."""
+    """Context in which SIGTERM is a Ctrl-C, and one dropped by Python, as in its garbage collector, is repeated."""
     before, timers = sys.unraisablehook, []
+    is_main = threading.current_thread() is threading.main_thread()
+    terminate = signal.signal(signal.SIGTERM, signal.default_int_handler) if is_main else None
 
     def interrupt_again(dropped):
         if dropped.exc_type is not KeyboardInterrupt:
@@ -66,6 +68,8 @@ def lasting_interrupts():
     try:
         yield
     finally:
+        if is_main:
+            signal.signal(signal.SIGTERM, terminate)
         sys.unraisablehook = before
         for timer in timers:
             timer.cancel()

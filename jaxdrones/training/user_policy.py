@@ -44,7 +44,7 @@ class UserPolicy:
         return self
 
     def env(self, **options: Any) -> Env:
-        """Environment; options of `jaxdrones.make` override those of the policy, and its own those of a published one."""
+        """Environment; options of `jaxdrones.make` override those of the policy."""
         own = adaptive.OPTIONS if self.reference in POLICIES else {}
         return make(self.task, realistic=self.realistic, **own | self.options | options)
 

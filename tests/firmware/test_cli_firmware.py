@@ -51,7 +51,8 @@ def simulated(tmp_path):
 
 
 @pytest.mark.slow
-def test_noise_is_no_traceback_and_ctrl_c_ends_a_flight_with_its_log(simulated, tmp_path):
+@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM])
+def test_noise_is_no_traceback_and_a_signal_ends_a_flight_with_its_log(simulated, tmp_path, ended_by):
     noise = (b"", b"x" * 2000, b"y" * 32, b"\xff", b"\x5d\x06", b"\x3c" + bytes(3), b"\x2f\x00", b"\x8c" + bytes(30))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
         client.connect(("127.0.0.1", 19998))
@@ -62,7 +63,7 @@ def test_noise_is_no_traceback_and_ctrl_c_ends_a_flight_with_its_log(simulated, 
         while b"Bitcraze Crazyflie" not in client.recv(100):
             pass
     time.sleep(0.5)
-    simulated.send_signal(signal.SIGINT)
+    simulated.send_signal(ended_by)
     out, err = simulated.communicate(timeout=30)
     assert simulated.returncode == 130 and err == "jaxdrones: interrupted\n"
     assert "invalid 3" in out and (tmp_path / "runs" / "crazyflie" / "log.npz").is_file()

@@ -16,7 +16,8 @@ try:
     import rclpy.signals
 except ImportError as error:
     raise ImportError(
-        "rclpy is not installed; source the setup.bash of a ROS 2, or install its wheels (docs/ros2.md)"
+        "rclpy is not installed; source the setup.bash of a ROS 2, or pip install ros-rclpy ros-rmw-fastrtps-cpp "
+        "ros-std-msgs ros-sensor-msgs ros-geometry-msgs ros-nav-msgs ros-std-srvs ros-rosgraph-msgs"
     ) from error
 
 from jaxdrones.ros2 import messages as msg

@@ -1,14 +1,22 @@
-"""Conditional computation of costly functions in many worlds."""
+"""Functions that are computed only in the worlds in which they are needed, and so are their derivatives.
+
+Under `jax.vmap` a condition computes both of its branches in every world. The primitive here keeps one program of one
+world under `jax.vmap` and under derivatives, and gathers the worlds when it is compiled.
+"""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
+
+from jaxdrones.accelerate import compiler
 
 
 @jax.custom_batching.custom_vmap
@@ -22,61 +30,177 @@ def _in_all_worlds(worlds: int, batched: list[bool], holds: Array) -> tuple[Arra
     return in_all_worlds(jnp.all(holds)), False
 
 
-def where_needed(function: Callable[..., Any], one_in: int = 64) -> Callable[..., Any]:
+def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | None = None) -> Callable[..., Any]:
     """Build `(needed, *args) -> function(*args)`, with zeros where `needed` () is false.
 
-    Under `jax.vmap` only worlds with `needed` are computed, in chunks of one in `one_in`. Derivatives are those of the
-    function where it is needed, else zero; they are computed in every world.
+    Under `jax.vmap` only worlds with `needed` are computed, in chunks of `chunk` worlds or of one in `one_in`.
+    Derivatives are those of the function where it is needed, else zero, and cost as many worlds; in reverse mode the
+    function is recomputed.
+
+    Args:
+        function: pure function of arrays.
+        one_in: all worlds over those of a chunk.
+        chunk: number of worlds of a chunk, in place of `one_in`.
     """
 
-    @jax.custom_jvp
-    def result(needed: Array, args: tuple[Any, ...]) -> Any:
-        shapes = jax.eval_shape(function, *args)
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return in_chosen_worlds(lambda args: function(*args), lambda worlds: worlds // one_in)(needed, zeros, args)
+    def where(needed: Array, *args: Any) -> Any:
+        program, consts, shape = compiler.trace(function, *args)
+        inputs = [*consts, *map(jnp.asarray, jax.tree.leaves(args))]
+        mapped = (False,) * len(inputs)
+        out = _where.bind(needed, *inputs, program=program, mapped=mapped, worlds=None, one_in=one_in, chunk=chunk)
+        return jax.tree.unflatten(jax.tree.structure(shape), out)
 
-    @result.defjvp
-    def _(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-        needed, args = primals
-        _, changes = jax.jvp(function, args, tangents[1])
-        return result(needed, args), jax.tree.map(lambda x: jnp.where(needed, x, jnp.zeros_like(x)), changes)
-
-    return lambda needed, *args: result(needed, args)
+    return where
 
 
-def in_chosen_worlds(function: Callable[[Any], Any], chunk: Callable[[int], int]) -> Callable[[Array, Any, Any], Any]:
-    """Build `(chosen, otherwise, args) -> function(args) if chosen else otherwise`, without derivatives.
+def where_due(draw: Callable[..., Any], chunk: int) -> Callable[..., Any]:
+    """Build `(due, before, *args) -> draw(*args)`, with `before` where `due` () is false; see `where_needed`."""
 
-    Under `jax.vmap` the chosen worlds are gathered and computed in chunks; `chunk` returns their size for a number of
-    worlds. A condition would compute both of its branches in every world.
-    """
+    def drawn(due: Array, before: Any, *args: Any) -> Any:
+        new = where_needed(draw, chunk=chunk)(due, *args)
+        return jax.tree.map(functools.partial(jnp.where, due), new, before)
 
-    @jax.custom_batching.custom_vmap
-    def one(chosen: Array, otherwise: Any, args: Any) -> Any:
-        return jax.lax.cond(chosen, lambda: function(args), lambda: otherwise)
+    return drawn
 
-    @one.def_vmap
-    def many(worlds: int, batched: list, chosen: Array, otherwise: Any, args: Any) -> tuple[Any, Any]:
-        chosen_varies, otherwise_varies, args_vary = batched
-        axes = jax.tree.map(lambda x: 0 if x else None, args_vary)
-        otherwise = jax.tree.map(
-            lambda x, varies: x if varies else jnp.broadcast_to(x, (worlds, *x.shape)), otherwise, otherwise_varies
-        )
-        chosen = chosen if chosen_varies else jnp.broadcast_to(chosen, (worlds,))
-        count, size = jnp.sum(chosen), min(max(chunk(worlds), 1), worlds)
 
-        def of_chunk(i: Array, found: Any, index: Array) -> Any:
+_where = Primitive("where_needed")
+"""Operands are `needed` and the inputs of `program`. Those that are `mapped` have a leading axis over `worlds`,
+like `needed` and the results; without worlds (`None`) it is of one world."""
+_where.multiple_results = True
+
+
+def _computed(needed: Array, *inputs: Array, program: Any, mapped: tuple, worlds: int | None, **of_chunk: Any) -> list:
+    evaluate = _function(program)
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in _results(program, worlds)]
+    if worlds is None:
+        return jax.lax.cond(needed, lambda: evaluate(*inputs), lambda: zeros)
+    count, size = jnp.sum(needed), _chunk(worlds, **of_chunk)
+    every = jax.vmap(evaluate, [0 if varies else None for varies in mapped], axis_size=size)
+
+    def of_needed() -> list:
+        index = jnp.nonzero(needed, size=worlds + -worlds % size, fill_value=worlds)[0]
+
+        def advance(i: Array, found: list) -> list:
             to = jax.lax.dynamic_slice_in_dim(index, i * size, size)
             at = jnp.minimum(to, worlds - 1)
-            inputs = jax.tree.map(lambda x, varies: x[at] if varies else x, args, args_vary)
-            new = jax.vmap(function, in_axes=(axes,), axis_size=size)(inputs)
-            return jax.tree.map(lambda all, x: all.at[to].set(x, mode="drop"), found, new)
+            new = every(*(x[at] if varies else x for x, varies in zip(inputs, mapped, strict=True)))
+            return [all.at[to].set(x, mode="drop") for all, x in zip(found, new, strict=True)]
 
-        def of_all(found: Any) -> Any:
-            index = jnp.nonzero(chosen, size=worlds + -worlds % size, fill_value=worlds)[0]
-            return jax.lax.fori_loop(0, -(-count // size), functools.partial(of_chunk, index=index), found)
+        return jax.lax.fori_loop(0, -(-count // size), advance, zeros)
 
-        out = jax.lax.cond(count > 0, of_all, lambda found: found, otherwise)
-        return out, jax.tree.map(lambda _: True, out)
+    return jax.lax.cond(count > 0, of_needed, lambda: zeros)
 
-    return one
+
+def _chunk(worlds: int, one_in: int, chunk: int | None) -> int:
+    return min(chunk or max(worlds // one_in, 1), worlds)
+
+
+def _results(program: Any, worlds: int | None) -> list[jax.ShapeDtypeStruct]:
+    leading = () if worlds is None else (worlds,)
+    return [jax.ShapeDtypeStruct((*leading, *v.aval.shape), v.aval.dtype) for v in program.outvars]
+
+
+@_where.def_impl
+def _at_once(needed: Array, *inputs: Array, **params: Any) -> list[Array]:
+    if params["worlds"] is None and needed:
+        return _function(params["program"])(*inputs)
+    return jax.jit(functools.partial(_computed, **params))(needed, *inputs)
+
+
+@_where.def_abstract_eval
+def _shapes(needed: Any, *inputs: Any, program: Any, worlds: int | None, **_: Any) -> list[Any]:
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in _results(program, worlds)]
+
+
+def _batched(args: Sequence, dims: Sequence, *, mapped: tuple, worlds: int | None, **params: Any) -> tuple:
+    """More worlds: an axis over worlds, or one over worlds of worlds, which becomes part of it."""
+    size = next(x.shape[dim] for x, dim in zip(args, dims, strict=True) if dim is not None)
+
+    def leading(x: Array, dim: int | None, varies: bool) -> Array:
+        x = x[None] if dim is None else jnp.moveaxis(x, dim, 0)
+        if worlds is None:
+            return jnp.broadcast_to(x, (size, *x.shape[1:]))
+        x = x if varies else x[:, None]
+        return jnp.broadcast_to(x, (size, worlds, *x.shape[2:])).reshape(size * worlds, *x.shape[2:])
+
+    (needed, *inputs), (of_needed, *of_inputs) = args, dims
+    needed = leading(needed, of_needed, worlds is not None)
+    varying = tuple(varies or dim is not None for varies, dim in zip(mapped, of_inputs, strict=True))
+    inputs = [
+        leading(x, dim, was) if varies else x
+        for x, dim, was, varies in zip(inputs, of_inputs, mapped, varying, strict=True)
+    ]
+    out = _where.bind(needed, *inputs, mapped=varying, worlds=size * (worlds or 1), **params)
+    if worlds is not None:
+        out = [x.reshape(size, worlds, *x.shape[1:]) for x in out]
+    return out, [0] * len(out)
+
+
+def _differentiated(primals: Sequence, tangents: Sequence, *, program: Any, mapped: tuple, **params: Any) -> tuple:
+    """Results, and their changes by the program of the changes of one world."""
+    (needed, *inputs), changes = primals, tangents[1:]
+    out = _where.bind(needed, *inputs, program=program, mapped=mapped, **params)
+    moving = [i for i, change in enumerate(changes) if type(change) is not ad.Zero]
+    smooth = [i for i, x in enumerate(out) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    evaluate = _function(program)
+
+    def changed(inputs: list, changes: list) -> list:
+        def of_moving(*moved: Array) -> list:
+            results = evaluate(*_replaced(inputs, moving, moved))
+            return [results[i] for i in smooth]
+
+        return jax.jvp(of_moving, [inputs[i] for i in moving], changes)[1]
+
+    shapes = _inputs(program)
+    linear, consts, _ = compiler.trace(changed, shapes, [shapes[i] for i in moving])
+    operands = [*consts, *inputs, *(changes[i] for i in moving)]
+    mapped = (*(False for _ in consts), *mapped, *(mapped[i] for i in moving))
+    found = _where.bind(needed, *operands, program=linear, mapped=mapped, **params)
+    return out, _replaced([ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out], smooth, found)
+
+
+def _transposed(given: Sequence, needed: Array, *inputs: Any, program: Any, mapped: tuple, **params: Any) -> list:
+    """Cotangents of the inputs in which the program is linear."""
+    linear = [i for i, x in enumerate(inputs) if ad.is_undefined_primal(x)]
+    known = [i for i in range(len(inputs)) if i not in linear]
+    used = [i for i, x in enumerate(given) if type(x) is not ad.Zero]
+    evaluate, shapes, results = _function(program), _inputs(program), _results(program, None)
+
+    def pulled_back(values: list, given: list) -> list:
+        def of_linear(*moved: Array) -> list:
+            found = evaluate(*_replaced(_replaced([None] * len(inputs), known, values), linear, moved))
+            return [found[i] for i in used]
+
+        return jax.linear_transpose(of_linear, *(shapes[i] for i in linear))(given)
+
+    back, consts, _ = compiler.trace(pulled_back, [shapes[i] for i in known], [results[i] for i in used])
+    operands = [*consts, *(inputs[i] for i in known), *(given[i] for i in used)]
+    has_worlds = params["worlds"] is not None
+    varying = (*(False for _ in consts), *(mapped[i] for i in known), *(has_worlds for _ in used))
+    found = _where.bind(needed, *operands, program=back, mapped=varying, **params)
+    found = [x.sum(axis=0) if has_worlds and not mapped[i] else x for i, x in zip(linear, found, strict=True)]
+    return [None, *_replaced([None] * len(inputs), linear, found)]
+
+
+def _function(program: Any) -> Callable[..., list]:
+    """Function of closed-over values and inputs."""
+    closed_over = len(program.constvars)
+    return lambda *inputs: compiler.as_function(program, inputs[:closed_over])(*inputs[closed_over:])
+
+
+def _inputs(program: Any) -> list[jax.ShapeDtypeStruct]:
+    variables = (*program.constvars, *program.invars)
+    return [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in variables]
+
+
+def _replaced(values: Sequence, places: Sequence[int], others: Sequence) -> list:
+    new = list(values)
+    for i, x in zip(places, others, strict=True):
+        new[i] = x
+    return new
+
+
+batching.primitive_batchers[_where] = _batched
+ad.primitive_jvps[_where] = _differentiated
+ad.primitive_transposes[_where] = _transposed
+mlir.register_lowering(_where, mlir.lower_fun(_computed, multiple_results=True))

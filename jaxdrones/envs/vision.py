@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.accelerate.where_due import where_due
+from jaxdrones.accelerate.where_needed import where_due
 from jaxdrones.arguments import checked, choices
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.envs.functions import DrawScene

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdrones.accelerate.where_due import where_due
+from jaxdrones.accelerate.where_needed import where_due
 
 WORLDS, CHUNK, STEPS = 7, 3, 5
 RNG = np.random.default_rng(0)

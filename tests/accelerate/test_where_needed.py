@@ -38,3 +38,11 @@ def test_worlds_with_one_key_get_one_result():
     key = jax.random.key(0)
     found = jax.vmap(where_needed(jax.random.normal), (0, None))(X > 3, key)
     np.testing.assert_array_equal(found, jnp.where(X > 3, jax.random.normal(key), 0))
+
+
+def test_closed_over_values_are_inputs_too():
+    def loss(factors):
+        scaled = where_needed(lambda x: jnp.sum(factors * x**2), one_in=8)
+        return jnp.sum(jax.vmap(scaled)(X > 3, X))
+
+    np.testing.assert_allclose(jax.grad(loss)(jnp.ones(2)), np.sum(np.asarray(X[3:]) ** 2), rtol=1e-12)

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # First flight
-# Four Crazyflies fly the circle of gym-pybullet-drones (2021) by its PID. The flight is plotted, then played in three
-# dimensions, then flown once more with wind.
+# Four Crazyflies fly the circle of gym-pybullet-drones (2021) with its PID controller. This notebook plots the flight,
+# plays it in three dimensions, and repeats it with wind.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -30,7 +30,7 @@ from jaxdrones.visualization.palette import COLORS
 plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True, "grid.linewidth": 0.3}
 
 # %% [markdown]
-# `State` changes during a flight, `Params` are constant, and the physics are arguments of `make_step`: here drag,
+# `State` changes during a flight, `Params` are constant. The arguments of `make_step` define the physics: here drag,
 # ground effect and downwash, with two physics steps of 1/240 s per control step.
 
 # %%
@@ -61,7 +61,7 @@ final, trajectory = fly(params, start)
 print("positions:", trajectory.pos.shape, "= control steps, drones, (x, y, z)")
 
 # %% [markdown]
-# Every drone follows a target on the circle. The PID uses the target's position but not its velocity, so it lags.
+# Every drone follows a target on the circle. The PID uses the position of the target but not its velocity, so it lags.
 
 # %%
 t = np.arange(1, 12 * HZ + 1) / HZ
@@ -84,15 +84,15 @@ right.set(xlabel="t (s)", ylabel="distance from the target (cm)", ylim=(0, None)
 assert error[4 * HZ :].mean() < 0.12  # the PID lags some 10 cm behind, as in gym-pybullet-drones
 
 # %% [markdown]
-# `jd.show` plays the flight: drag to rotate the view, press `?` for the keys. (A static display of the notebook, as on
-# GitHub, shows a picture instead.)
+# `jd.show` plays the flight: drag to rotate the view, press `?` for the keys. (Static views of the notebook, such as on
+# GitHub, show a picture instead.)
 
 # %%
 jd.show(trajectory, params, dt=1 / HZ, targets=targets, title="Four Crazyflies on a circle")
 
 # %% [markdown]
 # ## The same flight in wind
-# Wind is a field of `Params` and acts through the drag. `jax.vmap` simulates one world for each wind.
+# Wind is a field of `Params` and acts through the drag. `jax.vmap` simulates one world for each wind speed.
 
 # %%
 speeds = jnp.array([0.0, 2.0, 4.0])  # m/s along x

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Thousands of drones
-# A step advances one world; `jax.vmap` maps it over many worlds, masses or vehicles. First two thousand worlds with one
-# drone each, then one world with a thousand drones.
+# A step advances one world; `jax.vmap` maps it over many worlds, masses or vehicles. This notebook simulates two
+# thousand worlds with one drone each, then one world with a thousand drones.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -30,7 +30,7 @@ plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True,
 
 # %% [markdown]
 # ## Two thousand worlds
-# The same flight with two thousand masses: 5 s from rest to a place 0.3 m away.
+# The same flight with two thousand masses: 5 s from rest to a target 0.3 m away.
 
 # %%
 HZ, WORLDS = 120, 2000
@@ -55,7 +55,8 @@ masses = jnp.linspace(0.020, 0.040, WORLDS)  # kg
 
 
 # %% [markdown]
-# `jd.over_worlds(fly)` returns what `jax.jit(jax.vmap(fly))` returns, and is faster on a CPU. The first call compiles.
+# `jd.over_worlds(fly)` returns the same results as `jax.jit(jax.vmap(fly))`, and is faster on a CPU. The first call
+# compiles.
 
 
 # %%
@@ -86,8 +87,8 @@ assert jnp.abs(pos[jnp.argmin(jnp.abs(masses - nominal.mass)), -1, 2] - 1.0) < 0
 
 # %% [markdown]
 # ## A thousand drones in one world
-# Two sheets of 500 drones, one 0.6 m above the other, track a wave. Each drone flies in the downwash of those above
-# it. With a `NeighborGrid` only pairs within 1.5 m of each other are evaluated, instead of all 999,000.
+# Two layers of 500 drones, one 0.6 m above the other, track a wave. Each drone flies in the downwash of the drones
+# above it. With a `NeighborGrid` only pairs within 1.5 m of each other are evaluated, instead of all 999,000.
 
 # %%
 SECONDS = 2

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Gradients through flight
-# The simulator is differentiable from end to end. Here the derivative of a flight tunes the gains of a PID, identifies
-# a mass from a recorded flight, and optimizes a trajectory through four gates.
+# The simulator is differentiable from end to end. This notebook uses the derivative of a flight to tune the gains of a
+# PID, identify a mass from a simulated measurement, and optimize a trajectory through four gates.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -54,9 +54,9 @@ def descend(cost, x, learning_rate, updates):
 
 # %% [markdown]
 # ## Tuning a PID
-# The PID of gym-pybullet-drones flies a wider curve than its target, whose position and velocity it is given. The cost
-# is the mean squared distance from the target over one and a half turns of a curve. The variables are the logarithms of
-# a factor on each gain of the position loop, so that gains stay positive. The attitude loop stays as it is.
+# The PID of gym-pybullet-drones receives the position and velocity of the target, but flies a wider curve. The cost is
+# the mean squared distance from the target over one and a half turns of a curve. The variables are the logarithms of a
+# factor on each gain of the position loop, so gains stay positive. The attitude loop is not changed.
 
 # %%
 t = jnp.arange(1, 6 * HZ + 1) / HZ
@@ -110,14 +110,15 @@ print(f"distance from the target, rms: {100 * costs[0] ** 0.5:.1f} cm before, {1
 assert costs[-1] < 0.5 * costs[0]
 
 # %% [markdown]
-# The path is as round as before and closer to the target. The gains are tuned for this flight alone, in a simulation
-# without noise and delay, where high gains cost nothing. For a real drone, put these into the simulation first.
+# The path is as round as before and closer to the target. The gains are tuned only for this flight, in a simulation
+# without noise and delay, where high gains have no disadvantage. For a real drone, add noise and delay to the
+# simulation first.
 
 # %% [markdown]
 # ## Identifying a mass
-# A drone with an unknown payload climbs by a meter, and its heights are recorded with 1 cm of noise. The controller
+# A drone with an unknown payload climbs by one meter, and its height is measured with 1 cm of noise. The controller
 # assumes the nominal mass. The mass is estimated by nonlinear least squares (Gauss-Newton), with the derivative of the
-# whole flight with respect to the mass by `jax.jacfwd`. The curvature gives the standard error.
+# whole flight with respect to the mass, computed by `jax.jacfwd`. The curvature gives the standard error.
 
 
 # %%
@@ -166,9 +167,9 @@ assert abs(mass - TRUE_MASS) < 4 * standard_error
 
 # %% [markdown]
 # ## A trajectory through gates
-# The variables are the control points of a cubic B-spline, the reference of a controller. The cost is on the *flown*
-# path: it should pass the middle of every gate at a given time and straight through, and the curve should be smooth.
-# The optimization thus also compensates for the lag of the controller.
+# The variables are the control points of a cubic B-spline, the reference of a controller. The cost is a function of the
+# *flown* path: it should pass through the center of every gate at a given time and perpendicular to it, and the curve
+# should be smooth. The optimization therefore also compensates for the lag of the controller.
 
 # %%
 times = jnp.array([1.4, 2.6, 4.2, 5.4])  # s, at which the gates are to be passed

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Train a policy
-# The task: hover with all four rotors, from any motion within a meter of the goal. Two learners are compared:
-# backpropagation through time (BPTT), which follows the gradient of the rewards through the physics, and batched PPO,
-# which needs no gradient of the physics.
+# The task is to hover with all four rotors, from random motions within one meter of the goal. This notebook compares
+# two learners: backpropagation through time (BPTT), which uses the gradient of the rewards through the physics, and
+# batched PPO, which needs no gradient of the physics.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -31,7 +31,7 @@ from jaxdrones.visualization.palette import COLORS
 plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True, "grid.linewidth": 0.3}
 
 # %% [markdown]
-# `print(jd.explain(env))` describes the environment in full: observation, action, rewards, terminations, physics.
+# `print(jd.explain(env))` describes the complete environment: observation, action, rewards, terminations, physics.
 
 # %%
 env = jd.make("hover")
@@ -40,9 +40,9 @@ print("\n\n".join(part for part in parts if part.startswith(("hover", "Action", 
 
 # %% [markdown]
 # ## Two trainings
-# `presets.preset` has tuned settings; PPO's are cut to fewer and shorter updates here. A training is one compiled
-# program for all worlds. The times are of the processor, which other programs change little; the README has the seconds
-# that one waits for BPTT on two idle cores, compilation and training apart.
+# `presets.preset` returns tuned settings; here PPO has fewer and shorter updates. Training is one compiled program for
+# all worlds. The printed times are CPU times, which depend little on other programs; the README has the wall-clock
+# times of compilation and training by BPTT on two idle cores.
 
 # %%
 env, config = presets.preset("hover", "bptt")
@@ -55,7 +55,8 @@ for (name, config), learner in zip(configs.items(), (bptt, ppo), strict=True):
 
 # %% [markdown]
 # ## Learning curves
-# PPO's rewards are those of flights with random exploration, so they stay below those of its policy without it.
+# The rewards of PPO are those of flights with random exploration, so they are lower than those of the deterministic
+# policy.
 
 # %%
 figure, axis = plt.subplots(figsize=(6.5, 3.5), dpi=80, layout="constrained")
@@ -71,7 +72,8 @@ axis.legend()
 
 # %% [markdown]
 # ## How good are they?
-# Success is to be within 5 cm and 0.1 m/s of the goal for the last two of five seconds, over 1,000 new starts.
+# An episode is a success if the drone is within 5 cm of the goal and slower than 0.1 m/s for the last two of five
+# seconds. The success rate is over 1,000 new starts.
 
 # %%
 for name, result in results.items():

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Leader and follower
 # The multi-agent example of gym-pybullet-drones (2021), equation 13 of the paper: the leader hovers at z = 0.5 m, and
-# the follower matches its height. Each has its own policy of its own twelve observations. The centralized critic, for
-# training only, has 25 inputs: both drones' observations and the other's action.
+# the follower matches its height. Each drone has its own policy with its own twelve observations as inputs. The
+# centralized critics, used only in training, have 25 inputs: the observations of both drones and the action of the
+# other drone.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -41,7 +42,7 @@ print(f"trained in {time.perf_counter() - began:.0f} s, compilation included")
 
 # %% [markdown]
 # ## Learning curve
-# The reward is the negative squared error of a drone's height, so it is zero at best.
+# The reward of a drone is a negative squared error, so it is zero at best.
 
 # %%
 reward = np.asarray(result.history["reward"])

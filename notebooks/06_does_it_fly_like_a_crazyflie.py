@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Does it fly like a Crazyflie?
 # Two recorded flights of a real Crazyflie 2.1 come with the package; they are from NanoBench (Ullah and Baca 2026,
-# arXiv 2603.09908, BSD-3). One is used to identify the vehicle, the other one to test how well the simulation repeats a
-# flight that was not fitted.
+# arXiv 2603.09908, BSD-3). One is used to identify the vehicle, the other one to test how well the simulation
+# reproduces a flight that was not fitted.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -62,10 +62,11 @@ right.legend(loc="lower center", fontsize="small")
 print(f"{kept.name}: {len(kept.t)} rows, {kept.t[-1] - kept.t[0]:.0f} s, at most {np.abs(kept.vel).max():.1f} m/s")
 
 # %% [markdown]
-# ## Vehicles from papers
-# *Open loop*: from every state of the log, the model gets the recorded PWM and voltage of the next half second. The
-# table has its mean errors. *Hold* is a model with a constant state. `cf2x` has the parameters of
-# Panerati et al. 2021, `cf21` those of a later identification of the same vehicle with these propellers (crazyflow).
+# ## Vehicles with published parameters
+# *Open loop*: from every state of the log, the model is simulated with the recorded PWM and voltage of the next half
+# second. The table has the mean errors. *Hold* is a model with a constant state. `cf2x` has the parameters of Panerati
+# et al. 2021, `cf21` those of a later identification of the same vehicle with the propellers of these flights
+# (crazyflow).
 
 # %%
 motors, gains = crazyflie_motors("2.1+"), firmware_pid.gains(propellers="2.1+")
@@ -86,10 +87,10 @@ print(open_loop_table({name: errors_as_dict(e) for name, e in open_loop(kept).it
 # the real drone's motors, relative to the firmware's curve and to each other, is unknown.
 
 # %% [markdown]
-# ## Identify it from a flight
-# The vehicle is simulated over windows of half a second (`pieces` below) from their logged starts. Gauss-Newton steps
-# on 14 parameters minimize the differences from the log. The simulation is differentiated with respect to all
-# parameters. The standard errors assume independent residuals.
+# ## Identification from a flight
+# The vehicle is simulated over windows of half a second (`pieces` below), each from its logged initial state. The
+# Gauss-Newton method minimizes the differences from the log over 14 parameters, with the derivative of the simulation
+# with respect to all of them. The standard errors assume independent residuals.
 
 # %%
 NAMES = ("mass", "km", "drag_coeff_x", "drag_coeff_y", "flapping_coeff", "inertia_x", "inertia_y", "rate_damping")
@@ -117,11 +118,11 @@ print(open_loop_table({"hold": errors_as_dict(errors["hold"]), "pieces": errors_
 assert (errors["pieces"][-1, [0, 1, 3]] < errors["hold"][-1, [0, 1, 3]]).all()
 
 # %% [markdown]
-# ## The whole flight again
-# *Closed loop*: the inputs of the firmware's PID are the logged set-points and the logged voltage alone. Now a
-# controller corrects the errors of the model, so the flight identifies other parameters. Thrust over mass comes
-# from the balance of vertical forces. Drag, flapping, rotor lag and the scale of the tilt in the drone's state estimate
-# come from the path itself, with the derivative of the whole flight.
+# ## Simulation of the whole flight
+# *Closed loop*: the only inputs of the firmware's PID are the logged set-points and the logged voltage. Now a
+# controller corrects the errors of the model, so the flight identifies other parameters. The ratio of thrust to mass
+# follows from the balance of vertical forces. Drag, flapping, rotor lag and the scale of the tilt in the drone's state
+# estimate are fitted to the path, with the derivative of the whole flight.
 
 # %%
 began = time.perf_counter()
@@ -149,15 +150,15 @@ assert twins["path"].as_dict()["xy_rms_m"] < twins["cf2x"].as_dict()["xy_rms_m"]
 
 # %% [markdown]
 # ## Limits of the agreement
-# - **No vehicle is best at both.** The vehicle that was fitted to half a second without a controller has an inertia
-#   more than ten times too large, and a damping that goes with it: thrust errors of a percent turn a light model away,
-#   and a slow model has the smallest errors. With the PID it oscillates and climbs away. The vehicle that was fitted to
-#   the path loses its attitude within a quarter of a second where no controller corrects it.
-# - **Rotor speeds were not measured.** PWM and voltage give the thrust within some percent, and it differs from flight
-#   to flight. With the measured rotor speeds of faster flights, the error after half a second is 9 cm, and that of
-#   *hold* 41 cm (docs/reality.md).
-# - **The mass is estimated as 44 g**, for a drone of 27 g with its markers. A flight identifies only thrust over mass:
-#   it is as if the motors gave less thrust than the firmware's curve.
+# - **No vehicle is best in both tests.** The vehicle fitted to half-second windows without a controller has an inertia
+#   that is more than ten times too large, and a correspondingly large damping: thrust errors of a percent rotate a
+#   model with the true inertia, so a slow model has the smallest errors. With the PID it oscillates and climbs away.
+#   The attitude of the vehicle fitted to the path diverges within a quarter of a second without a controller.
+# - **Rotor speeds were not measured.** PWM and voltage determine the thrust only to within a few percent, with
+#   differences from flight to flight. With the measured rotor speeds of faster flights, the error after half a second
+#   is 9 cm, and that of *hold* 41 cm (docs/reality.md).
+# - **The mass is estimated as 44 g**, for a drone of 27 g with its markers. A flight identifies only the ratio of
+#   thrust to mass: the actual thrust is lower than that of the firmware's curve.
 # - **The recording.** The drone's own state estimate and Vicon differ by 2 to 4 cm, which no vehicle explains.
 #
 # `jaxdrones score` and `jaxdrones fit` do the same with your flights.

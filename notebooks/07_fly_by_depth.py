@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Fly by depth
 # A drone flies through a random forest, with a depth image of 16 x 12 pixels and its own motion as observations,
-# without its position. Every episode has a new forest, inside the compiled program.
+# without its position. A new forest is drawn in every episode, inside the compiled program.
 #
-# This notebook trains for about a minute, on a shorter and sparser forest than the default. That is enough to learn to
-# avoid trees, not enough for a high success rate; the last section has the result of a full training.
+# This notebook trains for about a minute, on a shorter and sparser forest than the default. This is enough to learn to
+# avoid trees, but not for a high success rate; the last section has the result of a full training.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -57,8 +57,8 @@ axis.set_title("depth at the start, 16 x 12 pixels")
 
 # %% [markdown]
 # ## A short training
-# By backpropagation through time. With `image_gradient=False` the images are constants for the gradient, which is
-# faster.
+# The learner is backpropagation through time. With `image_gradient=False` the images are constants in the gradient,
+# which is faster.
 
 # %%
 short = dict(updates=240, worlds=64, horizon=50)
@@ -123,6 +123,6 @@ jd.show(flights)
 
 # %% [markdown]
 # ## A full training
-# `jaxdrones train forest` trains on the task's own forest (20 m, 3 m/s) through the pixels, for about a quarter of an
-# hour on one core. In 1,000 new forests, each of three such policies succeeded in 97.7 % (`jaxdrones eval runs/forest
-# --episodes 1000`).
+# `jaxdrones train forest --set image_gradient=True --set updates=600` trains on the full forest (20 m, 3 m/s) with the
+# gradient through the pixels, for about a quarter of an hour on one core. In 1,000 new forests, each of three such
+# policies succeeded in 97.7 % (`jaxdrones eval runs/forest --episodes 1000`).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Your own task, effect and sensor
-# Extensions are a few lines: an **effect**, a column of rising air; a **sensor**, a barometer with noise and a lag; and
-# a **task**, to fly to and fro through the column at a constant height, measured only by the barometer. Then a policy
-# learns the task.
+# Extensions need only a few lines. This notebook adds an **effect**, a column of rising air; a **sensor**, a barometer
+# with noise and a lag; and a **task**, to fly to and fro through the column at a constant height, measured only by the
+# barometer. Then it trains a policy for the task.
 
 # %%
 # Installs the package where it is missing, as on Colab. PACKAGE may also be the path of a wheel, or
@@ -32,8 +32,8 @@ plt.rcParams |= {"axes.prop_cycle": plt.cycler(color=COLORS), "axes.grid": True,
 
 # %% [markdown]
 # ## An effect
-# An effect is a function of one drone that returns a `Wrench`: force (N) and torque (N m) in body axes. A column of
-# rising air, 0.6 m wide, pushes a drone up with 40 % of its weight where it is strongest.
+# An effect is a function of one drone that returns a `Wrench`: force (N) and torque (N m) in body axes. Here a column
+# of rising air, 0.6 m wide, pushes a drone up with at most 40 % of its weight.
 
 # %%
 RADIUS = 0.3  # m
@@ -55,7 +55,7 @@ for x in 0.0, 0.3, 1.0:
 
 # %% [markdown]
 # ## A sensor
-# A sensor measures one drone. It may have a memory, here the pressure inside its housing, expressed as a height, which
+# A sensor measures one drone. It may have a memory: here the pressure inside the housing, expressed as a height, which
 # follows the outside pressure with a lag. `entries` describe the reading for `jd.explain`.
 
 # %%
@@ -77,7 +77,7 @@ barometer = jd.Sensor("barometer", measure, init, bound=10.0, entries=(Quantity(
 # %% [markdown]
 # ## A task
 # A task is a function that returns a `Task`: start, target, rewards, terminations. Its arguments become options of
-# `jd.make`. `jd.envs.check_env(env)` is the contract test of environments.
+# `jd.make`. `jd.envs.check_env(env)` tests that an environment follows the interface.
 
 
 # %%
@@ -133,7 +133,7 @@ for entry in jd.explain(env).observation[:3]:
 
 # %% [markdown]
 # ## Training
-# The gradient includes your effect, sensor and task.
+# The gradient passes through the custom effect, sensor and task.
 
 # %%
 config = bptt.Config(updates=120, worlds=64)

@@ -5,6 +5,7 @@ from pathlib import Path
 _LEFT_OUT = ("cli", "_assets", "__pycache__")
 _HEAD = "# {name}\n\n{link}::: {name}\n    options:\n      members: false\n"
 _MODULE = "\n## {name}\n\n::: {name}\n    options:\n      heading_level: 3\n"
+_WITHOUT = "      filters: ['!^_', '!^{name}$']\n"  # what has a page of its own
 _FIRST = {  # with a page of their own, before the rooms
     "make": "jaxdrones.envs.registry.make",
     "State": "jaxdrones.state.State",
@@ -40,4 +41,5 @@ def _page(root: Path, room: Path) -> str:
     modules = [".".join(f.relative_to(root).with_suffix("").parts) for f in sorted(inner)]
     shown = [module for module in modules if "__" not in module]
     head = _HEAD.format(name=name, link=_ROOT if room.name == "jaxdrones" else "")
-    return head + "".join(_MODULE.format(name=module) for module in shown)
+    apart = {path.rpartition(".")[0]: _WITHOUT.format(name=name) for name, path in _FIRST.items()}
+    return head + "".join(_MODULE.format(name=module) + apart.get(module, "") for module in shown)

@@ -14,7 +14,8 @@ import jax
 
 try:
     from jax.experimental.xla_metadata import set_xla_metadata
-    from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+    from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
+    from jax.interpreters import ad, batching, mlir
     from jax.interpreters.partial_eval import dce_jaxpr
 
     AVAILABLE = True
@@ -98,6 +99,46 @@ def _is_known(name: str, value: Any) -> bool:
 def set_notes(result: Any, **notes: str) -> Any:
     """Result of a call with XLA attributes, or of a plain call without support in JAX."""
     return set_xla_metadata(result, **notes) if AVAILABLE else result
+
+
+def primitive(
+    name: str,
+    compute: Callable,
+    at_once: Callable,
+    shapes: Callable,
+    batched: Callable,
+    differentiated: Callable,
+    transposed: Callable,
+) -> Any:
+    """Primitive of several results, with its rules as JAX calls them; `compute` is what is compiled.
+
+    In `differentiated` a tangent can be `zero_of` a number, and `is_zero` then; in `transposed` it can be a cotangent,
+    and an input in which the primitive is linear `is_linear`.
+    """
+    new = Primitive(name)
+    new.multiple_results = True
+    new.def_impl(at_once)
+    new.def_abstract_eval(shapes)
+    batching.primitive_batchers[new] = batched
+    ad.primitive_jvps[new] = differentiated
+    ad.primitive_transposes[new] = transposed
+    mlir.register_lowering(new, mlir.lower_fun(compute, multiple_results=True))
+    return new
+
+
+def zero_of(x: Any) -> Any:
+    """Tangent of an array that does not change."""
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+def is_zero(tangent: Any) -> bool:
+    """Whether a tangent or cotangent is zero without being an array."""
+    return type(tangent) is ad.Zero
+
+
+def is_linear(x: Any) -> bool:
+    """Whether the operand of a transposed primitive is an input in which it is linear."""
+    return ad.is_undefined_primal(x)
 
 
 def trace(function: Callable, *arguments: Any) -> tuple[Any, list, Any]:

@@ -12,8 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler
@@ -44,6 +42,8 @@ def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | No
     """
 
     def where(needed: Array, *args: Any) -> Any:
+        if not compiler.AVAILABLE:
+            return jax.tree.map(lambda x: jnp.where(needed, x, jnp.zeros_like(x)), function(*args))
         program, consts, shape = compiler.trace(function, *args)
         inputs = [*consts, *map(jnp.asarray, jax.tree.leaves(args))]
         mapped = (False,) * len(inputs)
@@ -61,12 +61,6 @@ def where_due(draw: Callable[..., Any], chunk: int) -> Callable[..., Any]:
         return jax.tree.map(functools.partial(jnp.where, due), new, before)
 
     return drawn
-
-
-_where = Primitive("where_needed")
-"""Operands are `needed` and the inputs of `program`. Those that are `mapped` have a leading axis over `worlds`,
-like `needed` and the results; without worlds (`None`) it is of one world."""
-_where.multiple_results = True
 
 
 def _computed(needed: Array, *inputs: Array, program: Any, mapped: tuple, worlds: int | None, **of_chunk: Any) -> list:
@@ -100,14 +94,12 @@ def _results(program: Any, worlds: int | None) -> list[jax.ShapeDtypeStruct]:
     return [jax.ShapeDtypeStruct((*leading, *v.aval.shape), v.aval.dtype) for v in program.outvars]
 
 
-@_where.def_impl
 def _at_once(needed: Array, *inputs: Array, **params: Any) -> list[Array]:
     if params["worlds"] is None and needed:
         return _function(params["program"])(*inputs)
     return jax.jit(functools.partial(_computed, **params))(needed, *inputs)
 
 
-@_where.def_abstract_eval
 def _shapes(needed: Any, *inputs: Any, program: Any, worlds: int | None, **_: Any) -> list[Any]:
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in _results(program, worlds)]
 
@@ -140,7 +132,7 @@ def _differentiated(primals: Sequence, tangents: Sequence, *, program: Any, mapp
     """Results, and their changes by the program of the changes of one world."""
     (needed, *inputs), changes = primals, tangents[1:]
     out = _where.bind(needed, *inputs, program=program, mapped=mapped, **params)
-    moving = [i for i, change in enumerate(changes) if type(change) is not ad.Zero]
+    moving = [i for i, change in enumerate(changes) if not compiler.is_zero(change)]
     smooth = [i for i, x in enumerate(out) if jnp.issubdtype(x.dtype, jnp.inexact)]
     evaluate = _function(program)
 
@@ -156,14 +148,14 @@ def _differentiated(primals: Sequence, tangents: Sequence, *, program: Any, mapp
     operands = [*consts, *inputs, *(changes[i] for i in moving)]
     mapped = (*(False for _ in consts), *mapped, *(mapped[i] for i in moving))
     found = _where.bind(needed, *operands, program=linear, mapped=mapped, **params)
-    return out, _replaced([ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out], smooth, found)
+    return out, _replaced([compiler.zero_of(x) for x in out], smooth, found)
 
 
 def _transposed(given: Sequence, needed: Array, *inputs: Any, program: Any, mapped: tuple, **params: Any) -> list:
     """Cotangents of the inputs in which the program is linear."""
-    linear = [i for i, x in enumerate(inputs) if ad.is_undefined_primal(x)]
+    linear = [i for i, x in enumerate(inputs) if compiler.is_linear(x)]
     known = [i for i in range(len(inputs)) if i not in linear]
-    used = [i for i, x in enumerate(given) if type(x) is not ad.Zero]
+    used = [i for i, x in enumerate(given) if not compiler.is_zero(x)]
     evaluate, shapes, results = _function(program), _inputs(program), _results(program, None)
 
     def pulled_back(values: list, given: list) -> list:
@@ -200,7 +192,7 @@ def _replaced(values: Sequence, places: Sequence[int], others: Sequence) -> list
     return new
 
 
-batching.primitive_batchers[_where] = _batched
-ad.primitive_jvps[_where] = _differentiated
-ad.primitive_transposes[_where] = _transposed
-mlir.register_lowering(_where, mlir.lower_fun(_computed, multiple_results=True))
+if compiler.AVAILABLE:
+    _where = compiler.primitive("where_needed", _computed, _at_once, _shapes, _batched, _differentiated, _transposed)
+    """Operands are `needed` and the inputs of `program`. Those that are `mapped` have a leading axis over `worlds`, as
+    `needed` and the results have; without worlds (`None`) it is of one world."""

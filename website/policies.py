@@ -1,4 +1,4 @@
-"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`, and the one for any vehicle.
+"""Trains the bundled policies, each by `jaxdrones train TASK --seed 0`, and the one for any vehicle with seed 1.
 
     python website/policies.py [NAME ...]
 
@@ -51,8 +51,8 @@ def main() -> None:
         if not (run / "report.json").exists():
             shutil.rmtree(run, ignore_errors=True)
             command = [sys.executable, "-c", "import sys; from jaxdrones.cli import main; sys.exit(main())"]
-            task = ["hover", "--realistic", "any"] if name == _ANY else [name]
-            subprocess.run([*command, "train", *task, "--seed", "0", "--output", run], check=True)
+            task = ["hover", "--realistic", "any", "--seed", "1"] if name == _ANY else [name, "--seed", "0"]
+            subprocess.run([*command, "train", *task, "--output", run], check=True)
             (run / "commit").write_text(_git("rev-parse", "--short", "HEAD"))
         folder = BUNDLED.parent / _ANY if name == _ANY else BUNDLED / name
         folder.mkdir(parents=True, exist_ok=True)

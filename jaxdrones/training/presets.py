@@ -137,7 +137,7 @@ _ANY_VEHICLE_CONFIGS: dict[tuple[str, str], dict[str, Any]] = {
         horizon=96,
         hidden_sizes=(16,),
         recurrent_size=13,
-        learning_rate=2.5e-3,
+        learning_rate=5e-3,
         max_grad_norm=0.1,
         outlier_gradient=5.0,
     ),

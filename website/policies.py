@@ -31,8 +31,6 @@ TASKS = (
     "transport",
 )
 _ANY = "any-vehicle"
-_ANY_TASK = ("hover", "--realistic", "any", "--seed", "1", "--set", "learning_rate=2.5e-3")
-"""The best of three trainings: seed 0 had 92.1 % with this learning rate, and 96.5 % with that of the preset."""
 _FILES = ("best.json", "best.msgpack", "report.json")
 _HEAD = """# Bundled policies
 
@@ -53,8 +51,8 @@ def main() -> None:
         if not (run / "report.json").exists():
             shutil.rmtree(run, ignore_errors=True)
             command = [sys.executable, "-c", "import sys; from jaxdrones.cli import main; sys.exit(main())"]
-            task = _ANY_TASK if name == _ANY else (name, "--seed", "0")
-            subprocess.run([*command, "train", *task, "--output", run], check=True)
+            task = ["hover", "--realistic", "any"] if name == _ANY else [name]
+            subprocess.run([*command, "train", *task, "--seed", "0", "--output", run], check=True)
             (run / "commit").write_text(_git("rev-parse", "--short", "HEAD"))
         folder = BUNDLED.parent / _ANY if name == _ANY else BUNDLED / name
         folder.mkdir(parents=True, exist_ok=True)

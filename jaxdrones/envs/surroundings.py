@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdrones.arguments import Count, checked, number
 from jaxdrones.quantity import Quantity, quantities
-from jaxdrones.tasks.pairs import CORE, closest_approach, nearby, nearest, seen_from
+from jaxdrones.tasks.pairs import CORE, Vectors, closest_approach, dot, nearby, nearest, seen_from
 from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, norm
 
 _MAX_DISTANCE = 20.0  # m: bound of the observations, and place of a drone or obstacle that does not exist
@@ -35,8 +35,7 @@ def neighbors(count: Count) -> ObservationTerm:
         """Position and velocity of the nearest drones, relative to the drone."""
         drones = world.drones
         index = nearest(drones.pos, count)
-        rows = jnp.concatenate([seen_from(drones.pos, index), seen_from(drones.vel, index)], axis=-1)
-        return _flat(rows, count)
+        return _rows([*seen_from(drones.pos, index), *seen_from(drones.vel, index)], count)
 
     entries: list[Quantity] = []
     for which in _names(count, "drone"):
@@ -61,7 +60,7 @@ def encounters(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2
         """Position, velocity and closest approach of the nearest drones, relative to the drone."""
         drones = world.drones
         index = nearby(drones.pos, count)
-        return _flat(_meetings(seen_from(drones.pos, index), seen_from(drones.vel, index)), count)
+        return _rows(_meetings(seen_from(drones.pos, index), seen_from(drones.vel, index)), count)
 
     return _set(observe, count, reach, "encounters", "drone")
 
@@ -82,18 +81,19 @@ def obstacles(count: Count, reach: Annotated[float, number("m", above=0)] = 1.2)
             is_there = jnp.isfinite(surface.distance)[:, None]
             return jnp.where(is_there, surface.point - pos[None], jnp.array([[_MAX_DISTANCE, 0, 0]], pos.dtype))
 
-        pos = jax.vmap(seen)(world.drones.pos)
-        return _flat(_meetings(pos, jnp.broadcast_to(-world.drones.vel[:, None], pos.shape)), count)
+        pos = list(jnp.moveaxis(jax.vmap(seen)(world.drones.pos), (2, 1), (0, 1)))
+        vel = [jnp.broadcast_to(-v, pos[0].shape) for v in world.drones.vel.T]
+        return _rows(_meetings(pos, vel), count)
 
     return _set(observe, count, reach, "obstacles", "obstacle")
 
 
-def _meetings(pos: Float[Array, "n k 3"], vel: Float[Array, "n k 3"]) -> Float[Array, "n k 13"]:
+def _meetings(pos: Vectors, vel: Vectors) -> list[Float[Array, "k n"]]:
     """Position (m), velocity (m/s), closest approach (m), its time (s), direction by nearness of relative motions."""
     time, approach = closest_approach(pos, vel, _HORIZON)
-    away = jnp.sqrt(jnp.sum(pos**2, axis=-1, keepdims=True) + CORE**2)
-    direction = pos / away * (_NEARNESS / (away + _NEAR))
-    return jnp.concatenate([pos, vel, approach, time[..., None], direction], axis=-1)
+    away = jnp.sqrt(dot(pos, pos) + CORE**2)
+    nearness = _NEARNESS / (away * (away + _NEAR))
+    return [*pos, *vel, *approach, time, *(nearness * x for x in pos)]
 
 
 def _set(observe: Term, count: int, reach: float, name: str, what: str) -> ObservationTerm:
@@ -113,8 +113,9 @@ def _names(count: int, what: str) -> list[str]:
     return [f"{_RANKS.get(i, f'{i + 1}th-')}nearest {what}" for i in range(count)]
 
 
-def _flat(rows: Float[Array, "n k f"], count: int) -> Float[Array, "n d"]:
-    """Rows side by side, followed by drones that are far away, up to `count` rows."""
+def _rows(columns: list[Float[Array, "k n"]], count: int) -> Float[Array, "n d"]:
+    """Rows of k drones side by side, followed by drones that are far away, up to `count` rows."""
+    rows = jnp.stack(columns, axis=-1).swapaxes(0, 1)
     n, known, size = rows.shape
     far = jnp.zeros((n, count - known, size), rows.dtype).at[..., :3].set(_MAX_DISTANCE)
     return jnp.concatenate([rows, far], axis=1).reshape(n, -1)

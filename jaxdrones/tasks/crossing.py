@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxdrones import vector
 from jaxdrones.control import Setpoint
 from jaxdrones.quantity import quantities
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
-from jaxdrones.tasks.pairs import CORE, nearby, nearest_on_the_way, seen_from
+from jaxdrones.tasks.pairs import CORE, dot, nearby, nearest_on_the_way, seen_from
 from jaxdrones.tasks.task import ObservationTerm, Task, Term, World, distance
 
 SPEED = 1.2  # m/s, to the goal
@@ -90,12 +91,12 @@ def _approach(task: Task, world: World) -> Float[Array, " n"]:
     """Sum over the nearest drones of the smoothed penetration of a margin that grows with the relative motion, m."""
     index = nearby(world.drones.pos, _SEEN)
     pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
-    apart = jnp.sqrt(jnp.sum(pos**2, axis=-1) + CORE**2)
-    closing = jnp.maximum(-jnp.sum(pos * vel, axis=-1) / apart, 0)
-    gap = apart - 2 * world.params.collision_radius[:, None]
-    speed = jnp.sqrt(jnp.sum(vel**2, axis=-1) + _SLOW**2)
+    apart = jnp.sqrt(dot(pos, pos) + CORE**2)
+    closing = jnp.maximum(-dot(pos, vel) / apart, 0)
+    gap = apart - 2 * world.params.collision_radius
+    speed = jnp.sqrt(dot(vel, vel) + _SLOW**2)
     inside = _MARGIN + _PASSING_TIME * speed + _MARGIN_TIME * closing - gap
-    return jnp.sum((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS), axis=-1)
+    return vector.total((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS))
 
 
 def _safe(task: Task, world: World) -> Float[Array, " n"]:

@@ -120,15 +120,16 @@ def test_the_nearest_are_those_of_a_sorted_search(count):
     away = np.linalg.norm(pos[:, None] - pos[None], axis=-1) + 99 * np.eye(7)
     expected = np.argsort(away, axis=1)[:, : min(count, 6)]
     np.testing.assert_array_equal(nearest(pos, count), expected)
-    seen = np.linalg.norm(seen_from(pos, nearby(pos, count)), axis=-1)
+    seen = np.linalg.norm(seen_from(pos, nearby(pos, count)), axis=0).T
     np.testing.assert_allclose(np.sort(seen, axis=1), np.take_along_axis(away, expected, axis=1), rtol=1e-6)
 
 
 def test_the_gradient_of_the_closest_approach_is_finite_for_drones_at_rest_and_at_one_place():
-    for pos, vel in (([1.0, 0, 0], [0.0, 0, 0]), ([0.0, 0, 0], [0.0, 0, 0])):
-        gradient = jax.grad(lambda p, v: jnp.sum(closest_approach(p, v, 1.5)[1]), (0, 1))(
-            jnp.array(pos), jnp.array(vel)
-        )
+    def of(p, v):
+        return jnp.sum(jnp.stack(closest_approach(*(list(x[:, None, None]) for x in (p, v)), 1.5)[1]))
+
+    for pos in ([1.0, 0, 0], [0.0, 0, 0]):
+        gradient = jax.grad(of, (0, 1))(jnp.array(pos), jnp.zeros(3))
         assert np.all(np.isfinite(gradient))
 
 

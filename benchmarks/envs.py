@@ -1,6 +1,7 @@
 """How many environment steps per second, with observation, reward and a fresh reset of every episode that ends?
 
-Inside one compiled program; through gymnasium's `make_vec` with NumPy in and out; and one gymnasium environment.
+Inside one compiled program, on one or more devices; through gymnasium's `make_vec` with NumPy in and out; and one
+gymnasium environment.
 """
 
 import argparse
@@ -9,6 +10,7 @@ import time
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxdrones.adapters.gymnasium  # noqa: F401 (registers the environments)
@@ -16,6 +18,7 @@ from benchmarks.cameras_scenes import objects20
 from benchmarks.common import compiled, seconds
 from jaxdrones.cli import throughput as programs
 from jaxdrones.envs import make
+from jaxdrones.learning import sharding
 from jaxdrones.tasks import forest
 
 STEPS = 50  # of a compiled call
@@ -25,9 +28,11 @@ SLOW_CAMERA = dataclasses.replace(forest.camera, rate=15.0)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--devices", type=int, default=1, help="of the compiled programs, each with a core of its own")
 
 
 def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
+    jax.config.update("jax_num_cpu_devices", options.devices)
     if options.quick:
         options.worlds, options.repeats = 16, 1
 
@@ -48,16 +53,27 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         "hover, make_vec, NumPy in and out: env-steps/s": vector(options),
         "hover, one gymnasium environment: steps/s": single(options),
     }
-    a_step = {"worlds": options.worlds, "control": "100 Hz", "substeps": 5, "integrator": "semi_implicit_euler"}
+    a_step = {
+        "worlds": options.worlds,
+        "devices": options.devices,
+        "control": "100 Hz",
+        "substeps": 5,
+        "integrator": "semi_implicit_euler",
+    }
     lines = [f"{rate:14,.0f}  {name}" for name, rate in rows.items()]
     return {"about": a_step, "rates": rows}, lines
 
 
 def in_jit(env, options) -> float:
     """Environment steps per second with random actions and autoreset; episodes start out of step."""
-    fly, episodes = programs.episodes(env, options.worlds, STEPS)
-    program, _ = compiled(fly, episodes, jax.random.key(3))
-    return options.worlds * STEPS / seconds(program, episodes, jax.random.key(3), repeats=options.repeats)["median"]
+    fly, episodes = programs.episodes(env, options.worlds // options.devices, STEPS)
+    episodes = jax.tree.map(lambda x: jnp.concatenate([x] * options.devices), episodes)
+    keys = jax.random.split(jax.random.key(3), options.devices)
+    with jax.set_mesh(sharding.make_mesh(options.worlds)):
+        of_all = sharding.map_worlds(lambda episodes, keys: fly(episodes, keys[0]), sharding.WORLDS, sharding.WORLDS)
+        program, _ = compiled(of_all, episodes, keys)
+        taken = seconds(program, episodes, keys, repeats=options.repeats)
+    return options.worlds * STEPS / taken["median"]
 
 
 def vector(options) -> float:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdrones.accelerate import compiler
-from jaxdrones.accelerate.fitting import fits_a_kernel
+from jaxdrones.accelerate.fitting import fits_a_kernel, gains_by_chunks
 from jaxdrones.accelerate.reordered import has_reordered, store_reordered
 from jaxdrones.accelerate.soa import vmap_for_kernel
 from jaxdrones.arguments import Count, checked
@@ -63,7 +63,7 @@ class ChunkedProgram:
         return fits_a_kernel(self.program)
 
     def by_vmap(self, *leaves: Array) -> list[Array]:
-        """Results for many worlds by `jax.vmap`, chunk by chunk unless the program has effects."""
+        """Results for many worlds by `jax.vmap`, chunk by chunk where that is faster."""
         return self._by_vmap(self.consts, leaves)
 
     def by_one_kernel(self, *leaves: Array) -> list[Array]:
@@ -89,9 +89,10 @@ class ChunkedProgram:
         return flown(self.consts, leaves)
 
     def _by_vmap(self, consts: Sequence[Array], leaves: Sequence[Array]) -> list[Array]:
-        evaluate = store_reordered if has_reordered(self.program) else _as_it_is
+        in_chunks = gains_by_chunks(self.program)
+        evaluate = store_reordered if in_chunks and has_reordered(self.program) else _as_it_is
         of_many = jax.vmap(functools.partial(evaluate, self.program, consts), self.along)
-        if self.program.effects:
+        if not in_chunks:
             return of_many(*leaves)
         chunks = _chunks(of_many, leaves, self.along, self.chunk or _VMAP_CHUNK)
         return [_joined(x, self._worlds(leaves)) for x in chunks]

@@ -16,6 +16,9 @@ Arrays of four drones fill the vectors of a CPU without a split."""
 _MAX_NUMBERS = 8_000
 """Largest number of entries in the loops of a program to split: they compile in about 15 s."""
 
+_MANY_NUMBERS = 1_000
+"""Size of an array of which those of all worlds may not fit in the cache."""
+
 ELEMENTWISE = frozenset(
     "abs add add_any and atan2 bitcast_convert_type cbrt ceil clamp convert_element_type cos cosh div eq erf exp exp2"
     " expm1 floor ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow rem round rsqrt"
@@ -51,8 +54,18 @@ def fits_a_kernel(program: Any) -> bool:
 
     It should if it has a loop, with otherwise many kernels per iteration.
     """
-    loops = [eqn for eqn in _equations(program) if eqn.primitive.name == "scan" and eqn.params["length"] > 1]
-    return bool(loops) and can_be_a_kernel(program)
+    return _has_loop(program) and can_be_a_kernel(program)
+
+
+def gains_by_chunks(program: Any) -> bool:
+    """Whether a program of several kernels gains by chunks of worlds that fit in the cache.
+
+    It does if it has a loop. Random numbers take many kernels, each with a cost per chunk, so they need large arrays.
+    """
+    equations = list(_equations(program))
+    has_random = any(eqn.primitive.name.startswith("random_") for eqn in equations)
+    largest = max((v.aval.size for eqn in equations for v in eqn.outvars), default=0)
+    return _has_loop(program) and not program.effects and (not has_random or largest > _MANY_NUMBERS)
 
 
 def can_be_a_kernel(program: Any) -> bool:
@@ -70,6 +83,14 @@ def fits_number_by_number(program: Any) -> bool:
     """Whether the loops of a program have few enough entries to split."""
     sizes = list(_sizes_in_loops(program))
     return max(sizes, default=0) <= LARGEST and sum(sizes) <= _MAX_NUMBERS
+
+
+def _has_loop(program: Any) -> bool:
+    """Whether a program has a loop of more than one iteration."""
+    return any(
+        eqn.primitive.name == "while" or (eqn.primitive.name == "scan" and eqn.params["length"] > 1)
+        for eqn in _equations(program)
+    )
 
 
 def _equations(program: Any) -> Iterable[compiler.Equation]:

@@ -143,6 +143,20 @@ def test_a_function_of_which_no_kernel_can_be_made_is_flown_by_many():
     assert_close(in_chunks(solved, 2)(starts), jax.vmap(solved)(starts), 1e-12)
 
 
+@pytest.mark.parametrize(
+    ("numbers", "in_loop", "chunks"), [(0, True, True), (0, False, False), (3, True, False), (2_000, True, True)]
+)
+def test_several_kernels_are_for_chunks_where_these_save_more_than_they_cost(numbers, in_loop, chunks):
+    def sorted_speeds(start, key):
+        noise = jnp.sum(jax.random.normal(key, (numbers,))) if numbers else 0.0
+        return jax.lax.fori_loop(0, 2 if in_loop else 1, lambda _, v: jnp.sort(-v, axis=0) + noise, start.vel)
+
+    keys = jax.random.split(jax.random.key(0), 5)
+    many = in_chunks(sorted_speeds, 2)
+    assert_close(many(starts, keys), jax.vmap(sorted_speeds)(starts, keys), 1e-12)
+    assert ("dynamic_slice" in str(jax.make_jaxpr(many)(starts, keys))) == chunks
+
+
 def summed_squares(x):
     """2 + 3^2 and so on, by primitives that hold a program of their own."""
     return jax.lax.reduce_window(x, 0.0, lambda a, b: a + b * b, (2,), (1,), "SAME")

@@ -6,6 +6,9 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+from jaxdrones.checks import short_repr
+from jaxdrones.errors import UserError
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -32,6 +35,12 @@ def quantities(
 ) -> tuple[Quantity, ...]:
     """Components of a vector, or entries of a list, with names such as `x of the velocity`; see `Quantity`."""
     return tuple(Quantity(f"{part} of the {name}", unit, frame, values) for part in parts)
+
+
+def check_quantities(name: str, entries: Any) -> None:
+    """Raise unless entries are described by a tuple of quantities."""
+    if not (isinstance(entries, tuple) and all(isinstance(entry, Quantity) for entry in entries)):
+        raise UserError(f"{name} is {short_repr(entries)}; give a tuple, (Quantity('height', 'm', 'world'), ...)")
 
 
 def described(text: str, function: Function) -> Function:

@@ -102,7 +102,8 @@ def _executed(file: str, text: str) -> types.ModuleType:
         exec(compile(text, file, "exec", dont_inherit=True), vars(module))
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
-        alone = "; a file of yours may import libraries, but no files beside it" * isinstance(error, ImportError)
+        not_found = isinstance(error, ImportError) and (error.name or "").partition(".")[0] not in sys.modules
+        alone = "; a file of yours may import libraries, but no files beside it" * not_found
         if isinstance(error, SyntaxError) and error.filename == file:
             said = f"{file}: line {error.lineno} raises {type(error).__name__}: {error.msg}"
         else:  # text with a null byte is refused before any line of it

@@ -112,10 +112,13 @@ def _value(text: str) -> Any:
 
 @contextlib.contextmanager
 def user_mistakes(changes: dict[str, Any], task: str):
-    """Context that converts errors caused by options of a task to a `UserError` with their names."""
+    """Context that converts the overflow of an integer among the options of a task to a `UserError` with their names.
+
+    Tasks check their options themselves, so any other error is internal.
+    """
     try:
         yield
-    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+    except OverflowError as error:
         known = inspect.signature(task_function(task)).parameters
         given = ", ".join(f"{name}={x}" for name, x in changes.items() if name in known)
         if not given or blame(error):

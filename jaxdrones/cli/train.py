@@ -232,8 +232,7 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
                 return print_error(where + f"; continue with: {request.again}" * run.started, INTERRUPTED)
             except Diverged as error:
                 train_output.draw_curves(request, {seed: run}, run.folder)
-                advice = f"{error}, for example --set learning_rate=1e-3; {train_output.remaining_best(run)}"
-                return print_error(f"training diverged: {advice}", 1)
+                return print_error(f"training diverged: {error}; {train_output.remaining_best(run)}", 1)
     code = train_output.show_results(request, runs)
     deadlines.warn_if_missed()
     return code

@@ -82,7 +82,7 @@ class Env:
             params = randomize.with_delay(params, sum(self.delay_steps) / 2)
         object.__setattr__(self, "params", params)
         if isinstance(self.steps, int) and not self.steps:
-            object.__setattr__(self, "steps", round(self.task.duration / self.dt) + self.task.extra_steps)
+            object.__setattr__(self, "steps", round(float(self.task.duration) / self.dt) + self.task.extra_steps)
 
     def __reduce__(self):
         import cloudpickle  # tasks and randomizations are closures

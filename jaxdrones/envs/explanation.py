@@ -16,7 +16,7 @@ from jaxdrones.engine.wrenches import describe
 from jaxdrones.envs.env import Env
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
-from jaxdrones.quantity import Quantity, description
+from jaxdrones.quantity import Quantity, check_quantities, description
 from jaxdrones.sensing import Scene
 from jaxdrones.tasks.task import ObservationTerm
 
@@ -181,6 +181,7 @@ def _checked(what: str, described: tuple[Quantity, ...], size: int) -> tuple[Qua
     """Quantities of a term or action type, one per entry; placeholders without a description."""
     if not described:
         return tuple(Quantity(f"number {i}", _UNKNOWN, _UNKNOWN) for i in range(size))
+    check_quantities(f"entries of {what}", described)
     if len(described) != size:
         raise UserError(f"{what} describes {len(described)} numbers and has {size}; give entries=(...) of {size}")
     return described

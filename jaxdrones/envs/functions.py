@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import short_repr
+from jaxdrones.checks import check_params, short_repr
 from jaxdrones.control import Setpoint
 from jaxdrones.envs.actions import Action
 from jaxdrones.errors import UserError
@@ -104,6 +104,21 @@ def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None
     _check_arrays(f"{where} returns variables", returned[1])
 
 
+def equipped(task: Task, params: Params) -> Params:
+    """Parameters of a team with the constants of the task's models."""
+    returned = task.equip(params)
+    if not _is_own(task.equip):
+        where, n = _where("equip", task.equip), task.drones
+        if not isinstance(returned, Params):
+            raise UserError(f"{where} returns {_kind(returned)}; return params.replace(...)")
+        _check_like(where, "parameters", returned, params)
+        check_params(returned)
+        for leaf in jax.tree.leaves(returned.aux):
+            if (_shape(leaf) or ())[:1] != (n,):
+                raise UserError(f"{where} returns parameters whose aux has {_kind(leaf)}; give an array ({n}, ...)")
+    return returned
+
+
 def _check_randomizations(task: Task, params: Params) -> None:
     """Raise unless each randomization of a task returns the parameters of one drone."""
     one = jax.tree.map(lambda x: x[0], params)
@@ -127,6 +142,12 @@ def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> 
         shape = _shape(x)
         if shape is None or len(shape) != 2 or shape[0] != n or shape[1] == 0:
             raise UserError(f"{where} returns {_kind(x)}; return an array ({n}, d), one row for every drone")
+        if jnp.result_type(x).kind not in "iuf":
+            raise UserError(f"{where} returns {_kind(x)}; return real numbers")
+        if _shape(again := term.observe(task, world)) != shape:
+            raise UserError(f"{where} returns {_kind(x)}, and {_kind(again)} when called again; keep its shape")
+        if term.rows and shape[1] % term.rows:
+            raise UserError(f"{where} returns {shape[1]} numbers in {term.rows} rows; give rows of equal length")
         for name, given in ("bound", term.bound), ("entries", term.entries):
             if isinstance(given, tuple) and given and len(given) != shape[1]:
                 raise UserError(f"{where} returns {shape[1]} numbers and has {len(given)} in {name}; give one for each")
@@ -199,8 +220,10 @@ def _check_like(where: str, what: str, given: Any, wanted: Any) -> None:
         if field == "aux" or like is None:
             continue
         x = getattr(given, field)
-        if _shape(x) != np.shape(like) or jnp.result_type(x).kind not in "iuf":
-            raise UserError(f"{where} returns {what} whose {field} is {_kind(x)}; give an array {np.shape(like)}")
+        kinds = "f" if isinstance(wanted, State) else "iuf"  # a state is integrated
+        if _shape(x) != np.shape(like) or jnp.result_type(x).kind not in kinds:
+            wants = f"give an array {np.shape(like)} of {like.dtype}"
+            raise UserError(f"{where} returns {what} whose {field} is {_kind(x)}; {wants}")
 
 
 def _check_kept(where: str, what: str, before: Any, after: Any) -> None:

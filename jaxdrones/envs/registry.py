@@ -24,7 +24,7 @@ from jaxdrones.engine.wrenches import TeamEffect
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.disturbances import Disturbance
 from jaxdrones.envs.env import Env
-from jaxdrones.envs.functions import DrawScene, check_controller, check_process, scene_example
+from jaxdrones.envs.functions import DrawScene, check_controller, check_process, equipped, scene_example
 from jaxdrones.envs.named_tasks import make_task
 from jaxdrones.envs.observations import OBSERVATIONS, reading
 from jaxdrones.envs.randomize import (
@@ -117,7 +117,7 @@ def make(
     task = make_task(task, options, _OWN_OPTIONS)
     control_hz = task.control_hz if control_hz is None else control_hz
     substeps = task.substeps if substeps is None else substeps
-    dt = 1 / control_hz
+    dt = 1 / float(control_hz)
     preset = _REALISTIC if realistic else _PLAIN
     if randomize is None and realistic != "any":
         randomize = preset["randomize"]
@@ -125,7 +125,7 @@ def make(
     vehicle = "cf2x" if vehicle is None else vehicle
     nominal = repeat(vehicle if isinstance(vehicle, Params) else load_params(vehicle), task.drones)
     check_finite("vehicle", nominal)
-    nominal = task.equip(nominal_params(randomize, nominal))
+    nominal = equipped(task, nominal_params(randomize, nominal))
     rotors = _named("rotors", preset["rotors"] if rotors is None else rotors, ROTORS)
     effects = _all_named("effects", preset["effects"] if effects is None else effects, EFFECTS, others=PAIRS)
     effects = [*effects, *task.effects]

@@ -30,6 +30,13 @@ PATIENCE = 10
 _RATE_FACTOR = 1.2  # factor of an adaptation of the learning rate
 
 
+SMALLER = "try a smaller learning rate, for example learning_rate=1e-3"
+_NEVER_FINITE = (
+    "no update had finite ones, so the learning rate is not the cause: look in the task for NaN, very large rewards, "
+    "and roots or norms of zero, whose gradient is not finite"
+)
+
+
 class Diverged(RuntimeError):
     """Diverged training: parameters or gradients are not finite."""
 
@@ -138,7 +145,7 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
             step += count
             nonfinite = rows[-1]["nonfinite_gradients"]
             if is_concrete(nonfinite):  # not so when an environment with traced parameters is mapped
-                streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak)
+                streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak, step - count)
             values = {name: x[0].item() for name, x in rows[-1].items()} if callbacks else {}
             stop = any([call(step, values, state) is True for call in callbacks])
         history = {name: jnp.concatenate([row[name] for row in rows]) for name in rows[0]}
@@ -184,17 +191,20 @@ def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result
     return Result(state.policy, state, history)
 
 
-def check_gradients(nonfinite: Sequence[int] | np.ndarray, patience: int = PATIENCE, before: int = 0) -> int:
+def check_gradients(
+    nonfinite: Sequence[int] | np.ndarray, patience: int = PATIENCE, before: int = 0, made: int = 0
+) -> int:
     """Raise `Diverged` after `patience` consecutive updates with gradients that are not finite.
 
-    `nonfinite` (updates,) is their number in each update, and `before` the number of such updates in a row before
-    these. Return the latter at the end.
+    `nonfinite` (updates,) is their number in each update, `before` the number of such updates in a row before these,
+    and `made` the number of all updates before these. Return the new `before`.
     """
     streak = before
-    for count in nonfinite:
+    for update, count in enumerate(nonfinite, made + 1):
         streak = streak + 1 if count else 0
         if streak >= patience:
-            raise Diverged(f"gradients were not finite in {streak} updates in a row; try a smaller learning rate")
+            advice = SMALLER if streak < update else _NEVER_FINITE
+            raise Diverged(f"gradients were not finite in {streak} updates in a row; {advice}")
     return streak
 
 

@@ -20,7 +20,7 @@ from jaxdrones.dynamics.model import Model
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
-from jaxdrones.quantity import Quantity
+from jaxdrones.quantity import Quantity, check_quantities
 from jaxdrones.sensing import Camera, Scene
 from jaxdrones.state import State
 from jaxdrones.vector import safe_sqrt
@@ -107,6 +107,8 @@ class ObservationTerm:
         check_function("observe of an ObservationTerm", self.observe, _OF_A_WORLD)
         for bound in self.bound if isinstance(self.bound, tuple) else (self.bound,):
             check_number("bound of an observation", bound, above=0, infinite=True)
+        if not callable(self.entries):
+            check_quantities("entries of an ObservationTerm", self.entries)
 
 
 @checked
@@ -190,6 +192,8 @@ class Task:
                 raise UserError(f"{name} of the task is {short_repr(x)}; give a {what}")
         for field, function, names in self._functions():
             check_function(field, function, names)
+        for name in {*self.truncations}.intersection({*self.terminations, "time"}):
+            raise UserError(f"truncations has {name!r}, the name of another end of the episode; give it another name")
         for name in self.success_terminations:
             check_choice("success termination", name, self.terminations)
         for name, term in _mapping("observations", self.observations, "an ObservationTerm").items():

@@ -16,7 +16,7 @@ from jaxdrones.errors import UserError
 from jaxdrones.learning import sharding
 from jaxdrones.learning.evaluation import Report
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.result import MAX_CALL, PATIENCE, Callback, Diverged, check_gradients
+from jaxdrones.learning.result import MAX_CALL, PATIENCE, SMALLER, Callback, Diverged, check_gradients
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.training import distributed
 from jaxdrones.training.plan import EVALUATIONS, IN_A_ROW, STOPPING_EVALUATIONS, TimePlan, next_evaluation
@@ -153,7 +153,7 @@ class _Loop:
         seconds = distributed.from_first_host(time.perf_counter() - start)
         bad = [~np.isfinite(x) for name, x in metrics.items() if name != "return"]  # NaN until an episode has ended
         nonfinite = metrics["nonfinite_gradients"] + np.any(bad, axis=0)
-        self.nonfinite_streak = check_gradients(nonfinite, min(PATIENCE, self.updates), self.nonfinite_streak)
+        self.nonfinite_streak = check_gradients(nonfinite, min(PATIENCE, self.updates), self.nonfinite_streak, self.update)
         if not _is_finite(state):
             raise _diverged("parameters are not finite", self.update + length)
         rows = [
@@ -249,7 +249,7 @@ class _Loop:
 
 
 def _diverged(what: str, update: int) -> Diverged:
-    return Diverged(f"{what} at update {update}; try a smaller learning rate")
+    return Diverged(f"{what} at update {update}; {SMALLER}")
 
 
 def _is_finite(state: Any) -> bool:

@@ -46,7 +46,7 @@ def same(a, b, **tolerance):
 def test_gradients_that_are_not_finite_are_counted_and_stop_training_when_they_repeat(name):
     learner, env = LEARNERS[name], Steep()
     config = dataclasses.replace(SMALL[learner], updates=PATIENCE)
-    with pytest.raises(Diverged, match=f"gradients were not finite in {PATIENCE} updates in a row; try a smaller"):
+    with pytest.raises(Diverged, match=f"gradients were not finite in {PATIENCE} updates in a row; no update had finite"):
         learner.train(KEY, env, config)
     history = jax.jit(lambda key: learner.train(key, env, config).history)(KEY)  # where nothing can be raised
     assert np.all(np.isfinite(history["reward"])) and np.all(history["nonfinite_gradients"] >= 1)
@@ -66,6 +66,12 @@ def test_training_goes_on_after_gradients_that_are_not_finite_unless_they_repeat
             check_gradients(counts, before=before)
     with pytest.raises(Diverged, match="not finite in 2 updates in a row"):
         check_gradients([1, 1], patience=2)
+
+
+@pytest.mark.parametrize(("before", "made", "advice"), [(0, 3, "try a smaller"), (1, 1, "learning rate is not the")])
+def test_the_learning_rate_is_no_cause_of_gradients_that_never_were_finite(before, made, advice):
+    with pytest.raises(Diverged, match=advice):
+        check_gradients([1] * (PATIENCE - before), before=before, made=made)
 
 
 def test_a_gradient_that_is_not_finite_is_replaced_by_zero_and_counted():

@@ -44,7 +44,7 @@ def draw(key, params):
 def mine(drones: int = 2):
     return Task(
         name="mine", summary="a task", drones=drones, duration=1.0, start=start, target=target,
-        rewards={"near": (1.0, near)}, terminations={"low": low}, truncations={"low": low}, metrics={"near": near},
+        rewards={"near": (1.0, near)}, terminations={"low": low}, truncations={"end": low}, metrics={"near": near},
         advance=kept, success=success, observations={"height": ObservationTerm(height, 5.0)}, randomize=(draw,),
         observation=("height",), camera=None, contact=(),
     )
@@ -150,7 +150,7 @@ MISTAKES = [  # (what stands in the file, what a user wrote in its place, what i
     ('terminations={"low": low}', "terminations=[low]", r"terminations is \[.*; give a dictionary of names"),
     ('terminations={"low": low}', "terminations={'low': True}", r"terminations\['low'\]: True is not a function"),
     ('terminations={"low": low}', "terminations={1: low}", "terminations is {1.*; give a dictionary of names"),
-    ('truncations={"low": low}', "truncations=low", "truncations is <function low.*; give a dictionary"),
+    ('truncations={"end": low}', "truncations=low", "truncations is <function low.*; give a dictionary"),
     ("pos[:, 2] < 0", "pos[:, 2]", r"termination 'low' returns .*float32; return one boolean for every drone"),
     ("pos[:, 2] < 0", "pos < 0", r"termination 'low' returns an array \(2, 3\) of bool"),
     ('metrics={"near": near}', "metrics=('near',)", r"metrics is .*; give a dictionary of names"),

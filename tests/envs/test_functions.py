@@ -1,0 +1,93 @@
+"""Functions of a task that return what an environment cannot use: `make` refuses them and names the function."""
+
+import dataclasses
+import itertools
+
+import jax.numpy as jnp
+import pytest
+
+import jaxdrones as jd
+from jaxdrones.control import Setpoint
+from jaxdrones.envs.explanation import explain
+from jaxdrones.errors import UserError
+from jaxdrones.tasks import ObservationTerm, Quantity, Task
+
+N = 2
+calls = itertools.count(1)
+
+
+def start(key, params):
+    return jd.State.at_rest(jnp.ones((N, 3))), jnp.zeros(N)
+
+
+def height(task, world):
+    return world.drones.pos[:, 2:]
+
+
+def low(task, world):
+    return world.drones.pos[:, 2] < 0
+
+
+TASK = Task(
+    name="mine",
+    summary="a task",
+    drones=N,
+    duration=1.0,
+    start=start,
+    target=lambda variables, time: Setpoint.at(jnp.ones((N, 3))),
+    rewards={"high": (1.0, lambda task, world: world.drones.pos[:, 2])},
+    terminations={"low": low},
+    observation=(ObservationTerm(height, 5.0),),
+)
+
+
+def of_whole_numbers(key, params):
+    state, variables = start(key, params)
+    return state.replace(pos=jnp.ones((N, 3), int)), variables
+
+
+MISTAKES = [
+    (dict(start=of_whole_numbers), "start returns a state whose pos is .*int.*; give an array .* of float"),
+    (dict(equip=lambda params: None), "equip returns None; return params.replace"),
+    (dict(equip=lambda params: params.replace(mass=jnp.ones(7))), r"equip returns .* mass is an array \(7,\)"),
+    (dict(equip=lambda params: params.replace(mass=-params.mass)), "params.mass is .*; give positive numbers"),
+    (
+        dict(equip=lambda params: params.replace(aux={"load": jnp.ones(())})),
+        r"equip returns parameters whose aux has an array \(\) of .*; give an array \(2, ...\)",
+    ),
+    (
+        dict(observation=(ObservationTerm(lambda task, world: height(task, world) > 1, 5.0),)),
+        r"returns an array \(2, 1\) of bool; return real numbers",
+    ),
+    (
+        dict(observation=(ObservationTerm(lambda task, world: jnp.zeros((N, next(calls))), 5.0),)),
+        r"returns an array \(2, \d\) of .*, and an array \(2, \d\) of .* when called again; keep its shape",
+    ),
+    (dict(observation=(ObservationTerm(height, 5.0, rows=2),)), "returns 1 numbers in 2 rows; give rows of equal"),
+]
+
+
+@pytest.mark.parametrize(("change", "said"), MISTAKES, ids=[said for _, said in MISTAKES])
+def test_what_a_function_of_a_task_returns_is_refused_where_nothing_can_be_flown_with_it(change, said):
+    with pytest.raises(UserError, match=said):
+        jd.make(dataclasses.replace(TASK, **change))
+
+
+def test_a_duration_and_a_rate_may_be_arrays():
+    env = jd.make(dataclasses.replace(TASK, duration=jnp.array(1.5)), control_hz=jnp.array(50.0))
+    assert type(env.steps) is int and env.steps == 75 and type(env.dt) is float
+
+
+@pytest.mark.parametrize("name", ["low", "time"])
+def test_the_ends_of_an_episode_have_different_names(name):
+    with pytest.raises(UserError, match=f"truncations has '{name}', the name of another end"):
+        dataclasses.replace(TASK, truncations={name: low})
+
+
+@pytest.mark.parametrize("entries", [("height",), 3, [Quantity("height")]])
+def test_entries_of_an_observation_are_a_tuple_of_quantities(entries):
+    with pytest.raises(UserError, match="entries of an ObservationTerm is .*; give a tuple"):
+        ObservationTerm(height, 5.0, entries=entries)
+    term = ObservationTerm(height, 5.0, entries=lambda drones, action: entries)
+    with pytest.raises(UserError, match="entries of the observation term .* is .*; give a tuple"):
+        explain(jd.make(dataclasses.replace(TASK, observation=(term,))))

@@ -107,8 +107,10 @@ def _explained(error: BaseException) -> str | None:
         return f"{error.filename}: {error.strerror}; choose another --output" if error.filename else str(error)
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
         return "there is not enough memory; give fewer worlds, drones or episodes"
-    if isinstance(error, FloatingPointError) and _DEBUG.intersection(os.environ):
-        return f"{error}, as {' and '.join(sorted(_DEBUG.intersection(os.environ)))} asked to find"
+    in_program = type(error).__name__ == "InternalFloatingPointError"  # which JAX raises for a compiled program
+    if (in_program or isinstance(error, FloatingPointError)) and _DEBUG.intersection(os.environ):
+        found = f"there is {error.args[1]} in {error.args[0]}" if in_program else error
+        return f"{found}, as {' and '.join(sorted(_DEBUG.intersection(os.environ)))} asked to find"
     try:
         machine.devices()
     except UserError as missing:

@@ -65,6 +65,7 @@ MISTAKES = [  # (what stands in the file, what a user wrote in its place, what i
     ("import jax,", "import sys; sys.exit(0)\nimport jax,", r"raises SystemExit\(0\); .* must not end the program"),
     ("import jax,", "raise SystemExit\nimport jax,", r"raises SystemExit\(None\)"),
     ("import jax,", "import no_such_library\nimport jax,", "No module named 'no_such_library'; a file of yours may"),
+    ("import jax,", "from jaxdrones import Stat\nimport jax,", r"cannot import name 'Stat' from 'jaxdrones' \(.*\)\n"),
     ("def start(", "def start(:\ndef start(", "line 6 raises SyntaxError"),
     ("def mine", "def mein", "defines no 'mine'; did you mean 'mein'?"),
     ("drones=drones,", "", "raises TypeError: .*missing .*'drones'"),
@@ -326,16 +327,32 @@ def test_an_error_in_a_users_file_is_not_blamed_on_settings_and_debug_shows_its_
         assert err.splitlines()[-1].startswith(f"jaxdrones: error: my.py: line {line} (near) raises AttributeError")
 
 
-@pytest.mark.parametrize("error", [ValueError("of numpy"), KeyError("x"), AssertionError()])
+@pytest.mark.parametrize("error", [ValueError("of numpy"), KeyError("x"), TypeError("of jax"), AssertionError()])
 def test_a_fault_of_the_library_shows_its_traceback_and_ends_with_70(error, capsys, monkeypatch):
     def broken(*_, **__):
         raise error
 
     monkeypatch.setattr("jaxdrones.cli.explain.explain", broken)
-    assert main(["explain", "hover"]) == 70
+    assert main(["explain", "hover", "--set", "duration=2.5"]) == 70
     err = capsys.readouterr().err
     assert "Traceback (most recent call last)" in err and "in broken" in err
     assert "this is a fault of jaxdrones, please report it" in err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_nan_that_jax_was_asked_to_find_is_no_fault_of_the_library(compiled, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_DEBUG_NANS", "1")
+    program = jax.jit(lambda x: x / x)
+    zero = jax.numpy.zeros(())
+    program = program.lower(zero).compile() if compiled else program
+    with jax.debug_nans(True):
+        assert re.search("nan.*as JAX_DEBUG_NANS asked to find", said(capsys, lambda: program(zero)))
+
+
+@pytest.mark.float32
+def test_an_integer_that_overflows_is_blamed_on_its_setting(capsys):
+    assert main(["explain", "tracking", "--set", "period=100000000000"]) == 2
+    assert "--set period=100000000000 does not fit tracking: An overflow" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", [[], ["fly"], ["ros2", "replay"]])

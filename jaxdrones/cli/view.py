@@ -130,10 +130,11 @@ def _is_flight(path: Path) -> bool:
         log = find_log(path)
     except ValueError:
         return False
-    if not zipfile.is_zipfile(log):
+    try:
+        with zipfile.ZipFile(log) as archive:
+            return "pos.npy" in archive.namelist()
+    except (OSError, zipfile.BadZipFile):
         return log.is_dir() or log.suffix in (".npz", ".csv")
-    with zipfile.ZipFile(log) as archive:
-        return "pos.npy" in archive.namelist()
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -187,9 +187,9 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
         raise ImportError(f"rosbags is not installed; {install('ros2')}") from error
     store = get_typestore(Stores.ROS2_JAZZY)
     found: dict[str, dict[int, Any]] = {}
+    kinds = {"nav_msgs/msg/Odometry": "odom", "std_msgs/msg/Float64MultiArray": "motors"}
     try:
         with Reader(path) as reader:
-            kinds = {"nav_msgs/msg/Odometry": "odom", "std_msgs/msg/Float64MultiArray": "motors"}
             wanted = [c for c in reader.connections if c.topic.endswith(f"/{kinds.get(c.msgtype, '?')}")]
             for connection, ns, data in reader.messages(wanted):
                 message = store.deserialize_cdr(data, connection.msgtype)
@@ -199,9 +199,14 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
     n = 0
     while {f"drone_{n}/odom", f"drone_{n}/motors"} <= found.keys():
         n += 1
-    times = sorted(set.intersection(*map(set, found.values()))) if n else []
+    if not n:
+        raise UserError(f"{path} holds no flight: it lacks /drone_0/odom or /drone_0/motors; record it with both")
+    times = sorted(set.intersection(*(set(found[f"drone_{i}/{kind}"]) for i in range(n) for kind in kinds.values())))
     if not times:
-        raise UserError(f"{path} holds no flight: it lacks /drone_0/odom and /drone_0/motors; record it with both")
+        raise UserError(f"{path}: /odom and /motors of its {n} drones have no time in common; record them with equal times")
+    motors = [[found[f"drone_{i}/motors"][ns].data for i in range(n)] for ns in times]
+    if any(len(speeds) != _WIDTHS["rpm"] for team in motors for speeds in team):
+        raise UserError(f"{path}: a message of /motors has not {_WIDTHS['rpm']} numbers; record the rotor speeds, RPM")
     odometry = [[found[f"drone_{i}/odom"][ns] for i in range(n)] for ns in times]
 
     def stacked(part: str, kind: str, axes: str) -> np.ndarray:
@@ -216,7 +221,7 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
         "quat": quat,
         "vel": body_vel + quat[..., 3:] * turned + np.cross(quat[..., :3], turned),
         "omega": stacked("twist", "angular", "xyz"),
-        "rpm": np.array([[found[f"drone_{i}/motors"][ns].data for i in range(n)] for ns in times]),
+        "rpm": np.array(motors),
     }
 
 
@@ -259,7 +264,7 @@ def _check(log: FlightLog) -> None:
         row, drone = broken[0].tolist()
         where = f"before row {row}" if row else "in row 0"
         raise UserError(f"{log.name}: the state of {log.labels[drone]} is not finite {where}; remove such rows")
-    length = np.linalg.norm(log.quat, axis=-1)
+    length = np.linalg.norm(log.quat.astype(float), axis=-1)
     if (np.abs(length - 1) > _MAX_STRETCH).any():
         row, drone = np.argwhere(np.abs(length - 1) > _MAX_STRETCH)[0].tolist()
         raise UserError(

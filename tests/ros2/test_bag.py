@@ -115,6 +115,25 @@ def test_a_bag_without_a_flight_is_refused(tmp_path):
         read_log(tmp_path / "bag")
 
 
+@pytest.mark.parametrize(
+    ("late", "speeds", "said"),
+    [(0, 4, None), (7, 4, "of its 1 drones have no time in common"), (0, 3, "/motors has not 4 numbers")],
+)
+def test_a_flight_is_that_of_the_drones_whatever_else_a_bag_holds(late, speeds, said, tmp_path):
+    odom, motors = topics.output(0, "odom"), topics.output(0, "motors")
+    other = topics.Topic("cart/odom", odom.type, odom.qos)
+    with bag.Recorder(tmp_path / "bag") as recorder:
+        for ns in 5, 10, 15:
+            recorder.write(odom, msg.Odometry(), ns)
+            recorder.write(motors, msg.Float64MultiArray(data=(1.0,) * (speeds if ns == 10 else 4)), ns + late)
+            recorder.write(other, msg.Odometry(), ns + 1)
+    if said is None:
+        assert len(read_log(tmp_path / "bag").t) == 3
+    else:
+        with pytest.raises(ValueError, match=said):
+            read_log(tmp_path / "bag")
+
+
 @pytest.fixture
 def wired(monkeypatch):
     """The command line on a transport within this process."""

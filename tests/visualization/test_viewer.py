@@ -254,10 +254,13 @@ def test_of_several_paths_those_that_are_no_flights_are_skipped_with_a_note(reco
     assert told.err == f"skipped, as no flights: {', '.join(skipped)}\n"
     assert json.loads(told.out)["skipped"] == skipped
     assert json.loads(told.out)["flights"] == [str(tmp_path / name) for name in ("one", "other")]
-    (tmp_path / "damaged.npz").write_bytes((tmp_path / "one" / "log.npz").read_bytes()[:2000])
+    whole = (tmp_path / "one" / "log.npz").read_bytes()
+    (tmp_path / "damaged.npz").write_bytes(whole[:2000])
+    (tmp_path / "directory.npz").write_bytes(whole.replace(b"PK\x01\x02", b"PK\x01\x03"))  # of the archive, at its end
     for others, message in (
         (["nowhere"], "nowhere is not there"),
         (["damaged.npz"], "damaged.npz: is not an .npz file"),
+        (["directory.npz"], "directory.npz: is not an .npz file"),
     ):
         assert main(["view", str(tmp_path / "one"), *(str(tmp_path / x) for x in others), *page]) == 2
         assert message in capsys.readouterr().err

@@ -203,7 +203,9 @@ def _bag(path: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{path} holds no flight: it lacks /drone_0/odom or /drone_0/motors; record it with both")
     times = sorted(set.intersection(*(set(found[f"drone_{i}/{kind}"]) for i in range(n) for kind in kinds.values())))
     if not times:
-        raise UserError(f"{path}: /odom and /motors of its {n} drones have no time in common; record them with equal times")
+        raise UserError(
+            f"{path}: /odom and /motors of its {n} drones have no time in common; record them with equal times"
+        )
     motors = [[found[f"drone_{i}/motors"][ns].data for i in range(n)] for ns in times]
     if any(len(speeds) != _WIDTHS["rpm"] for team in motors for speeds in team):
         raise UserError(f"{path}: a message of /motors has not {_WIDTHS['rpm']} numbers; record the rotor speeds, RPM")

@@ -153,7 +153,9 @@ class _Loop:
         seconds = distributed.from_first_host(time.perf_counter() - start)
         bad = [~np.isfinite(x) for name, x in metrics.items() if name != "return"]  # NaN until an episode has ended
         nonfinite = metrics["nonfinite_gradients"] + np.any(bad, axis=0)
-        self.nonfinite_streak = check_gradients(nonfinite, min(PATIENCE, self.updates), self.nonfinite_streak, self.update)
+        self.nonfinite_streak = check_gradients(
+            nonfinite, min(PATIENCE, self.updates), self.nonfinite_streak, self.update
+        )
         if not _is_finite(state):
             raise _diverged("parameters are not finite", self.update + length)
         rows = [

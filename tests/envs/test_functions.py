@@ -86,8 +86,8 @@ def test_the_ends_of_an_episode_have_different_names(name):
 
 @pytest.mark.parametrize("entries", [("height",), 3, [Quantity("height")]])
 def test_entries_of_an_observation_are_a_tuple_of_quantities(entries):
-    with pytest.raises(UserError, match="entries of an ObservationTerm is .*; give a tuple"):
+    with pytest.raises(UserError, match=r"entries of an ObservationTerm is .*; give a tuple"):
         ObservationTerm(height, 5.0, entries=entries)
     term = ObservationTerm(height, 5.0, entries=lambda drones, action: entries)
-    with pytest.raises(UserError, match="entries of the observation term .* is .*; give a tuple"):
+    with pytest.raises(UserError, match=r"entries of the observation term .* is .*; give a tuple"):
         explain(jd.make(dataclasses.replace(TASK, observation=(term,))))

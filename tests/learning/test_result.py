@@ -46,7 +46,9 @@ def same(a, b, **tolerance):
 def test_gradients_that_are_not_finite_are_counted_and_stop_training_when_they_repeat(name):
     learner, env = LEARNERS[name], Steep()
     config = dataclasses.replace(SMALL[learner], updates=PATIENCE)
-    with pytest.raises(Diverged, match=f"gradients were not finite in {PATIENCE} updates in a row; no update had finite"):
+    with pytest.raises(
+        Diverged, match=f"gradients were not finite in {PATIENCE} updates in a row; no update had finite"
+    ):
         learner.train(KEY, env, config)
     history = jax.jit(lambda key: learner.train(key, env, config).history)(KEY)  # where nothing can be raised
     assert np.all(np.isfinite(history["reward"])) and np.all(history["nonfinite_gradients"] >= 1)

@@ -202,3 +202,10 @@ def test_drawn_parameters_are_found_however_rarely_they_differ(randomize, drawn)
     assert [jax.tree_util.keystr(path, simple=True) for (path, _), is_drawn in found if is_drawn] == drawn
     env = make("hover", randomize=(randomize,))
     assert env.privileged_size == sum(getattr(env.params, name).size for name in drawn)
+
+
+@pytest.mark.parametrize("steps", [0.0, 1.0, 2.0, 0.5, 1.75])
+def test_a_delayed_action_is_the_one_of_so_many_steps_ago(steps):
+    actions = jnp.array([[[5.0], [6.0], [7.0], [8.0]]])  # the newest one last
+    np.testing.assert_allclose(delayed(actions, steps), 8 - steps)
+    np.testing.assert_allclose(delayed(actions, jnp.array([steps])), 8 - steps)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import jit_unoptimized
 from sensing.estimates import along, few, flights
 
 import jaxdrones as jd
@@ -84,6 +85,17 @@ def test_the_field_that_a_magnetometer_feels_is_that_of_the_world_in_body_axes()
     sensor, params, (state, rate) = magnetometer(Noise()), jd.load_params("cf2x"), random_state(4)
     _, read = sensor.measure(KEY, params, state, rate, jd.Scene(), sensor.init(KEY, params))
     np.testing.assert_allclose(jd.rotation.rotate(state.quat, read), EUROPE, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("delay", "age"), [(0.0, 0.0), (0.03, 3.0), (0.025, 2.5)])
+def test_a_pose_is_as_old_as_the_delay(delay, age):
+    sensor = motion_capture(MotionCaptureSystem(rate=100.0, delay=delay))
+    params, measure = jd.load_params("cf2x"), jit_unoptimized(sensor.measure)
+    memory = sensor.init(KEY, params)
+    for k in range(6):
+        state = jax.tree.map(lambda x: x[0], jd.State.at_rest(jnp.array([[1.0 * k, 0, 1]])))
+        memory, pose = measure(KEY, params, state, state, None, memory)
+    np.testing.assert_allclose(pose["pos"][0], 5 - age, atol=1e-9)
 
 
 @pytest.mark.slow

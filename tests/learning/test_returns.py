@@ -1,12 +1,6 @@
-from types import SimpleNamespace
-
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import jit_unoptimized
 
-from jaxdrones.learning import collect
-from jaxdrones.learning.metrics import with_returns
 from jaxdrones.learning.returns import advantages
 
 T, W = 12, 5
@@ -61,16 +55,3 @@ def test_with_lambda_one_values_cancel_and_the_target_is_the_discounted_return()
     target = value + advantages(reward, value, next_value, never, never, gamma=0.9, gae_lambda=1.0)
     expected = np.sum(reward[:, 0] * 0.9 ** np.arange(T)) + 0.9**T * 3.0
     np.testing.assert_allclose(target[0, 0], expected, rtol=1e-12)
-
-
-def test_an_episode_that_may_have_been_cut_weighs_the_inverse_of_its_chance_to_last():
-    """In trajectories of 4 steps one of 9 steps, which began two trajectories ago, was left alone at two restarts."""
-    t, done = 4, np.zeros((4, 2), bool)
-    done[1], lengths = True, np.zeros((4, 2), int)
-    lengths[1] = [2, 9 + 1]
-    flown = SimpleNamespace(done=done, was_done=np.zeros((t, 2, 1), bool), length=lengths)
-    flown.reward, flown.episode_return = np.zeros((t, 2, 1)), np.full((t, 2, 1), 3.0)
-    worlds = collect.Worlds(None, None, None, jnp.zeros(2), jnp.zeros(2))
-    after = jit_unoptimized(lambda worlds: with_returns(worlds, flown, 0.3))(worlds)
-    np.testing.assert_allclose(after.last_weight, [1.0, 0.7**-2])
-    np.testing.assert_allclose(after.last_return, 3.0)

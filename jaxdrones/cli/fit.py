@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxdrones.cli.common import check_writable, folder, print_warning
 from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle
 from jaxdrones.cli.report import as_json
-from jaxdrones.errors import install
+from jaxdrones.errors import UserError
 
 _FIGURE = "errors.png"
 
@@ -54,6 +54,7 @@ def _fit(options: argparse.Namespace) -> int:
     from jaxdrones.flights.report import check_no_fit, report_as_dict, write_vehicle
     from jaxdrones.flights.vehicle import REPORT, URDF
     from jaxdrones.urdf import load_params
+    from jaxdrones.visualization.plots import check_matplotlib
     from jaxdrones.visualization.residuals import save_errors
 
     params = load_params(options.vehicle)
@@ -73,10 +74,11 @@ def _fit(options: argparse.Namespace) -> int:
     files = [URDF, REPORT]
     if not options.no_figure:
         try:
+            check_matplotlib()
             save_errors(report.errors, options.output / _FIGURE)
             files.append(_FIGURE)
-        except ImportError as error:
-            print_warning(f"no {_FIGURE}: {error}; {install('cli')}")
+        except UserError as error:
+            print_warning(f"no {_FIGURE}: {error}")
     if not options.json:
         print(f"{options.output}: {', '.join(files)}")
     return 0

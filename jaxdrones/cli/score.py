@@ -96,6 +96,9 @@ def _check_figure(file: Path, has_paths: bool) -> None:
         raise UserError("no log has set-points, so there are no paths to draw; leave --figure out")
     if file.suffix not in _PICTURES:
         raise UserError(f"--figure is {str(file)!r}; give a name that ends in {' or '.join(_PICTURES)}")
+    from jaxdrones.visualization.plots import check_matplotlib
+
+    check_matplotlib()
     check_writable(file)
 
 

@@ -39,16 +39,18 @@ _WIDTH, _PATHS, _ROW = 13.0, 5.4, 1.6  # in
 
 
 def check_matplotlib() -> None:
-    """Raise `ValueError` without matplotlib.
+    """Raise `ValueError` where matplotlib cannot be used.
 
     Raises:
-        ValueError: matplotlib is not installed.
+        ValueError: matplotlib is not installed, or its settings are invalid.
     """
     try:
         import matplotlib  # noqa: F401
+    except ValueError as error:  # in MPLBACKEND or in its file of settings
+        raise UserError(f"matplotlib does not start: {error}; correct MPLBACKEND, or draw no figure") from None
     except ImportError:
         raise UserError(
-            f"matplotlib is not installed, so no figure can be drawn; {install('cli')}, or pass --no-figure"
+            f"matplotlib is not installed, so no figure can be drawn; {install('cli')}, or draw no figure"
         ) from None
 
 

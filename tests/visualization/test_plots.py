@@ -1,4 +1,7 @@
 import dataclasses
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -107,6 +110,14 @@ def test_outlines_of_obstacles_have_their_area():
     np.testing.assert_allclose([area(box), area(sphere), area(cylinder)], [0.4, 0.09 * np.pi, 0.04 * np.pi], rtol=0.02)
     np.testing.assert_allclose(cylinder.mean(axis=0), [-1, 0], atol=1e-6)
     np.testing.assert_allclose(area(paths.outlines(scene, x, z)[2]), 0.8, rtol=0.02)
+
+
+def test_invalid_settings_of_matplotlib_are_a_users_mistake():
+    """In a process of its own, as they are read when it is imported."""
+    script = "from jaxdrones.visualization import plots; plots.check_matplotlib()"
+    environ = os.environ | {"MPLBACKEND": "nonsense"}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environ, check=False)
+    assert "UserError: matplotlib does not start: Key backend: 'nonsense'" in done.stderr
 
 
 def test_without_matplotlib_the_error_names_the_extra(monkeypatch):

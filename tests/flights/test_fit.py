@@ -159,10 +159,10 @@ def test_a_fit_is_written_without_matplotlib_and_never_over_another(
     np.savez(tmp_path / "a---.npz", **columns)
     real = builtins.__import__
 
-    def missing(name, *args):
+    def missing(name, *args, **others):
         if hidden and name.partition(".")[0] == "matplotlib":
             raise ImportError("No module named 'matplotlib'")
-        return real(name, *args)
+        return real(name, *args, **others)
 
     monkeypatch.setattr(builtins, "__import__", missing)
     (tmp_path / "x---y.urdf").write_text(to_urdf(params, "x"))

@@ -104,6 +104,7 @@ def test_an_episode_is_what_it_was_at_its_end_whatever_comes_after(before, succe
     report = reports[0]
     assert report.success == succeeds and report.mean_return == steps
     assert report.end_rates == {"fell": ended == "fell", "done": ended == "done"}
+    assert report.distinct_episodes == 1 and report.success_interval is None  # all flew alike
     np.testing.assert_allclose(report.mean_length, 0.1 * steps, rtol=1e-6)
     climb = 0.1 * before * (1 if before < 0 else float(LIFT.params.max_rpm[0] / LIFT.params.hover_rpm[0]) - 1)
     errors = np.abs(climb) * np.arange(1, steps + 1)
@@ -142,6 +143,11 @@ def test_a_failure_counts_where_the_goal_is_reached_in_the_same_step_and_any_oth
     assert not LIFT.task.succeeded({"error": jnp.full((10, 1), 3.0)}, {}, 0.1)
     with pytest.raises(ValueError, match="unknown success termination 'cut'"):
         dataclasses.replace(LIFT.task, success_terminations=("cut",))
+
+
+def test_an_episode_with_a_position_that_is_not_finite_is_no_success():
+    env = lift(success=lambda metrics, dt: jnp.ones(1, bool))
+    assert flown(0.1, env=env).success == 1 and flown(jnp.nan, env=env).success == 0
 
 
 def test_an_episode_of_a_team_succeeds_when_all_of_it_does():

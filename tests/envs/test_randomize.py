@@ -77,7 +77,9 @@ def test_noise_is_seen_and_does_not_move_the_drone():
     assert 0 < jnp.abs(seen - expected).max() < 0.2
 
 
-@pytest.mark.parametrize(("steps", "expected"), [(0, 5.0), (1, 4.0), (2, 3.0), (0.25, 4.75), (1.5, 3.5)])
+@pytest.mark.parametrize(
+    ("steps", "expected"), [(0.0, 5.0), (1.0, 4.0), (2.0, 3.0), (2, 3.0), (0.25, 4.75), (1.5, 3.5)]
+)
 def test_a_delay_takes_an_older_action_or_mixes_two(steps, expected):
     actions = jnp.arange(6.0)[None, :, None]
     np.testing.assert_allclose(delayed(actions, steps), expected)
@@ -204,8 +206,9 @@ def test_drawn_parameters_are_found_however_rarely_they_differ(randomize, drawn)
     assert env.privileged_size == sum(getattr(env.params, name).size for name in drawn)
 
 
-@pytest.mark.parametrize("steps", [0.0, 1.0, 2.0, 0.5, 1.75])
-def test_a_delayed_action_is_the_one_of_so_many_steps_ago(steps):
-    actions = jnp.array([[[5.0], [6.0], [7.0], [8.0]]])  # the newest one last
-    np.testing.assert_allclose(delayed(actions, steps), 8 - steps)
-    np.testing.assert_allclose(delayed(actions, jnp.array([steps])), 8 - steps)
+def test_the_first_observation_has_the_noise_and_the_state_has_not():
+    env = make("hover", observation=("velocity",), noise=lambda key, state: state.replace(vel=state.vel + 3))
+    first = jit_unoptimized(lambda key: episode.first_observation(env, key, episode.start(env, key), None))
+    obs, world = first(KEY)
+    np.testing.assert_allclose(obs - world.drones.vel, 3, rtol=1e-6)
+    assert jnp.all(jnp.abs(world.drones.vel) < 2)

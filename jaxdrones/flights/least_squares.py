@@ -104,5 +104,9 @@ def normal_equations(
 
 
 def standard_errors(information: np.ndarray) -> np.ndarray:
-    """Standard errors of parameters from their information matrix (n, n), the inverse of the covariance."""
-    return np.sqrt(np.diag(np.linalg.inv(information)))
+    """Standard errors of parameters from their information matrix (n, n), the inverse of the covariance.
+
+    They are infinite where rounding leaves no positive variance, as the matrix is nearly singular.
+    """
+    variance = np.diag(np.linalg.inv(information))
+    return np.sqrt(np.where(variance > 0, variance, np.inf))

@@ -19,6 +19,7 @@ from jaxdrones.dynamics.propulsion import crazyflie_motors
 from jaxdrones.errors import UserError
 from jaxdrones.flights import Vehicle, fit, hold_errors, load_flights, load_vehicle, open_loop_errors
 from jaxdrones.flights.fit import _estimate
+from jaxdrones.flights.least_squares import standard_errors
 from jaxdrones.flights.open_loop import residuals
 from jaxdrones.flights.preparation import named_apart
 from jaxdrones.flights.report import write_vehicle
@@ -178,6 +179,12 @@ def test_a_fit_is_written_without_matplotlib_and_never_over_another(
     assert main(command) == 2
     assert "exists already; remove it, or give another --output" in capsys.readouterr().err
     assert {file: file.read_bytes() for file in (tmp_path / "fit").iterdir()} == before
+
+
+def test_a_parameter_without_a_positive_variance_has_an_infinite_standard_error():
+    """The inverse of a nearly singular matrix is rounded below zero: its second parameter has no information."""
+    errors = standard_errors(np.diag([4.0, -1e-20]))
+    np.testing.assert_array_equal(errors, [0.5, np.inf])
 
 
 @pytest.mark.parametrize("text", ["a---b", "--", "ends with -", "-->", 'quo"te & <tag>', "bell \x07 \x00"])

@@ -1,4 +1,4 @@
-"""Drone whose motors a firmware commands: its physics, and what is measured on it."""
+"""Drone whose motors a firmware commands: its physics, measurements and clock."""
 
 from __future__ import annotations
 
@@ -16,6 +16,23 @@ from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
 from jaxdrones.params import Params
 from jaxdrones.state import State
+
+LATE = 0.1  # s, lag behind the clock after which the schedule restarts
+
+
+@dataclasses.dataclass
+class Pace:
+    """Simulated and real time of a flight."""
+
+    simulated_s: float = 0.0
+    real_s: float = 0.0
+    late: int = 0
+    """Number of times that the flight fell behind the clock by 0.1 s."""
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated over real time."""
+        return self.simulated_s / self.real_s if self.real_s else 0.0
 
 
 @dataclasses.dataclass(frozen=True)

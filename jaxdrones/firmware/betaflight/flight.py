@@ -12,12 +12,11 @@ import numpy as np
 
 from jaxdrones.firmware.betaflight import msp, settings
 from jaxdrones.firmware.betaflight.link import Link, connect_msp
-from jaxdrones.firmware.betaflight.packets import Sticks, rc_packet, state_packet
+from jaxdrones.firmware.betaflight.packets import Sticks, rc_packet
 from jaxdrones.firmware.betaflight.pilots import PERIOD, Pilot
 from jaxdrones.firmware.betaflight.process import Process
 from jaxdrones.firmware.betaflight.simulation import Simulation
-from jaxdrones.firmware.drone import Sample
-from jaxdrones.firmware.pace import LATE, Pace
+from jaxdrones.firmware.drone import LATE, Pace, Sample
 
 _SILENT, _SILENT_IN_LOCKSTEP = 0.5, 3.0  # s of real time without motors after which Betaflight is lost
 _REPLY = 0.01  # s for the motors of a step in lockstep, after which the state is sent again
@@ -145,11 +144,14 @@ class Flight:
             return "it is started again with its settings"
         if again:
             self._warn("the joined Betaflight takes the rate of its loop when it is started again; it flies without")
-        self._start_clock()
+        first = self._simulation.packet()
+        for _ in range(_FIRST):  # with one time: the pace of Betaflight's clock begins afterwards
+            self._link.send_state(first)
+            time.sleep(0.001)
         self._booted, why = True, ""
         ran = time.monotonic()
         while time.monotonic() < end:
-            now = settings.status(client)
+            now = settings.parse_status(client.request(msp.STATUS))
             ran = time.monotonic() if now.cycle else ran
             if time.monotonic() > ran + _STUCK:
                 if self._process is not None:
@@ -170,14 +172,6 @@ class Flight:
         self._sticks = Sticks()
         return why
 
-    def _start_clock(self) -> None:
-        """Send the present state again and again, with one time: the pace of Betaflight's clock begins afterwards."""
-        for _ in range(_FIRST):
-            sample = self._simulation.sample
-            packet = state_packet(self._simulation.time, sample.quat, sample.omega, sample.acc)
-            self._link.send_state(packet)
-            time.sleep(0.001)
-
     def _run_for(self, seconds: float) -> None:
         """Take steps for a real time (s)."""
         end = time.monotonic() + seconds
@@ -189,7 +183,7 @@ class Flight:
         simulation = self._simulation
         sample = simulation.advance(self._outputs)
         t = simulation.time
-        packet = state_packet(t, sample.quat, sample.omega, sample.acc)
+        packet = simulation.packet()
         if self._lockstep:
             self._link.outputs()  # drops late answers to the last state
         if self._booted:

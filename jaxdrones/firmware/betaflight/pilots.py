@@ -50,8 +50,7 @@ class Hover:
 
     def __call__(self, t: float, sample: Sample) -> Sticks:
         """Sticks at a time since arming (s)."""
-        setpoint = Setpoint.at(np.array(self.target))
-        thrust, omega = jax.device_get(_command(self.params, state_of(sample), setpoint))
+        thrust, omega = jax.device_get(_command(self.params, state_of(sample), Setpoint.at(np.array(self.target))))
         return sticks_for(self.params, float(thrust) * float(self.params.mass), omega)
 
 

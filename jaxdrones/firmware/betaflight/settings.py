@@ -126,11 +126,6 @@ def rc_tuning() -> bytes:
     return bytes([rate, 0, rate, rate, rate]) + throttle + bytes([0, rate, rate, 0, 0, 100]) + limits + bytes([_ACTUAL])
 
 
-def status(client: msp.Client) -> Status:
-    """Status of the flight controller."""
-    return parse_status(client.request(msp.STATUS))
-
-
 def parse_status(data: bytes) -> Status:
     """Status in an answer."""
     try:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxdrones.engine.step import Step
 from jaxdrones.errors import UserError
 from jaxdrones.firmware import drone
-from jaxdrones.firmware.betaflight.packets import motor_order
+from jaxdrones.firmware.betaflight.packets import motor_order, state_packet
 from jaxdrones.firmware.drone import Sample
 from jaxdrones.params import Params, repeat
 from jaxdrones.state import State
@@ -21,8 +21,6 @@ from jaxdrones.urdf import load_params
 _LEAST_HZ = 1000  # of the physics
 _SPINS = np.array([1.0, -1.0, -1.0, 1.0])
 """Signs of the reaction torque of motors 1 to 4 in Betaflight's default direction, props in."""
-
-
 _WIDTHS = np.cumsum([3, 4, 3, 3, 4])
 
 
@@ -40,34 +38,29 @@ class Simulation:
             UserError: rotors that are not in X configuration, or not alternating in direction.
         """
         self.params, self.dt, self.steps = load_params(vehicle), 1 / hz, 0
-        self._check(vehicle)
-        self._motor_of_rotor = motor_order(np.asarray(self.params.rotor_pos))
-        substeps = -(-_LEAST_HZ // hz)
-        step = drone.make_physics(self.dt, substeps)
+        pos, spin = np.asarray(self.params.rotor_pos), np.asarray(self.params.rotor_spin)
+        if sorted(np.sign(pos[:, 0]) + 2 * np.sign(pos[:, 1])) != [-3, -1, 1, 3]:
+            raise UserError(f"{vehicle} has rotors on its axes; Betaflight's mixer is for an X, give such a vehicle")
+        self._motor_of_rotor = motor_order(pos)
+        turns = spin * _SPINS[self._motor_of_rotor]
+        if abs(turns.sum()) != 4:
+            raise UserError(f"{vehicle} has rotors with the directions {spin.tolist()}; neighbors must turn oppositely")
+        self.reversed_yaw = bool(turns[0] < 0)
+        """Whether the rotors turn in the opposite of Betaflight's default direction: props out."""
+        step = drone.make_physics(self.dt, substeps=-(-_LEAST_HZ // hz))
         self._team = repeat(self.params, 1)
         self._advance = jax.jit(functools.partial(_advance, step))
         self._state = step.init(self._team, drone.on_ground(self.params))
         self.sample = self.advance(np.zeros(4))
 
-    def _check(self, vehicle: str) -> None:
-        pos, spin = np.asarray(self.params.rotor_pos), np.asarray(self.params.rotor_spin)
-        quadrants = np.sign(pos[:, 0]) + 2 * np.sign(pos[:, 1])
-        if sorted(quadrants) != [-3, -1, 1, 3]:
-            raise UserError(f"{vehicle} has rotors on its axes; Betaflight's mixer is for an X, give such a vehicle")
-        turns = spin * _SPINS[motor_order(pos)]
-        if abs(turns.sum()) != 4:
-            raise UserError(f"{vehicle} has rotors with the directions {spin.tolist()}; neighbors must turn oppositely")
-
-    @property
-    def reversed_yaw(self) -> bool:
-        """Whether the rotors turn in the opposite of Betaflight's default direction: props out."""
-        order = motor_order(np.asarray(self.params.rotor_pos))
-        return bool(np.asarray(self.params.rotor_spin)[0] != _SPINS[order][0])
-
     @property
     def time(self) -> float:
         """Simulated time, s."""
         return self.steps * self.dt
+
+    def packet(self) -> bytes:
+        """State packet of the present sample."""
+        return state_packet(self.time, self.sample.quat, self.sample.omega, self.sample.acc)
 
     def advance(self, outputs: np.ndarray) -> Sample:
         """Take one step with the outputs (4,) of motors 1 to 4, fractions of the largest rotor speed."""

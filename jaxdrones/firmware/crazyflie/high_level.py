@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import struct
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -57,14 +56,12 @@ class HighLevel:
         values: list[Any] = list(struct.unpack("<" + form, data[1:]))
         for place, value in missing.items():
             values.insert(place, value)
-        group = name != "define_trajectory" and name != "set_group_mask"
-        error = 0
+        error, own = 0, name in ("define_trajectory", "set_group_mask")  # all others are for a group
         if not all(math.isfinite(x) for x in values):
             error = ENOEXEC
-        elif not group or values[0] == _ALL_GROUPS or values[0] & self._group:
+        elif own or values[0] == _ALL_GROUPS or values[0] & self._group:
             start = now if self.trajectory is None else self.trajectory.at(t)
-            execute: Callable[..., int] = getattr(self, f"_{name}")
-            error = execute(t, start, *(values[1:] if group else values))
+            error = self._execute(name, t, start, *(values if own else values[1:]))
         return data[:3].ljust(3, b"\0") + bytes([error])
 
     def off(self) -> None:
@@ -84,59 +81,35 @@ class HighLevel:
         """Whether no trajectory is in flight at time t (s)."""
         return self.trajectory is None or self.trajectory.finished(t)
 
-    def _set_group_mask(self, t: float, start: Goal, mask: int) -> int:
-        self._group = mask
+    def _execute(self, name: str, t: float, start: Goal, *values: Any) -> int:
+        """Execute a command at time t (s), from a point of the flight; the error number."""
+        match name, *values:
+            case "set_group_mask", mask:
+                self._group = mask
+            case "define_trajectory", number, place, kind, offset, pieces:
+                if place != _IN_MEMORY or kind != _POLYNOMIALS:
+                    return ENOEXEC
+                self._defined[number] = offset, pieces
+            case "start_trajectory", *_:
+                return self._start_trajectory(t, start, *values)
+            case "stop", *_:
+                self.off()
+            case "go_to", relative, linear, *pos, yaw, duration:
+                origin, turn = (start.pos, start.yaw) if relative else (0, 0)
+                self._fly(t, start, np.array(pos) + origin, yaw + turn, duration, linear)
+            case "takeoff" | "land", height, yaw, keep_yaw, duration:
+                self._fly(t, start, np.append(start.pos[:2], height), start.yaw if keep_yaw else yaw, duration)
+                self._landing = name == "land"
+            case _, height, relative, yaw, keep_yaw, velocity:  # takeoff_with_velocity, land_with_velocity
+                name = name.removesuffix("_with_velocity")
+                height = start.pos[2] + (height if name == "takeoff" else -height) if relative else height
+                way = abs(height - start.pos[2])
+                return self._execute(name, t, start, height, yaw, keep_yaw, way / velocity if velocity > 0 else 0.0)
         return 0
 
-    def _fly(self, t: float, start: Goal, pos: Any, yaw: float, duration: float, linear: bool = False) -> int:
+    def _fly(self, t: float, start: Goal, pos: Any, yaw: float, duration: float, linear: bool = False) -> None:
         self._landing = False
-        self.trajectory = go_to(start, np.asarray(pos), yaw, max(duration, _LEAST_DURATION), t, linear)
-        return 0
-
-    def _takeoff(self, t: float, start: Goal, height: float, yaw: float, keep_yaw: bool, duration: float) -> int:
-        return self._fly(t, start, np.append(start.pos[:2], height), start.yaw if keep_yaw else yaw, duration)
-
-    def _land(self, *arguments: Any) -> int:
-        self._takeoff(*arguments)
-        self._landing = True
-        return 0
-
-    def _takeoff_with_velocity(
-        self, t: float, start: Goal, height: float, relative: bool, yaw: float, keep_yaw: bool, velocity: float
-    ) -> int:
-        height = start.pos[2] + height if relative else height
-        return self._takeoff(t, start, height, yaw, keep_yaw, _duration(height - start.pos[2], velocity))
-
-    def _land_with_velocity(
-        self, t: float, start: Goal, height: float, relative: bool, yaw: float, keep_yaw: bool, velocity: float
-    ) -> int:
-        height = start.pos[2] - height if relative else height
-        return self._land(t, start, height, yaw, keep_yaw, _duration(height - start.pos[2], velocity))
-
-    def _stop(self, t: float, start: Goal) -> int:
-        self.off()
-        return 0
-
-    def _go_to(
-        self,
-        t: float,
-        start: Goal,
-        relative: bool,
-        linear: bool,
-        x: float,
-        y: float,
-        z: float,
-        yaw: float,
-        duration: float,
-    ) -> int:
-        pos = np.array([x, y, z]) + (start.pos if relative else 0)
-        return self._fly(t, start, pos, yaw + (start.yaw if relative else 0), duration, linear)
-
-    def _define_trajectory(self, t: float, start: Goal, number: int, place: int, kind: int, offset: int, n: int) -> int:
-        if place != _IN_MEMORY or kind != _POLYNOMIALS:
-            return ENOEXEC
-        self._defined[number] = offset, n
-        return 0
+        self.trajectory = go_to(start, pos, yaw, max(duration, _LEAST_DURATION), t, linear)
 
     def _start_trajectory(
         self, t: float, start: Goal, relative: bool, relative_yaw: bool, backwards: bool, number: int, scale: float
@@ -152,7 +125,3 @@ class HighLevel:
         shift = start.pos - turned.at(t).pos if relative else np.zeros(3)
         self.trajectory, self._landing = dataclasses.replace(turned, shift=shift), False
         return 0
-
-
-def _duration(way: float, velocity: float) -> float:
-    return abs(way) / velocity if velocity > 0 else _LEAST_DURATION

@@ -61,11 +61,9 @@ def _parameters(gains: Gains) -> dict[str, Parameter]:
         "sound.effect": 0,
     }
     found |= {name: Parameter(u8, value) for name, value in settings.items()}
-    found |= {"hlCommander.vtoff": Parameter(TYPES["float"], 0.5), "hlCommander.vland": Parameter(TYPES["float"], 0.5)}
-    found |= {"kalman.initialX": Parameter(TYPES["float"], 0), "kalman.initialY": Parameter(TYPES["float"], 0)}
-    found |= {"kalman.initialZ": Parameter(TYPES["float"], 0), "kalman.initialYaw": Parameter(TYPES["float"], 0)}
-    revision = {"firmware.revision0": 0, "firmware.revision1": 0}
-    found |= {name: Parameter(TYPES["uint32_t"], value, True) for name, value in revision.items()}
+    found |= {f"hlCommander.{name}": Parameter(TYPES["float"], 0.5) for name in ("vtoff", "vland")}
+    found |= {f"kalman.initial{name}": Parameter(TYPES["float"], 0) for name in ("X", "Y", "Z", "Yaw")}
+    found |= {f"firmware.revision{i}": Parameter(TYPES["uint32_t"], 0, True) for i in (0, 1)}
     return dict(sorted(found.items()))
 
 

@@ -77,7 +77,7 @@ class Trajectory:
                 break
             along -= piece.duration
         speed = (-1.0 if self.backwards else 1.0) / self.scale if t < self.begin + self.duration else 0.0
-        values = [_derivative(piece.coefficients, along, order) * speed**order for order in range(3)]
+        values = [piece.coefficients @ _row(along, order) * speed**order for order in range(3)]
         cos, sin = math.cos(self.turn), math.sin(self.turn)
         rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
         pos, vel, acc = (rotation @ value[:3] for value in values)
@@ -119,7 +119,3 @@ def _row(t: float, order: int) -> np.ndarray:
     """(8,) derivatives of the powers of t."""
     factors = [math.perm(k, order) * t ** (k - order) if k >= order else 0.0 for k in range(_ORDER)]
     return np.array(factors)
-
-
-def _derivative(coefficients: np.ndarray, t: float, order: int) -> np.ndarray:
-    return coefficients @ _row(t, order)

@@ -11,9 +11,9 @@ from typing import Any
 
 from jaxdrones.errors import UserError
 from jaxdrones.firmware.crazyflie.firmware import Crazyflie
-from jaxdrones.firmware.crazyflie.packet import NULL, Packet, decode, encode
+from jaxdrones.firmware.crazyflie.packet import NULL, decode, encode
 from jaxdrones.firmware.crazyflie.vehicle import PERIOD, Sample, Target
-from jaxdrones.firmware.pace import LATE, Pace
+from jaxdrones.firmware.drone import LATE, Pace
 
 HOST = "127.0.0.1"
 PORT = 19850
@@ -76,7 +76,7 @@ class Server:
             due += PERIOD / speed
             self._serve_until(due)
             for client, packet in self._crazyflie.advance(time.monotonic()):
-                self._send(packet, client)
+                self._send(encode(packet), client)
             rows += 1
             on_row(self._crazyflie.time, self._crazyflie.vehicle.sample, self._crazyflie.target)
             now = time.monotonic()
@@ -101,19 +101,16 @@ class Server:
             return
         self.flown.received += 1
         if datagram == NULL:
-            self._deliver(NULL, client)
+            self._send(NULL, client)
             return
         packet = decode(datagram)
         if packet is None:
             self.flown.invalid += 1
             return
         for answer in self._crazyflie.answer(packet, client, time.monotonic()):
-            self._send(answer, client)
+            self._send(encode(answer), client)
 
-    def _send(self, packet: Packet, client: Any) -> None:
-        self._deliver(encode(packet), client)
-
-    def _deliver(self, datagram: bytes, client: Any) -> None:
+    def _send(self, datagram: bytes, client: Any) -> None:
         try:
             self._socket.sendto(datagram, client)
             self.flown.sent += 1

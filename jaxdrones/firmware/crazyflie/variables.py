@@ -35,10 +35,10 @@ def _variables() -> dict[str, Variable]:
     number = TYPES["float"]
     found: dict[str, Variable] = {}
 
-    def add(names: str, kind: Type, read: Callable[[Readings, int], Any]) -> None:
+    def add(names: str, kind: Type, read: Callable[..., Any]) -> None:
         group, _, rest = names.partition(".")
         for i, name in enumerate(rest.split()):
-            found[f"{group}.{name}"] = Variable(kind, functools.partial(_read, read, i))
+            found[f"{group}.{name}"] = Variable(kind, functools.partial(read, i=i))
 
     add("stateEstimate.x y z", number, lambda now, i: now.sample.pos[i])
     add("kalman.stateX stateY stateZ", number, lambda now, i: now.sample.pos[i])
@@ -64,10 +64,6 @@ def _variables() -> dict[str, Variable]:
     bits = (3, 4, 5, 1)
     add("sys.canfly isFlying isTumbled armed", TYPES["uint8_t"], lambda now, i: now.status >> bits[i] & 1)
     return dict(sorted(found.items()))
-
-
-def _read(read: Callable[[Readings, int], Any], i: int, now: Readings) -> float:
-    return read(now, i)
 
 
 def _world_acc(sample: Sample) -> np.ndarray:

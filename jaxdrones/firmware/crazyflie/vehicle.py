@@ -139,7 +139,7 @@ def _advance(
     params = jax.tree.map(lambda x: x[0], team)
 
     def tick(board: OnBoard, _: None) -> tuple[OnBoard, Array]:
-        state = _one(board.state)
+        state = jax.tree.map(lambda x: x[0], board.state)
         heading = _heading(board, state, target)
         setpoint = _in_world(state, heading, target)
         memory, rpm = firmware_pid.control(gains, params, board.memory, state, setpoint, dt=_DT)
@@ -150,10 +150,6 @@ def _advance(
     board, rpm = jax.lax.scan(tick, board, None, length=_TICKS)
     motors = jnp.minimum(params.kf * rpm[-1] ** 2 / gains.motor.max_thrust, 1) * FULL
     return board, (*drone.measured(step, team, board.state, rpm[-1:]), rpy(board.state.quat[0]), motors)
-
-
-def _one(state: State) -> State:
-    return jax.tree.map(lambda x: x[0], state)
 
 
 def _heading(board: OnBoard, state: State, target: Target) -> Array:

@@ -19,7 +19,7 @@ from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.box_qp import box_qp, solve_free
 from jaxdrones.optimal.coordinates import command_unit, difference, displaced, linearize_step, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, check_period, check_plan, hover, reference, replaced_unless
+from jaxdrones.optimal.problem import Reference, Weights, hover, posed
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -106,11 +106,7 @@ def control(
     The guess is the previous plan, shifted by one step, and at first a flight with the regulator of `lqr`. See
     `jaxdrones.optimal` for arguments and errors.
     """
-    check_period(settings.step, dt)
-    check_plan(settings.horizon, setpoints, on_failure, params, memory, state)
-    valid = is_finite((state, setpoints))
-    state, setpoints = replaced_unless(valid, params, state, setpoints)
-    target = reference(params, setpoints, state.aux, dt)
+    valid, state, target = posed(settings, params, memory, state, setpoints, dt, on_failure)
     unit = command_unit(params)
 
     def kept() -> Array:

@@ -21,7 +21,7 @@ from jaxdrones.control.allocation import mixer
 from jaxdrones.control.single import OneParams, OneState
 from jaxdrones.optimal import lqr
 from jaxdrones.optimal.coordinates import command_unit, single, tracking_error
-from jaxdrones.optimal.problem import Reference, Weights, check_period, check_plan, hover, reference, replaced_unless
+from jaxdrones.optimal.problem import Reference, Weights, hover, posed
 from jaxdrones.optimal.problem import weights as default_weights
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
@@ -111,12 +111,8 @@ def control(
 
     See `jaxdrones.optimal` for arguments and errors.
     """
-    check_period(settings.step, dt)
-    check_plan(settings.horizon, setpoints, on_failure, params, memory, state)
-    valid = is_finite((state, setpoints))
-    state, setpoints = replaced_unless(valid, params, state, setpoints)
+    valid, state, target = posed(settings, params, memory, state, setpoints, dt, on_failure)
     next_key, noise_key = jax.random.split(memory.key)
-    target = reference(params, setpoints, state.aux, dt)
     guess = jnp.concatenate([memory.correction[1:], memory.correction[-1:]])
     plans = guess[None] + _noise(noise_key, settings, params, guess)
     plans = plans.at[0].set(guess).at[1].set(0)

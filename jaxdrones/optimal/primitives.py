@@ -31,10 +31,6 @@ def _integer_pow(x: Any, y: int, **_: Any) -> Any:
     return product if y >= 0 else 1 / product
 
 
-def _round(x: Any, **_: Any) -> Any:
-    return casadi.floor(x + 0.5)
-
-
 def _of_two(function: Callable) -> Callable:
     return lambda x, y, **_: function(x, y)
 
@@ -43,57 +39,31 @@ def _of_one(function: Callable) -> Callable:
     return lambda x, **_: function(x)
 
 
+_SAME_NAMES = "acos acosh asin asinh atan atanh ceil cos cosh erf exp expm1 floor log log1p sign sin sinh sqrt tan tanh"
+_OPERATORS = "add eq ge gt le lt mul ne pow sub"
+
 ELEMENTWISE: dict[str, Callable[..., Any]] = {
+    **{name: _of_one(getattr(casadi, name)) for name in _SAME_NAMES.split()},
+    **{name: _of_two(getattr(operator, name)) for name in _OPERATORS.split()},
     "abs": _of_one(casadi.fabs),
-    "acos": _of_one(casadi.acos),
-    "acosh": _of_one(casadi.acosh),
-    "add": _of_two(operator.add),
     "add_any": _of_two(operator.add),
     "and": _of_two(casadi.logic_and),
-    "asin": _of_one(casadi.asin),
-    "asinh": _of_one(casadi.asinh),
-    "atan": _of_one(casadi.atan),
     "atan2": _of_two(casadi.atan2),
-    "atanh": _of_one(casadi.atanh),
     "cbrt": _of_one(lambda x: casadi.sign(x) * casadi.fabs(x) ** (1 / 3)),
-    "ceil": _of_one(casadi.ceil),
     "clamp": lambda low, x, high, **_: casadi.fmin(casadi.fmax(x, low), high),
-    "cos": _of_one(casadi.cos),
-    "cosh": _of_one(casadi.cosh),
     "div": _of_two(operator.truediv),
-    "eq": _of_two(operator.eq),
-    "erf": _of_one(casadi.erf),
-    "exp": _of_one(casadi.exp),
     "exp2": _of_one(lambda x: 2**x),
-    "expm1": _of_one(casadi.expm1),
-    "floor": _of_one(casadi.floor),
-    "ge": _of_two(operator.ge),
-    "gt": _of_two(operator.gt),
     "integer_pow": _integer_pow,
     "is_finite": _of_one(lambda x: casadi.fabs(x) < casadi.inf),
-    "le": _of_two(operator.le),
-    "log": _of_one(casadi.log),
-    "log1p": _of_one(casadi.log1p),
     "logistic": _of_one(lambda x: 1 / (1 + casadi.exp(-x))),
-    "lt": _of_two(operator.lt),
     "max": _of_two(casadi.fmax),
     "min": _of_two(casadi.fmin),
-    "mul": _of_two(operator.mul),
-    "ne": _of_two(operator.ne),
     "neg": _of_one(operator.neg),
     "not": _of_one(casadi.logic_not),
     "or": _of_two(casadi.logic_or),
-    "pow": _of_two(operator.pow),
-    "round": _round,
+    "round": _of_one(lambda x: casadi.floor(x + 0.5)),
     "rsqrt": _of_one(lambda x: 1 / casadi.sqrt(x)),
-    "sign": _of_one(casadi.sign),
-    "sin": _of_one(casadi.sin),
-    "sinh": _of_one(casadi.sinh),
-    "sqrt": _of_one(casadi.sqrt),
     "square": _of_one(lambda x: x * x),
-    "sub": _of_two(operator.sub),
-    "tan": _of_one(casadi.tan),
-    "tanh": _of_one(casadi.tanh),
     "xor": _of_two(operator.ne),
 }
 """Elementwise functions, with the parameters of the equation as keywords."""

@@ -14,11 +14,11 @@ from jaxdrones.checks import check_shape
 from jaxdrones.control import Setpoint, attitude
 from jaxdrones.control.allocation import rpm_from_wrench
 from jaxdrones.errors import UserError
-from jaxdrones.optimal.coordinates import command_unit, tracking_error
+from jaxdrones.optimal.coordinates import command_unit
 from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
-from jaxdrones.status import check_on_failure
+from jaxdrones.status import check_on_failure, is_finite
 from jaxdrones.vector import along_z, cross, dot, safe_sqrt
 
 
@@ -109,14 +109,25 @@ def hover(params: Params, state: State) -> State:
     )
 
 
-def replaced_unless(
-    valid: Bool[Array, ""], params: Params, state: State, setpoints: Setpoint
-) -> tuple[State, Setpoint]:
-    """State and setpoints, replaced by hover at the origin where invalid, to keep NaN out of plans and gradients."""
+def posed(
+    settings: Any, params: Params, memory: Any, state: State, setpoints: Setpoint, dt: float, on_failure: str
+) -> tuple[Bool[Array, ""], State, Reference]:
+    """Problem of a planner of this call: its validity, the state and the reference.
+
+    An invalid problem is that of hover at the origin, to keep NaN out of plans and gradients.
+
+    Raises:
+        ValueError: a wrong time between calls, number of setpoints, or `on_failure` for these arguments.
+    """
+    check_period(settings.step, dt)
+    check_plan(settings.horizon, setpoints, on_failure, params, memory, state)
+    valid = is_finite((state, setpoints))
     rest = hover(params, state)
     rest = rest.replace(aux=jax.tree.map(jnp.zeros_like, rest.aux))
     zero = jax.tree.map(jnp.zeros_like, setpoints)
-    return jax.tree.map(lambda x, safe: jnp.where(valid, x, safe), (state, setpoints), (rest, zero))
+    given, safe = (state, setpoints), (rest, zero)
+    state, setpoints = jax.tree.map(lambda x, y: jnp.where(valid, x, y), given, safe)
+    return valid, state, reference(params, setpoints, state.aux, dt)
 
 
 def check_plan(horizon: int, setpoints: Setpoint, on_failure: str, *given: Any) -> None:
@@ -130,9 +141,3 @@ def check_period(step: Any, dt: float) -> None:
     period = getattr(step, "period", None)
     if period is not None and not math.isclose(period, dt, rel_tol=1e-6):
         raise UserError(f"dt is {dt} s and the step takes {period:g} s; give a step of one control period")
-
-
-def quadratic(params: Params, matrix: Float[Array, "d d"], state: State, target: State) -> Float[Array, ""]:
-    """Cost z M z / 2 of the tracking error z."""
-    z = tracking_error(params, state, target)
-    return z @ (matrix @ z) / 2

@@ -42,31 +42,6 @@ class EnvParams(PyTreeNode):
     """Nominal parameters of the team."""
 
 
-def wrap(
-    env: envs.Env,
-    *,
-    separate_truncation: bool = False,
-    discrete_actions: ArrayLike | None = None,
-    spaces: Spaces = jax_spaces,
-    team_reward: str = "sum",
-) -> GymnaxEnv:
-    """Wrap an environment with the interface of gymnax.
-
-    Args:
-        env: environment.
-        separate_truncation: whether `step` returns `terminated` and `truncated`, as in gymnax 1.0, in place of `done`.
-        discrete_actions: (k, n a) table of actions of the whole team for discrete actions; by default actions are
-            continuous.
-        spaces: module of the space classes, for loops that check the class of a space, such as
-            `gymnax.environments.spaces`.
-        team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
-
-    Raises:
-        ValueError: a table of actions of another shape, or with numbers that are not finite.
-    """
-    return GymnaxEnv(env, separate_truncation, discrete_actions, spaces, team_reward)
-
-
 class GymnaxEnv:
     """One world with one agent and automatic reset in the same step.
 
@@ -77,11 +52,27 @@ class GymnaxEnv:
     def __init__(
         self,
         env: envs.Env,
-        separate_truncation: bool,
-        discrete_actions: ArrayLike | None,
-        spaces: Spaces,
-        team_reward: str,
+        *,
+        separate_truncation: bool = False,
+        discrete_actions: ArrayLike | None = None,
+        spaces: Spaces = jax_spaces,
+        team_reward: str = "sum",
     ):
+        """Wrap an environment.
+
+        Args:
+            env: environment.
+            separate_truncation: whether `step` returns `terminated` and `truncated`, as in gymnax 1.0, in place of
+                `done`.
+            discrete_actions: (k, n a) table of actions of the whole team for discrete actions; by default actions are
+                continuous.
+            spaces: module of the space classes, for loops that check the class of a space, such as
+                `gymnax.environments.spaces`.
+            team_reward: reward of a team, `sum` or `mean` of the rewards of its drones.
+
+        Raises:
+            ValueError: a table of actions of another shape, or with numbers that are not finite.
+        """
         self.env, self._rewarding = env, rewarding(team_reward)
         self._separate_truncation = separate_truncation
         self._layout = Layout(env, None)
@@ -176,6 +167,10 @@ class GymnaxEnv:
     def _arranged(self, obs: Any) -> Any:
         obs = self._layout.arrange(obs)
         return obs | {"state": jnp.ravel(obs["state"])} if isinstance(obs, dict) else jnp.ravel(obs)
+
+
+wrap = GymnaxEnv
+"""Wrap an environment with the interface of gymnax."""
 
 
 def _step_and_reset(env: envs.Env, key: jax.Array, state: Episode, action: jax.Array) -> tuple:

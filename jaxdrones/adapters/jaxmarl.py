@@ -31,29 +31,31 @@ ALL = "__all__"
 WORLD_STATE = "world_state"
 
 
-def wrap(
-    env: envs.Env, *, world_state: bool = False, discrete_actions: ArrayLike | None = None, spaces: Spaces = jax_spaces
-) -> JaxMARLEnv:
-    """Wrap an environment with the interface of JaxMARL.
-
-    Args:
-        env: environment.
-        world_state: whether observations also have `world_state` (n, n d), a row for the centralized critic of every
-            agent: its own observation, then those of the others, without images.
-        discrete_actions: (k, a) table of actions of a drone for discrete actions; by default actions are continuous.
-        spaces: module of the space classes, for loops that check the class of a space, such as
-            `jaxmarl.environments.spaces`.
-
-    Raises:
-        ValueError: a table of actions of another shape, or with numbers that are not finite.
-    """
-    return JaxMARLEnv(env, world_state, discrete_actions, spaces)
-
-
 class JaxMARLEnv:
     """One world with automatic reset in the same step; episodes begin and end for all agents at once."""
 
-    def __init__(self, env: envs.Env, world_state: bool, discrete_actions: ArrayLike | None, spaces: Spaces):
+    def __init__(
+        self,
+        env: envs.Env,
+        *,
+        world_state: bool = False,
+        discrete_actions: ArrayLike | None = None,
+        spaces: Spaces = jax_spaces,
+    ):
+        """Wrap an environment.
+
+        Args:
+            env: environment.
+            world_state: whether observations also have `world_state` (n, n d), a row for the centralized critic of
+                every agent: its own observation, then those of the others, without images.
+            discrete_actions: (k, a) table of actions of a drone for discrete actions; by default actions are
+                continuous.
+            spaces: module of the space classes, for loops that check the class of a space, such as
+                `jaxmarl.environments.spaces`.
+
+        Raises:
+            ValueError: a table of actions of another shape, or with numbers that are not finite.
+        """
         self.env = env
         self.num_agents = env.drones
         self.agents = [f"drone_{i}" for i in range(env.drones)]
@@ -148,3 +150,7 @@ class JaxMARLEnv:
         rewards = {agent: reward[i] for i, agent in enumerate(self.agents)}
         dones = {agent: ended[i] for i, agent in enumerate(self.agents)} | {ALL: terminated | truncated}
         return rewards, dones, infos
+
+
+wrap = JaxMARLEnv
+"""Wrap an environment with the interface of JaxMARL."""

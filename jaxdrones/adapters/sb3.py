@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,7 @@ class VecEnv(vec_env.VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Common attribute for every requested world."""
-        return [getattr(self.envs, attr_name) for _ in self._chosen(indices)]
+        return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Unsupported: all worlds are one compiled step."""
@@ -102,7 +102,4 @@ class VecEnv(vec_env.VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """False for every world."""
-        return [False for _ in self._chosen(indices)]
-
-    def _chosen(self, indices: int | Iterable[int] | None) -> Iterable[int]:
-        return self._get_indices(indices)
+        return [False for _ in self._get_indices(indices)]

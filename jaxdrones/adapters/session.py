@@ -1,4 +1,4 @@
-"""Single episodes on the host, with NumPy arrays and one compiled call per control step."""
+"""Episodes of one world on the host, with NumPy arrays and one compiled call per control step."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdrones.adapters import pictures
+from jaxdrones.adapters.spaces import Layout
 from jaxdrones.arguments import checked, choice
 from jaxdrones.checks import UnexpectedKeyword
 from jaxdrones.envs import AutoReset, Env, make
+from jaxdrones.errors import UserError
 from jaxdrones.tasks.task import Task, World
 
 SEEDS = 2**32  # modulus of seeds
@@ -51,6 +53,51 @@ class Session:
         """Close the connection to Bullet, if any."""
         self.running = False
         self.env.close()
+
+
+class TeamEpisodes:
+    """Episodes by agent, `drone_0`, `drone_1`, ...: the part of the interface that PettingZoo and RLlib share.
+
+    An agent leaves `agents` when its episode has ended, by default with all others. See `Task.ends`.
+    """
+
+    def _wrap(self, task: str | Task | Env, options: dict[str, Any]) -> None:
+        self.env = as_env(task, options)
+        self.possible_agents = [f"drone_{i}" for i in range(self.env.drones)]
+        self.agents: list[str] = []
+        self._layout = Layout(self.env, self.possible_agents)
+        self.observation_spaces = dict(self._layout.observation.items())
+        self.action_spaces = dict(self._layout.action.items())
+        self._session = Session(self.env)
+        self._seeds = np.random.default_rng()
+        self._obs: Any = None
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Start an episode; a seed makes it and the following ones reproducible. There are no options."""
+        if seed is not None:
+            self._seeds = np.random.default_rng(seed)
+        self.agents = list(self.possible_agents)
+        self._obs = self._session.reset(int(self._seeds.integers(SEEDS)) if seed is None else seed)
+        return self._layout.arrange(self._obs), {agent: {} for agent in self.agents}
+
+    def _step(self, actions: Any) -> tuple[list[dict[str, Any]], tuple[bool, bool], dict[str, Any]]:
+        """Observations, rewards and ends by agent; the ends of the team; and the info of all drones."""
+        if not self._session.running:
+            raise UserError("step is called before reset or after the end of an episode; call reset")
+        drones = {agent: i for i, agent in enumerate(self.possible_agents) if agent in self.agents}
+        self._obs, reward, *ends, info = self._session.step(self._layout.gather_present(actions, drones))
+        observed, flags = self._layout.arrange(self._obs), (info["terminated"], info["truncated"])
+        self.agents = [agent for agent, i in drones.items() if not any(flag[i] for flag in flags)]
+        results = [
+            {agent: observed[agent] for agent in drones},
+            {agent: reward[i].item() for agent, i in drones.items()},
+            *({agent: bool(flag[i]) for agent, i in drones.items()} for flag in flags),
+        ]
+        return results, (ends[0], ends[1]), info
+
+    def close(self) -> None:
+        """Close the connection to Bullet, if any."""
+        self._session.close()
 
 
 def as_env(task: str | Task | Env, options: dict[str, Any]) -> Env:

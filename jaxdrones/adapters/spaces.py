@@ -74,7 +74,9 @@ class Layout:
             return action[..., None, :] if alone else action
         if not isinstance(action, Mapping) or set(action) != set(self.names):
             given = ", ".join(map(str, action)) if isinstance(action, Mapping) else repr(action)
-            raise UserError(f"action is for {given or 'no drone'}; give a dict with one each for {self._agents}")
+            raise UserError(
+                f"action is for {given or 'no drone'}; give a dict with one each for {', '.join(self.names)}"
+            )
         rows = [_check(action[name], f"action of {name}", (*batch, self.size), "") for name in self.names]
         stack = np.stack if isinstance(rows[0], np.ndarray) else jnp.stack
         return stack(rows, axis=len(batch))
@@ -86,24 +88,17 @@ class Layout:
             actions = dict.fromkeys(left, np.zeros(self.size, np.float32)) | dict(actions)
         return self.gather(actions)
 
-    @property
-    def _agents(self) -> str:
-        return ", ".join(self.names)
-
 
 def _check(action: Any, name: str, shape: tuple[int, ...], meaning: str) -> Any:
     if not isinstance(action, jax.Array):
         action = np.asarray(action, np.float32)
         if not np.isfinite(action).all():
-            raise UserError(f"{name} is not finite in {_where(action)}; give numbers in [-1, 1]")
+            bad = np.argwhere(~np.isfinite(action))
+            where = f"{len(bad)} of {action.size} entries, the first at {tuple(map(int, bad[0]))}"
+            raise UserError(f"{name} is not finite in {where}; give numbers in [-1, 1]")
     if action.shape != shape:
         check_shape(name, action, shape, meaning)
     return action
-
-
-def _where(action: np.ndarray) -> str:
-    bad = np.argwhere(~np.isfinite(action))
-    return f"{len(bad)} of {action.size} entries, the first at {tuple(map(int, bad[0]))}"
 
 
 def _pick(tree: Any, i: int, axis: int) -> Any:

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,8 @@ from jaxdrones.export.network import layers_of
 from jaxdrones.export.text import Description
 from jaxdrones.learning.networks import Policy
 
-Contents = tuple[dict[str, bytes], Description]
+TARGETS = ("c", "onnx", "stablehlo", "js")
+"""Names of the targets."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +87,7 @@ def save(
         own_name = f"{name}_{i}" if policy.per_agent else name
         own_title = (title or env.task.name) + f", drone {i}" * policy.per_agent
         description = Description(own_title, explanation, env.dt)
-        contents, description = TARGETS[to](one, images, description, own_name)
+        contents, description = _contents(to, one, images, description, own_name)
         folder.mkdir(parents=True, exist_ok=True)
         for file, content in contents.items():
             writing.write(folder / file, content)
@@ -106,32 +106,20 @@ def _with_costs(description: Description, graph: Graph, ram: int | None = None) 
     )
 
 
-def _c(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
+def _contents(
+    to: str, policy: Policy, images: tuple[Tensor, ...], description: Description, name: str
+) -> tuple[dict[str, bytes], Description]:
+    """Files of the policy of one drone, and its description with its costs."""
+    if to == "stablehlo":
+        with contextlib.suppress(UserError):  # unknown layers, whose costs are unknown too
+            description = _with_costs(description, layers_of(policy, images))
+        about = json.dumps(description.as_dict(), indent=2)
+        return {f"{name}.stablehlo": stablehlo.program(policy, images), f"{name}.json": about.encode()}, description
     graph = layers_of(policy, images)
+    if to == "onnx":
+        description = _with_costs(description, graph)
+        return {f"{name}.onnx": onnx.model(graph, description)}, description
     program = program_of(graph)
     description = _with_costs(description, graph, program.ram)
-    return {f"{name}.h": c.header(graph, program, description, name).encode()}, description
-
-
-def _js(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
-    graph = layers_of(policy, images)
-    program = program_of(graph)
-    description = _with_costs(description, graph, program.ram)
-    return {f"{name}.js": js.module(graph, program, description, name).encode()}, description
-
-
-def _onnx(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
-    graph = layers_of(policy, images)
-    description = _with_costs(description, graph)
-    return {f"{name}.onnx": onnx.model(graph, description)}, description
-
-
-def _stablehlo(policy: Policy, images: tuple[Tensor, ...], description: Description, name: str) -> Contents:
-    with contextlib.suppress(UserError):  # unknown layers, whose costs are unknown too
-        description = _with_costs(description, layers_of(policy, images))
-    about = json.dumps(description.as_dict(), indent=2)
-    return {f"{name}.stablehlo": stablehlo.program(policy, images), f"{name}.json": about.encode()}, description
-
-
-TARGETS: dict[str, Callable[..., Contents]] = {"c": _c, "onnx": _onnx, "stablehlo": _stablehlo, "js": _js}
-"""Targets by name: files and costs of the policy of one drone."""
+    text = (c.header if to == "c" else js.module)(graph, program, description, name)
+    return {f"{name}.{'h' if to == 'c' else 'js'}": text.encode()}, description

@@ -74,29 +74,19 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _view_history(options: argparse.Namespace) -> int:
+    from jaxdrones.training.history import fly_history
+
     if len(options.flights) > 1:
         raise UserError("--history shows one run; give one folder")
     output = options.output or options.flights[0] / "history.html"
     run = open_policy(options.flights[0], None, False, {})
     check_writable(output)
-    page = _history_of(run, options.title)
-    return _write(options, page, output, {"run": str(run.folder), "policies": len(run.kept)})
-
-
-def _history_of(run: Any, title: str | None) -> Page:
-    from jaxdrones.training.history import fly_history
-
     recipe = run.recipe()
     with recipe.env() as env:
         evaluated = fly_history(run, env)
         label = "return" if env.task.success is None else "success"
-    return show_history(
-        [policy.flight for policy in evaluated],
-        [(policy.update, policy.value) for policy in evaluated],
-        run.sidecar_entry("best", "update"),
-        label,
-        title or described(recipe),
-    )
+    page = show_history(evaluated, run.sidecar_entry("best", "update"), label, options.title or described(recipe))
+    return _write(options, page, output, {"run": str(run.folder), "policies": len(run.kept)})
 
 
 def _write(options: argparse.Namespace, page: Page, output: Path, about: dict[str, Any]) -> int:

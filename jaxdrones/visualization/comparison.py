@@ -50,10 +50,7 @@ def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str, af
 
 def _draw_paths(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> None:
     """Draw the paths of all drones in their widest plane, at equal scales."""
-    plane = list(paths.widest_plane(flights[0].pos))
-    names = ["xyz"[k] for k in plane]
-    for outline in paths.outlines(flights[0].scene, *np.eye(3)[plane]):
-        axis.fill(*outline.T, **paths.OUTLINE)
+    plane = paths.prepare_plane(axis, flights)
     for record, tint, width in zip(flights, tints, style.widths(len(flights)), strict=True):
         for i in range(len(record.labels)):
             axis.plot(*record.pos[:, i, plane].T, color=tint, linewidth=width)
@@ -61,9 +58,6 @@ def _draw_paths(axis: Any, flights: list[FlightLog], tints: tuple[str, ...]) -> 
     for target in _once(flights[0].target_pos[..., plane].astype(float)):
         axis.plot(*target.T, **_COMMANDED)
     axis.plot(*flights[0].pos[0][:, plane].T, color="#222222", **paths.START)
-    ranges = np.array([paths.ranges(record, plane) for record in flights])
-    paths.set_equal(axis, ranges[:, 0], ranges[:, 1])
-    axis.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)", title=paths.plane_title(names))
 
 
 def _once(lines: np.ndarray) -> list[np.ndarray]:

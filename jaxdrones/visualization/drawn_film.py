@@ -20,7 +20,7 @@ from jaxdrones.sensing.shading import SUN
 from jaxdrones.state import State
 from jaxdrones.visualization.overlay import Lens, Overlay
 from jaxdrones.visualization.palette import as_rgb, colors
-from jaxdrones.visualization.shots import FIELD_OF_VIEW, Shot, shoot
+from jaxdrones.visualization.shots import FIELD_OF_VIEW, shoot
 
 _DARKNESS = 0.45  # fraction of light lost in a shadow
 _SCALED = ("rotor_pos", "prop_radius", "collision_radius", "collision_height", "collision_offset")
@@ -38,11 +38,8 @@ def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Ge
     for k, row in enumerate(shot.rows):
         state = State(*(getattr(record, name)[row] for name in ("pos", "quat", "vel", "omega", "rpm")))
         picture, depth = draw(shot.scene, params, state, shot.eyes[k], shot.targets[k], tints)
-        yield overlay.draw(np.asarray(picture), np.asarray(depth), _lens(shot, k, size), int(row), k / fps)
-
-
-def _lens(shot: Shot, k: int, size: tuple[int, int]) -> Lens:
-    return Lens(shot.eyes[k], shot.targets[k], FIELD_OF_VIEW, size)
+        lens = Lens(shot.eyes[k], shot.targets[k], FIELD_OF_VIEW, size)
+        yield overlay.draw(np.asarray(picture), np.asarray(depth), lens, int(row), k / fps)
 
 
 def _enlarged(params: Params, scale: float) -> Params:

@@ -14,6 +14,8 @@ from jaxdrones.visualization import video
 from jaxdrones.visualization.browser import find_browser
 from jaxdrones.visualization.shots import shoot
 
+RENDERERS = ("page", "jax", "bullet")
+"""Renderers of films: the viewer's page in Chromium, the JAX renderer, or Bullet's TinyRenderer."""
 FPS = 24
 SIZE = (1280, 720)
 
@@ -64,7 +66,7 @@ def film(
         ValueError: a missing dependency, or no finite state in the flight.
         OSError: the film cannot be written.
     """
-    frames = RENDERERS[choose_renderer(renderer, path)](record, title, fps, size)
+    frames = _frames(choose_renderer(renderer, path), record, title, fps, size)
 
     def reported() -> Iterator[np.ndarray]:
         for k, frame in enumerate(frames):
@@ -75,24 +77,14 @@ def film(
         return video.write(reported(), path, fps)
 
 
-def _by_page(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
-    from jaxdrones.visualization.viewer import film, show
+def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
+    if renderer == "page":
+        from jaxdrones.visualization.viewer import film, show
 
-    shot = shoot(record, fps, size[0] / size[1])
-    return film.frames(show(record, scene=shot.scene, title=title), fps, size, shot)
-
-
-def _by_jax(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
-    from jaxdrones.visualization import drawn_film  # needs Pillow
-
-    return drawn_film.frames(record, title, fps, size)
-
-
-def _by_bullet(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Generator[np.ndarray]:
-    from jaxdrones.visualization import replay  # needs pybullet
-
-    return replay.frames(record, title, fps, size)
-
-
-RENDERERS = {"page": _by_page, "jax": _by_jax, "bullet": _by_bullet}
-"""Renderers of films: the viewer's page in Chromium, the JAX renderer, or Bullet's TinyRenderer."""
+        shot = shoot(record, fps, size[0] / size[1])
+        return film.frames(show(record, scene=shot.scene, title=title), fps, size, shot)
+    if renderer == "jax":
+        from jaxdrones.visualization import drawn_film as drawn  # needs Pillow
+    else:
+        from jaxdrones.visualization import replay as drawn  # needs pybullet
+    return drawn.frames(record, title, fps, size)

@@ -48,7 +48,8 @@ def save_curves(
             curves = {run: points for run, rows in histories.items() if len(points := _points(rows, name))}
             _draw_runs(axis, curves, list(histories))
             if name != "reward":
-                _draw_stars(axis, {run: _points(_rows_of(histories, kept, run), name) for run in curves})
+                for run in curves:
+                    axis.plot(*_points(_rows_of(histories, kept, run), name).T, linestyle="none", **_STAR)
             if len(curves) > 1:
                 steps, median, lowest, highest = spread(list(curves.values()))
                 axis.fill_between(steps, lowest, highest, color=_BAND, alpha=0.5, linewidth=0)
@@ -114,11 +115,6 @@ def _rows_of(
 ) -> list[Mapping[str, float]]:
     """Row of the best policy of a run; none for an untrained one."""
     return [row for row in histories[run] if kept and "update" in row and row["update"] == kept.get(run)]
-
-
-def _draw_stars(axis: Any, points: Mapping[str, np.ndarray]) -> None:
-    for x in points.values():
-        axis.plot(*x.T, linestyle="none", **_STAR)
 
 
 def _tints(runs: int) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.visualization.palette import colors
+from jaxdrones.visualization.palette import as_rgb, colors
 
 _MOST_NAMED = 8  # drones with names in the picture
 _CROWD, _SHORT = 24, 2.0  # drones above which trails are short, and their length then, s
@@ -55,7 +55,7 @@ class Overlay:
     def __init__(self, record: FlightLog, title: str, scale: float) -> None:
         """Prepare for a record, with drones enlarged by `scale`."""
         self._record, self._title = record, title
-        self._colors = [(*(int(color[i : i + 2], 16) for i in (1, 3, 5)), 255) for color in colors(len(record.labels))]
+        self._colors = [(*as_rgb(color).tolist(), 255) for color in colors(len(record.labels))]
         self._radius = scale * float(np.max(np.linalg.norm(record.params.rotor_pos, axis=-1)))
         if scale > 1:
             self._title += f" (drones {scale:g} times as large as they are)"

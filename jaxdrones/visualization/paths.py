@@ -41,32 +41,31 @@ def widest_plane(pos: np.ndarray) -> tuple[int, int]:
 
 def draw_plane(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:
     """Draw the paths in the widest plane, at equal scales, with outlines of obstacles."""
-    plane = list(widest_plane(record.pos))
-    names = ["xyz"[k] for k in plane]
-    axis.set_title(plane_title(names))
-    for outline in outlines(record.scene, *np.eye(3)[plane]):
-        axis.fill(*outline.T, **OUTLINE)
+    plane = prepare_plane(axis, [record])
     if record.scene.ground and plane[1] == 2:
         axis.axhline(0, color="#9aa1a8", linewidth=1.2, zorder=0)
     crowded = len(colors) > MOST_NAMED
     for i, color in enumerate(colors):
         _draw_path(axis, record.pos[:, i, plane], record.target_pos[:, i, plane], color, crowded)
-    set_equal(axis, *np.array(ranges(record, plane))[:, None])
-    axis.set(xlabel=f"{names[0]} (m)", ylabel=f"{names[1]} (m)")
 
 
-def plane_title(names: Sequence[str]) -> str:
-    """Title of a panel in the plane of two axes, `x`, `y` or `z`."""
-    return "path from above" if "z" not in names else "path from the side"
+def prepare_plane(axis: Any, records: Sequence[FlightLog]) -> list[int]:
+    """Draw the obstacles of the first flight in its widest plane, and set the panel for paths; return the plane's axes.
 
-
-def set_equal(axis: Any, x: np.ndarray, y: np.ndarray) -> None:
-    """Set ranges (c, 2) of a panel at equal scales, with a limited aspect ratio."""
-    left, right, low, high = x[:, 0].min(), x[:, 1].max(), y[:, 0].min(), y[:, 1].max()
+    The scales are equal, with a limited aspect ratio.
+    """
+    plane = list(widest_plane(records[0].pos))
+    for outline in outlines(records[0].scene, *np.eye(3)[plane]):
+        axis.fill(*outline.T, **OUTLINE)
+    found = np.array([ranges(record, plane) for record in records])  # (flights, 2 axes, 2 ends)
+    (left, low), (right, high) = found[..., 0].min(axis=0), found[..., 1].max(axis=0)
     wide, tall = max(right - left, (high - low) / 1.5), max(high - low, (right - left) / 1.5)
     middle, height = (left + right) / 2, (low + high) / 2
     axis.set(xlim=(middle - wide / 2, middle + wide / 2), ylim=(height - tall / 2, height + tall / 2))
     axis.set_aspect("equal")
+    title = "path from the side" if 2 in plane else "path from above"
+    axis.set(xlabel=f"{'xyz'[plane[0]]} (m)", ylabel=f"{'xyz'[plane[1]]} (m)", title=title)
+    return plane
 
 
 def draw_space(axis: Any, record: FlightLog, colors: Sequence[str]) -> None:

@@ -33,10 +33,11 @@ def check_video(path: Path) -> None:
 def write(frames: Iterable[np.ndarray], path: Path, fps: int) -> int:
     """Write RGB frames (height, width, 3) uint8, at least one, as a film; return their number.
 
+    The path is one that `check_video` passes.
+
     Raises:
         OSError: the file cannot be written.
     """
-    check_video(path)
     return (_write_mp4 if path.suffix == ".mp4" else _write_gif)(frames, path, fps)
 
 

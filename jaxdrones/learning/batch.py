@@ -14,7 +14,7 @@ from jaxdrones.learning import collect, sharding
 from jaxdrones.learning.critic import critic_observation, discounted_value
 from jaxdrones.learning.exploration import sample
 from jaxdrones.learning.normalize import map_state_vector
-from jaxdrones.learning.returns import trajectory_advantages
+from jaxdrones.learning.returns import advantages
 from jaxdrones.pytree import PyTreeNode
 
 
@@ -55,7 +55,7 @@ def batch_of(
     critic_obs = critic_observation(policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged, action)
     value = discounted_value(config, state.critic, critic_obs)
     next_value = _next_value(config, state, trajectory, value, noise)
-    advantage = trajectory_advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
+    advantage = advantages(trajectory, value, next_value, config.gamma, config.gae_lambda)
     valid = ~trajectory.was_done if ends_alone else None
     centered = advantage - sharding.mean_over_devices(jnp.mean(advantage, where=valid))
     std = jnp.sqrt(sharding.mean_over_devices(jnp.mean(centered**2, where=valid)))

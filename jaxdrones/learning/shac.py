@@ -21,7 +21,7 @@ from jaxdrones.learning.gradients import GradientConfig, gradient_between_steps,
 from jaxdrones.learning.layers import expand
 from jaxdrones.learning.metrics import measure
 from jaxdrones.learning.networks import Policy
-from jaxdrones.learning.returns import discounted_rewards, trajectory_advantages
+from jaxdrones.learning.returns import advantages, discounted_rewards
 
 _CRITIC_BATCH = 4  # successive control steps in a minibatch of the critic
 
@@ -148,7 +148,7 @@ def _fit_critic(config: Config, key: jax.Array, state: TrainState, trajectory: c
     obs = critic_observation(state.policy, trajectory.obs, trajectory.hidden_state, trajectory.privileged)
     now = discounted_value(config, state.target_critic, obs)
     later = discounted_value(config, state.target_critic, _final_observation(state.policy, trajectory))
-    target = now + trajectory_advantages(trajectory, now, later, config.gamma, config.gae_lambda)
+    target = now + advantages(trajectory, now, later, config.gamma, config.gae_lambda)
     data = jax.lax.stop_gradient((obs, target, (~trajectory.was_done).astype(target.dtype)))
     length = min(_CRITIC_BATCH, config.horizon)
 

@@ -50,9 +50,17 @@ def collisions(params: Params, state: State, scene: Scene = _BARE, margin: Array
     Raises:
         ValueError: a wrong shape, a mesh or URDF file in the scene, or a negative margin.
     """
-    _check(params, state, scene, margin)
+    hint = "one row per drone, at least one drone; for many worlds use jax.vmap"
+    check_shape("state.pos", state.pos, ("n", 3), hint)
+    n = len(state.pos)
+    check_shape("state.quat", state.quat, (n, 4), f"state.pos has {n} drones")
+    hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
+    for name in "collision_radius", "collision_height", "collision_offset":
+        check_shape(f"params.{name}", getattr(params, name), (n,), hint)
+    check_scene(scene)
+    check_number("margin", margin, "m", at_least=0)
     bodies = _bodies(params, state)
-    touched = jnp.zeros(len(state.pos), bool)
+    touched = jnp.zeros(n, bool)
     for obstacles in merged(scene.shapes(bodies.pos.dtype)):
         touched |= _touch_any(bodies, obstacles, margin)
     return Collisions(
@@ -131,15 +139,3 @@ def _gap(body: Cylinder, obstacle: Obstacle) -> Float[Array, ""]:
     directions = [on_obstacle - nearest_of_body(on_obstacle), center, axis, radial, *around_z(center, axis)]
     directions += list(jnp.eye(3, dtype=center.dtype)[:2])
     return jnp.max(jax.vmap(lambda direction: along(unit(direction)))(jnp.stack(directions)))
-
-
-def _check(params: Params, state: State, scene: Scene, margin: ArrayLike) -> None:
-    hint = "one row per drone, at least one drone; for many worlds use jax.vmap"
-    check_shape("state.pos", state.pos, ("n", 3), hint)
-    n = len(state.pos)
-    check_shape("state.quat", state.quat, (n, 4), f"state.pos has {n} drones")
-    for name in "collision_radius", "collision_height", "collision_offset":
-        hint = f"state.pos has {n} drones; make a team with jaxdrones.repeat or jaxdrones.stack"
-        check_shape(f"params.{name}", getattr(params, name), (n,), hint)
-    check_scene(scene)
-    check_number("margin", margin, "m", at_least=0)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxdrones import rotation
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing.geometry import Number, Point, length
-from jaxdrones.sensing.shapes import Obstacle, Rounded
+from jaxdrones.sensing.shapes import Obstacle
 from jaxdrones.vector import along_z
 
 
@@ -29,7 +29,7 @@ class Surface(PyTreeNode):
     """(3,) outward unit normal of the surface there, world; zero where there is none."""
 
 
-class Solid(Rounded, kw_only=True):
+class Solid(Obstacle, kw_only=True):
     """Box, sphere, cylinder or capsule in one representation."""
 
     half: Any = None
@@ -41,19 +41,18 @@ class Solid(Rounded, kw_only=True):
 
 
 def merged(kinds: list[Any]) -> list[Any]:
-    """Merge obstacles of several kinds, each with a leading axis, into fewer arrays, in the same order.
+    """Merge obstacles of several kinds, each with a leading axis, into one kind, in the same order.
 
     Fewer arrays compile faster.
     """
-    rounded = [jax.vmap(_as_solid)(kind) for kind in kinds if isinstance(kind, Rounded)]
-    others = [kind for kind in kinds if not isinstance(kind, Rounded)]
-    return ([jax.tree.map(lambda *x: jnp.concatenate(x), *rounded)] if rounded else []) + others
 
+    def as_solid(obstacle: Obstacle) -> Solid:
+        rounding = jnp.asarray(obstacle.rounding, obstacle.pos.dtype)
+        own = {name: getattr(obstacle, name) for name in ("pos", "quat", "active", "half")}
+        return Solid(**own, color=None, is_round=jnp.asarray(obstacle.is_round), rounding=rounding)
 
-def _as_solid(obstacle: Rounded) -> Solid:
-    rounding = jnp.asarray(obstacle.rounding, obstacle.pos.dtype)
-    own = {name: getattr(obstacle, name) for name in ("pos", "quat", "active", "half")}
-    return Solid(**own, color=None, is_round=jnp.asarray(obstacle.is_round), rounding=rounding)
+    solids = [jax.vmap(as_solid)(kind) for kind in kinds]
+    return [jax.tree.map(lambda *x: jnp.concatenate(x), *solids)] if solids else []
 
 
 def distance_of(kinds: list[Any], ground: bool, point: Point) -> Number:
@@ -70,7 +69,7 @@ def nearest_of(kinds: list[Any], ground: bool, point: Point) -> Surface:
     surfaces = [_no_surface(point)]
     if ground:
         surfaces.append(_nearest_on_ground(point))
-    surfaces += [_nearest_of_kind(kind, point) for kind in kinds]
+    surfaces += [_surface(_nearest_obstacle(kind, point), point) for kind in kinds]
     return functools.reduce(_nearer, surfaces)
 
 
@@ -88,13 +87,13 @@ def nearest_few_of(kinds: list[Any], ground: bool, point: Point, count: int) -> 
     return jax.tree.map(lambda x: x[index], every)
 
 
-def touched_of(kinds: list[Any], points: Float[Array, "m 3"], within: Number) -> Surface:
+def touched_of(kind: Any, points: Float[Array, "m 3"], within: Number) -> Surface:
     """Nearest surface to each of several points close together, where it is nearer than `within` (m).
 
     Where nothing is nearer, it is the surface of an arbitrary obstacle.
     """
-    surfaces = [_touched_of_kind(kind, points, within) for kind in kinds]
-    return functools.reduce(jax.vmap(_nearer), surfaces)
+    index = _nearest_within(*jax.lax.stop_gradient((kind, points, within)))
+    return jax.vmap(_surface)(jax.tree.map(lambda x: x[index], kind), points)
 
 
 def as_floats(x: ArrayLike) -> Array:
@@ -133,10 +132,6 @@ def _nearest_on_ground(point: Point) -> Surface:
     return Surface(height, point - along_z(height), along_z(jnp.ones_like(height)))
 
 
-def _nearest_of_kind(kind: Any, point: Point) -> Surface:
-    return _surface(_nearest_obstacle(kind, point), point)
-
-
 def _nearest_obstacle(kind: Any, point: Point) -> Any:
     """The obstacle of a kind that is nearest to a point.
 
@@ -145,11 +140,6 @@ def _nearest_obstacle(kind: Any, point: Point) -> Any:
     """
     index = jnp.argmin(jax.lax.stop_gradient(_distances(kind, point)))
     return jax.tree.map(lambda x: x[index], kind)
-
-
-def _touched_of_kind(kind: Any, points: Float[Array, "m 3"], within: Number) -> Surface:
-    index = _nearest_within(*jax.lax.stop_gradient((kind, points, within)))
-    return jax.vmap(_surface)(jax.tree.map(lambda x: x[index], kind), points)
 
 
 def _nearest_within(kind: Any, points: Float[Array, "m 3"], within: Number) -> Int[Array, " m"]:

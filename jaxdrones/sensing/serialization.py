@@ -18,7 +18,12 @@ def scene_to_dict(scene: Scene) -> dict[str, Any]:
     It has `ground`, whether there is a ground plane, and `obstacles`, a list of objects with the `kind` (such as `Box`)
     and the fields of each obstacle.
     """
-    return {"ground": scene.ground, "obstacles": [_to_dict(solid) for solid in scene.numbered.values()]}
+    obstacles = []
+    for solid in scene.numbered.values():
+        fields = {name: x for name, x in vars(solid).items() if name not in ("active", "path")}
+        entry = {"kind": type(solid).__name__} | {name: np.asarray(x, float).tolist() for name, x in fields.items()}
+        obstacles.append(entry | {"path": str(solid.path)} if isinstance(solid, File) else entry)
+    return {"ground": scene.ground, "obstacles": obstacles}
 
 
 def scene_from_dict(entries: dict[str, Any]) -> Scene:
@@ -28,12 +33,3 @@ def scene_from_dict(entries: dict[str, Any]) -> Scene:
         fields = {name: tuple(x) if isinstance(x, list) else x for name, x in entry.items() if name != "kind"}
         obstacles.append(_CLASSES[entry["kind"]](**fields))
     return Scene.of(*obstacles, ground=entries["ground"])
-
-
-def _to_dict(solid: Any) -> dict[str, Any]:
-    fields = {name: x for name, x in vars(solid).items() if name != "active"}
-    if isinstance(solid, File):
-        fields["path"] = str(solid.path)
-    return {"kind": type(solid).__name__} | {
-        name: x if isinstance(x, str) else np.asarray(x, float).tolist() for name, x in fields.items()
-    }

@@ -36,7 +36,8 @@ def shade(
     rays = [x + view.u * y + view.v * z for x, y, z in view.axes.T]  # world
     if ground is not None:
         x, y = (eye + depth * ray for eye, ray in zip(view.eye[:2], rays[:2], strict=True))
-        tiles = _mixed(_DARK, _BRIGHT, _checkered(x, y, _footprint(view, depth, rays)))
+        footprint = depth * view.pixel * _length(rays) / jnp.maximum(jnp.abs(rays[2]), 1e-3)  # larger at grazing angles
+        tiles = _mixed(_DARK, _BRIGHT, _checkered(x, y, footprint))
         color = jnp.where(index == ground, _number([_lit(SUN[2]) * channel for channel in tiles]), color)
     climb = rays[2] / _length(rays)
     sky = _number(_mixed(_HORIZON, _ZENITH, jnp.clip(climb, 0, 1)))
@@ -75,13 +76,8 @@ def _mixed(a: tuple[float, float, float], b: tuple[float, float, float], share: 
     return [x + share * (y - x) for x, y in zip(a, b, strict=True)]
 
 
-def _footprint(view: View, depth: Float[Array, "h w"], rays: list[Array]) -> Float[Array, "h w"]:
-    """Edge of a pixel's footprint on the ground, m; larger at grazing angles."""
-    return depth * view.pixel * _length(rays) / jnp.maximum(jnp.abs(rays[2]), 1e-3)
-
-
 def _checkered(x: Array, y: Array, footprint: Array) -> Array:
-    """0 and 1 on the tiles of a checkered ground, averaged over the footprint of a pixel against flicker."""
+    """0 and 1 on the tiles of a checkered ground, averaged over the edge (m) of a pixel's footprint against flicker."""
     width = footprint / _TILE + 1e-3
 
     def wave(s: Array) -> Array:

@@ -1,7 +1,8 @@
 """Kinds of obstacles and their geometry: distances, rays, extents.
 
-An obstacle is convex: all points within `rounding` of a core. A sphere is a rounded point and a capsule a rounded line
-segment; a box and a cylinder are their own cores. All methods are about a single obstacle, in its own frame.
+An obstacle is convex: all points within `rounding` of a core, which is a box or a cylinder, possibly of zero width. A
+sphere is a rounded point and a capsule a rounded line segment; a box and a cylinder are their own cores. All methods
+are about a single obstacle, in its own frame.
 """
 
 from __future__ import annotations
@@ -65,40 +66,6 @@ class Obstacle(PyTreeNode, kw_only=True):
         """A point of the world in the frame of the obstacle, m."""
         return rotation.rotate_inverse(self.quat, point - self.pos)
 
-    def distance(self, point: Point) -> Number:
-        """Signed distance of a point from the surface, m; negative inside."""
-        raise NotImplementedError
-
-    def outward(self, point: Point) -> Point:
-        """Outward unit normal at the nearest point of the surface: the gradient of the distance.
-
-        Ties are broken arbitrarily.
-        """
-        raise NotImplementedError
-
-    def interval(self, origin: Components, direction: Components) -> Interval:
-        """Interval of lines `origin` + t `direction` inside the obstacle: first and last t.
-
-        The first is larger than the last for a miss.
-        """
-        raise NotImplementedError
-
-    def normals(self, point: Components) -> Components:
-        """Outward normals of any length at points on the surface."""
-        raise NotImplementedError
-
-    def nearest(self, point: Point) -> Point:
-        """Nearest point of the core to a point, m."""
-        raise NotImplementedError
-
-    def extent(self, direction: Point) -> Number:
-        """Support function of the core: its extent from its center along a unit vector, m."""
-        raise NotImplementedError
-
-
-class Rounded(Obstacle, kw_only=True):
-    """Obstacle with a core that is a box or cylinder centered at `pos`, possibly of zero width."""
-
     @property
     def half(self) -> Any:
         """(3,) half of the core's extents along x, y and z, m."""
@@ -110,11 +77,14 @@ class Rounded(Obstacle, kw_only=True):
         return False
 
     def distance(self, point: Point) -> Number:
-        """Signed distance of a point from the surface, m."""
+        """Signed distance of a point from the surface, m; negative inside."""
         return signed_distance(self._beyond(point)) - self.rounding
 
     def outward(self, point: Point) -> Point:
-        """Outward unit normal at the nearest point of the surface."""
+        """Outward unit normal at the nearest point of the surface: the gradient of the distance.
+
+        Ties are broken arbitrarily.
+        """
         side = jnp.where(point < 0, -1, 1).astype(point.dtype)
         normal = outward(self._beyond(point))
 
@@ -138,13 +108,24 @@ class Rounded(Obstacle, kw_only=True):
         return _either(self.is_round, of_cylinder, lambda: inside)
 
     def extent(self, direction: Point) -> Number:
-        """Extent of the core from its center along a unit vector, m."""
+        """Support function of the core: its extent from its center along a unit vector, m."""
         across, _, along = components(self.half)
         return _either(
             self.is_round,
             lambda: along * jnp.abs(direction[2]) + across * length(direction[:2]),
             lambda: dot(jnp.abs(direction), self.half),
         )
+
+    def interval(self, origin: Components, direction: Components) -> Interval:
+        """Interval of lines `origin` + t `direction` inside the obstacle: first and last t.
+
+        The first is larger than the last for a miss.
+        """
+        raise NotImplementedError
+
+    def normals(self, point: Components) -> Components:
+        """Outward normals of any length at points on the surface."""
+        raise NotImplementedError
 
     def _beyond(self, point: Point) -> Array:
         """Excess of a point beyond the core along x, y and z, or beyond its radius and ends, m."""
@@ -156,7 +137,7 @@ class Rounded(Obstacle, kw_only=True):
         return _either(self.is_round, of_cylinder, lambda: jnp.abs(point) - self.half)
 
 
-class Box(Rounded, kw_only=True):
+class Box(Obstacle, kw_only=True):
     """Cuboid centered at `pos`."""
 
     size: Any
@@ -180,7 +161,7 @@ class Box(Rounded, kw_only=True):
         return [jnp.where(jnp.abs(p) == largest, p, 0) for p in (x, y, z)]
 
 
-class Sphere(Rounded, kw_only=True):
+class Sphere(Obstacle, kw_only=True):
     """Ball centered at `pos`."""
 
     radius: Any
@@ -205,7 +186,7 @@ class Sphere(Rounded, kw_only=True):
         return point
 
 
-class Cylinder(Rounded, kw_only=True):
+class Cylinder(Obstacle, kw_only=True):
     """Cylinder centered at `pos`, with its axis along its own z."""
 
     radius: Any
@@ -233,7 +214,7 @@ class Cylinder(Rounded, kw_only=True):
         return [jnp.where(at_end, 0, x), jnp.where(at_end, 0, y), jnp.where(at_end, z, 0)]
 
 
-class Capsule(Rounded, kw_only=True):
+class Capsule(Obstacle, kw_only=True):
     """Cylinder centered at `pos`, with its axis along its own z, and half a ball on either end."""
 
     radius: Any

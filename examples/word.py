@@ -20,8 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 import jaxdrones as jd
 from jaxdrones.learning.networks import AnyPolicy
-from jaxdrones.tasks import crossing
-from jaxdrones.tasks.conditions import out_of_control
+from jaxdrones.tasks import crossing, out_of_control
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.training.episode import EpisodeLog, fly_episode
 from jaxdrones.training.run import Run

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones import vector
-from jaxdrones.control import Setpoint
 from jaxdrones.quantity import quantities
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
@@ -33,7 +32,7 @@ def task(obstacles: bool = False, **own: Any) -> Task:
     With `obstacles` the drones observe those of the scene and keep clear of them.
     """
     return Task(
-        target=target,
+        target=shaping.goal,
         rewards=REWARDS_AMONG_OBSTACLES if obstacles else REWARDS,
         advance=advance,
         metrics={"safe": _safe, "reached": _reached},
@@ -44,11 +43,6 @@ def task(obstacles: bool = False, **own: Any) -> Task:
         observation=OBSERVATION_AMONG_OBSTACLES if obstacles else OBSERVATION,
         **own,
     )
-
-
-def target(variables: dict[str, Array], t: Array) -> Setpoint:
-    """Goal."""
-    return Setpoint.at(variables["goal"])
 
 
 def variables(state: State, goal: Float[Array, "n 3"]) -> dict[str, Array]:

@@ -14,8 +14,7 @@ from jaxdrones.arguments import Switch, checked, number
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene, Sphere
 from jaxdrones.state import State
-from jaxdrones.tasks import crossing
-from jaxdrones.tasks.conditions import out_of_control
+from jaxdrones.tasks import crossing, shaping
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Task, Team
 
@@ -80,7 +79,7 @@ def crowd(
         drones=drones,
         duration=duration,
         start=start,
-        terminations=out_of_control(longest + 4.0, center=(0, 0, FLOOR + side / 2)),
+        terminations=shaping.out_of_control(longest + 4.0, center=(0, 0, FLOOR + side / 2)),
         ends="drone",
     )
 

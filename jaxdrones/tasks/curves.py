@@ -8,6 +8,7 @@ from typing import Annotated
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxdrones.arguments import Range, Seconds, checked, whole
@@ -34,6 +35,27 @@ def setpoint_on(point: Callable[[Float[Array, ""]], Float[Array, "3"]], t: Float
 
     acc = jax.jvp(velocity, (t,), (jnp.ones_like(t),))[1]
     return Setpoint.at(point(t), vel=velocity(t), acc=acc)
+
+
+def draw(
+    shape_key: jax.Array, phase_key: jax.Array, count: int, spacing: float, height: float, dtype: DTypeLike
+) -> dict[str, Array]:
+    """Centers of curves (m, in a row along y), their random numbers, and the phases of their points at time zero."""
+    y = spacing * (jnp.arange(count, dtype=dtype) - (count - 1) / 2)
+    return {
+        "center": jnp.stack([jnp.zeros_like(y), y, jnp.full_like(y, height)], axis=-1),
+        "random": jax.random.uniform(shape_key, (count, RANDOM_NUMBERS), dtype, -1, 1),
+        "phase": jax.random.uniform(phase_key, (count,), dtype),
+    }
+
+
+def along(shape: Shape, period: float, curves: dict[str, Array], t: Float[Array, ""]) -> Setpoint:
+    """Moving points on curves from `draw`, with this period, s."""
+
+    def one(center: Array, u: Array, phase: Array) -> Setpoint:
+        return setpoint_on(lambda t: center + shape(u, phase + t / period), t)
+
+    return jax.vmap(one)(curves["center"], curves["random"], curves["phase"])
 
 
 def unit_circle(u: Array, s: Array) -> Array:

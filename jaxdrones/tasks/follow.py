@@ -19,7 +19,6 @@ from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Camera
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
-from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.curves import RANDOM_NUMBERS, lissajous, setpoint_on
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import ObservationTerm, Task, Team, World, norm
@@ -114,7 +113,7 @@ def follow(
             "touched": (-10.0, _TOUCHED),
         },
         terminations={"touched": shaping.flag("touched", "A drone touches another one or the ground.")}
-        | out_of_control(2 * HEIGHT + distance * drones, center=(0, 0, HEIGHT)),
+        | shaping.out_of_control(2 * HEIGHT + distance * drones, center=(0, 0, HEIGHT)),
         advance=_advance,
         metrics={
             "distance_error": distance_error,

@@ -12,17 +12,14 @@ from jaxtyping import Array, Bool, Float
 from jaxdrones import rotation
 from jaxdrones.arguments import checked, number
 from jaxdrones.checks import check_number
-from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Camera, Cylinder, Scene
 from jaxdrones.sensing import forest as draw_forest
 from jaxdrones.state import State
-from jaxdrones.tasks import shaping
-from jaxdrones.tasks.conditions import out_of_control
+from jaxdrones.tasks import shaping, touching
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
-from jaxdrones.tasks.touching import touches
 from jaxdrones.vector import safe_sqrt
 
 HEIGHT = 1.5  # m, of flight
@@ -40,11 +37,7 @@ camera = Camera(resolution=(16, 12), field_of_view=90.0, far=24.0)
 """Camera of the task, fixed to the body; its range is longer than the forest."""
 
 
-_METRICS = {
-    "touched": shaping.variable("touched", "One if the drone has touched something."),
-    "reached": shaping.variable("reached", f"One if the drone has been within {REACHED:g} m of its goal."),
-    "clearance": shaping.variable("clearance", "Smallest distance from obstacles and ground so far, m."),
-}
+_HAS_REACHED = shaping.variable("reached", f"One if the drone has been within {REACHED:g} m of its goal.")
 
 
 @checked
@@ -100,10 +93,6 @@ def forest(
             "reached": false,
         }
 
-    def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """Goal on the other side of the forest."""
-        return Setpoint.at(variables["goal"])
-
     def desired(task: Task, world: World) -> Float[Array, "n 3"]:
         """Velocity towards the goal, m/s, world; slower only at the goal."""
         return shaping.velocity_to_target(task, world, speed, REACHED)
@@ -158,7 +147,7 @@ def forest(
         drones=drones,
         duration=duration,
         start=start,
-        target=target,
+        target=shaping.goal,
         rewards={
             "alive": (1.0, shaping.alive),
             "velocity": (-1.0, velocity),
@@ -168,17 +157,17 @@ def forest(
             "heading": (-0.2, heading),
             "omega": (-0.02, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
-            "touched": (-10.0, _METRICS["touched"]),
-            "reached": (10.0, _METRICS["reached"]),
+            "touched": (-10.0, touching.METRICS["touched"]),
+            "reached": (10.0, _HAS_REACHED),
         },
         terminations={
             "touched": shaping.flag("touched", "A drone touches the ground, a tree or another drone."),
             "reached": all_reached,
             "left": left,
-            "spinning": out_of_control(length)["spinning"],
+            "spinning": shaping.out_of_control(length)["spinning"],
         },
         advance=_advance,
-        metrics=_METRICS | {"detour": _detour, "traversability": traversability},
+        metrics=touching.METRICS | {"reached": _HAS_REACHED, "detour": _detour, "traversability": traversability},
         success=_reached_untouched,
         success_terminations=("reached",),
         observations={
@@ -200,13 +189,9 @@ def forest(
 def _advance(task: Task, world: World) -> dict[str, Array]:
     variables, pos = world.variables, world.drones.pos
     goal = variables["goal"]
-    found = touches(world, variables["pos"])
-    return variables | {
-        "pos": pos,
+    return touching.advance(task, world) | {
         "progress": norm(variables["pos"] - goal) - norm(pos - goal),
         "path": variables["path"] + norm(pos - variables["pos"]),
-        "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
-        "touched": variables["touched"] | found.ground | found.drones | found.scene,
         "reached": variables["reached"] | (norm(pos - goal) < REACHED),
     }
 

@@ -15,7 +15,6 @@ from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.tasks import racetrack, shaping
-from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.racetrack import ARENA, FRAME, GATES, MIDDLE, OPENING, POLES, START
 from jaxdrones.tasks.starts import hovering, standing_height
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
@@ -102,7 +101,8 @@ def gates(
             "omega": (-0.002, shaping.body_rates),
             "action_change": (-0.02, shaping.action_change),
         },
-        terminations={"finished": finished, "crashed": racetrack.crashed} | out_of_control(ARENA, center=MIDDLE),
+        terminations={"finished": finished, "crashed": racetrack.crashed}
+        | shaping.out_of_control(ARENA, center=MIDDLE),
         advance=_advance,
         metrics=racetrack.METRICS,
         success=_finished,

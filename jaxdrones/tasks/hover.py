@@ -9,12 +9,10 @@ from jaxtyping import Array
 
 from jaxdrones import rotation
 from jaxdrones.arguments import Seconds, checked, number
-from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
-from jaxdrones.tasks.conditions import MAX_SPIN, out_of_control
 from jaxdrones.tasks.starts import standing_height, thrown
 from jaxdrones.tasks.task import Drones, Task, World, upright
 
@@ -33,7 +31,7 @@ def hover(
     drones: Drones = 1,
     reach: Annotated[float, number("m", at_least=0, at_most=_MAX_REACH)] = 1.0,
     speed: Annotated[float, number("m/s", at_least=0, at_most=_MAX_SPEED)] = 1.0,
-    omega: Annotated[float, number("rad/s", at_least=0, below=MAX_SPIN)] = 1.0,
+    omega: Annotated[float, number("rad/s", at_least=0, below=shaping.MAX_SPIN)] = 1.0,
     tilt: Annotated[float, number("degrees", at_least=0, at_most=180)] = 90.0,
     height: Height = 2.0,
     duration: Seconds = 5.0,
@@ -50,9 +48,10 @@ def hover(
         duration: duration of an episode, s; of 2 s or less there is no criterion of success.
     """
 
-    def start(key: jax.Array, params: Params) -> tuple[State, Array]:
+    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         goal = _goals(params, height)
-        return thrown(key, params, goal, reach=reach, speed=speed, omega=omega, tilt=jnp.radians(tilt)), goal
+        state = thrown(key, params, goal, reach=reach, speed=speed, omega=omega, tilt=jnp.radians(tilt))
+        return state, {"goal": goal}
 
     where = f"Within +-{reach:g} m of the goal, +-{speed:g} m/s, +-{omega:g} rad/s, tilted by up to {tilt:g} degrees."
     return Task(
@@ -61,9 +60,9 @@ def hover(
         drones=drones,
         duration=duration,
         start=described(where, start),
-        target=_stay,
+        target=shaping.goal,
         rewards=shaping.REACH_AND_STAY,
-        terminations=out_of_control(_MAX_REACH + SPACING * drones),
+        terminations=shaping.out_of_control(_MAX_REACH + SPACING * drones),
         success=settled if duration > SETTLED else None,
     )
 
@@ -80,10 +79,6 @@ def recovery(drones: Drones = 1, height: Height = 5.0, duration: float = 4.0) ->
         quat = jax.vmap(rotation.multiply, (0, None))(state.quat, half_turn)
         return state.replace(quat=quat), {"goal": goal, "lowest": state.pos[:, 2], "start": state.pos[:, 2]}
 
-    def target(variables, t):
-        """Goal."""
-        return Setpoint.at(variables["goal"])
-
     def altitude_lost(task: Task, world: World) -> Array:
         """Height of the start above the lowest point so far, m."""
         return world.variables["start"] - world.variables["lowest"]
@@ -98,9 +93,9 @@ def recovery(drones: Drones = 1, height: Height = 5.0, duration: float = 4.0) ->
         drones=drones,
         duration=duration,
         start=start,
-        target=target,
+        target=shaping.goal,
         rewards=shaping.REACH_AND_STAY | {"upright": (0.1, upright)},
-        terminations=out_of_control(_MAX_REACH + SPACING * drones),
+        terminations=shaping.out_of_control(_MAX_REACH + SPACING * drones),
         advance=advance,
         metrics={
             "altitude_lost": altitude_lost,
@@ -126,10 +121,6 @@ def landing(
         state = thrown(key, params, over, reach=reach, speed=0.5, omega=0.5, tilt=jnp.radians(20.0))
         return state, {"goal": pad, "sinking": -state.vel[:, 2], "touch_speed": jnp.zeros_like(params.mass)}
 
-    def target(variables: dict[str, Array], t: Array) -> Setpoint:
-        """Landing pad."""
-        return Setpoint.at(variables["goal"])
-
     def above(world: World) -> Array:
         """Height above rest on the pad, m."""
         return world.drones.pos[:, 2] - world.variables["goal"][:, 2]
@@ -150,9 +141,9 @@ def landing(
         drones=drones,
         duration=duration,
         start=start,
-        target=target,
+        target=shaping.goal,
         rewards=shaping.REACH_AND_STAY | {"descent": (-1.0, descent)},
-        terminations=out_of_control(_MAX_REACH + SPACING * drones) | {"crashed": _upside_down},
+        terminations=shaping.out_of_control(_MAX_REACH + SPACING * drones) | {"crashed": _upside_down},
         advance=advance,
         metrics={
             "upright": upright,
@@ -192,8 +183,3 @@ def _goals(params: Params, height: float) -> Array:
     n = len(params.mass)
     x = SPACING * (jnp.arange(n) - (n - 1) / 2)
     return jnp.stack([x, jnp.zeros_like(x), jnp.full_like(x, height)], axis=-1)
-
-
-def _stay(goal: Array, t: Array) -> Setpoint:
-    """The goal."""
-    return Setpoint.at(goal)

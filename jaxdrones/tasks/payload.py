@@ -18,9 +18,8 @@ from jaxdrones.dynamics.payload import cable, payload, with_payload
 from jaxdrones.params import Params
 from jaxdrones.quantity import quantities
 from jaxdrones.state import State
-from jaxdrones.tasks import shaping
-from jaxdrones.tasks.conditions import out_of_control
-from jaxdrones.tasks.curves import RANDOM_NUMBERS, SHAPES, setpoint_on
+from jaxdrones.tasks import curves, shaping
+from jaxdrones.tasks.curves import SHAPES
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Drones, ObservationTerm, Task, World, norm
 
@@ -118,7 +117,7 @@ class _Carrying:
                 "omega": (-0.02, shaping.body_rates),
                 "action_change": (-0.02, shaping.action_change),
             },
-            terminations=out_of_control(4.0 + SPACING * self.drones),
+            terminations=shaping.out_of_control(4.0 + SPACING * self.drones),
             metrics={"error": _error, "swing": self.swing},
             success=_close_and_upright if duration > _CAUGHT_UP else None,
             observations=_observations(self),
@@ -145,26 +144,17 @@ class _Carrying:
 
     def target(self, variables: dict[str, Array], t: Array) -> Setpoint:
         """Moving point on the curve, of the load."""
-        shape = SHAPES[self.curve]
-
-        def one(center, u, phase):
-            return setpoint_on(lambda t: center + shape(u, phase + t / self.period), t)
-
-        return jax.vmap(one)(variables["center"], variables["random"], variables["phase"])
+        return curves.along(SHAPES[self.curve], self.period, variables, t)
 
     def start(self, key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Near a random point of the curve, in motion; a load of a single drone swings."""
         shape_key, phase_key, start_key, load_key = jax.random.split(key, 4)
         n, dtype = self.drones, params.mass.dtype
-        curves = 1 if self.shared else n
-        y = SPACING * (jnp.arange(curves, dtype=dtype) - (curves - 1) / 2)
-        center = jnp.stack([jnp.zeros_like(y), y, jnp.full_like(y, HEIGHT)], axis=-1)
-        random = jax.random.uniform(shape_key, (curves, RANDOM_NUMBERS), dtype, -1, 1)
-        phase = jax.random.uniform(phase_key, (curves,), dtype)
-        variables = {"center": center, "random": random, "phase": phase}
+        loads = 1 if self.shared else n
+        variables = curves.draw(shape_key, phase_key, loads, SPACING, HEIGHT, dtype)
         variables = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape[1:])), variables)
         here, places = self.target(variables, jnp.zeros((), dtype)), self.places(dtype)
-        offset = jax.random.uniform(load_key, (curves, 3), dtype, -1, 1)
+        offset = jax.random.uniform(load_key, (loads, 3), dtype, -1, 1)
         if self.shared:
             beside = here.pos + 0.1 * offset
             state = thrown(start_key, params, beside + places, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)

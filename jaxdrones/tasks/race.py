@@ -15,7 +15,6 @@ from jaxdrones.quantity import quantities
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
 from jaxdrones.tasks import centerline, crossing, racetrack, shaping
-from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.pairs import nearest_on_the_way
 from jaxdrones.tasks.racetrack import ARENA, GATES, MIDDLE, OPENING, START
 from jaxdrones.tasks.starts import hovering, standing_height, thrown
@@ -147,7 +146,7 @@ def race(
         },
         terminations={"finished": finished}
         | ({"crashed": racetrack.crashed} if contact else {})
-        | out_of_control(ARENA, center=MIDDLE),
+        | shaping.out_of_control(ARENA, center=MIDDLE),
         ends="drone",
         advance=advance,
         metrics=racetrack.METRICS

@@ -16,11 +16,9 @@ from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing import room as build_room
 from jaxdrones.state import State
-from jaxdrones.tasks import crossing, shaping
-from jaxdrones.tasks.conditions import out_of_control
+from jaxdrones.tasks import crossing, shaping, touching
 from jaxdrones.tasks.starts import thrown
-from jaxdrones.tasks.task import Drones, Task, World
-from jaxdrones.tasks.touching import touches
+from jaxdrones.tasks.task import Drones, Task
 
 HEIGHT = 1.5  # m, of starts and goals
 ROOM_HEIGHT = 3.0  # m
@@ -28,12 +26,6 @@ _BESIDE = 1.0  # m between the places and the walls
 _SPACING = 1.0  # m between neighboring places on the ring
 _CLEARANCE = 0.6  # m between a pillar and a place
 _ARRIVED = 0.2  # m
-
-
-_METRICS = {
-    "touched": shaping.variable("touched", "One if the drone has touched something."),
-    "clearance": shaping.variable("clearance", "Smallest distance from obstacles and ground so far, m."),
-}
 
 
 @checked
@@ -82,12 +74,12 @@ def room(
         drones=drones,
         duration=duration,
         start=start,
-        target=crossing.target,
-        rewards=crossing.REWARDS_AMONG_OBSTACLES | {"touched": (-10.0, _METRICS["touched"])},
+        target=shaping.goal,
+        rewards=crossing.REWARDS_AMONG_OBSTACLES | {"touched": (-10.0, touching.METRICS["touched"])},
         terminations={"touched": shaping.flag("touched", "A drone touches the room, a pillar or another drone.")}
-        | out_of_control(size, center=(0, 0, HEIGHT)),
-        advance=_advance,
-        metrics=_METRICS,
+        | shaping.out_of_control(size, center=(0, 0, HEIGHT)),
+        advance=touching.advance,
+        metrics=touching.METRICS,
         success=_arrived_untouched,
         observations=crossing.GOAL,
         control_hz=50.0,
@@ -97,16 +89,6 @@ def room(
         action="thrust_and_rates",
         observation=crossing.OBSERVATION_AMONG_OBSTACLES,
     )
-
-
-def _advance(task: Task, world: World) -> dict[str, Array]:
-    variables = world.variables
-    found = touches(world, variables["pos"])
-    return variables | {
-        "pos": world.drones.pos,
-        "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
-        "touched": variables["touched"] | found.ground | found.drones | found.scene,
-    }
 
 
 def _arrived_untouched(metrics: Mapping[str, Array], dt: float) -> Array:

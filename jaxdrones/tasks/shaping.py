@@ -1,15 +1,17 @@
-"""Shared reward terms, all smooth for gradient-based learners."""
+"""Shared parts of tasks: a target, terminations, and reward terms, all smooth for gradient-based learners."""
 
 import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdrones import rotation
+from jaxdrones.control import Setpoint
 from jaxdrones.quantity import described
 from jaxdrones.tasks.task import Condition, Task, Term, World, norm, square
 
+MAX_SPIN = 100.0  # rad/s; an episode in which a drone turns faster is terminated
 _NEAR, _FAR = 0.02, 3.0  # m: the position term is a parabola below the first, and levels off beyond the second
 _SLOW = 0.1  # m/s; below, the velocity term is a parabola
 _SLOW_TURN = 1.0  # rad/s; below, the term of the body rates is a parabola
@@ -17,6 +19,11 @@ _STEEP = 0.1  # length of the nose's level part below which there is no heading
 _CROWDED = 0.4  # m, distance of the nearest drone below which the reward falls
 _MARGIN = 0.2  # m between a drone and an obstacle beside it
 _SOFTNESS = 0.1  # m, over which the margin begins
+
+
+def goal(variables: dict[str, Array], t: Array) -> Setpoint:
+    """Goal."""
+    return Setpoint.at(variables["goal"])
 
 
 def length(v: Float[Array, "n 3"], small: float) -> Float[Array, " n"]:
@@ -113,6 +120,33 @@ def flag(name: str, meaning: str) -> Condition:
 def action_change(task: Task, world: World) -> Float[Array, " n"]:
     """Squared difference of the last two actions."""
     return square(world.actions[:, -1] - world.actions[:, -2])
+
+
+def out_of_control(reach: float, center: tuple[float, float, float] | None = None) -> dict[str, Condition]:
+    """Conditions of an unrecoverable flight or a state that is not finite.
+
+    `lost`: a drone is farther than `reach` (m) from `center` (m, world; by default its target) along some axis.
+    `spinning`: it rotates faster than 100 rad/s about some axis.
+    """
+
+    def lost(task: Task, world: World) -> Bool[Array, " n"]:
+        pos = world.drones.pos
+        middle = task.target_now(world).pos if center is None else jnp.asarray(center, pos.dtype)[None]
+        return _beyond(pos - middle, reach)
+
+    def spinning(task: Task, world: World) -> Bool[Array, " n"]:
+        return _beyond(world.drones.omega, MAX_SPIN)
+
+    place = "the target" if center is None else f"({', '.join(f'{x:g}' for x in center)}) m"
+    return {
+        "lost": described(f"A drone is {reach:g} m or more from {place} along some axis.", lost),
+        "spinning": described(f"A drone rotates at {MAX_SPIN:g} rad/s or faster about some axis.", spinning),
+    }
+
+
+def _beyond(v: Float[Array, "n 3"], limit: float) -> Bool[Array, " n"]:
+    x, y, z = (jnp.abs(column) < limit for column in v.T)  # false for NaN
+    return ~(x & y & z)
 
 
 REACH_AND_STAY: dict[str, tuple[float, Term]] = {

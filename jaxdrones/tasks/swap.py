@@ -9,8 +9,7 @@ from jaxtyping import Array
 from jaxdrones.arguments import Seconds, checked
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.tasks import crossing
-from jaxdrones.tasks.conditions import out_of_control
+from jaxdrones.tasks import crossing, shaping
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Task, Team
 
@@ -46,5 +45,5 @@ def swap_goals(drones: Team = 8, duration: Seconds | None = None) -> Task:
         drones=drones,
         duration=_SETTLING + 2 * radius / crossing.SPEED if duration is None else duration,
         start=start,
-        terminations=out_of_control(2 * radius + 4.0),
+        terminations=shaping.out_of_control(2 * radius + 4.0),
     )

@@ -1,4 +1,4 @@
-"""Collision flags of a world."""
+"""Collision flags of a world, and their use as task variables."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,8 @@ from jaxdrones.sensing import Collisions, Scene, collisions
 from jaxdrones.sensing.distances import merged
 from jaxdrones.sensing.sweep import Disc, meets
 from jaxdrones.state import State
-from jaxdrones.tasks.task import World, norm
+from jaxdrones.tasks import shaping
+from jaxdrones.tasks.task import Task, World, norm
 from jaxdrones.vector import safe_sqrt
 
 _MARGIN = 1e-3  # m: largest gap that counts as contact
@@ -26,6 +27,24 @@ def touches(world: World, before: Float[Array, "n 3"], scene: Scene | None = Non
     scene = world.scene if scene is None else scene
     args = jax.lax.stop_gradient((world.params, world.drones, before, scene))
     return Collisions(*where_needed(_found, one_in=_ONE_IN)(jnp.any(_near(*args)), *args))
+
+
+def advance(task: Task, world: World) -> dict[str, Array]:
+    """Task variables after a step: positions `pos`, smallest `clearance` (m) so far, and whether a drone `touched`."""
+    variables = world.variables
+    found = touches(world, variables["pos"])
+    return variables | {
+        "pos": world.drones.pos,
+        "clearance": jnp.minimum(variables["clearance"], shaping.gap(world)),
+        "touched": variables["touched"] | found.ground | found.drones | found.scene,
+    }
+
+
+METRICS = {
+    "touched": shaping.variable("touched", "One if the drone has touched something."),
+    "clearance": shaping.variable("clearance", "Smallest distance from obstacles and ground so far, m."),
+}
+"""Metrics of the variables of `advance`."""
 
 
 def _found(params: Params, drones: State, before: Array, scene: Scene) -> tuple[Array, Array, Array]:

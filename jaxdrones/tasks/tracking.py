@@ -13,9 +13,8 @@ from jaxdrones.arguments import Seconds, Switch, checked, choice, number
 from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
-from jaxdrones.tasks import shaping
-from jaxdrones.tasks.conditions import out_of_control
-from jaxdrones.tasks.curves import RANDOM_NUMBERS, SHAPES, setpoint_on
+from jaxdrones.tasks import curves, shaping
+from jaxdrones.tasks.curves import SHAPES
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Drones, Task
 
@@ -42,26 +41,17 @@ def tracking(
         duration: duration of an episode, s; of 1 s or less there is no criterion of success.
         random_start: drones start at a random point of the curve, 0.1 m and 0.1 m/s off; else at its start, at rest.
     """
-    shape = SHAPES[curve]
 
     def target(variables: dict[str, Array], t: Array) -> Setpoint:
         """Moving point on the curve."""
-
-        def one(center, u, phase):
-            return setpoint_on(lambda t: center + shape(u, phase + t / period), t)
-
-        return jax.vmap(one)(variables["center"], variables["random"], variables["phase"])
+        return curves.along(SHAPES[curve], period, variables, t)
 
     def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """On the curve: near a random point in motion, or at its start at rest."""
         shape_key, phase_key, start_key = jax.random.split(key, 3)
-        n, dtype = len(params.mass), params.mass.dtype
-        y = SPACING * (jnp.arange(n, dtype=dtype) - (n - 1) / 2)
-        variables = {
-            "center": jnp.stack([jnp.zeros_like(y), y, jnp.full_like(y, HEIGHT)], axis=-1),
-            "random": jax.random.uniform(shape_key, (n, RANDOM_NUMBERS), dtype, -1, 1),
-            "phase": random_start * jax.random.uniform(phase_key, (n,), dtype),
-        }
+        dtype = params.mass.dtype
+        variables = curves.draw(shape_key, phase_key, drones, SPACING, HEIGHT, dtype)
+        variables["phase"] = random_start * variables["phase"]
         here = target(variables, jnp.zeros((), dtype))
         if not random_start:
             return thrown(start_key, params, here.pos, reach=0, speed=0, omega=0, tilt=0), variables
@@ -76,7 +66,7 @@ def tracking(
         start=start,
         target=target,
         rewards=shaping.REACH_AND_STAY,
-        terminations=out_of_control(4.0 + SPACING * drones),
+        terminations=shaping.out_of_control(4.0 + SPACING * drones),
         success=_close_throughout if duration > _CAUGHT_UP else None,
         observation=("position_error", "rotation_matrix", "velocity_error", "omega", "last_action", "preview"),
     )

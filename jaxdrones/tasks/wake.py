@@ -15,7 +15,6 @@ from jaxdrones.control import Setpoint
 from jaxdrones.params import Params
 from jaxdrones.state import State
 from jaxdrones.tasks import shaping
-from jaxdrones.tasks.conditions import out_of_control
 from jaxdrones.tasks.curves import setpoint_on
 from jaxdrones.tasks.starts import thrown
 from jaxdrones.tasks.task import Task, Team, World
@@ -79,7 +78,7 @@ def wake(
         start=start,
         target=target,
         rewards=shaping.REACH_AND_STAY,
-        terminations=out_of_control(2.0 + amplitude),
+        terminations=shaping.out_of_control(2.0 + amplitude),
         advance=_advance,
         metrics={"altitude_error": _altitude_error, "altitude_deviation": _altitude_deviation},
         success=_kept_altitude,

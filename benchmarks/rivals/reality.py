@@ -25,8 +25,8 @@ from benchmarks.rivals.crazyflow import make_sim, make_step
 from benchmarks.rivals.rotorpy import RADIANS_PER_SECOND
 from jaxdrones.dynamics.propulsion import FULL_PWM, crazyflie_motors
 from jaxdrones.flights import HORIZONS, FlightLog, errors_as_dict, load_flights
+from jaxdrones.flights.log import PERIOD
 from jaxdrones.flights.open_loop import cut_windows, mean_errors, window_starts
-from jaxdrones.flights.preparation import PERIOD
 
 BEFORE, LENGTH = 30, HORIZONS[-1]  # rows before a start, in which lagging rotors come to their speed, and after it
 SUBSTEPS = 5  # of crazyflow in a row: its 500 Hz

@@ -15,9 +15,8 @@ from jaxdrones.control import Setpoint, firmware_pid
 from jaxdrones.dynamics.integrators import midpoint
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.errors import UserError
-from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.log import PERIOD, FlightLog
 from jaxdrones.flights.open_loop import equations_of_motion, lagged_rpm
-from jaxdrones.flights.preparation import PERIOD
 from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.state import State
 from jaxdrones.thrust_curves import thrust_at

@@ -73,10 +73,6 @@ class Conditions:
                 object.__setattr__(self, name, value)
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "vehicle", str(self.vehicle))
-        self._check()
-
-    def _check(self) -> None:
-        flight = FLIGHTS[self.flight]
         if self.duration > _MAX_DURATION:
             raise UserError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
         _check_once(self.effects)

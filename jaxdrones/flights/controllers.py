@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -37,7 +36,12 @@ def controller_of(conditions: Conditions) -> Controller:
         return _optimal(conditions)
     n = conditions.drones
     module = velocity if conditions.flight == "velocity" else control.CONTROLLERS[conditions.controller]
-    gains = _gains(module, conditions.vehicle)
+    if module in (pid, velocity):
+        gains = pid.gains(conditions.vehicle)
+    elif module is mrac or (module in _SCALED and conditions.vehicle not in pid.VEHICLES):
+        gains = module.gains(load_params(conditions.vehicle))
+    else:
+        gains = module.gains()
     memory = for_team((pid if module is velocity else module).init(), n)
     one = functools.partial(module.control, gains, dt=conditions.dt)
 
@@ -56,14 +60,6 @@ def setpoints(conditions: Conditions, t: jax.Array) -> Any:
     if not conditions.feedforward:
         return target(t)
     return setpoint_on(lambda t: target(t).pos, t).replace(yaw=target(t).yaw)
-
-
-def _gains(module: ModuleType, vehicle: str) -> Any:
-    if module in (pid, velocity):
-        return pid.gains(vehicle)
-    if module is mrac or (module in _SCALED and vehicle not in pid.VEHICLES):
-        return module.gains(load_params(vehicle))
-    return module.gains()
 
 
 def physics_of(conditions: Conditions) -> dict[str, Any]:

@@ -172,16 +172,14 @@ class _Problem:
         loss = float(self.prior @ x**2)
         coordinates = [self.indices(i) for i in range(len(self.flights))]
         with ThreadPoolExecutor(os.cpu_count()) as pool:  # a program of one flight keeps one core busy
-            parts = pool.map(self._flight_normal, (x[i] for i in coordinates), scales, self.windows, self.masks)
+            own = functools.partial(normal_equations, self.start, self.names, motors=self.pwm_motors)
+            parts = pool.map(own, (x[i] for i in coordinates), scales, self.windows, self.masks)
         for i, part in zip(coordinates, parts, strict=True):
             matrix[np.ix_(i, i)] += part.matrix
             gradient[i] += part.gradient
-            loss += part.loss
+            loss += float(part.loss)
             robust.append(part.scale)
         return Normal(matrix, gradient, loss, np.stack(robust))
-
-    def _flight_normal(self, x: np.ndarray, scale: np.ndarray, windows: Windows, mask: jax.Array) -> Normal:
-        return normal_equations(self.start, self.names, x, scale, windows, mask, self.pwm_motors)
 
     def vehicle(self, x: np.ndarray) -> Vehicle:
         """Vehicle with the shared parameters and the medians of the per-flight parameters."""
@@ -207,7 +205,7 @@ class _Problem:
             robust = list(normal.scale)
             if k < len(active) - 1:
                 continue
-            loss = self._validation_loss(x, validate) if validate else normal.loss
+            loss = self._validation_loss(x, validate) if validate else float(normal.loss)
             progress(f"round {k + 1} of {len(active) + _ROUNDS}: {'validation' if validate else 'loss'} {loss:.4g}")
             if not validate or loss < best[0]:
                 best = (loss, x, normal)

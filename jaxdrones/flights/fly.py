@@ -14,7 +14,7 @@ from jaxdrones.engine.rollout import Control, leg_length, legs
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import Conditions
 from jaxdrones.flights.controllers import controller_of, physics_of
-from jaxdrones.flights.examples import FLIGHTS, Flight
+from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.params import Params, repeat
 from jaxdrones.sensing import Scene, obstacles_2021
@@ -51,14 +51,19 @@ def fly(
 
     @jax.jit
     def prepare(params: Params) -> tuple[Params, State, Any]:
-        team, start = example.change_params(repeat(params, n)), _start(example, n, conditions.seed)
+        team, start = example.change_params(repeat(params, n)), example.start(n)
+        if conditions.seed is not None:
+            moved = jax.random.normal(jax.random.key(conditions.seed), start.pos.shape)
+            start = start.replace(pos=start.pos + _START_SPREAD * moved)
         return team, start, controller.init(team, start)
 
     @jax.jit
     def plan(params: Params) -> dict[str, jax.Array]:
         t = dt * jnp.arange(1, steps + 1)
         target = jax.vmap(lambda t: example.target(n, t, conditions.duration))(t)
-        return {"t": t} | _commanded(target, params)
+        if isinstance(target, Setpoint):
+            return {"t": t, "target_pos": target.pos}
+        return {"t": t, "target_vel": jax.vmap(jax.vmap(velocity.commanded), (None, 0))(params, target)}
 
     params, start, memory = prepare(load_params(conditions.vehicle))
     planned, team = jax.device_get((plan(params), params))
@@ -109,13 +114,6 @@ def _flown(
         yield from legs(watched, control, params, start, memory, conditions.steps, length)
 
 
-def _start(flight: Flight, n: int, seed: int | None) -> State:
-    state = flight.start(n)
-    if seed is None:
-        return state
-    return state.replace(pos=state.pos + _START_SPREAD * jax.random.normal(jax.random.key(seed), state.pos.shape))
-
-
 def _report(k: jax.Array, steps: int, progress: Callable[[float], None]) -> None:
     """Report the completed fraction of the flight to the host, in steps of 1 %."""
     every = max(1, steps // 100)
@@ -124,10 +122,3 @@ def _report(k: jax.Array, steps: int, progress: Callable[[float], None]) -> None
         jax.debug.callback(lambda k: progress(float(k + 1) / steps), k)
 
     jax.lax.cond((k + 1) % every == 0, report, lambda: None)
-
-
-def _commanded(target: Setpoint | jax.Array, params: Params) -> dict[str, jax.Array]:
-    """Commanded positions or velocities over time."""
-    if isinstance(target, Setpoint):
-        return {"target_pos": target.pos}
-    return {"target_vel": jax.vmap(jax.vmap(velocity.commanded), (None, 0))(params, target)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,26 +24,31 @@ _MEDIAN_SQUARE = 0.455  # median of the square of a standard normal variable
 class Normal(NamedTuple):
     """Normal equations of one flight, or of all flights."""
 
-    matrix: np.ndarray
+    matrix: Any
     """(n, n) Gauss-Newton matrix J'WJ."""
-    gradient: np.ndarray
+    gradient: Any
     """(n,) J'Wr."""
-    loss: float
-    scale: np.ndarray = np.ones(())
+    loss: Any
+    """()"""
+    scale: Any = np.ones(())
     """(horizons, 4) robust standard deviation of the unweighted residuals, by horizon and quantity."""
 
 
 def levenberg_marquardt(
-    normal: Callable[[np.ndarray], Normal], x: np.ndarray, steps: int, min_decrease: float = 0.0
+    normal: Callable[[Any], Normal], x: np.ndarray, steps: int, min_decrease: float = 0.0
 ) -> tuple[np.ndarray, Normal]:
-    """Minimize a sum of squares from x (n,); return the best coordinates and their normal equations.
+    """Minimize a sum of squares from x (n,); return the best coordinates and their normal equations, in float64.
 
     It takes `steps`, rejected ones included, or stops at a relative decrease of the loss below `min_decrease`.
     """
-    best, damping = normal(x), _INITIAL_DAMPING
+
+    def evaluated(x: np.ndarray) -> Normal:
+        return jax.tree.map(lambda x: np.asarray(x, float), normal(x))
+
+    best, damping = evaluated(x), _INITIAL_DAMPING
     for _ in range(steps):
         candidate = x - np.linalg.solve(best.matrix + damping * np.diag(np.diag(best.matrix)), best.gradient)
-        tried = normal(candidate)
+        tried = evaluated(candidate)
         decrease = best.loss - tried.loss
         if decrease > 0:
             x, best, damping = candidate, tried, damping / 10
@@ -55,7 +60,7 @@ def levenberg_marquardt(
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _normal(
+def normal_equations(
     vehicle: Vehicle,
     names: tuple[str, ...],
     x: Array,
@@ -63,7 +68,12 @@ def _normal(
     windows: Windows,
     mask: Array,
     motors: Motors | None,
-):
+) -> Normal:
+    """Normal equations of one flight at the coordinates x of the parameters; at x = 0 they are the vehicle's.
+
+    Residuals are scaled by `scale` (horizons, 4); `mask` (windows,) is 1 for a window, 0 for padding.
+    """
+
     def scaled(x: Array, window: Windows) -> Float[Array, "horizons 4 3"]:
         predicted = predict(with_parameters(vehicle, names, list(x)), window.start, window.command, motors)
         return jax.vmap(residuals)(predicted, window.logged) / scale[:, :, None]
@@ -81,26 +91,7 @@ def _normal(
     gradient = jnp.einsum("pik,pk,p->i", jacobian, r, weight)
     squares = jnp.where(mask[:, None] > 0, r * r, jnp.nan)
     median = jnp.nanmedian(squares, axis=0).reshape(len(HORIZONS), 4, 3)
-    return matrix, gradient, jnp.sum(loss), scale * jnp.sqrt(jnp.mean(median, axis=-1) / _MEDIAN_SQUARE)
-
-
-def normal_equations(
-    vehicle: Vehicle,
-    names: tuple[str, ...],
-    x: np.ndarray,
-    scale: np.ndarray,
-    windows: Windows,
-    mask: Array,
-    motors: Motors | None,
-) -> Normal:
-    """Normal equations of one flight at the coordinates x of the parameters; at x = 0 they are the vehicle's.
-
-    Residuals are scaled by `scale` (horizons, 4); `mask` (windows,) is 1 for a window, 0 for padding.
-    """
-    matrix, gradient, loss, robust = _normal(
-        vehicle, names, jnp.asarray(x, float), jnp.asarray(scale, float), windows, mask, motors
-    )
-    return Normal(np.asarray(matrix, float), np.asarray(gradient, float), float(loss), np.asarray(robust, float))
+    return Normal(matrix, gradient, jnp.sum(loss), scale * jnp.sqrt(jnp.mean(median, axis=-1) / _MEDIAN_SQUARE))
 
 
 def standard_errors(information: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ from jaxdrones.urdf import load_params
 
 STATE = {"pos": 3, "quat": 4, "vel": 3, "omega": 3}
 """Arrays of the state and their widths."""
+PERIOD = 0.01
+"""Time between the rows of a log prepared for identification, s."""
 OPTIONAL = {"rpm": 4, "pwm": 4, "vbat": 0, "target_pos": 3, "target_vel": 3, "target_yaw": 0}
 """Optional arrays and their widths; 0 for a number per drone."""
 

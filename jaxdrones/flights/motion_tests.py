@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-_PERIOD = 0.01  # s
+from jaxdrones.flights.log import PERIOD
+
 _GRAVITY = 9.81  # m/s^2
 _SHIFT_ROWS, _TURN_ROWS, _FORCE_ROWS = 50, 25, 25  # rows between compared positions, attitudes and velocities
 _MAX_WINDOWS = 1500
@@ -80,7 +81,7 @@ def typical(x: np.ndarray) -> float:
 
 def _path(pos: np.ndarray, vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First rows of windows, and the integral of the velocity, m."""
-    steps = (vel[1:] + vel[:-1]) / 2 * _PERIOD
+    steps = (vel[1:] + vel[:-1]) / 2 * PERIOD
     return starts_of(len(pos), _SHIFT_ROWS), np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
@@ -125,7 +126,7 @@ def turn_test(attitude: Rotation, omega: np.ndarray) -> MotionTest:
     starts = starts_of(len(omega), _TURN_ROWS)
     turned = Rotation.identity(len(starts))
     for row in range(_TURN_ROWS):
-        turned *= Rotation.from_rotvec((omega[starts + row] + omega[starts + row + 1]) / 2 * _PERIOD)
+        turned *= Rotation.from_rotvec((omega[starts + row] + omega[starts + row + 1]) / 2 * PERIOD)
     relative = attitude[starts].inv() * attitude[starts + _TURN_ROWS]
     return MotionTest(relative.as_rotvec(), turned.as_rotvec(), _MIN_TURN, _MAX_TURN_MISFIT, _MAX_TURN_ERROR)
 
@@ -137,7 +138,7 @@ def force_test(vel: np.ndarray, attitude: Rotation, drag: float = 0.0) -> Motion
     """
     starts = starts_of(len(vel), _FORCE_ROWS)
     ends = starts + _FORCE_ROWS
-    acc = (vel[ends] - vel[starts]) / (_FORCE_ROWS * _PERIOD) + drag * (vel[ends] + vel[starts]) / 2 * [1, 1, 0]
+    acc = (vel[ends] - vel[starts]) / (_FORCE_ROWS * PERIOD) + drag * (vel[ends] + vel[starts]) / 2 * [1, 1, 0]
     up = attitude.apply([0, 0, 1.0])
     summed = np.concatenate([np.zeros((1, 3)), np.cumsum(up, axis=0)])
     mean_up = (summed[ends + 1] - summed[starts]) / (_FORCE_ROWS + 1)
@@ -157,7 +158,7 @@ def lift_correlation(thrust: np.ndarray, vel: np.ndarray, attitude: Rotation) ->
     if len(starts) < MIN_WINDOWS:
         return 0.0
     ends = starts + _FORCE_ROWS
-    acc = (vel[ends, 2] - vel[starts, 2]) / (_FORCE_ROWS * _PERIOD)
+    acc = (vel[ends, 2] - vel[starts, 2]) / (_FORCE_ROWS * PERIOD)
     summed = np.concatenate([np.zeros(1), np.cumsum(thrust * attitude.apply([0, 0, 1.0])[:, 2])])
     lift = summed[ends + 1] - summed[starts]
     lift = lift - np.polyval(np.polyfit(ends, lift, 2), ends)  # the same command gives less thrust as a battery empties

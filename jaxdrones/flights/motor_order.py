@@ -8,7 +8,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-_PERIOD = 0.01  # s
+from jaxdrones.flights.log import PERIOD
+
 _MIN_LIKENESS, _MIN_LEAD = 0.75, 0.15  # of an order of the motors; over the documented order
 _PATTERNS = {
     "X": np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]]) / 2,  # roll and pitch by each motor
@@ -27,8 +28,8 @@ def check_motors(squares: np.ndarray, attitude: Rotation, vel: np.ndarray, omega
     effect = motor_effects(squares, attitude, vel, omega)
     if effect is None:
         return []
-    orders = list(itertools.permutations(range(4)))
-    likeness = np.array([max(_likeness(effect, p[:, list(order)]) for p in _PATTERNS.values()) for order in orders])
+    orders = [list(order) for order in itertools.permutations(range(4))]
+    likeness = np.max([[np.vdot(effect, p[:, order]) / 2 for order in orders] for p in _PATTERNS.values()], axis=0)
     best = int(np.argmax(likeness))
     documented = likeness[0]
     if likeness[best] < _MIN_LIKENESS or likeness[best] - documented < _MIN_LEAD:
@@ -37,17 +38,13 @@ def check_motors(squares: np.ndarray, attitude: Rotation, vel: np.ndarray, omega
     return [f"the motors turn the drone as if their columns were {order}: give {', '.join(_NAMES)}"]
 
 
-def _likeness(effect: np.ndarray, pattern: np.ndarray) -> float:
-    return float(np.mean(np.sum(effect * pattern, axis=1)))
-
-
 def motor_effects(squares: np.ndarray, attitude: Rotation, vel: np.ndarray, omega: np.ndarray) -> np.ndarray | None:
     """(2, 4) relative effect of each motor on roll and pitch, unit rows; `None` if not observable."""
     n = _MOTOR_ROWS
     squares, vel, omega = (x[:_MAX_MOTOR_ROWS] for x in (squares, vel, omega))
     if len(squares) < 2 * _TREND_ROWS:
         return None
-    acc = (omega[n:, :2] - omega[:-n, :2]) / (n * _PERIOD)
+    acc = (omega[n:, :2] - omega[:-n, :2]) / (n * PERIOD)
     body_vel = attitude[: len(vel)].inv().apply(vel)
     others = [(x[n:] + x[:-n]) / 2 for x in (body_vel, omega)]
     summed = np.cumsum((squares[1:] + squares[:-1]) / 2 / np.mean(squares), axis=0)

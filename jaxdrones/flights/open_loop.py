@@ -16,8 +16,7 @@ from jaxdrones.dynamics.integrators import midpoint
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.engine.explicit import Derivative, make_derivative
 from jaxdrones.errors import UserError
-from jaxdrones.flights.log import FlightLog
-from jaxdrones.flights.preparation import PERIOD
+from jaxdrones.flights.log import PERIOD, FlightLog
 from jaxdrones.flights.vehicle import Vehicle
 from jaxdrones.params import Params
 from jaxdrones.state import State
@@ -51,7 +50,9 @@ class Windows(NamedTuple):
 
 def cut_windows(log: FlightLog, starts: np.ndarray) -> Windows:
     """Cut windows of a log at the given rows, from `window_starts`."""
-    command = log.rpm[:, 0] if log.has("rpm") else _duty_and_voltages(log)
+    command = log.rpm[:, 0]
+    if not log.has("rpm"):
+        command = np.column_stack([log.pwm[:, 0] / FULL_PWM, log.vbat, np.full(len(log.vbat), log.sag)])
     padded = np.pad(command, ((_WARM_UP + _MAX_DELAY, _MAX_DELAY + 1), (0, 0)), mode="edge")
     rows = starts[:, None] + np.arange(_WARM_UP + _LENGTH + 2 * _MAX_DELAY + 1)
 
@@ -208,8 +209,3 @@ def lagged_rpm(params: Params, rpm: Float[Array, "4"], thrust: Float[Array, "4"]
     commanded = safe_sqrt(thrust / params.kf)
     time_constant = jnp.where(commanded > rpm, params.rotor_rise_time, params.rotor_fall_time)
     return commanded + (rpm - commanded) * jnp.exp(-dt / time_constant)
-
-
-def _duty_and_voltages(log: FlightLog) -> np.ndarray:
-    """(T, 6) duty cycles, 0 to 1, voltage of the battery and its sag at take-off, V."""
-    return np.column_stack([log.pwm[:, 0] / FULL_PWM, log.vbat, np.full(len(log.vbat), log.sag)])

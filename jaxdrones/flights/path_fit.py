@@ -15,9 +15,8 @@ from jaxdrones.control import firmware_pid
 from jaxdrones.dynamics.propulsion import FULL_PWM, Motors
 from jaxdrones.flights import closed_loop
 from jaxdrones.flights.least_squares import Normal, levenberg_marquardt, standard_errors
-from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.log import PERIOD, FlightLog
 from jaxdrones.flights.parameters import with_parameters
-from jaxdrones.flights.preparation import PERIOD
 from jaxdrones.flights.vehicle import Vehicle
 
 BALANCE_PARAMETERS = ("mass", "unfelt_sag")
@@ -139,7 +138,7 @@ def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float
     """
 
     @jax.jit
-    def normal(x: Array) -> tuple[Array, Array, Array]:
+    def normal(x: Array) -> Normal:
         along = jax.vmap(lambda e: jax.jvp(residuals, (x,), (e,)), out_axes=(None, 0))
         r, jacobian = along(jnp.eye(count))
         relative = r * r / cauchy_scale_squared
@@ -147,13 +146,9 @@ def _least_squares(residuals: Residuals, count: int, cauchy_scale_squared: float
         robust = r * r if np.isinf(cauchy_scale_squared) else cauchy_scale_squared * jnp.log1p(relative)
         loss = jnp.sum(robust) + _PRIOR_PRECISION * x @ x
         matrix = weighted @ jacobian.T + _PRIOR_PRECISION * jnp.eye(count)
-        return matrix, weighted @ r + _PRIOR_PRECISION * x, loss
+        return Normal(matrix, weighted @ r + _PRIOR_PRECISION * x, loss)
 
-    def evaluated(x: np.ndarray) -> Normal:
-        matrix, gradient, loss = normal(jnp.asarray(x, float))
-        return Normal(np.asarray(matrix, float), np.asarray(gradient, float), float(loss))
-
-    x, last = levenberg_marquardt(evaluated, np.zeros(count), _MAX_STEPS, _MIN_DECREASE)
+    x, last = levenberg_marquardt(normal, np.zeros(count), _MAX_STEPS, _MIN_DECREASE)
     return jnp.asarray(x, float), standard_errors(last.matrix)
 
 

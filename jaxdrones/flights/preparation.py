@@ -11,10 +11,7 @@ import numpy as np
 
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import read_log
-from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
-
-PERIOD = 0.01
-"""Time between the rows of a prepared log, s."""
+from jaxdrones.flights.log import OPTIONAL, PERIOD, STATE, FlightLog
 
 _MAX_PERIOD = 0.012 + 1e-8  # s; larger steps do not resolve the motion of a small quadrotor
 _MAX_GAP = 0.05  # s

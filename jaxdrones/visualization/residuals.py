@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxdrones.flights import HORIZONS, QUANTITIES, ClosedLoopResult
-from jaxdrones.flights.preparation import PERIOD
+from jaxdrones.flights.log import PERIOD
 from jaxdrones.visualization import style
 from jaxdrones.visualization.palette import colors
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -144,45 +143,26 @@ def to_command(name: str, message: Any) -> Command:
     Raises:
         Refused: numbers that are not finite, an unknown frame, a zero quaternion, or a wrong number of rotors.
     """
-    return _COMMANDS[name](message)
-
-
-def _pose_command(message: msg.PoseStamped) -> Command:
-    frame = message.header.frame_id
-    if frame not in ("", topics.WORLD):
-        raise Refused("frame_id", f"is {frame!r}", f"give poses in {topics.WORLD!r}")
-    x, y, z, w = _finite(numbers(message.pose.orientation), "orientation")
-    length = math.hypot(x, y, z, w)
-    if not abs(length - 1) < 1e-3:
-        raise Refused("orientation", f"has length {length:g}", "give a unit quaternion (x, y, z, w)")
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return Command.zero(Mode.POSITION, pos=_finite(numbers(message.pose.position), "position"), yaw=yaw)
-
-
-def _velocity_command(message: msg.Twist) -> Command:
-    vel, turn = (_finite(numbers(v), name) for v, name in ((message.linear, "linear"), (message.angular, "angular")))
-    return Command.zero(Mode.VELOCITY, vel=vel, yaw_rate=turn[2])
-
-
-def _rates_command(message: msg.Twist) -> Command:
-    acc, omega = (_finite(numbers(v), name) for v, name in ((message.linear, "linear"), (message.angular, "angular")))
-    if acc[2] < 0:
-        raise Refused("linear.z, the collective thrust per mass,", f"is {acc[2]:g} m/s^2", "give 0 or more")
-    return Command.zero(Mode.RATES, omega=omega, thrust=acc[2])
-
-
-def _motor_command(message: msg.Float64MultiArray) -> Command:
-    if len(message.data) != 4:
-        raise Refused("data", f"has {len(message.data)} numbers", "give 4 rotor speeds, RPM")
-    return Command.zero(Mode.MOTORS, rpm=_finite(message.data, "data"))
-
-
-_COMMANDS: dict[str, Callable[[Any], Command]] = {
-    "cmd_pose": _pose_command,
-    "cmd_vel": _velocity_command,
-    "cmd_rates": _rates_command,
-    "cmd_motors": _motor_command,
-}
+    if name == "cmd_motors":
+        if len(message.data) != 4:
+            raise Refused("data", f"has {len(message.data)} numbers", "give 4 rotor speeds, RPM")
+        return Command.zero(Mode.MOTORS, rpm=_finite(message.data, "data"))
+    if name == "cmd_pose":
+        frame = message.header.frame_id
+        if frame not in ("", topics.WORLD):
+            raise Refused("frame_id", f"is {frame!r}", f"give poses in {topics.WORLD!r}")
+        x, y, z, w = _finite(numbers(message.pose.orientation), "orientation")
+        length = math.hypot(x, y, z, w)
+        if not abs(length - 1) < 1e-3:
+            raise Refused("orientation", f"has length {length:g}", "give a unit quaternion (x, y, z, w)")
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return Command.zero(Mode.POSITION, pos=_finite(numbers(message.pose.position), "position"), yaw=yaw)
+    linear, angular = _finite(numbers(message.linear), "linear"), _finite(numbers(message.angular), "angular")
+    if name == "cmd_vel":
+        return Command.zero(Mode.VELOCITY, vel=linear, yaw_rate=angular[2])
+    if linear[2] < 0:
+        raise Refused("linear.z, the collective thrust per mass,", f"is {linear[2]:g} m/s^2", "give 0 or more")
+    return Command.zero(Mode.RATES, omega=angular, thrust=linear[2])
 
 
 def numbers(vector: Any) -> tuple[float, ...]:

@@ -63,11 +63,6 @@ class Watch:
         return self._failsafe.timeout if self._ever else self._failsafe.wait
 
 
-def resting_height(params: Params, i: int) -> float:
-    """Height of the center of mass of drone `i` at rest on the ground, m."""
-    return float(params.collision_height[i] / 2 - params.collision_offset[i])
-
-
 def hover(command: Command, state: State, i: int) -> Command:
     """Command to hold the last commanded position, or after other commands the present one of drone `i`."""
     if command.mode == Mode.POSITION:
@@ -79,7 +74,7 @@ def hover(command: Command, state: State, i: int) -> Command:
 
 def sink(command: Command, params: Params, state: State, i: int, dt: float) -> Command:
     """Next command of a landing after `dt` (s), with rotors off once drone `i` is on the ground."""
-    ground = resting_height(params, i)
+    ground = float(params.collision_height[i] / 2 - params.collision_offset[i])  # m, height of the center of mass
     if command.mode == Mode.MOTORS or float(state.pos[i, 2]) < ground + _NEAR_GROUND:
         return Command.zero(Mode.MOTORS)
     pos = np.array(command.pos)

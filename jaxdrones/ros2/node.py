@@ -38,10 +38,6 @@ class Flown:
     landed: bool = False
 
 
-def _silent(text: str) -> None:
-    pass
-
-
 class Node:
     """Node that publishes the state of a team and executes received commands.
 
@@ -59,7 +55,7 @@ class Node:
         speed: float = 1.0,
         camera: Camera | None = None,
         recorder: Recorder | None = None,
-        warn: Callable[[str], None] = _silent,
+        warn: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ):
         """Offer the topics of a team.

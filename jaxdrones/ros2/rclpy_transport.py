@@ -71,7 +71,7 @@ class RclpyTransport:
             response.success, response.message = answer()
             return response
 
-        self._node.create_service(_trigger(), f"/{name}", respond)
+        self._node.create_service(importlib.import_module("std_srvs.srv").Trigger, f"/{name}", respond)
 
     def _deliver(self) -> None:
         """Deliver all received messages.
@@ -145,10 +145,6 @@ def to_ros(message: msg.Message) -> Any:
 def from_ros(kind: str, message: Any) -> msg.Message:
     """Convert a message of the installed ROS 2 of the type `kind`."""
     return msg.decode(kind, message)
-
-
-def _trigger() -> Any:
-    return importlib.import_module("std_srvs.srv").Trigger
 
 
 def _ros_array(field: msg.Field, given: Any) -> Any:

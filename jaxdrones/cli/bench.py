@@ -1,9 +1,9 @@
 """`jaxdrones bench`."""
 
 import argparse
-import functools
+import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -65,12 +65,12 @@ def _bench(options: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     longest: dict[str, float] = {}
     left_out = 0
-    for kind, count, measure in _measurements(worlds):
+    for count, kind in itertools.product(worlds, _MEANINGS):
         start = time.perf_counter()
         if rows and start - begin + longest.get(kind, max(longest.values())) > options.seconds:
             left_out += 1
             continue
-        rows.append({"what": kind, "worlds": count, "per_s": measure()})
+        rows.append({"what": kind, "worlds": count, "per_s": _rate(kind, count)})
         longest[kind] = max(longest.get(kind, 0.0), time.perf_counter() - start)
         if not options.json:
             print(f"{rows[-1]['per_s']:15,.0f}  {_MEANINGS[kind]}, {count:,} worlds", flush=True)
@@ -84,13 +84,6 @@ def _bench(options: argparse.Namespace) -> int:
             print(f"left out, as it would take longer: {left_out} of {left_out + len(rows)}; give more --seconds")
         print(_line(result))
     return 0
-
-
-def _measurements(worlds: Sequence[int]) -> Iterator[tuple[str, int, Callable[[], float]]]:
-    """Kinds, numbers of worlds, and functions that measure steps per second."""
-    for count in worlds:
-        for kind in _MEANINGS:
-            yield kind, count, functools.partial(_rate, kind, count)
 
 
 def _rate(kind: str, worlds: int) -> float:

@@ -12,7 +12,7 @@ from jaxdrones.arguments import number, whole
 from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, folder, print_error, print_warning
 from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.policies import open_policy
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import listed, print_results
 from jaxdrones.errors import UserError
 from jaxdrones.firmware import betaflight
 from jaxdrones.firmware.betaflight.build import build
@@ -117,7 +117,7 @@ def _run(options: argparse.Namespace) -> int:
             }
         say(f"wrote {file}")
     report = {name: round(x, 4) if isinstance(x, float) else x for name, x in report.items()}
-    print(as_json(report) if options.json else ", ".join(f"{n.replace('_', ' ')} {x:g}" for n, x in report.items()))
+    print_results(options, report, listed(report))
     if lost:
         return print_error(lost, 1)
     return print_error("interrupted", INTERRUPTED) if interrupted else 0

@@ -8,7 +8,7 @@ from typing import Any
 from jaxdrones.cli.common import check_writable
 from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_options, warn
 from jaxdrones.cli.options import add_no_figure, add_output
-from jaxdrones.cli.report import as_json, table
+from jaxdrones.cli.report import print_results, table
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
@@ -57,7 +57,8 @@ def _compare(options: argparse.Namespace) -> int:
         title = (" against " if len(cases) == 2 else ", ").join(cases)
         comparison.save_comparison(records, files[-1], f"{options.flight}: {title}", settling_time)
     diverged = {name: results.diverged(record) for name, record in records.items()}
-    about: dict[str, Any] = {"flight": options.flight, kind: list(cases)}
+    about: dict[str, Any] = {"flight": options.flight, kind: list(cases), "diverged": diverged}
+    about["files"] = list(map(str, files))
     if kind == "backends":
         first, second = records.values()
         found = {"divergence": results.divergence(first, second)}
@@ -66,12 +67,8 @@ def _compare(options: argparse.Namespace) -> int:
         found = {"results": _results(records, settling_time)}
         headline = ", ".join(cases) + ", largest over the drones"
         text = f"{table(found['results'])}\n{results.definitions(next(iter(records.values())), settling_time)}"
-    if options.json:
-        print(as_json(about | found | {"diverged": diverged, "files": list(map(str, files))}))
-    else:
-        print(f"{options.flight}: {headline}\n{text}")
-        if files:
-            print("wrote " + ", ".join(map(str, files)))
+    wrote = ["wrote " + ", ".join(about["files"])] * bool(files)
+    print_results(options, about | found, f"{options.flight}: {headline}", text, *wrote)
     return warn(next(filter(None, diverged.values()), {}))
 
 

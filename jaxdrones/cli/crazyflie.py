@@ -6,7 +6,7 @@ from pathlib import Path
 from jaxdrones.arguments import number, whole
 from jaxdrones.cli.common import INTERRUPTED, check_options, check_writable, print_error
 from jaxdrones.cli.options import add_output, add_vehicle
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import listed, print_results
 from jaxdrones.firmware.crazyflie import Crazyflie, Server, Vehicle
 from jaxdrones.firmware.crazyflie.server import PORT
 from jaxdrones.firmware.recorder import Recorder
@@ -48,21 +48,13 @@ def _run(options: argparse.Namespace) -> int:
         if not options.json:
             print(f"a Crazyflie ({options.vehicle}) is at udp://127.0.0.1:{server.port}; Ctrl-C ends it", flush=True)
         try:
-            server.run(
-                options.duration,
-                options.speed,
-                lambda t, now, target: recorder.add(t, now),
-            )
+            server.run(options.duration, options.speed, lambda t, now, target: recorder.add(t, now))
         except KeyboardInterrupt:
             interrupted = True
-    report = vars(server.flown) | {"real_time_factor": round(server.flown.real_time_factor, 3), "files": []}
-    if len(recorder):
+    report = vars(server.flown) | {"real_time_factor": round(server.flown.real_time_factor, 3)}
+    files = [str(file)] if len(recorder) else []
+    if files:
         conditions = {"vehicle": options.vehicle, "controller": "firmware_pid"}
         save_npz(recorder.log(vehicle.params, conditions, f"crazyflie: {options.vehicle}, flown by cflib"), file)
-        report["files"] = [str(file)]
-    if options.json:
-        print(as_json(report))
-    else:
-        print(", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in report.items() if name != "files"))
-        print("wrote " + ", ".join(report["files"]) if report["files"] else "nothing was flown")
+    print_results(options, report | {"files": files}, listed(report), f"wrote {file}" if files else "nothing was flown")
     return print_error("interrupted", INTERRUPTED) if interrupted else 0

@@ -12,7 +12,7 @@ from jaxdrones.cli.common import check_writable, folder
 from jaxdrones.cli.live import add_live
 from jaxdrones.cli.options import add_drones, add_output
 from jaxdrones.cli.policies import open_policy
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import print_results
 from jaxdrones.errors import UserError
 from jaxdrones.visualization.viewer.gallery import Exhibit, gallery, read_exhibits
 from jaxdrones.writing import write
@@ -59,10 +59,8 @@ def _demo(options: argparse.Namespace) -> int:
     check_writable(output)
     first = exhibits.pop(options.flight)
     write(output, gallery([first, *exhibits.values()]).encode())
-    if options.json:
-        print(as_json({"flights": [first.name, *exhibits], "files": [str(output)]}))
-    else:
-        print(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+    size = f"{output.stat().st_size / 1e6:.1f} MB"
+    print_results(options, {"flights": [first.name, *exhibits], "files": [str(output)]}, f"wrote {output} ({size})")
     if not options.no_open and not webbrowser.open(output.absolute().as_uri()):
         print("no browser was found; open the page in one")
     return 0

@@ -5,7 +5,6 @@ import importlib.metadata
 import re
 import shutil
 import time
-from pathlib import Path
 from typing import Any
 
 from jaxdrones.cli.report import as_json
@@ -40,11 +39,17 @@ def _doctor(options: argparse.Namespace) -> int:
     required, extras = _requirements(wrong)
     for name, wanted in required.items():
         wrong += _unfit(name, wanted)
-    devices = _devices(wrong)
+    try:
+        devices = machine.devices()
+    except UserError as error:
+        devices = []
+        wrong.append(str(error))
     present = {extra: _extra(extra, libraries, wrong) for extra, libraries in extras.items()}
     tests = _self_tests(present, wrong) if devices else {}
     result: dict[str, Any] = {"versions": versions, "processor": machine.processor(), "cores": machine.cores()}
-    result["programs"] = _kept_programs(machine.program_folder())
+    folder = machine.program_folder()
+    sizes = [path.stat().st_size for path in folder.glob("*-cache")]
+    result["programs"] = {"folder": str(folder), "files": len(sizes), "bytes": sum(sizes)}
     result |= {"devices": devices, "notes": _notes(devices), "extras": present, "self_test": tests, "wrong": wrong}
     print(as_json(result) if options.json else _text(result))
     return 1 if wrong else 0
@@ -133,21 +138,6 @@ def _numbers(version: str) -> tuple[int, ...]:
     """Release numbers of a version, without suffixes such as `rc1`."""
     found = re.match(r"\d+(\.\d+)*", version)
     return tuple(map(int, found[0].split("."))) if found else ()
-
-
-def _devices(wrong: list[str]) -> list[str]:
-    from jaxdrones.cli import machine
-
-    try:
-        return machine.devices()
-    except UserError as error:
-        wrong.append(str(error))
-        return []
-
-
-def _kept_programs(folder: Path) -> dict[str, Any]:
-    sizes = [path.stat().st_size for path in folder.glob("*-cache")]
-    return {"folder": str(folder), "files": len(sizes), "bytes": sum(sizes)}
 
 
 def _notes(devices: list[str]) -> list[str]:

@@ -8,7 +8,7 @@ from jaxdrones.arguments import choice, number
 from jaxdrones.cli.common import DIVERGED, check_options, print_error
 from jaxdrones.cli.options import add_backend, add_drones
 from jaxdrones.cli.policies import add_policy, open_policy, policy_of, team_of_run
-from jaxdrones.cli.report import as_json, evaluation_table, percent
+from jaxdrones.cli.report import evaluation_table, percent, print_results
 from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights.conditions import BACKENDS
@@ -56,11 +56,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         report = report_as_dict(evaluate(env, make_policy(env), key, options.episodes))
     if options.fail_below is not None and report["success"] is None:
         raise UserError(f"--fail-below {options.fail_below} is given, and the task has no criterion of success")
-    if options.json:
-        print(as_json(about | {"recipe": recipe.as_dict(), "evaluation": report}))
-    else:
-        print(title)
-        print(evaluation_table(report))
+    print_results(options, about | {"recipe": recipe.as_dict(), "evaluation": report}, title, evaluation_table(report))
     if options.fail_below is not None and report["success"] < options.fail_below:
         rate = percent(report["success"], options.episodes)
         return print_error(f"the success rate is {rate}, below --fail-below {options.fail_below:g}", DIVERGED)

@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdrones.cli.options import add_backend, add_drones, add_set, add_vehicle
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import add_realistic, asked_settings, user_mistakes
 from jaxdrones.envs import TASKS, explain, make
 
@@ -32,5 +32,5 @@ def _explain(options: argparse.Namespace) -> int:
         make(options.task, backend=options.backend, realistic=options.realistic, **settings) as env,
     ):
         explanation = explain(env)
-    print(as_json(explanation.as_dict()) if options.json else explanation)
+    print_results(options, explanation.as_dict(), explanation)
     return 0

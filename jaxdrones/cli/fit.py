@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxdrones.cli.common import check_writable, folder, print_warning
 from jaxdrones.cli.options import add_no_figure, add_output, add_vehicle
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import print_results
 from jaxdrones.errors import UserError
 
 _FIGURE = "errors.png"
@@ -67,10 +67,7 @@ def _fit(options: argparse.Namespace) -> int:
     fitted, validate = ([log for log in logs if (log.file in kept) is given] for given in (False, True))
     report = fit(fitted, params, names, validate, motors, lambda line: print(line, file=sys.stderr), gains)
     write_vehicle(options.output, report, options.vehicle)
-    if options.json:
-        print(as_json(report_as_dict(report) | {"output": str(options.output)}))
-    else:
-        print(parameter_table(report))
+    print_results(options, report_as_dict(report) | {"output": str(options.output)}, parameter_table(report))
     files = [URDF, REPORT]
     if not options.no_figure:
         try:

@@ -1,9 +1,9 @@
 """`jaxdrones list`."""
 
 import argparse
-import json
 
 from jaxdrones import assets
+from jaxdrones.cli.report import print_results
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
 from jaxdrones.envs import ACTIONS, OBSERVATIONS, TASKS
 from jaxdrones.flights.conditions import BACKENDS, CONTROLLERS
@@ -38,9 +38,5 @@ def known_names() -> dict[str, list[str]]:
 
 def _list(options: argparse.Namespace) -> int:
     names = known_names()
-    if options.json:
-        print(json.dumps(names))
-    else:
-        for kind, known in names.items():
-            print(f"{kind:12} {', '.join(known)}")
+    print_results(options, names, *(f"{kind:12} {', '.join(known)}" for kind, known in names.items()))
     return 0

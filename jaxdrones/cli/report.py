@@ -1,5 +1,6 @@
 """Formatting of results: tables, JSON, success rates and evaluations."""
 
+import argparse
 import json
 import math
 from typing import Any
@@ -35,6 +36,16 @@ _COLUMNS = {  # result: (heading, format)
 def as_json(results: dict[str, Any]) -> str:
     """One line of JSON, with null for numbers that are not finite."""
     return json.dumps(_finite(results), allow_nan=False)
+
+
+def print_results(options: argparse.Namespace, results: dict[str, Any], *lines: Any) -> None:
+    """Print results: one line of JSON with --json, else lines of text."""
+    print(as_json(results) if options.json else "\n".join(map(str, lines)))
+
+
+def listed(results: dict[str, Any]) -> str:
+    """Names and numbers in one line."""
+    return ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in results.items())
 
 
 def _finite(x):

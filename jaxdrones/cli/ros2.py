@@ -10,7 +10,7 @@ from typing import Any
 from jaxdrones.arguments import choice, number, whole
 from jaxdrones.cli.common import DIVERGED, INTERRUPTED, check_options, folder, print_error, print_warning
 from jaxdrones.cli.options import add_backend, add_drones, add_vehicle
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import listed, print_results
 from jaxdrones.dynamics.contact import drone_contact, ground_contact
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.errors import UserError
@@ -105,11 +105,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _print(options: argparse.Namespace, report: dict[str, Any]) -> None:
-    if options.json:
-        print(as_json(report))
-    else:
-        names = {name: name.replace("_s", " (s)") if name.endswith("_s") else name for name in report}
-        print(", ".join(f"{names[name]} {value:g}" for name, value in report.items()))
+    print_results(options, report, listed({name.replace("_s", " (s)"): x for name, x in report.items()}))
 
 
 def _simulation(options: argparse.Namespace, stack: contextlib.ExitStack) -> Simulation:

@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxdrones.cli.common import bar, check_writable, folder
 from jaxdrones.cli.fit import add_log_options, load_logs
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import print_results
 from jaxdrones.errors import UserError
 
 _NOMINAL = "cf2x"
@@ -82,12 +82,8 @@ def _score(options: argparse.Namespace) -> int:
         "closed_loop": closed_loop["vehicle"],
         "closed_loop_nominal": closed_loop["nominal"],
     }
-    if options.json:
-        print(as_json(results))
-    else:
-        print(open_loop_table(named(results["open_loop"])))
-        if with_setpoints:
-            print(closed_loop_table(named(closed_loop)))
+    tables = [open_loop_table(named(results["open_loop"]))]
+    print_results(options, results, *tables, *[closed_loop_table(named(closed_loop))] * bool(with_setpoints))
     return 0
 
 

@@ -154,7 +154,7 @@ def _train(options: argparse.Namespace) -> int:
     with fail_together():
         if not options.no_figure:
             plots.check_matplotlib()
-        requests = Request.of(options).swept(options.sweep)
+        requests = Request.of(options).swept()
     for request in requests:
         code = _train_row(request, begin)
         if code:

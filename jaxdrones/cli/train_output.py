@@ -47,7 +47,7 @@ class Deadlines:
         """Prepare, with the start of the command at `begin`, s on the clock of `time.perf_counter`."""
         self.seconds, self._text, self._begin = request.seconds, request.budget, begin
         self._end = begin + request.seeds * (request.seconds or 0.0)
-        self._figure = _FIGURE_SECONDS * request.figure
+        self._figure = _FIGURE_SECONDS * (not request.no_figure)
         self._left = request.seeds
 
     def start(self) -> None:
@@ -130,7 +130,7 @@ def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
     """Draw the learning curves, unless with --no-figure."""
     from jaxdrones.learning.evaluation import wilson_interval
 
-    if not request.figure:
+    if request.no_figure:
         return []
     histories = {f"seed {seed}": run.history() for seed, run in runs.items()}
     kept = {f"seed {seed}": run.sidecar_entry("best", "update") for seed, run in runs.items()}

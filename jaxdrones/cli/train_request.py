@@ -20,32 +20,12 @@ _MAX_SECONDS = 3.6e6
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
-@dataclasses.dataclass(frozen=True)
-class Request:
-    """Requested training; `None` for options left out."""
+class Request(argparse.Namespace):
+    """Validated options of the command, and what follows from them.
 
-    task: str
-    algorithm: str | None
-    realistic: bool | str
-    settings: dict[str, Any]
-    """Settings of the learner, with the `updates` of --budget, and options of the environment."""
-    stop_at: float | None
-    episodes: int | None
-    budget: str | None
-    seconds: float | None
-    """Time per run of --budget, s."""
-    seeds: int
-    seed: int | None
-    output: Path
-    resume: bool
-    overwrite: bool
-    keep_history: bool
-    live: int | None
-    figure: bool
-    json: bool
-    log: str | None
-    row: str = ""
-    """Settings of --sweep, for titles."""
+    These are `settings`, those of the learner, with the `updates` of --budget, and options of the environment;
+    `seconds`, the time per run of --budget; and `row`, the settings of --sweep, for titles.
+    """
 
     @classmethod
     def of(cls, options: argparse.Namespace) -> Request:
@@ -63,22 +43,13 @@ class Request:
         settings = asked_settings(options)
         if "updates" in settings and options.budget is not None:
             raise UserError(f"--set updates={settings['updates']} is given beside --budget; give one of them")
-        return cls(
-            task=options.task,
-            algorithm=options.algo,
-            settings=settings if updates is None else settings | {"updates": updates},
-            seconds=seconds,
-            output=options.output or run_folder(options.task),
-            figure=not options.no_figure,
-            **{
-                name: getattr(options, name) for name in ("realistic", "stop_at", "episodes", "budget", "seeds", "seed")
-            },
-            **{name: getattr(options, name) for name in ("resume", "overwrite", "keep_history", "live", "json", "log")},
-        )
+        settings = settings if updates is None else settings | {"updates": updates}
+        output = options.output or run_folder(options.task)
+        return cls(**vars(options) | {"settings": settings, "seconds": seconds, "output": output, "row": ""})
 
-    def swept(self, sweep: list[str]) -> list[Request]:
+    def swept(self) -> list[Request]:
         """Request for each combination of the values of --sweep, each with its own folder."""
-        rows = [parse_sweep(text) for text in sweep]
+        rows = [parse_sweep(text) for text in self.sweep]
         for name, _ in rows:
             if name in self.settings:
                 raise UserError(f"{name} is given by --set and by --sweep; give one of them")
@@ -89,9 +60,8 @@ class Request:
         for values in itertools.product(*(values for _, values in rows)):
             settings = dict(zip(names, values, strict=True))
             row = ",".join(f"{name}={x}".replace(" ", "").replace("/", "-") for name, x in settings.items())
-            requests.append(
-                dataclasses.replace(self, settings=self.settings | settings, output=self.output / row, row=row)
-            )
+            own = {"settings": self.settings | settings, "output": self.output / row, "row": row}
+            requests.append(Request(**vars(self) | own))
         return requests
 
     @property
@@ -136,7 +106,7 @@ class Request:
         from jaxdrones.training.recipe import Recipe
         from jaxdrones.training.run import Run
 
-        algorithm = default_algorithm(self.task) if self.algorithm is None else self.algorithm
+        algorithm = default_algorithm(self.task) if self.algo is None else self.algo
         recipe = Recipe.of(self.task, algorithm, self.realistic, **self.settings)
         for run in (*runs.values(), Run(self.output)):
             if run.files and not self.overwrite:
@@ -161,7 +131,7 @@ class Request:
         task, files = user_files.take_task(self.task, recipe.files)
         settings, vehicle = user_files.take_vehicle(self.settings, recipe.files)
         user_files.check_unchanged(folder, recipe.files, files | vehicle)
-        given = {"algo": self.algorithm, "realistic": self.realistic or None, "episodes": self.episodes}
+        given = {"algo": self.algo, "realistic": self.realistic or None, "episodes": self.episodes}
         wanted = {"task": task, **settings} | {name: x for name, x in given.items() if x is not None}
         if self.seed is not None and self.seeds == 1:
             had, wanted = had | {"seed": next(iter(runs))}, wanted | {"seed": self.seed}

@@ -11,7 +11,7 @@ from jaxdrones.arguments import choice, whole
 from jaxdrones.cli.common import check_options, check_writable, folder
 from jaxdrones.cli.options import add_output
 from jaxdrones.cli.policies import open_policy
-from jaxdrones.cli.report import as_json, described
+from jaxdrones.cli.report import described, print_results
 from jaxdrones.errors import UserError
 from jaxdrones.flights.files import find_log
 from jaxdrones.visualization import video
@@ -98,10 +98,8 @@ def _write(options: argparse.Namespace, page: Page, output: Path, about: dict[st
         files.append(options.video)
     if options.open:
         webbrowser.open(files[0].absolute().as_uri())
-    if options.json:
-        print(as_json(about | {"files": [*map(str, files)]}))
-    else:
-        print("wrote " + ", ".join(f"{file} ({file.stat().st_size / 1e6:.1f} MB)" for file in files))
+    wrote = ", ".join(f"{file} ({file.stat().st_size / 1e6:.1f} MB)" for file in files)
+    print_results(options, about | {"files": [*map(str, files)]}, f"wrote {wrote}")
     return 0
 
 

@@ -26,7 +26,7 @@ _SIGN = (-1, 1)
 _LENGTH = (1e-4, 100)  # m
 _PLACE = (-100, 100)  # m
 _TIME_CONSTANT = (0.0025, 10)  # s; an explicit step of 1/240 s is unstable below 2.1 ms
-_PROPERTIES = {  # attribute: (length, meaning and unit, range)
+PROPERTIES = {  # attribute: (length, meaning and unit, range)
     "kf": (1, "thrust coefficient, N/RPM^2", (1e-20, 1)),
     "km": (1, "torque coefficient, N m/RPM^2", (1e-20, 1)),
     "thrust2weight": (1, "highest thrust over weight", (0, 100)),
@@ -86,7 +86,7 @@ def parse_params(name: str, text: str) -> Params:
 
 def _params(urdf: "_Urdf") -> Params:
     inertial, cylinder = f"{_BASE}/inertial", f"{_BASE}/collision/geometry/cylinder"
-    properties = {name: urdf.property(name) for name in _PROPERTIES}
+    properties = {name: urdf.property(name) for name in PROPERTIES}
     mass = urdf.number(f"{inertial}/mass", "value", "mass, kg", _MASS)
     kf, thrust2weight = properties["kf"], properties["thrust2weight"]
     values = {name: value for name, value in properties.items() if name not in _OTHER_WORDS} | dict(
@@ -221,7 +221,7 @@ class _Urdf:
                 )
 
     def property(self, name: str) -> float | np.ndarray:
-        length, meaning, within = _PROPERTIES[name]
+        length, meaning, within = PROPERTIES[name]
         values = self.numbers("properties", name, length, meaning, within, _DEFAULTS.get(name))
         return values[0] if length == 1 else values
 

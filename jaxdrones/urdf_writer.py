@@ -7,25 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxdrones.params import Params
-from jaxdrones.urdf import GRAVITY
-
-_PROPERTIES = (
-    "kf",
-    "km",
-    "rotor_spin",
-    "rotor_rise_time",
-    "rotor_fall_time",
-    "rotor_inertia",
-    "drag_coeff",
-    "flapping_coeff",
-    "flapping_climb",
-    "rate_damping",
-    "trim_torque",
-    "ground_effect_coeff",
-    "downwash_coeff",
-    "inflow_loss",
-    "prop_radius",
-)
+from jaxdrones.urdf import GRAVITY, PROPERTIES
 
 _INVALID = re.compile(r"[^\t\n\r\x20-\uD7FF\uE000-\uFFFD\U00010000-\U0010FFFF]")  # characters in XML
 
@@ -42,8 +24,8 @@ def to_urdf(params: Params, name: str, comment: str = "") -> str:
     """
     comment, name = re.sub("-(?=-)", "- ", _INVALID.sub("", comment)), _INVALID.sub("", name)
     thrust2weight = 4 * params.kf * params.max_rpm**2 / (params.mass * GRAVITY)
-    properties = {field: getattr(params, field) for field in _PROPERTIES}
-    properties |= {"thrust2weight": thrust2weight, "max_speed_kmh": params.max_speed * 3.6}
+    derived = {"thrust2weight": thrust2weight, "max_speed_kmh": params.max_speed * 3.6}
+    properties = {field: derived[field] if field in derived else getattr(params, field) for field in PROPERTIES}
     attributes = "\n".join(f'    {field}="{_numbers(value)}"' for field, value in properties.items())
     ixx, iyy, izz = (_numbers(x) for x in np.asarray(params.inertia))
     shape = f'<geometry><cylinder radius="{_numbers(params.collision_radius)}" '

@@ -143,6 +143,8 @@ def header(graph: Graph, program: Program, description: Description, name: str =
     `name` is the prefix of all names; `description`, the meaning of inputs and outputs, is the comment at the top.
     """
     upper = name.upper()
+    used = {call.function for call in program.calls}
+    used |= {"sigmoid"} if used & {"gates", "apply_silu"} else set()
     sizes = {f"{x.name.upper()}_SIZE": x.size for x in graph.inputs if x.name != "hidden_state"}
     sizes |= {"ACT_SIZE": graph.action.size} | ({"HIDDEN_SIZE": graph.hidden_size} if graph.hidden_size else {})
     constants = [
@@ -156,19 +158,12 @@ def header(graph: Graph, program: Program, description: Description, name: str =
         "\n".join(f"#include <{file}>" for file in includes),
         "\n".join(f"#define {upper}_{key} {size}" for key, size in sizes.items()),
         "\n\n".join(constants),
-        "\n\n".join(_FUNCTIONS[key].strip().replace("NAME", name) for key in _used(program)),
+        "\n\n".join(text.strip().replace("NAME", name) for key, text in _FUNCTIONS.items() if key in used),
         *([_reset(name)] if graph.hidden_size else []),
         _step(graph, program, name),
         f"#endif /* {upper}_H */",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _used(program: Program) -> list[str]:
-    """Names of the functions that are called, those that others call first."""
-    names = {call.function for call in program.calls}
-    names |= {"sigmoid"} if names & {"gates", "apply_silu"} else set()
-    return [name for name in _FUNCTIONS if name in names]
 
 
 def _usage(graph: Graph, name: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -99,21 +100,17 @@ def _calls(layer: Layer, inputs: Sequence[Span], output: Span) -> list[Call]:
             function = "sum_of_rows"
             arguments = *shape, layer.inputs[1].shape[1], *inputs, FADE, 1 / layer.reach, SMALL_SQUARE, output
         case layers.Concatenate():
-            return _copies(layer, inputs, output)
+            ends = itertools.accumulate((x.shape[-1] for x in layer.inputs), initial=0)
+            pieces = zip(layer.inputs, inputs, ends, strict=False)
+            width = layer.output.shape[-1]
+            return [
+                Call("copy", (x.size // x.shape[-1], x.shape[-1], width, span, output + at)) for x, span, at in pieces
+            ]
         case layers.Flatten() | layers.Slice():
             return []
         case _:
             raise AssertionError(layer)
     return [Call(function, arguments)]
-
-
-def _copies(layer: Layer, inputs: Sequence[Span], output: Span) -> list[Call]:
-    width = layer.output.shape[-1]
-    calls, offset = [], 0
-    for x, span in zip(layer.inputs, inputs, strict=True):
-        calls.append(Call("copy", (x.size // x.shape[-1], x.shape[-1], width, span, output + offset)))
-        offset += x.shape[-1]
-    return calls
 
 
 def _spans(graph: Graph) -> tuple[dict[Tensor, Span], int]:

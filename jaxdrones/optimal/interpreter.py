@@ -158,10 +158,6 @@ def _dot_general(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarra
     return [_reduced(REDUCTIONS["reduce_sum"], products, [3]).reshape(batch + left_free + right_free)]
 
 
-def _select_n(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    return [_elementwise(select, inputs)]
-
-
 def _cond(equation: Equation, inputs: list[np.ndarray]) -> list[np.ndarray]:
     branches = [compiler.opened(branch) for branch in equation.params["branches"]]
     results = [evaluate(program, consts, inputs[1:]) for program, consts in branches]
@@ -198,7 +194,7 @@ _WHOLE: dict[str, Callable[[Equation, list[np.ndarray]], list[np.ndarray]]] = {
     "cumprod": _accumulated(operator.mul),
     "cumsum": _accumulated(operator.add),
     "dot_general": _dot_general,
-    "select_n": _select_n,
+    "select_n": lambda equation, inputs: [_elementwise(select, inputs)],
     "cond": _cond,
     "scan": _scan,
 }

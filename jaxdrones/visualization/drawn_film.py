@@ -31,7 +31,9 @@ def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Ge
     """Frames (height, width, 3) uint8 of a film by the JAX renderer."""
     shot = shoot(record, fps, size[0] / size[1])
     camera = Camera(resolution=size, field_of_view=FIELD_OF_VIEW)
-    params = _enlarged(record.params, shot.scale)
+    names = {field.name for field in dataclasses.fields(record.params)}.intersection(_SCALED)
+    larger = {name: shot.scale * jnp.asarray(getattr(record.params, name)) for name in names}
+    params = record.params.replace(**larger)
     tints = np.stack([as_rgb(color) for color in colors(len(record.labels))]) / 255
     draw = jax.jit(functools.partial(_draw, camera=camera))
     overlay = Overlay(record, title, shot.scale)
@@ -40,12 +42,6 @@ def frames(record: FlightLog, title: str, fps: int, size: tuple[int, int]) -> Ge
         picture, depth = draw(shot.scene, params, state, shot.eyes[k], shot.targets[k], tints)
         lens = Lens(shot.eyes[k], shot.targets[k], FIELD_OF_VIEW, size)
         yield overlay.draw(np.asarray(picture), np.asarray(depth), lens, int(row), k / fps)
-
-
-def _enlarged(params: Params, scale: float) -> Params:
-    """Parameters of enlarged drones."""
-    names = {field.name for field in dataclasses.fields(params)}
-    return params.replace(**{name: scale * jnp.asarray(getattr(params, name)) for name in _SCALED if name in names})
 
 
 def _draw(scene, params: Params, state: State, eye: Array, target: Array, tints: Array, camera: Camera):

@@ -92,8 +92,9 @@ class Overlay:
 
     def _trail(self, brush: Any, path: np.ndarray, color: tuple, depth: np.ndarray, lens: Lens) -> None:
         pixels, _ = lens.project(path)
-        visible = _visible(path, depth, lens)
-        for begin, end in _runs(visible):
+        visible = _visible(path, depth, lens).astype(int)
+        runs = np.flatnonzero(np.diff(np.concatenate([[0], visible, [0]]))).reshape(-1, 2)  # start and stop of each
+        for begin, end in runs:
             if end - begin > 1:
                 brush.line((2 * pixels[begin:end]).ravel().tolist(), fill=color, width=5, joint="curve")
 
@@ -129,12 +130,6 @@ def _visible(points: np.ndarray, depth: np.ndarray, lens: Lens) -> np.ndarray:
         inside = np.logical_and(pixels >= 0, pixels < (width, height)).all(axis=-1)
     column, line = np.where(np.reshape(inside, (-1, 1)), pixels, 0).astype(int).T
     return inside & (away < _BEHIND * depth[line, column])
-
-
-def _runs(flags: np.ndarray) -> np.ndarray:
-    """(r, 2) start and stop index of every run of true flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    return edges.reshape(-1, 2)
 
 
 def _text(brush: Any, at: tuple[float, float], text: str, size: float, anchor: str) -> tuple[float, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -61,7 +60,11 @@ def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
     """
     finite, rows = _finite_rows(record), rows_of_frames(record, fps)
     reach = float(np.max(np.linalg.norm(record.params.rotor_pos, axis=-1).max(-1) + record.params.prop_radius))
-    directions = _directions()
+    directions = [  # from the team to the camera, in order of preference
+        np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+        for up in _ELEVATIONS
+        for around in _AZIMUTHS
+    ]
     everything = np.concatenate([record.pos[finite], record.target_pos[finite]], axis=1).reshape(-1, 3).astype(float)
     everything = everything[np.isfinite(everything).all(axis=1)]
     everything = everything[:: max(1, len(everything) // _POINTS)]
@@ -79,7 +82,9 @@ def shoot(record: FlightLog, fps: int, aspect: float) -> Shot:
     eyes = np.stack([middle + _distance(points, reach, d, aspect)[:, None] * d for d in directions])
     hidden = _hidden(scene, eyes[:, some], seen)  # (obstacles, directions, sight lines)
     best = int(np.argmin(hidden.any(axis=0).mean(axis=-1).round(1)))
-    scene = _without(scene, hidden[:, best].mean(axis=-1) > _BLOCKING)
+    blocking = hidden[:, best].mean(axis=-1) > _BLOCKING
+    kept = [solid for i, solid in scene.numbered.items() if not blocking[i]]
+    scene = Scene.of(*kept, ground=scene.ground)
     smallest = reach / (np.linalg.norm(eyes[best] - middle, axis=1).max() * _slope())
     scale = next((scale for scale in _SCALES if scale * smallest > _SMALL), _SCALES[-1])
     return Shot(rows, eyes[best], middle, scene, scale)
@@ -119,15 +124,6 @@ def _slope() -> float:
     return float(np.tan(np.deg2rad(FIELD_OF_VIEW) / 2))
 
 
-def _directions() -> list[np.ndarray]:
-    """Unit vectors from the team to the camera, in order of preference."""
-    return [
-        np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
-        for up in _ELEVATIONS
-        for around in _AZIMUTHS
-    ]
-
-
 def _calm(low: np.ndarray, high: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
     """Smoothed bounding boxes: means of boxes that contain all within `half` frames."""
 
@@ -160,8 +156,3 @@ def _hidden(scene: Scene, eyes: np.ndarray, seen: np.ndarray) -> np.ndarray:
     found = [jax.jit(jax.vmap(lines, (None, None, 0)))(begins, ends, kind) for kind in scene.shapes(ends.dtype)]
     none = np.zeros((0, len(ends)), bool)
     return np.concatenate([none, *found]).reshape(-1, len(eyes), seen.shape[0] * seen.shape[1])
-
-
-def _without(scene: Scene, left_out: Sequence[bool] | np.ndarray) -> Scene:
-    kept = [solid for i, solid in scene.numbered.items() if not left_out[i]]
-    return Scene.of(*kept, ground=scene.ground)

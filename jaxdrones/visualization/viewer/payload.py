@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from jaxdrones.flights.log import FlightLog
-from jaxdrones.params import Params
 from jaxdrones.sensing.serialization import scene_to_dict
 from jaxdrones.visualization.palette import COLORS, as_rgb
 from jaxdrones.visualization.shots import only_shapes
@@ -82,7 +81,9 @@ def encode(
     worlds = []
     for record, name in zip(records, names, strict=True):
         world: dict[str, Any] = {"name": name, "labels": list(record.labels)} | _rows(arrays, record)
-        world["vehicle"] = [_index(vehicles, vehicle) for vehicle in _vehicles(record.params)]
+        constants = {name: np.asarray(getattr(record.params, name), float).tolist() for name in _CONSTANTS}
+        drones = [{name: values[i] for name, values in constants.items()} for i in range(len(record.labels))]
+        world["vehicle"] = [_index(vehicles, drone) for drone in drones]
         world["images"] = [
             {"name": kind, "t": arrays.add(images.t), "frames": arrays.add_bytes(_pixels(kind, images.frames))}
             | ({"farthest": _farthest(images.frames)} if kind == "depth" else {})
@@ -164,9 +165,3 @@ def _index(known: list[dict[str, Any]], entry: dict[str, Any]) -> int:
     if entry not in known:
         known.append(entry)
     return known.index(entry)
-
-
-def _vehicles(params: Params) -> list[dict[str, Any]]:
-    """Geometry of each drone of a team for the page."""
-    constants = {name: np.asarray(getattr(params, name), float).tolist() for name in _CONSTANTS}
-    return [{name: values[i] for name, values in constants.items()} for i in range(len(constants["mass"]))]

@@ -9,24 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdrones.arguments import choice
 from jaxdrones.engine.step import HostStep
 from jaxdrones.envs import Env
-from jaxdrones.errors import UserError
 from jaxdrones.sensing import Camera, photograph
 from jaxdrones.tasks.task import World
 
 MODES = ["rgb_array"]
+RenderMode = Annotated[str | None, choice("render_mode", MODES)]
 _CAMERA = Camera(resolution=(640, 480), field_of_view=60.0)
 _DIRECTION = np.array([-1.2, 0.9, 0.6])  # from the middle of the team to the camera, with the sun behind it
 _AT_A_TIME = 8  # pictures of worlds at a time, to fit in a cache
-
-
-def _check_mode(name: str, mode: str) -> None:
-    if mode not in MODES:
-        raise UserError(f"{name} is {mode!r}; take 'rgb_array' or leave it out")
-
-
-RenderMode = Annotated[str | None, _check_mode]
 
 
 def of_world(env: Env, world: World) -> np.ndarray:

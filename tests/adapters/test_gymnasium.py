@@ -134,7 +134,7 @@ def test_mistakes_are_named(env_of):
         gymnasium.make_vec("jaxdrones/Hover-v0", num_envs=2, colour="red")
     with pytest.raises(ValueError, match="num_envs is 0"):
         VectorEnv("hover", 0)
-    with pytest.raises(ValueError, match="render_mode is 'human'"):
+    with pytest.raises(ValueError, match="unknown render_mode 'human'"):
         GymnasiumEnv("hover", render_mode="human")
     with pytest.raises(TypeError, match="unexpected keyword argument 'backend' beside an environment"):
         GymnasiumEnv(short(env_of), backend="explicit")

@@ -62,7 +62,7 @@ def test_rendering_needs_its_mode(recwarn):
     envs = VectorEnv("hover", 2)
     envs.reset(seed=0)
     assert envs.render() is None and "render_mode" in str(recwarn.pop().message)
-    with pytest.raises(ValueError, match="render_mode is 'human'"):
+    with pytest.raises(ValueError, match="unknown render_mode 'human'"):
         VectorEnv("hover", 2, render_mode="human")
 
 

@@ -22,8 +22,3 @@ def jit(function: Callable, env: Env, config: Config | None = None, **arguments:
     has_epochs = config is not None and not isinstance(config, GradientConfig)
     options = training_options(large_arrays=has_epochs or env.vision is not None)
     return jax.jit(function, compiler_options=options, **arguments)
-
-
-def is_tracing() -> bool:
-    """Whether the caller runs inside a function that JAX is tracing to compile it."""
-    return isinstance(jax.numpy.zeros(()) + 0, jax.core.Tracer)

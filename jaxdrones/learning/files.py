@@ -58,7 +58,7 @@ def load_bytes(file: Path, sidecar: dict[str, Any]) -> bytes:
 def read_sidecar(path: str | os.PathLike) -> dict[str, Any]:
     """Content of the sidecar of a checkpoint."""
     path = Path(path)
-    file = _sidecar_file(path)
+    file = path.with_name(path.name + ".json")
     content = _read(file)
     if content is None:
         raise FileNotFoundError(f"no checkpoint at {path}: {file} does not exist")
@@ -112,10 +112,6 @@ def _finish(file: Path) -> None:
         valid = False
     if valid:
         writing.rename(file)
-
-
-def _sidecar_file(path: Path) -> Path:
-    return path.with_name(path.name + ".json")
 
 
 def _plain(x):

@@ -126,11 +126,13 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
         """
         check_config(config, kind)
         callbacks = (callback,) if callable(callback) else tuple(callback)
-        if compilation.is_tracing() or not all(map(is_concrete, (key, *vars(config).values()))):
+        if not all(map(is_concrete, (jnp.zeros(()) + 0, key, *vars(config).values()))):  # the first: inside jax.jit
             if callbacks:
                 raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
             state = init(key, env, config, network) if state is None else state
-            return _scan_updates(update, env, config, state)
+            length = config.updates - (int(state.step) if is_concrete(state.step) else 0)
+            state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=length)
+            return Result(state.policy, state, history)
         start, program = _programs(init, update, env, config)
         if state is None:
             state = start(key) if network is None else init(key, env, config, network)
@@ -183,12 +185,6 @@ def _programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple[
 def _cached_programs(init: Callable, update: Callable, env: Env, config: Any) -> tuple:
     start = compilation.jit(lambda key: init(key, env, config), env)
     return start, compilation.jit(functools.partial(advance, update, env, config), env, config)
-
-
-def _scan_updates(update: Callable, env: Env, config: Any, state: Any) -> Result:
-    length = config.updates - (int(state.step) if is_concrete(state.step) else 0)
-    state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=length)
-    return Result(state.policy, state, history)
 
 
 def check_gradients(

@@ -144,8 +144,8 @@ def draw_curves(request: Request, runs: dict, folder: Path) -> list[Path]:
 
 def show_results(request: Request, runs: dict) -> int:
     """Draw learning curves, choose the best seed, and print the results."""
+    from jaxdrones.training.plan import best_of, score_of
     from jaxdrones.training.run import Run
-    from jaxdrones.training.selection import best_of, score_of
 
     output = request.output
     reports = {seed: run.report() for seed, run in runs.items()}

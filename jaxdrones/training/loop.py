@@ -19,10 +19,19 @@ from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.result import MAX_CALL, PATIENCE, SMALLER, Callback, Diverged, check_gradients
 from jaxdrones.limits import LARGEST_COUNT
 from jaxdrones.training import distributed
-from jaxdrones.training.plan import EVALUATIONS, IN_A_ROW, STOPPING_EVALUATIONS, TimePlan, next_evaluation
-from jaxdrones.training.progress import Progress
-from jaxdrones.training.run import Run, report_as_dict
-from jaxdrones.training.selection import REPORT_STREAM, SELECTION_STREAM, Score, best_of, score_of
+from jaxdrones.training.plan import (
+    EVALUATIONS,
+    IN_A_ROW,
+    REPORT_STREAM,
+    SELECTION_STREAM,
+    STOPPING_EVALUATIONS,
+    Score,
+    TimePlan,
+    best_of,
+    next_evaluation,
+    score_of,
+)
+from jaxdrones.training.run import Progress, Run, report_as_dict
 from jaxdrones.training.trainer import Trainer
 
 _CALL_SECONDS = 0.3  # target duration of a call of the compiled program, which delays Ctrl-C

@@ -1,10 +1,11 @@
-"""Schedule of evaluations and end of a training: by updates, success rate or time."""
+"""Schedule of evaluations, end of a training by updates, success rate or time, and choice of its best policy."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 
 from jaxdrones.errors import UserError
 from jaxdrones.learning.evaluation import wilson_interval
@@ -17,6 +18,15 @@ STOPPING_EVALUATIONS = 30
 IN_A_ROW = 3
 """Number of consecutive evaluations with this rate to stop at."""
 _EVALUATION_SHARE = 0.25  # largest fraction of a time budget for evaluations, except for the first and the last two
+
+SELECTION_STREAM, REPORT_STREAM = 2**31, 2**31 + 1
+"""Numbers to fold into the key of a seed, for the episodes of the selection and of the final report.
+They are distinct from the streams 0, 1, 2, ... of a split."""
+
+_STANDARD_ERRORS = 1.0  # half width of the intervals, in standard errors, for a statistical tie of two success rates
+
+Score = tuple[float, float]
+"""Success rate and mean return of an evaluation."""
 
 
 def check_stop_at(stop_at: float | None, has_success: bool, episodes: int) -> None:
@@ -81,3 +91,30 @@ class TimePlan:
     def next_evaluation(self, updates: int, made: int) -> int:
         """Next update with an evaluation, of `updates` in total."""
         return max(made + 1, self.evaluated + math.ceil((updates - self.evaluated) / self.evaluations))
+
+
+def score_of(success: float | None, mean_return: float) -> Score:
+    """Score of an evaluation; missing success is 0, a return that is NaN is the worst."""
+    return success or 0.0, mean_return if math.isfinite(mean_return) else -math.inf
+
+
+def best_of(scores: Sequence[Score], episodes: int, highest_success: float = 0.0) -> int:
+    """Index of the policy to keep.
+
+    It is the first one with the highest return among policies whose success rate is statistically tied for first. Two
+    success rates are tied if their Wilson intervals of one standard error overlap: for 1,000 episodes, a difference of
+    1 is a tie, and a difference of 5 is not.
+
+    Args:
+        scores: scores of all policies to choose from.
+        episodes: number of episodes of each evaluation.
+        highest_success: highest success rate of earlier evaluations, with as many episodes. It keeps small losses from
+            accumulating over selections.
+    """
+
+    def interval(success: float) -> tuple[float, float]:
+        return wilson_interval(round(success * episodes), episodes, _STANDARD_ERRORS)
+
+    least = max(interval(success)[0] for success in (highest_success, *(success for success, _ in scores)))
+    near = [i for i, (success, _) in enumerate(scores) if interval(success)[1] >= least]
+    return max(near or range(len(scores)), key=lambda i: scores[i][1])

@@ -187,7 +187,9 @@ def preset(
         options = _PRACTICE_OPTIONS.get(task, {}) | options
     env = make(task, realistic=realistic, **options)
     if isinstance(task, str):
-        config = dataclasses.replace(config, **_settings(task, algorithm, realistic))
+        tables = [_CONFIGS, *[_REALISTIC_CONFIGS] * bool(realistic), *[_ANY_VEHICLE_CONFIGS] * (realistic == "any")]
+        for table in tables:
+            config = dataclasses.replace(config, **table.get((task, algorithm), {}))
     lagging = env.physics.physics.rotors is not instant_rotors
     if lagging and getattr(config, "gradient", None) == "surrogate":  # without the lag; nothing would be learned
         config = dataclasses.replace(config, gradient="exact")
@@ -204,9 +206,3 @@ def settings_known(task: str, algorithm: str, any_vehicle: bool = False) -> bool
     if any_vehicle:
         return (task, algorithm) in _ANY_VEHICLE_CONFIGS
     return (task, algorithm) in _CONFIGS or algorithm in _BY_DEFAULT.get(task, ())
-
-
-def _settings(task: str, algorithm: str, realistic: bool | str) -> dict[str, Any]:
-    known = _CONFIGS.get((task, algorithm), {})
-    known = known | (_REALISTIC_CONFIGS.get((task, algorithm), {}) if realistic else {})
-    return known | (_ANY_VEHICLE_CONFIGS.get((task, algorithm), {}) if realistic == "any" else {})

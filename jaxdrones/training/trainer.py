@@ -35,7 +35,11 @@ class Trainer:
         self.shapes = jax.eval_shape(self._init, jax.random.key(0))
         check_episodes(self.env, episodes)
         check_stop_at(recipe.stop_at, self.env.task.success is not None, episodes)
-        self._check_memory()
+        actions = recipe.config.worlds * self.env.drones * self.env.action_size * jnp.zeros(()).dtype.itemsize
+        step = actions + size_of((self.shapes.worlds.obs, self.shapes.worlds.hidden_state))
+        size = (size_of(self.shapes) + recipe.config.horizon * step) // jax.process_count()
+        what = f"{recipe.config.worlds} worlds x {recipe.config.horizon} control steps x {self.env.drones} drones"
+        check_memory(f"a training of {what}", size, "give fewer worlds, a shorter horizon or smaller networks")
         start = time.perf_counter()
         self._traced = self._trace_updates()
         self.metrics = sorted(self._traced.out_info[1])
@@ -75,14 +79,6 @@ class Trainer:
         updates = compilation.jit(self._updates, self.practice_env, self.recipe.config, **shardings)
         with jax.set_mesh(self.mesh):
             return updates.trace(self.shapes, count, count)
-
-    def _check_memory(self) -> None:
-        config, env = self.recipe.config, self.env
-        actions = config.worlds * env.drones * env.action_size * jnp.zeros(()).dtype.itemsize
-        step = actions + size_of((self.shapes.worlds.obs, self.shapes.worlds.hidden_state))
-        size = size_of(self.shapes) + config.horizon * step
-        what = f"a training of {config.worlds} worlds x {config.horizon} control steps x {env.drones} drones"
-        check_memory(what, size // jax.process_count(), "give fewer worlds, a shorter horizon or smaller networks")
 
     def _init(self, key: jax.Array):
         return self.learner.init(key, self.practice_env, self.recipe.config)

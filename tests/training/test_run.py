@@ -15,9 +15,8 @@ import pytest
 from jaxdrones import writing
 from jaxdrones.envs import make
 from jaxdrones.learning.networks import Policy
-from jaxdrones.training.progress import Progress
 from jaxdrones.training.recipe import Recipe
-from jaxdrones.training.run import Run
+from jaxdrones.training.run import Progress, Run
 
 
 def test_lines_after_the_update_that_training_goes_on_from_are_dropped(tmp_path):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxdrones.training.selection import best_of, score_of
+from jaxdrones.training.plan import best_of, score_of
 
 
 @pytest.mark.parametrize(

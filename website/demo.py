@@ -26,7 +26,7 @@ from jaxdrones.training.episode import fly_episode
 from jaxdrones.training.run import Run
 from jaxdrones.visualization.viewer.gallery import Exhibit
 from jaxdrones.visualization.viewer.payload import encode
-from jaxdrones.visualization.viewer.show import looks, records_of
+from jaxdrones.visualization.viewer.show import records_of
 
 sys.path.append(str(Path(__file__).parent.parent / "examples"))
 import word
@@ -109,8 +109,8 @@ def _reality() -> Exhibit:
         f"{100 * apart['tracking_real_m']:.0f} cm from its set-points, which its PID trails."
     )
     worlds = [dataclasses.replace(log, t=log.t - log.t[0]) for log in map(_thinned, (real, simulated))]
-    shown = looks(worlds) | {"signals": ["position x", "distance from target"], "error": True}
-    payload = encode(worlds, ["real", "simulated"], _REAL, layout="ghosts", play=True, **shown)
+    signals = ["position x", "distance from target"]
+    payload = encode(worlds, ["real", "simulated"], _REAL, layout="ghosts", play=True, signals=signals, error=True)
     return Exhibit(_REAL, about, f"jaxdrones score {_RECORDED} --vehicle cf21", payload)
 
 
@@ -124,7 +124,7 @@ def _word() -> Exhibit:
         "The policy of crowd, which eight drones learned, flies a thousand to the points of a word. In this flight "
         f"{safe:.1f} % touched nobody, and {reached:.1f} % were at their points in the end."
     )
-    payload = encode([record], [_WORD], _WORD, layout="alone", play=True, **looks([record]))
+    payload = encode([record], [_WORD], _WORD, layout="alone", play=True)
     return Exhibit(_WORD, about, "python examples/word.py --policy assets/policies/crowd", payload)
 
 
@@ -137,7 +137,7 @@ def _exhibit(task: str, options: dict[str, Any]) -> Exhibit:
         about = f"{env.task.summary[0].upper()}{env.task.summary[1:]}. {_success(task)}"
     (record,) = records_of(episode, dict.fromkeys(("params", "dt", "targets", "labels", "images")))
     record = _thinned(record)
-    payload = encode([record], [task], task, layout="alone", play=True, **looks([record]))
+    payload = encode([record], [task], task, layout="alone", play=True)
     team = "".join(f" --{name} {value}" for name, value in options.items())
     return Exhibit(task, about, f"jaxdrones fly --policy {task}{team} --live", payload)
 

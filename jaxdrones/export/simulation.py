@@ -29,7 +29,6 @@ from jaxdrones.rotation import rotate_inverse
 from jaxdrones.state import State
 from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.payload import encode
-from jaxdrones.visualization.viewer.show import looks
 from jaxdrones.wrench import Wrench
 
 _CONTROLLERS = {"cf2": ("pid", "geometric", "mellinger"), "": ("geometric",)}
@@ -125,7 +124,7 @@ def page(policy: Policy, env: Env, title: str, drones: int = 1) -> Page:
     record = FlightLog(np.zeros(1), goals, quat, vel, omega, rpm, target_pos=goals, params=params, labels=labels)
     live = {"running": True, "rows": _ROWS, "end": _SPAN}
     about = dataclasses.asdict(made) | {"span": _SPAN}
-    return Page(title, encode([record], [title], title, layout="alone", live=live, simulation=about, **looks([record])))
+    return Page(title, encode([record], [title], title, layout="alone", live=live, simulation=about))
 
 
 def _grid(drones: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxdrones.visualization.viewer.page import Page
 from jaxdrones.visualization.viewer.payload import encode
-from jaxdrones.visualization.viewer.show import LAYOUTS, check_size, looks, records_of
+from jaxdrones.visualization.viewer.show import LAYOUTS, records_of
 
 
 def show_history(evaluated: Sequence[Any], best: int, label: str, title: str) -> Page:
@@ -24,10 +24,9 @@ def show_history(evaluated: Sequence[Any], best: int, label: str, title: str) ->
         ValueError: too much data for a browser.
     """
     records = [record for policy in evaluated for record in records_of(policy.flight, {})]
-    check_size(*(record.pos for record in records))
     values = [f"{100 * x.value:.1f} %" if label == "success" else f"{x.value:.4g}" for x in evaluated]
     names = [f"update {x.update}: {label} {value}" for x, value in zip(evaluated, values, strict=True)]
     points = [[x.update, x.value if math.isfinite(x.value) else None] for x in evaluated]
     history = {"label": label, "points": points, "best": best}
-    payload = encode(records, names, title, layout=LAYOUTS["hidden"], play=True, history=history, **looks(records))
+    payload = encode(records, names, title, layout=LAYOUTS["hidden"], play=True, history=history)
     return Page(title, payload)

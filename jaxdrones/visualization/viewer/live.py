@@ -14,9 +14,9 @@ import numpy as np
 from jaxdrones.arguments import checked, whole
 from jaxdrones.errors import UserError
 from jaxdrones.flights.log import OPTIONAL, STATE, FlightLog
-from jaxdrones.visualization.viewer.payload import encode, encode_rows
+from jaxdrones.visualization.viewer.payload import check_size, encode, encode_rows
 from jaxdrones.visualization.viewer.server import Server
-from jaxdrones.visualization.viewer.show import LAYOUTS, check_size, looks, records_of
+from jaxdrones.visualization.viewer.show import LAYOUTS, records_of
 
 _RELOADING = 2.0  # s, wait for a viewer that left
 _ALIVE = 0.5  # s between keep-alive messages, to detect closed viewers
@@ -129,7 +129,7 @@ class Live:
         title = str(record.conditions) if self._title is None else self._title
         with self._changed:
             self._parts = [record]
-            self._header = {"title": title, "live": live, "layout": LAYOUTS["hidden"], **looks([record])}
+            self._header = {"title": title, "live": live, "layout": LAYOUTS["hidden"]}
             self._flight += 1
             self._changed.notify_all()
 

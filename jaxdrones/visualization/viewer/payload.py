@@ -15,14 +15,17 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from jaxdrones.errors import UserError
 from jaxdrones.flights.log import FlightLog
 from jaxdrones.sensing.serialization import scene_to_dict
-from jaxdrones.visualization.palette import COLORS, as_rgb
+from jaxdrones.visualization.palette import COLORS, DISTINCT, as_rgb, colors
 from jaxdrones.visualization.shots import only_shapes
 
 _LARGEST_ERROR = {"pos": 5e-5, "targets": 5e-5}  # m, of rounding to int16
 _FARTHEST = 10.0  # m: depth of the darkest pixel, if any is as far
+_MOST = 2_000_000  # states of drones in a page, 60 MB
 _LEVELS = 65535  # steps of an int16 beside the first
 _CONSTANTS = ("rotor_pos", "prop_radius", "rotor_spin", "kf", "mass", "inertia", "gravity")  # of the page
 
@@ -64,7 +67,7 @@ class _Arrays:
 
 
 def encode(
-    records: Sequence[FlightLog], names: Sequence[str], title: str, arrows: np.ndarray | None = None, **looks: Any
+    records: Sequence[FlightLog], names: Sequence[str], title: str, arrows: np.ndarray | None = None, **others: Any
 ) -> str:
     """Encode the payload of a page.
 
@@ -73,8 +76,13 @@ def encode(
         names: of the worlds.
         title: of the page.
         arrows: (K, n, 3) vectors along the paths of the first world.
-        looks: further entries of the header.
+        others: further entries of the header, or in place of the colors of drones (`palette`) and of the names of the
+            first plots (`signals`).
+
+    Raises:
+        ValueError: too much data for a browser.
     """
+    check_size(*(record.pos for record in records))
     arrays = _Arrays()
     vehicles: list[dict[str, Any]] = []
     scenes: list[dict[str, Any]] = []
@@ -93,7 +101,10 @@ def encode(
         worlds.append(world)
     if arrows is not None:
         worlds[0]["arrows"] = arrays.add(arrows)
-    return _packed({"title": title, "worlds": worlds, "vehicles": vehicles, "scenes": scenes} | looks, arrays)
+    has_targets = any(np.isfinite(record.target_pos).any() for record in records)
+    signals = ["distance from target" if has_targets else "position z", "rotor speeds"]  # names in plots.js
+    header = {"title": title, "worlds": worlds, "vehicles": vehicles, "scenes": scenes, "palette": colors(DISTINCT)}
+    return _packed(header | {"signals": signals} | others, arrays)
 
 
 def encode_rows(record: FlightLog) -> str:
@@ -150,8 +161,8 @@ def _pixels(kind: str, frames: np.ndarray) -> np.ndarray:
         grey = 1 - np.clip(np.nan_to_num(frames, nan=np.inf), 0, farthest) / farthest
         return np.round(255 * grey).astype(np.uint8)[..., None]
     if kind == "segmentation":
-        colors = np.array([as_rgb(color) for color in COLORS], np.uint8)
-        return np.where(frames[..., None] < 0, np.uint8(255), colors[frames % len(colors)])
+        painted = np.array([as_rgb(color) for color in COLORS], np.uint8)
+        return np.where(frames[..., None] < 0, np.uint8(255), painted[frames % len(painted)])
     return np.asarray(frames, np.uint8)
 
 
@@ -165,3 +176,13 @@ def _index(known: list[dict[str, Any]], entry: dict[str, Any]) -> int:
     if entry not in known:
         known.append(entry)
     return known.index(entry)
+
+
+def check_size(*positions: ArrayLike) -> None:
+    """Raise if arrays of positions (..., 3) are too large for a page."""
+    samples = sum(math.prod(np.shape(pos)[:-1]) for pos in positions)
+    if samples > _MOST:
+        raise UserError(
+            f"the flights have {samples:,} states of drones, more than a page plays ({_MOST:,}); give "
+            "fewer worlds, or every tenth row: jax.tree.map(lambda x: x[::10], trajectory)"
+        )

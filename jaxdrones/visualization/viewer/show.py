@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
@@ -22,15 +21,13 @@ from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
 from jaxdrones.sensing.scene import check_scene
 from jaxdrones.state import State
-from jaxdrones.visualization.palette import DISTINCT, colors
 from jaxdrones.visualization.viewer.page import Page
-from jaxdrones.visualization.viewer.payload import encode
+from jaxdrones.visualization.viewer.payload import check_size, encode
 
 LAYOUTS = {"ghosts": "ghosts", "side by side": "grid", "hidden": "alone"}
 """Initial layouts of other worlds -> names in the page."""
 CHANNELS = {"rgb": True, "depth": False, "segmentation": False}
 """Kinds of images -> whether a pixel has channels."""
-_MOST = 2_000_000  # states of drones in a page, 60 MB
 
 
 @checked
@@ -78,7 +75,6 @@ def show(
     if scene is not None:
         check_scene(scene, files=True)
         records = [dataclasses.replace(record, scene=scene) for record in records]
-    check_size(*(record.pos for record in records))
     if arrows is not None and (len(records) > 1 or np.shape(arrows) != records[0].pos.shape):
         raise UserError(
             f"arrows have shape {np.shape(arrows)} beside {len(records)} worlds, the first of shape "
@@ -86,15 +82,8 @@ def show(
         )
     arrows = None if arrows is None else np.nan_to_num(np.asarray(arrows, float))
     title = str(records[0].conditions) if title is None else title
-    payload = encode(records, list(worlds), title, arrows, layout=LAYOUTS[others], **looks(records))
+    payload = encode(records, list(worlds), title, arrows, layout=LAYOUTS[others])
     return Page(title, payload, height)
-
-
-def looks(records: Sequence[FlightLog]) -> dict[str, Any]:
-    """Colors of drones, and initially plotted signals, for the page."""
-    has_targets = any(np.isfinite(record.target_pos).any() for record in records)
-    signals = ["distance from target" if has_targets else "position z", "rotor speeds"]  # names in plots.js
-    return {"palette": colors(DISTINCT), "signals": signals}
 
 
 def _worlds(flight: Any, of_trajectory: dict[str, Any]) -> dict[str, FlightLog]:
@@ -223,13 +212,3 @@ def _images(images: Mapping[str, ArrayLike], t: np.ndarray, n: int) -> dict[str,
             axes = "(K, n, height, width" + (", channels)" if CHANNELS[name] else ")")
             raise UserError(f"images {name!r} have shape {shape}; give {axes} of {len(t)} times and {n} drones")
     return {name: ImageSequence(t, np.asarray(frames)) for name, frames in images.items()}
-
-
-def check_size(*positions: ArrayLike) -> None:
-    """Raise if arrays of positions (..., 3) are too large for a page."""
-    samples = sum(math.prod(np.shape(pos)[:-1]) for pos in positions)
-    if samples > _MOST:
-        raise UserError(
-            f"the flights have {samples:,} states of drones, more than a page plays ({_MOST:,}); give "
-            "fewer worlds, or every tenth row: jax.tree.map(lambda x: x[::10], trajectory)"
-        )

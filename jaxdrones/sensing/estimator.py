@@ -91,9 +91,8 @@ def state_estimate(
     Raises:
         ValueError: poses without noise, or with a rate or delay that is not a multiple of the IMU's period.
     """
-    check_number(f"pos_noise of {name}", system.pos_noise, "m", above=0)
-    if attitude:
-        check_number(f"angle_noise of {name}", system.angle_noise, "rad", above=0)
+    for noise, unit in ("pos_noise", "m"), *[("angle_noise", "rad")] * attitude:
+        check_number(f"{noise} of {name}", getattr(system, noise), unit, above=0)
     every = _whole(name, "rate", rate / system.rate, f"{system.rate:g} Hz", rate, at_least=1)
     late = _whole(name, "delay", system.delay * rate, f"{system.delay:g} s", rate, at_least=0)
     dt = 1 / rate

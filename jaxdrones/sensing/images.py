@@ -101,9 +101,9 @@ def view(
     all drones look alike. Other arguments and errors are those of `render`.
     """
     _check(scene, params, state, camera)
+    for name, point in ("eye", eye), ("target", target):
+        check_shape(name, point, (3,), "m, world")
     eye, target = (jnp.asarray(x, state.pos.dtype) for x in (eye, target))
-    check_shape("eye", eye, (3,), "m, world")
-    check_shape("target", target, (3,), "m, world")
     forward = unit(target - eye)
     left = unit(cross(along_z(jnp.ones_like(eye[0])), forward))
     rays = _view(camera, eye, jnp.stack([forward, left, cross(forward, left)]), _PHOTO_NEAR)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import re
 from typing import Annotated
 
 from jaxdrones import arguments, control, optimal
@@ -25,7 +26,6 @@ _MAX_HZ = 20_000  # above it a step of 1 mm/s is below the rounding of a float32
 _MAX_DURATION = 1e5  # s; beyond, the resolution of float32 times is coarser than control steps at 120 Hz
 _LOG_BYTES = 400  # per drone and control step: trajectory, log, figure
 _PAIR_BYTES = 32  # per pair of drones, while the effects between them are summed
-_VARIANTS = ("_2021", "_world_axes")  # suffixes of the names of other models of the same effect
 
 
 @checked
@@ -75,7 +75,13 @@ class Conditions:
         object.__setattr__(self, "vehicle", str(self.vehicle))
         if self.duration > _MAX_DURATION:
             raise UserError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
-        _check_once(self.effects)
+        seen: dict[str, str] = {}
+        for effect in self.effects:
+            kind = re.sub("(_2021|_world_axes)$", "", effect)  # other models of the same effect
+            if kind in seen:
+                both = "twice" if seen[kind] == effect else f"beside {seen[kind]!r}, another model of the same effect"
+                raise UserError(f"effect {effect!r} is given {both}; give one of them, once")
+            seen[kind] = effect
         if flight.labels and self.drones != len(flight.labels):
             who = ", ".join(flight.labels)
             raise UserError(f"drones is {self.drones}; the {self.flight} flight takes {flight.drones}: {who}")
@@ -132,15 +138,3 @@ class Conditions:
             f"{integrator} at {self.physics_hz} Hz, {self.rotors} rotors, "
             f"effects: {', '.join(self.effects) or 'none'}, {self.steps * self.dt:g} s"
         )
-
-
-def _check_once(effects: tuple[str, ...]) -> None:
-    seen: dict[str, str] = {}
-    for effect in effects:
-        kind = effect
-        for suffix in _VARIANTS:
-            kind = kind.removesuffix(suffix)
-        if kind in seen:
-            both = "twice" if seen[kind] == effect else f"beside {seen[kind]!r}, another model of the same effect"
-            raise UserError(f"effect {effect!r} is given {both}; give one of them, once")
-        seen[kind] = effect

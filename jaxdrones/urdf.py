@@ -196,18 +196,23 @@ class _Urdf:
                     f"{self.name}: has a joint {joint.get('name')!r}; only quadrotors fly, rotor0 to rotor3"
                 )
         for rotor in _ROTORS:
-            path = f"joint[@name='{rotor}']"
-            parent = self._tag(f"{path}/parent")
+            parent = self._tag(f"joint[@name='{rotor}']/parent")
             if parent is not None and parent.get("link") != "base_link":
                 raise UserError(
                     f"{self.name}: {rotor} hangs on {parent.get('link')!r}; give its place relative to base_link"
                 )
-            self._check_zero(f"{path}/origin", "rpy", slice(2), "rotors push along body z; give no roll and pitch")
         origin, collision = f"{_BASE}/inertial/origin", f"{_BASE}/collision/origin"
-        self._check_zero(origin, "xyz", slice(3), "put the origin of base_link at the centre of mass")
-        self._check_zero(origin, "rpy", slice(3), "turn the body axes into principal axes")
-        self._check_zero(collision, "xyz", slice(2), "centre the cylinder on body z")
-        self._check_zero(collision, "rpy", slice(2), "the cylinder must be along body z; give no roll and pitch")
+        upright = "rotors push along body z; give no roll and pitch"
+        for path, attribute, count, remedy in (
+            *((f"joint[@name='{rotor}']/origin", "rpy", 2, upright) for rotor in _ROTORS),
+            (origin, "xyz", 3, "put the origin of base_link at the centre of mass"),
+            (origin, "rpy", 3, "turn the body axes into principal axes"),
+            (collision, "xyz", 2, "centre the cylinder on body z"),
+            (collision, "rpy", 2, "the cylinder must be along body z; give no roll and pitch"),
+        ):
+            values = self.numbers(path, attribute, 3, "origin, m or rad", default="0 0 0")
+            if np.any(values[:count] != 0):
+                raise UserError(f"{self.name}: <{path}> {attribute} is {short_repr(values)}; {remedy}")
         for product in ("ixy", "ixz", "iyz"):
             path = f"{_BASE}/inertial/inertia"
             if self.number(path, product, "product of inertia, kg m^2", default="0") != 0:
@@ -253,11 +258,6 @@ class _Urdf:
         if not np.all((values >= low) & (values <= high)):
             raise UserError(f"{where} should be {low:g} to {high:g}")
         return values
-
-    def _check_zero(self, path: str, attribute: str, entries: slice, remedy: str) -> None:
-        values = self.numbers(path, attribute, 3, "origin, m or rad", default="0 0 0")
-        if np.any(values[entries] != 0):
-            raise UserError(f"{self.name}: <{path}> {attribute} is {short_repr(values)}; {remedy}")
 
     def _tag(self, path: str) -> ET.Element | None:
         tag = self._root

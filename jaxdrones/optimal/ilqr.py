@@ -31,14 +31,9 @@ _MIN_REGULARIZATION, _MAX_REGULARIZATION = 1e-6, 1e6
 _LESS, _MORE = 0.2, 10.0  # factors of the regularization after an iteration with and without an improvement
 
 
-class Settings(PyTreeNode):
-    """Model, weights, horizon and iterations of the planner."""
+class Settings(lqr.Settings, kw_only=True):
+    """Model, weights, horizon (H, planned control steps) and iterations of the planner."""
 
-    weights: Weights
-    step: Any = flax.struct.field(pytree_node=False)
-    """Step of a team, `(params, state, rpm) -> state`, over one control period."""
-    horizon: int = flax.struct.field(pytree_node=False)
-    """H, planned control steps."""
     iterations: int = flax.struct.field(pytree_node=False)
     """Iterations per call of `control`."""
 
@@ -79,12 +74,12 @@ def settings(step: Any, weights: Weights | None = None, horizon: int = 25, itera
     The terminal cost after `horizon` control steps is that of the regulator of `lqr`. The `iterations` of a call of
     `control` start from the previous plan.
     """
-    return Settings(default_weights() if weights is None else weights, step, horizon, iterations)
+    return Settings(default_weights() if weights is None else weights, step, horizon, iterations=iterations)
 
 
 def init(settings: Settings, params: Params, state: State) -> Memory:
     """Memory of one drone before its first call."""
-    regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
+    regulator = lqr.init(settings, params, state)
     always = jnp.ones((), bool)
     correction = jnp.zeros((settings.horizon, 4), regulator.gain.dtype)
     return Memory(correction, regulator, jnp.zeros((), bool), hover(params, state).rpm, status_of(always, always))

@@ -30,7 +30,7 @@ class Settings(PyTreeNode):
     step: Any = flax.struct.field(pytree_node=False)
     """Step of a team, `(params, state, rpm) -> state`, over one control period."""
     horizon: int = flax.struct.field(pytree_node=False, default=2)
-    """Future setpoints of `control`: two, for the angular acceleration of the target."""
+    """H, future setpoints of `control`; here two, for the angular acceleration of the target."""
 
 
 class Memory(PyTreeNode):

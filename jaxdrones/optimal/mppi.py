@@ -29,18 +29,13 @@ from jaxdrones.state import State
 from jaxdrones.status import Status, is_finite, raise_unless_ok, status_of
 
 
-class Settings(PyTreeNode):
-    """Model, weights, horizon and sampling of the planner."""
+class Settings(lqr.Settings, kw_only=True):
+    """Model, weights, horizon (H, planned control steps) and sampling of the planner."""
 
-    weights: Weights
     noise: Array
     """(4,) standard deviation of sampled commands in collective, roll, pitch and yaw, over the hover speed."""
     temperature: Array
     """() in standard deviations of the samples' costs."""
-    step: Any = flax.struct.field(pytree_node=False)
-    """Step of a team, `(params, state, rpm) -> state`, over one control period."""
-    horizon: int = flax.struct.field(pytree_node=False)
-    """H, planned control steps."""
     samples: int = flax.struct.field(pytree_node=False)
     """Samples per call of `control`."""
     hold: int = flax.struct.field(pytree_node=False)
@@ -76,21 +71,20 @@ def settings(
     deviations of the costs of the samples; a lower value favors the best sample. `hold` control steps lie between
     samples of the noise: noise at every step hardly moves a drone.
     """
-    noise = jnp.array([0.05, 0.02, 0.02, 0.02])
     return Settings(
         default_weights() if weights is None else weights,
-        noise,
-        jnp.asarray(temperature, float),
         step,
         horizon,
-        samples,
-        hold,
+        noise=jnp.array([0.05, 0.02, 0.02, 0.02]),
+        temperature=jnp.asarray(temperature, float),
+        samples=samples,
+        hold=hold,
     )
 
 
 def init(settings: Settings, params: Params, state: State, key: Array) -> Memory:
     """Memory of one drone with such models before its first call; every drone has its own random key."""
-    regulator = lqr.init(lqr.Settings(settings.weights, settings.step), params, state)
+    regulator = lqr.init(settings, params, state)
     always = jnp.ones((), bool)
     correction = jnp.zeros((settings.horizon, 4), regulator.gain.dtype)
     return Memory(key, correction, regulator, hover(params, state).rpm, status_of(always, always))

@@ -147,7 +147,8 @@ class Scene(PyTreeNode, kw_only=True):
         check_scene(self)
         if not self.has_obstacles:
             raise UserError("the scene has no obstacles that could be touched; check scene.has_obstacles first")
-        return touched_of(*merged(self.shapes(points.dtype)), points, within)
+        (obstacles,) = merged(self.shapes(points.dtype))
+        return touched_of(obstacles, points, within)
 
     def contains(self, point: ArrayLike) -> Bool[Array, ""]:
         """Whether a point (3,) (m, world) is inside an obstacle or underground."""

@@ -95,8 +95,10 @@ def check_sensors(sensors: Sequence[Sensor], dt: float | None = None) -> tuple[S
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise UserError(f"two sensors have the name {twice[0]!r}; give every sensor a name of its own")
+    if dt is None:
+        return sensors
     for sensor in sensors:
-        steps = 1 / (sensor.rate * dt) if sensor.clocked and sensor.rate and dt is not None else 1.0
+        steps = 1 / (sensor.rate * dt) if sensor.clocked and sensor.rate else 1.0
         if round(steps) < 1 or abs(steps - round(steps)) > _ROUNDING * steps:
             raise UserError(
                 f"sensor {sensor.name!r} measures at {sensor.rate:g} Hz, which does not divide the {1 / dt:g} Hz of "

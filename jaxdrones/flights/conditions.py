@@ -75,7 +75,7 @@ class Conditions:
         object.__setattr__(self, "vehicle", str(self.vehicle))
         if self.duration > _MAX_DURATION:
             raise UserError(f"duration is {self.duration} s; give at most {_MAX_DURATION:g} s")
-        seen: dict[str, str] = {}
+        seen = {}
         for effect in self.effects:
             kind = re.sub("(_2021|_world_axes)$", "", effect)  # other models of the same effect
             if kind in seen:

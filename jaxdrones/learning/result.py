@@ -130,7 +130,7 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
             if callbacks:
                 raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
             state = init(key, env, config, network) if state is None else state
-            length = config.updates - (int(state.step) if is_concrete(state.step) else 0)
+            length: Any = config.updates - (int(state.step) if is_concrete(state.step) else 0)
             state, history = jax.lax.scan(lambda state, _: update(env, config, state), state, length=length)
             return Result(state.policy, state, history)
         start, program = _programs(init, update, env, config)

@@ -84,7 +84,9 @@ def _frames(renderer: str, record: FlightLog, title: str, fps: int, size: tuple[
         shot = shoot(record, fps, size[0] / size[1])
         return film.frames(show(record, scene=shot.scene, title=title), fps, size, shot)
     if renderer == "jax":
-        from jaxdrones.visualization import drawn_film as drawn  # needs Pillow
-    else:
-        from jaxdrones.visualization import replay as drawn  # needs pybullet
-    return drawn.frames(record, title, fps, size)
+        from jaxdrones.visualization import drawn_film  # needs Pillow
+
+        return drawn_film.frames(record, title, fps, size)
+    from jaxdrones.visualization import replay  # needs pybullet
+
+    return replay.frames(record, title, fps, size)

@@ -19,7 +19,7 @@ from jaxdrones.firmware.betaflight.build import build
 from jaxdrones.firmware.betaflight.joystick import AXES, Joystick
 from jaxdrones.firmware.betaflight.link import connect_msp
 from jaxdrones.firmware.betaflight.pilots import Pilot
-from jaxdrones.firmware.recorder import Recorder
+from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
 
 _MAX_HZ = 8000

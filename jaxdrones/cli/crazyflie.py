@@ -9,7 +9,7 @@ from jaxdrones.cli.options import add_output, add_vehicle
 from jaxdrones.cli.report import listed, print_results
 from jaxdrones.firmware.crazyflie import Crazyflie, Server, Vehicle
 from jaxdrones.firmware.crazyflie.server import PORT
-from jaxdrones.firmware.recorder import Recorder
+from jaxdrones.firmware.drone import Recorder
 from jaxdrones.flights.files import save_npz
 
 _MAX_PORT = 65535

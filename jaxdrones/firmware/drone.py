@@ -1,7 +1,8 @@
-"""Drone whose motors a firmware commands: its physics, measurements and clock."""
+"""Drone whose motors a firmware commands: its physics, measurements, clock and records."""
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 from typing import Any
 
@@ -14,9 +15,11 @@ from jaxdrones.dynamics.rigid_body import specific_force
 from jaxdrones.dynamics.rotors import lagging_rotors
 from jaxdrones.engine.explicit import make_step
 from jaxdrones.engine.step import Step
-from jaxdrones.params import Params
+from jaxdrones.flights.log import FlightLog, LoggedConditions
+from jaxdrones.params import Params, repeat
 from jaxdrones.state import State
 
+_MOST_ROWS = 360_000  # an hour at 100 rows per second
 LATE = 0.1  # s, lag behind the clock after which the schedule restarts
 
 
@@ -76,3 +79,37 @@ def measured(step: Step, team: Params, state: State, rpm: jax.Array) -> tuple[An
     """Numbers of a `Sample` of a team of one under commanded rotor speeds (1, 4), RPM."""
     params, one, rate = jax.tree.map(lambda x: x[0], (team, state, step.rate(team, state, rpm)))
     return one.pos, one.quat, one.vel, one.omega, one.rpm, specific_force(params, one, rate.vel)
+
+
+class Recorder:
+    """Rows of a flight of one drone; of a long flight the last 360,000."""
+
+    def __init__(self) -> None:
+        self._rows: collections.deque[tuple[Any, ...]] = collections.deque(maxlen=_MOST_ROWS)
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self._rows)
+
+    def add(self, t: float, now: Sample, target: Any = None) -> None:
+        """Add a row: time (s), sample of the drone and target position (3,) (m, world), if it has one."""
+        unknown = np.full(3, np.nan)
+        arrays = (now.pos, now.quat, now.vel, now.omega, now.rpm, unknown if target is None else target)
+        self._rows.append((t, *(np.array(x, np.float32) for x in arrays)))
+
+    def log(self, params: Params, conditions: dict[str, Any], about: str) -> FlightLog:
+        """Log of the flight; the conditions, with `vehicle`, are for JSON, and `about` is the title."""
+        t, *arrays = map(np.array, zip(*self._rows, strict=True))
+        pos, quat, vel, omega, rpm, target = (x[:, None] for x in arrays)
+        known = np.isfinite(target).all()  # a log has targets in all rows or in none
+        return FlightLog(
+            t=t.astype(float),
+            pos=pos,
+            quat=quat,
+            vel=vel,
+            omega=omega,
+            rpm=rpm,
+            target_pos=target if known else np.asarray(np.nan),
+            conditions=LoggedConditions(conditions, about),
+            params=repeat(params, 1),
+        )

@@ -10,8 +10,7 @@ import pytest
 from jaxdrones import rotation
 from jaxdrones.errors import UserError
 from jaxdrones.firmware.betaflight import BetaflightLost, Flight, Flip, Hover, Link, Process, Simulation, find_program
-from jaxdrones.firmware.drone import Sample
-from jaxdrones.firmware.recorder import Recorder
+from jaxdrones.firmware.drone import Recorder, Sample
 
 try:
     PROGRAM = find_program()

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -46,10 +45,6 @@ class Flown(Pace):
     """Number of times that Betaflight was silent for 0.5 s, or 3 s in lockstep."""
 
 
-def _nothing(*_: Any) -> None:
-    pass
-
-
 class Flight:
     """Loop: physics, state to Betaflight, sticks of the pilot, motors from Betaflight."""
 
@@ -62,8 +57,8 @@ class Flight:
         process: Process | None = None,
         lockstep: bool = True,
         wait: float = 30.0,
-        on_row: Callable[[float, Sample, Sticks], None] = _nothing,
-        warn: Callable[[str], None] = _nothing,
+        on_row: Callable[[float, Sample, Sticks], None] = lambda t, sample, sticks: None,
+        warn: Callable[[str], None] = lambda text: None,
     ):
         """Prepare a flight.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
 from typing import Any
@@ -67,10 +68,8 @@ class Link:
         return found
 
     def _send(self, packet: bytes, port: int) -> None:
-        try:
+        with contextlib.suppress(OSError):  # nobody listens
             self._sender.sendto(packet, (HOST, port))
-        except OSError:  # nobody listens
-            pass
 
 
 def connect_msp() -> socket.socket | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -36,10 +38,7 @@ def encode(command: int, data: bytes = b"", direction: bytes = _TO) -> bytes:
 
 
 def _checksum(body: bytes) -> int:
-    total = 0
-    for byte in body:
-        total ^= byte
-    return total
+    return functools.reduce(operator.xor, body)
 
 
 class Decoder:

@@ -89,6 +89,7 @@ def compile_evaluation(
     `policy` is one of them, or its shapes. The devices of this host share the episodes, if they can share them equally;
     by default all of them.
     """
+    check_episodes(env, episodes)
     split = functools.partial(jax.random.split, num=episodes)
     keys = jax.eval_shape(split, jax.random.key(0))
     leaves, structure = jax.tree.flatten(policy)

@@ -16,7 +16,7 @@ import jax
 
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
-from jaxdrones.learning.evaluation import Report, check_episodes, compile_evaluation
+from jaxdrones.learning.evaluation import Report, compile_evaluation
 from jaxdrones.learning.networks import Policy
 
 
@@ -88,7 +88,6 @@ class KeepBest:
 
     def __init__(self, env: Env, key: jax.Array, every: int = 20, episodes: int = 200):
         """Evaluate in `env` after `every` updates, in the same `episodes` of a random key for all policies."""
-        check_episodes(env, episodes)
         self._env, self._key, self._every, self._episodes = env, key, every, episodes
         self._evaluate: Any = None
 

@@ -13,7 +13,7 @@ from jaxdrones.accelerate.worlds import over_worlds
 from jaxdrones.cli import machine
 from jaxdrones.cli import throughput as programs
 from jaxdrones.cli.common import check_options
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import print_results
 from jaxdrones.cli.throughput import seconds
 from jaxdrones.dynamics.aero import drag
 from jaxdrones.engine.explicit import make_step
@@ -77,12 +77,8 @@ def _bench(options: argparse.Namespace) -> int:
     about = {"processor": machine.processor(), "cores": machine.cores(), "devices": machine.devices()}
     result = {"rates": rows, "left_out": left_out, **about, "versions": machine.versions()}
     result |= {"dtype": str(jax.numpy.zeros(()).dtype), "seconds": time.perf_counter() - begin}
-    if options.json:
-        print(as_json(result | {"line": _line(result)}))
-    else:
-        if left_out:
-            print(f"left out, as it would take longer: {left_out} of {left_out + len(rows)}; give more --seconds")
-        print(_line(result))
+    missing = f"left out, as it would take longer: {left_out} of {left_out + len(rows)}; give more --seconds"
+    print_results(options, result | {"line": _line(result)}, *[missing] * bool(left_out), _line(result))
     return 0
 
 

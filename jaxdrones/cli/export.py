@@ -1,13 +1,12 @@
 """`jaxdrones export`."""
 
 import argparse
-from typing import Any
 
 from jaxdrones.arguments import choice
 from jaxdrones.cli.common import check_options, run_folder
 from jaxdrones.cli.options import add_drones, add_output
 from jaxdrones.cli.policies import add_policy, is_user_policy, open_policy, output_folder, policy_of
-from jaxdrones.cli.report import as_json
+from jaxdrones.cli.report import print_results
 from jaxdrones.cli.settings import asked_settings
 
 TARGETS = ("c", "onnx", "stablehlo", "js")
@@ -40,15 +39,13 @@ def _export(options: argparse.Namespace) -> int:
     place = run_folder(options.task, "/export") if own else output_folder(options.policy, "export")
     with recipe.env() as env:
         exported = save(make_policy(env), env, options.to, options.output or place, options.name, title)
-    if options.json:
-        about: dict[str, Any] = {"policy": str(options.policy), "to": options.to}
-        files = [vars(x) | {"files": [*map(str, x.files)]} for x in exported]
-        print(as_json(about | {"title": title, "exported": files}))
-        return 0
-    print(title)
+    files = [vars(x) | {"files": [*map(str, x.files)]} for x in exported]
+    lines = [title]
     for one in exported:
-        print(f"  wrote {', '.join(map(str, one.files))}")
+        lines.append(f"  wrote {', '.join(map(str, one.files))}")
         costs = {"multiply-adds": one.multiply_adds, "bytes of weights (flash)": one.flash, "bytes of RAM": one.ram}
         if shown := [f"{x:,} {what}" for what, x in costs.items() if x is not None]:
-            print(f"    one call: {', '.join(shown)}")
+            lines.append(f"    one call: {', '.join(shown)}")
+    results = {"policy": str(options.policy), "to": options.to, "title": title, "exported": files}
+    print_results(options, results, *lines)
     return 0

@@ -36,14 +36,14 @@ def save_comparison(records: Mapping[str, FlightLog], path: Path, title: str, af
     with style.figure(13, 7.2) as figure:
         axes = figure.subplot_mosaic([["path", "error"], ["path", "apart" if apart else "error"]])
         _draw_paths(axes["path"], flights, tints)
-        _draw_errors(axes["error"], flights, tints, start)
+        _draw_errors(axes["error"], records, tints, start)
         if apart:
             _draw_distance(axes["apart"], flights[0], flights[1], start)
             axes["error"].tick_params(labelbottom=False)
             figure.align_ylabels([axes["error"], axes["apart"]])
         axes["apart" if apart else "error"].set_xlabel("t (s)" if start == 0 else f"t (s), from {start:g} s on")
         figure.suptitle(title + "\n")
-        handles = _handles(records, tints)
+        handles = axes["error"].get_legend_handles_labels()[0] + _handles(flights)
         figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)))
         style.save(figure, path)
 
@@ -78,17 +78,17 @@ def _once(lines: np.ndarray) -> list[np.ndarray]:
     return shown
 
 
-def _draw_errors(axis: Any, flights: list[FlightLog], tints: tuple[str, ...], start: float) -> None:
+def _draw_errors(axis: Any, records: Mapping[str, FlightLog], tints: tuple[str, ...], start: float) -> None:
     """Draw mean and range over the drones of the distance to the target position, or of the difference in velocity."""
     ends = []
-    for record, tint, width in zip(flights, tints, style.widths(len(flights)), strict=True):
+    for (name, record), tint, width in zip(records.items(), tints, style.widths(len(records)), strict=True):
         difference, unit = record.difference()
         with np.errstate(over="ignore", invalid="ignore"):
             error = np.linalg.norm(difference.astype(float), axis=-1)[record.t >= start]
         t = record.t[record.t >= start]
-        if len(flights) <= _MOST_BANDED:
+        if len(records) <= _MOST_BANDED:
             axis.fill_between(t, error.min(axis=1), error.max(axis=1), color=tint, alpha=0.2, linewidth=0)
-        axis.plot(t, error.mean(axis=1), color=tint, linewidth=width)
+        axis.plot(t, error.mean(axis=1), color=tint, linewidth=width, label=name)
         ends.append(style.limits(error, _SMALLEST))
     axis.set_ylim(max(min(low for low, _ in ends), -0.02 * ends[0][1]), max(high for _, high in ends))
     what = "distance to the target" if unit == "m" else "difference to the commanded velocity"
@@ -116,20 +116,15 @@ def _draw_distance(axis: Any, first: FlightLog, second: FlightLog, start: float)
     axis.set(title="distance between the two flights", ylabel="largest (m)")
 
 
-def _handles(records: Mapping[str, FlightLog], tints: tuple[str, ...]) -> list[Any]:
-    """Legend: flights, dashed lines, start and end, and the band."""
+def _handles(flights: list[FlightLog]) -> list[Any]:
+    """Legend beside the flights: dashed lines, start and end, and the band."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    widths = style.widths(len(records))
-    handles: list[Any] = [
-        Line2D([], [], color=tint, linewidth=width, label=name)
-        for name, tint, width in zip(records, tints, widths, strict=True)
-    ]
-    record = next(iter(records.values()))
-    if np.isfinite(record.target_pos).any():
+    handles: list[Any] = []
+    if np.isfinite(flights[0].target_pos).any():
         handles.append(Line2D([], [], label="commanded", **_COMMANDED))
     handles += [Line2D([], [], color="#555555", label=label, **look) for label, look in paths.ENDS.items()]
-    if len(records) <= _MOST_BANDED and len(record.labels) > 1:
+    if len(flights) <= _MOST_BANDED and len(flights[0].labels) > 1:
         handles.append(Patch(facecolor="#555555", alpha=0.2, label="range of the drones"))
     return handles

@@ -35,51 +35,48 @@ class Flight:
     change_params: Callable[[Params], Params] = lambda team: team
 
 
-def _circle() -> Flight:
-    curve = curves.circle()
+_CIRCLE, _HOP = curves.circle(), curves.hop()
 
-    def yaw(n):
-        return jnp.arange(n) * (jnp.pi / 2) / n
 
-    return Flight(
+def _headings(n: int) -> jax.Array:
+    return jnp.arange(n) * (jnp.pi / 2) / n
+
+
+def _start_of_velocity(n: int) -> State:
+    i = jnp.arange(n)
+    pos = jnp.stack([0.3 * i, jnp.zeros(n), jnp.full(n, 0.1)], axis=-1)
+    return State.at_rest(pos, jnp.asarray(_HEADINGS)[i % 4])
+
+
+def _velocity_action(n: int, t: jax.Array, duration: float) -> jax.Array:
+    i = jnp.arange(n) % 4
+    reverse = t >= duration * (1 / 8 + i / 6)
+    direction = jnp.asarray(_DIRECTIONS)[i] * jnp.where(reverse, -1, 1)[:, None]
+    return jnp.concatenate([direction, jnp.full((n, 1), 0.99)], axis=-1)
+
+
+FLIGHTS = {
+    "circle": Flight(
         summary="a circle at staggered heights, with a different heading for each drone (PID)",
-        start=lambda n: State.at_rest(curve.positions(n), yaw(n)),
-        target=lambda n, t, duration: Setpoint.at(curve.positions(n, t), yaw=yaw(n)),
+        start=lambda n: State.at_rest(_CIRCLE.positions(n), _headings(n)),
+        target=lambda n, t, duration: Setpoint.at(_CIRCLE.positions(n, t), yaw=_headings(n)),
         drones=4,
         duration=12.0,
         control_hz=120,
-    )
-
-
-def _velocity() -> Flight:
-    def start(n):
-        i = jnp.arange(n)
-        pos = jnp.stack([0.3 * i, jnp.zeros(n), jnp.full(n, 0.1)], axis=-1)
-        return State.at_rest(pos, jnp.asarray(_HEADINGS)[i % 4])
-
-    def action(n, t, duration):
-        i = jnp.arange(n) % 4
-        reverse = t >= duration * (1 / 8 + i / 6)
-        direction = jnp.asarray(_DIRECTIONS)[i] * jnp.where(reverse, -1, 1)[:, None]
-        return jnp.concatenate([direction, jnp.full((n, 1), 0.99)], axis=-1)
-
-    return Flight(
+    ),
+    "velocity": Flight(
         summary="steps of the velocity input, reversed one drone after the other",
-        start=start,
-        target=action,
+        start=_start_of_velocity,
+        target=_velocity_action,
         drones=4,
         duration=12.0,
         control_hz=120,
         settling_time=10.0,
-    )
-
-
-def _ground_effect() -> Flight:
-    curve = curves.hop()
-    return Flight(
+    ),
+    "ground-effect": Flight(
         summary="a take-off with and without ground effect (equation 5)",
-        start=lambda n: State.at_rest(curve.positions(n, -1.0).at[:, 2].set(0.014)),
-        target=lambda n, t, duration: Setpoint.at(curve.positions(n, t)),
+        start=lambda n: State.at_rest(_HOP.positions(n, -1.0).at[:, 2].set(0.014)),
+        target=lambda n, t, duration: Setpoint.at(_HOP.positions(n, t)),
         drones=2,
         duration=0.5,
         control_hz=240,
@@ -88,24 +85,17 @@ def _ground_effect() -> Flight:
         panels=("z", "vz", "rpm0"),
         labels=("with ground effect", "without"),
         change_params=lambda team: team.replace(ground_effect_coeff=team.ground_effect_coeff.at[1].set(0)),
-    )
-
-
-def _downwash() -> Flight:
-    def curve(n):
-        return curves.crossing(n)
-
-    return Flight(
+    ),
+    "downwash": Flight(
         summary="drones crossing above each other, with downwash (equation 6)",
-        start=lambda n: State.at_rest(curve(n).positions(n)),
-        target=lambda n, t, duration: Setpoint.at(curve(n).positions(n, t)),
+        start=lambda n: State.at_rest(curves.crossing(n).positions(n)),
+        target=lambda n, t, duration: Setpoint.at(curves.crossing(n).positions(n, t)),
         drones=2,
         duration=12.0,
         control_hz=120,
         effects=("downwash_2021",),
         settling_time=3.0,
         panels=("x", "vx", "z", "vz", "pitch", "omega_y", "rpm0", "rpm1"),
-    )
-
-
-FLIGHTS = {"circle": _circle(), "velocity": _velocity(), "ground-effect": _ground_effect(), "downwash": _downwash()}
+    ),
+}
+"""The examples by name."""

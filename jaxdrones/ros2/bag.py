@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -40,7 +41,7 @@ def deserialize(data: bytes, name: str) -> msg.Message:
     return msg.decode(name, msg.typestore().deserialize_cdr(data, name))
 
 
-class Recorder:
+class Recorder(contextlib.AbstractContextManager["Recorder"]):
     """Writer of messages to a new bag; a context manager that finishes it."""
 
     def __init__(self, path: Path):
@@ -57,9 +58,6 @@ class Recorder:
             self._writer.open()
         except OSError as error:
             raise UserError(f"{path} cannot be written: {error.strerror}; choose another") from None
-
-    def __enter__(self) -> Recorder:
-        return self
 
     def __exit__(self, *_) -> None:
         self.close()

@@ -12,6 +12,7 @@ trainings in one folder are rejected.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import itertools
@@ -192,7 +193,7 @@ class Run:
         return rows
 
 
-class Progress:
+class Progress(contextlib.AbstractContextManager["Progress"]):
     """Writer of progress.csv of a run, and of the same rows to loggers."""
 
     def __init__(self, run: Run, columns: Sequence[str], update: int, loggers: Sequence[Callable[..., Any]] = ()):
@@ -220,9 +221,6 @@ class Progress:
         writer = csv.DictWriter(file, self._columns)
         for row in rows:
             writer.writerow(row | {name: int(row[name]) for name in ("update", "steps") if name in row})
-
-    def __enter__(self) -> Progress:
-        return self
 
     def __exit__(self, *_) -> None:
         self._file.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ AXES = (0, 1, 2, 3)
 """Numbers of the axes for roll, pitch, throttle and yaw, as a transmitter of RC sends them."""
 
 
-class Joystick:
+class Joystick(contextlib.AbstractContextManager["Joystick"]):
     """Pilot who holds a joystick; its switches are not used."""
 
     def __init__(self, device: Path, axes: Sequence[int] = AXES):
@@ -38,9 +39,6 @@ class Joystick:
         self._axes = tuple(axes)
         self._at: dict[int, float] = {}
         self._rest = b""
-
-    def __enter__(self) -> Joystick:
-        return self
 
     def __exit__(self, *_: Any) -> None:
         os.close(self._file)

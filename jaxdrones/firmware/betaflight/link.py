@@ -15,7 +15,7 @@ from jaxdrones.firmware.betaflight.packets import MOTOR_PORT, MSP_PORT, RC_PORT,
 HOST = "127.0.0.1"
 
 
-class Link:
+class Link(contextlib.AbstractContextManager["Link"]):
     """Datagrams to and from Betaflight; its ports are fixed, so there is one flight on a computer at a time."""
 
     def __init__(self) -> None:
@@ -34,9 +34,6 @@ class Link:
                 f"port {MOTOR_PORT} of the motors cannot be opened: {error.strerror}; end the other simulator"
             ) from None
         self._motors.setblocking(False)
-
-    def __enter__(self) -> Link:
-        return self
 
     def __exit__(self, *_: Any) -> None:
         self.close()

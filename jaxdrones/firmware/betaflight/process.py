@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import tempfile
@@ -36,7 +37,7 @@ def find_program() -> Path:
     raise UserError(f"{what}; run `jaxdrones betaflight --build`, which downloads its source and needs gcc and make")
 
 
-class Process:
+class Process(contextlib.AbstractContextManager["Process"]):
     """Running program, in a folder of its own."""
 
     def __init__(self, program: Path):
@@ -45,9 +46,6 @@ class Process:
         self._program = program
         self._output = Path(self._folder.name) / "output.txt"
         self._process = self._start()
-
-    def __enter__(self) -> Process:
-        return self
 
     def __exit__(self, *_: Any) -> None:
         self._end()

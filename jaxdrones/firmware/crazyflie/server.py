@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import select
 import socket
@@ -31,7 +32,7 @@ class Flown(Pace):
     """Datagrams that are no packets."""
 
 
-class Server:
+class Server(contextlib.AbstractContextManager["Server"]):
     """Socket of a simulated Crazyflie, on the loopback address only."""
 
     def __init__(self, crazyflie: Crazyflie, port: int = PORT):
@@ -50,9 +51,6 @@ class Server:
         self._socket.setblocking(False)
         self.port: int = self._socket.getsockname()[1]
         self.flown = Flown()
-
-    def __enter__(self) -> Server:
-        return self
 
     def __exit__(self, *_: Any) -> None:
         self._socket.close()

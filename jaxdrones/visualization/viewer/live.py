@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import threading
@@ -24,7 +25,7 @@ _FLUSHING = 5.0  # s, time for viewers to receive the rest at the end
 _ROWS = ("t", *STATE, *OPTIONAL)  # growing arrays of a log
 
 
-class Live:
+class Live(contextlib.AbstractContextManager["Live"]):
     """Context with a server that shows flights live to any number of viewers.
 
     It is reachable only from this machine, by the secret in `url`. A late viewer sees the flight from its start.
@@ -117,9 +118,6 @@ class Live:
             self._changed.wait_for(lambda: not self._viewers, _FLUSHING)
         self._server.shutdown()
         self._server.server_close()
-
-    def __enter__(self) -> Live:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

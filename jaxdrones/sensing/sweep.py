@@ -60,17 +60,6 @@ class Disc(NamedTuple):
         return dot(normal, self.center) - extent
 
 
-class Approach(NamedTuple):
-    """Contact flag and separating plane of a moving disc and an obstacle."""
-
-    touches: Bool[Array, ""]
-    """Whether the disc touches the obstacle during the motion."""
-    normal: Point
-    """Unit normal of a separating plane before contact, away from the obstacle, world."""
-    height: Number
-    """Offset of the plane from the origin, m."""
-
-
 class Planes(NamedTuple):
     """Separating planes of a disc and the obstacles in its way."""
 
@@ -85,10 +74,9 @@ def planes(kinds: list[Any], start: Disc, end: Disc) -> Planes:
 
     def look(found: tuple[Planes, Point, Array], obstacle: Obstacle, _: Any) -> tuple[Planes, Point, Array]:
         known, center, count = found
-        approach = _approach(obstacle, start, end)
-        normal, height = approach.normal, approach.height
+        touches, normal, height = _approach(obstacle, start, end)
         lowest = end._replace(center=center).lowest(normal)
-        behind = jnp.where(approach.touches, jnp.maximum(height - lowest, 0), 0)
+        behind = jnp.where(touches, jnp.maximum(height - lowest, 0), 0)
         here = (jnp.arange(_PLANES) == count) & (behind > 0)
         after = Planes(jnp.where(here[:, None], normal[None], known.normals), jnp.where(here, height, known.heights))
         return after, center + behind * normal, count + (behind > 0)
@@ -104,7 +92,7 @@ def meets(kinds: list[Any], start: Disc, end: Disc) -> Bool[Array, ""]:
     """Whether a moving disc touches any obstacle; arguments are those of `planes`."""
 
     def look(touches: Array, obstacle: Obstacle, _: Any) -> Array:
-        return touches | _approach(obstacle, start, end).touches
+        return touches | _approach(obstacle, start, end)[0]
 
     found = jnp.zeros((), bool)
     for kind in kinds:
@@ -117,11 +105,12 @@ def _reach(start: Disc, end: Disc) -> tuple[Point, Number]:
     return (start.center + end.center) / 2, length(end.center - start.center) / 2 + end.ring + end.rounding
 
 
-def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> Approach:
-    """Approach to one obstacle, computed in its axes: first with the initial attitude, then with the final one.
+def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> tuple[Bool[Array, ""], Point, Number]:
+    """Whether the disc touches one obstacle, and a separating plane before: its normal, away from it, and its height.
 
-    The plane is the last one with the initial attitude, because the other side of a thin obstacle is nearer as soon as
-    the disc is more than half through.
+    They are computed in the obstacle's axes, first with the initial attitude, then with the final one. The plane is the
+    last one with the initial attitude, because the other side of a thin obstacle is nearer as soon as the disc is more
+    than half through.
     """
     start, end = _in_axes(obstacle, start), _in_axes(obstacle, end)
     way = end.center - start.center
@@ -149,7 +138,7 @@ def _approach(obstacle: Obstacle, start: Disc, end: Disc) -> Approach:
     share, _, normal, height = jax.lax.fori_loop(0, _ADVANCES, advance, begin)
     touches = (share < 1) | (nearest(end, obstacle.nearest(end.lowest_point(normal)))[2] < 0)
     normal = rotation.rotate(obstacle.quat, normal)
-    return Approach(touches, normal, height + dot(obstacle.pos, normal))
+    return touches, normal, height + dot(obstacle.pos, normal)
 
 
 def _in_axes(obstacle: Obstacle, disc: Disc) -> Disc:

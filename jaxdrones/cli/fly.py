@@ -13,14 +13,14 @@ from jaxdrones.cli.flight_options import add_conditions, check_conditions, fly_o
 from jaxdrones.cli.live import add_live, live_server
 from jaxdrones.cli.options import add_backend, add_no_figure, add_output, add_set
 from jaxdrones.cli.policies import is_user_policy, open_policy, output_folder, team_of_run
-from jaxdrones.cli.report import as_json, summary, table
+from jaxdrones.cli.report import as_json, described, summary, table
 from jaxdrones.cli.settings import add_realistic, parse_settings
 from jaxdrones.errors import UserError
 from jaxdrones.flights import results
 from jaxdrones.flights.conditions import BACKENDS
 from jaxdrones.flights.examples import FLIGHTS
 from jaxdrones.flights.files import check_pwm, save_csv, save_npz
-from jaxdrones.flights.log import FlightLog
+from jaxdrones.flights.log import FlightLog, LoggedConditions
 from jaxdrones.visualization import films, paths, plots
 
 _SETTLING_SHARE = 0.6  # share of an episode after which its results are taken
@@ -145,7 +145,7 @@ def _fly_example(options: argparse.Namespace) -> int:
 def _fly_policy(options: argparse.Namespace) -> int:
     import jax
 
-    from jaxdrones.training.episode import EpisodeConditions, fly_episode, to_record
+    from jaxdrones.training.episode import fly_episode, to_record
 
     check_options(options, backend=arguments.choice("backend", BACKENDS), seed=arguments.seed)
     run = open_policy(options.policy, options.task, options.realistic, _options_of_task(options))
@@ -163,17 +163,11 @@ def _fly_policy(options: argparse.Namespace) -> int:
         with live_server(options.live, options.json, title) as live:
             on_progress = report or (lambda fraction: None)
             episode = fly_episode(env, policy, jax.random.key(seed), on_progress, live.add if live else None)
-    conditions = EpisodeConditions(
-        str(options.policy),
-        recipe.task,
-        recipe.algorithm,
-        recipe.realistic,
-        options.backend,
-        seed,
-        vehicle,
-        recipe.options | team,
-    )
-    record = to_record(episode, conditions)
+    entries = {"run": str(options.policy), "task": recipe.task, "algorithm": recipe.algorithm}
+    entries |= {"realistic": recipe.realistic, "backend": options.backend, "seed": seed, "vehicle": vehicle}
+    backend = "Bullet" if options.backend == "bullet" else f"the {options.backend} backend"
+    about = f"{described(recipe, **team)}, policy of {options.policy}, on {backend}, seed {seed}"
+    record = to_record(episode, LoggedConditions(entries | {"options": recipe.options | team}, about))
     files = _write(record, options, output, title, plots.POLICY_PANELS)
     end = {
         "success": episode.success,

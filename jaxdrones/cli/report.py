@@ -80,9 +80,9 @@ def table(results: list[dict]) -> str:
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
 
 
-def described(recipe) -> str:
-    """Title of a recipe: task, learner and options, such as `hover by bptt`."""
-    options = "".join(f", {name} {x}" for name, x in recipe.options.items())
+def described(recipe, **more: Any) -> str:
+    """Title of a recipe: task, learner and options, with `more` of them, such as `hover by bptt`."""
+    options = "".join(f", {name} {x}" for name, x in (recipe.options | more).items())
     return f"{recipe.task} by {recipe.algorithm}{realism(recipe.realistic)}{options}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +19,6 @@ from jaxdrones.params import Params
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.sensing import Scene
 from jaxdrones.state import State
-from jaxdrones.training.presets import realism
 from jaxdrones.visualization.viewer.show import records_of, refuse
 
 Decide = Callable[[Any, Any], tuple[Any, jax.Array]]
@@ -53,35 +51,7 @@ class EpisodeLog(PyTreeNode):
     """Whether all drones met the task's criterion of success; `None` without one."""
 
 
-@dataclasses.dataclass(frozen=True)
-class EpisodeConditions:
-    """Conditions of an episode, for a `FlightLog`."""
-
-    run: str
-    task: str
-    algorithm: str
-    realistic: bool | str
-    backend: str
-    seed: int
-    vehicle: str
-    """Name of a bundled vehicle, path of a URDF, or `any vehicle`."""
-    options: dict[str, Any]
-    """Options of `jaxdrones.make`."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """The conditions for JSON."""
-        return dataclasses.asdict(self)
-
-    def __str__(self) -> str:
-        options = "".join(f", {name} {x}" for name, x in self.options.items())
-        backend = "Bullet" if self.backend == "bullet" else f"the {self.backend} backend"
-        return (
-            f"{self.task} by {self.algorithm}{realism(self.realistic)}{options}, "
-            f"policy of {self.run}, on {backend}, seed {self.seed}"
-        )
-
-
-def to_record(log: EpisodeLog, conditions: EpisodeConditions | LoggedConditions) -> FlightLog:
+def to_record(log: EpisodeLog, conditions: LoggedConditions) -> FlightLog:
     """Convert an episode to a `FlightLog`."""
     drones = jax.tree.map(np.asarray, log.drones)
     return FlightLog(

@@ -18,7 +18,7 @@ from jaxdrones.envs.randomize import scaled, sensor_noise, shifted
 from jaxdrones.learning import bptt, ppo, shac
 from jaxdrones.learning.networks import Policy
 from jaxdrones.sensing import Scene, Sensor, Sphere
-from jaxdrones.training import selection
+from jaxdrones.training import plan
 
 KEY = jax.random.key(3)
 EVERYTHING = dict(
@@ -199,6 +199,6 @@ def test_the_draws_of_a_learner_and_of_its_evaluations_have_keys_of_their_own(ke
         patched.setattr("jaxdrones.learning.result.Policy", type("Policy", (), {"init": staticmethod(init)}))
         state = learner.init(KEY, env, config)
     jax.jit(lambda state: learner.update(env, config, state))(state)
-    for purpose in (selection.SELECTION_STREAM, selection.REPORT_STREAM):
+    for purpose in (plan.SELECTION_STREAM, plan.REPORT_STREAM):
         jax.random.split(jax.random.fold_in(KEY, purpose))
     keys.check(least=10)

@@ -1,7 +1,5 @@
 """Conversion of states to messages and of messages to commands."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Flights of the policies that a training has kept, and its learning curve."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

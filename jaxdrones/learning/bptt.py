@@ -39,7 +39,12 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> resul
     return result.TrainState(jnp.zeros((), jnp.int32), key, policy, opt_state, worlds)
 
 
-def update(
+def update(env: Env, config: Config, state: result.TrainState) -> tuple[result.TrainState, dict[str, Array]]:
+    """Simulate a trajectory of all worlds and take one gradient step on its rewards."""
+    return gradient_step(env, config, state)
+
+
+def gradient_step(
     env: Env,
     config: Config,
     state: S,

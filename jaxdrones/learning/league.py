@@ -58,7 +58,7 @@ def init(key: jax.Array, env: Env, config: Config, network: Any = None) -> Train
 def update(env: Env, config: Config, state: TrainState) -> tuple[TrainState, dict[str, Array]]:
     """Take a gradient step on the rewards of the first drones, and possibly keep the policy."""
     act = functools.partial(against, state.past)
-    state, metrics = bptt.update(env, config, state, act=act, learning=slice(1))
+    state, metrics = bptt.gradient_step(env, config, state, act=act, learning=slice(1))
     taken = state.step % config.snapshot_interval == 0
     slot = jnp.arange(config.past_policies) == state.step // config.snapshot_interval % config.past_policies
 

@@ -87,7 +87,7 @@ def _approach(task: Task, world: World) -> Float[Array, " n"]:
     pos, vel = seen_from(world.drones.pos, index), seen_from(world.drones.vel, index)
     apart = jnp.sqrt(dot(pos, pos) + CORE**2)
     closing = jnp.maximum(-dot(pos, vel) / apart, 0)
-    gap = apart - 2 * world.params.collision_radius
+    gap = apart - 2 * world.params.collision_radius[None]
     speed = jnp.sqrt(dot(vel, vel) + _SLOW**2)
     inside = _MARGIN + _PASSING_TIME * speed + _MARGIN_TIME * closing - gap
     return vector.total((1 + closing) * _SOFTNESS * jax.nn.softplus(inside / _SOFTNESS))

@@ -14,8 +14,8 @@ def components(v: Float[Array, "n *shape"]) -> list[Float[Array, "*shape"]]:
     return [jnp.squeeze(x, 0) for x in jax.lax.split(v, [1] * len(v))]
 
 
-def total(v: Float[Array, " n"]) -> Float[Array, ""]:
-    """Sum of the components of a short vector."""
+def total(v: Float[Array, "n *shape"]) -> Float[Array, "*shape"]:
+    """Sum of the components of a short vector, or of the rows of a short matrix."""
     return cast(Array, sum(components(v)))
 
 

@@ -78,7 +78,7 @@ def _bench(options: argparse.Namespace) -> int:
     result = {"rates": rows, "left_out": left_out, **about, "versions": machine.versions()}
     result |= {"dtype": str(jax.numpy.zeros(()).dtype), "seconds": time.perf_counter() - begin}
     missing = f"left out, as it would take longer: {left_out} of {left_out + len(rows)}; give more --seconds"
-    print_results(options, result | {"line": _line(result)}, *[missing] * bool(left_out), _line(result))
+    print_results(options, result | {"line": _line(result)}, missing if left_out else None, _line(result))
     return 0
 
 

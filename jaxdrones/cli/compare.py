@@ -67,8 +67,8 @@ def _compare(options: argparse.Namespace) -> int:
         found = {"results": _results(records, settling_time)}
         headline = ", ".join(cases) + ", largest over the drones"
         text = f"{table(found['results'])}\n{results.definitions(next(iter(records.values())), settling_time)}"
-    wrote = ["wrote " + ", ".join(about["files"])] * bool(files)
-    print_results(options, about | found, f"{options.flight}: {headline}", text, *wrote)
+    wrote = "wrote " + ", ".join(about["files"]) if files else None
+    print_results(options, about | found, f"{options.flight}: {headline}", text, wrote)
     return warn(next(filter(None, diverged.values()), {}))
 
 

@@ -39,8 +39,8 @@ def as_json(results: dict[str, Any]) -> str:
 
 
 def print_results(options: argparse.Namespace, results: dict[str, Any], *lines: Any) -> None:
-    """Print results: one line of JSON with --json, else lines of text."""
-    print(as_json(results) if options.json else "\n".join(map(str, lines)))
+    """Print results: one line of JSON with --json, else lines of text that are not `None`."""
+    print(as_json(results) if options.json else "\n".join(str(line) for line in lines if line is not None))
 
 
 def listed(results: dict[str, Any]) -> str:

@@ -82,8 +82,8 @@ def _score(options: argparse.Namespace) -> int:
         "closed_loop": closed_loop["vehicle"],
         "closed_loop_nominal": closed_loop["nominal"],
     }
-    tables = [open_loop_table(named(results["open_loop"]))]
-    print_results(options, results, *tables, *[closed_loop_table(named(closed_loop))] * bool(with_setpoints))
+    open_loop = open_loop_table(named(results["open_loop"]))
+    print_results(options, results, open_loop, closed_loop_table(named(closed_loop)) if with_setpoints else None)
     return 0
 
 

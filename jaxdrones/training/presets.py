@@ -185,9 +185,12 @@ def preset(
         options = _PRACTICE_OPTIONS.get(task, {}) | options
     env = make(task, realistic=realistic, **options)
     if isinstance(task, str):
-        tables = [_CONFIGS, *[_REALISTIC_CONFIGS] * bool(realistic), *[_ANY_VEHICLE_CONFIGS] * (realistic == "any")]
-        for table in tables:
-            config = dataclasses.replace(config, **table.get((task, algorithm), {}))
+        settings = _CONFIGS.get((task, algorithm), {})
+        if realistic:
+            settings = settings | _REALISTIC_CONFIGS.get((task, algorithm), {})
+        if realistic == "any":
+            settings = settings | _ANY_VEHICLE_CONFIGS.get((task, algorithm), {})
+        config = dataclasses.replace(config, **settings)
     lagging = env.physics.physics.rotors is not instant_rotors
     if lagging and getattr(config, "gradient", None) == "surrogate":  # without the lag; nothing would be learned
         config = dataclasses.replace(config, gradient="exact")

@@ -1,5 +1,7 @@
 """Error of users' mistakes, and installation hints."""
 
+from __future__ import annotations
+
 import importlib.metadata
 import json
 import urllib.parse

@@ -1,5 +1,7 @@
 """Base class of pytrees."""
 
+from __future__ import annotations
+
 import json
 from typing import Any
 

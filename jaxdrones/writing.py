@@ -1,5 +1,7 @@
 """Atomic writing of files by renaming."""
 
+from __future__ import annotations
+
 import contextlib
 import os
 from collections.abc import Iterator

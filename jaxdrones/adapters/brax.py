@@ -8,6 +8,8 @@ with brax.trainers():
     ppo.train(brax.wrap(env), episode_length=env.steps, wrap_env_fn=brax.wrap_for_training, ...)
 """
 
+from __future__ import annotations
+
 import contextlib
 import functools
 import sys

@@ -4,6 +4,8 @@
 compiled step; the options are those of `jaxdrones.make`.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import string
 from collections.abc import Sequence

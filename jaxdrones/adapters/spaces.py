@@ -1,5 +1,7 @@
 """Gymnasium spaces of an environment, and layouts of teams."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 

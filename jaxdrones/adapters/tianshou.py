@@ -1,5 +1,7 @@
 """Tianshou vector environment of many worlds in one compiled step, for `Collector`."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

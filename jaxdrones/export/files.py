@@ -1,5 +1,7 @@
 """Files of an exported policy."""
 
+from __future__ import annotations
+
 import contextlib
 import dataclasses
 import json

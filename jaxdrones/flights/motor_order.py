@@ -1,5 +1,7 @@
 """Check of the order of the motors in a log by roll and pitch accelerations."""
 
+from __future__ import annotations
+
 import itertools
 
 import numpy as np

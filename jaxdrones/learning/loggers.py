@@ -3,6 +3,8 @@
 A logger is a function `(update, metrics, state)`, with the number of updates so far.
 """
 
+from __future__ import annotations
+
 import csv
 import importlib
 import os

@@ -1,5 +1,7 @@
 """Bundled and published policies by name."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import jax

@@ -1,5 +1,7 @@
 """Common settings of the learners."""
 
+from __future__ import annotations
+
 import dataclasses
 from typing import Any
 

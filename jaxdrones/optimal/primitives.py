@@ -1,5 +1,7 @@
 """JAX primitives as functions of CasADi scalars. True is one, false zero."""
 
+from __future__ import annotations
+
 import functools
 import operator
 from collections.abc import Callable

@@ -1,5 +1,7 @@
 """Conversion of states to messages and of messages to commands."""
 
+from __future__ import annotations
+
 import math
 from typing import Any, NamedTuple
 

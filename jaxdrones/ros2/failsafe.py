@@ -1,5 +1,7 @@
 """Failsafe without commands."""
 
+from __future__ import annotations
+
 import dataclasses
 from typing import Annotated
 

@@ -1,5 +1,7 @@
 """Transport by rclpy, the Python library of ROS 2."""
 
+from __future__ import annotations
+
 import array
 import importlib
 import time

@@ -1,5 +1,7 @@
 """Interface of transports."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, Protocol
 

@@ -1,5 +1,7 @@
 """Barometer and magnetometer."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import jax

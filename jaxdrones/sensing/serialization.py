@@ -1,5 +1,7 @@
 """Scenes as JSON."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Trained policy as a pilot of Betaflight."""
 
+from __future__ import annotations
+
 import functools
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Flights of the policies that a training has kept, and its learning curve."""
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """Training loop of one seed: updates, progress, evaluations, checkpoints, and resumption."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 import secrets

@@ -1,5 +1,7 @@
 """Flight of a simulated drone with Betaflight in the loop, in lockstep or in real time."""
 
+from __future__ import annotations
+
 import contextlib
 import dataclasses
 import time

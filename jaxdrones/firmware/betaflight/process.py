@@ -1,5 +1,7 @@
 """Process of Betaflight's SITL."""
 
+from __future__ import annotations
+
 import contextlib
 import os
 import subprocess

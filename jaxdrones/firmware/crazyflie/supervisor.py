@@ -1,5 +1,7 @@
 """Supervisor: arming, tumbling and emergency stops."""
 
+from __future__ import annotations
+
 import dataclasses
 
 from jaxdrones.firmware.crazyflie.vehicle import Sample

@@ -1,5 +1,7 @@
 """Films of the page, by a headless Chromium."""
 
+from __future__ import annotations
+
 import contextlib
 import io
 import tempfile

@@ -1,5 +1,7 @@
 """Page with a list of flights, of which it plays one at a time."""
 
+from __future__ import annotations
+
 import dataclasses
 import json
 from collections.abc import Sequence

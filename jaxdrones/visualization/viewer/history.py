@@ -1,5 +1,7 @@
 """Page of a training: flights of its evaluated policies beside its learning curve."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,5 +1,7 @@
 """Viewer page as a file, and in a notebook."""
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 import html

@@ -1,5 +1,7 @@
 """`show`: viewer pages of trajectories, logs and episodes of one or many worlds."""
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 import os

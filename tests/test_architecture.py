@@ -143,8 +143,8 @@ def test_the_imports_of_a_file_are_found():
     assert imports(PACKAGE / "dynamics" / "aero.py") >= {"rotation", "dynamics", "wrench"}
 
 
-def test_importing_the_package_loads_no_optional_library():
-    code = "import sys, jaxdrones; print(*(name for name in sys.argv[1:] if name in sys.modules))"
+def test_neither_package_nor_command_line_load_an_optional_library():
+    code = "import sys, jaxdrones.cli; print(*(name for name in sys.argv[1:] if name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code, *OPTIONAL], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
 

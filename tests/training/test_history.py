@@ -121,7 +121,7 @@ def test_a_film_of_a_training_shows_every_policy_in_full(runs, tmp_path):
 @pytest.mark.skipif(browser.find_browser() is None, reason="there is no Chromium")
 def test_the_commands_of_the_page_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text = (ROOT / "docs" / "viewer.md").read_text().split("## A training as a film")[1].split("\n## ")[0]
+    text = (ROOT / "docs" / "viewer.md").read_text().split("## Films of a training run")[1].split("\n## ")[0]
     for command in re.findall(r"^jaxdrones ([^#\n]*)", text, re.M):
         more = SHORT if command.startswith("train") else "--fps 1"
         assert main([*command.split(), *more.split()]) == 0

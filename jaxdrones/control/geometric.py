@@ -16,14 +16,14 @@ from jaxdrones.pytree import PyTreeNode
 
 
 class Gains(PyTreeNode):
-    """Gains per unit of mass and inertia, independent of the vehicle, of this controller and of `rates`."""
+    """Gains per unit of mass and inertia, independent of the vehicle."""
 
     pos: Array
     """(3,) 1/s^2."""
     vel: Array
     """(3,) 1/s."""
     attitude: Array
-    """(3,) 1/s^2; in `rates` 1/s, rates per half radian of error."""
+    """(3,) 1/s^2."""
     rate: Array
     """(3,) 1/s."""
 

@@ -38,7 +38,7 @@ _MAX_RPY_INTEGRAL = (1.0, 1.0, 1500.0)  # rad s
 
 
 class Gains(PyTreeNode):
-    """Gains of the two loops, of this controller and of `simple_pid`, where N m are in place of PWM."""
+    """Gains of the two loops."""
 
     pos_p: Array
     """(3,) N/m."""

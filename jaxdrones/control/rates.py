@@ -10,24 +10,39 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation, vector
 from jaxdrones.arguments import checked
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.control.geometric import Gains, init
 from jaxdrones.control.setpoint import Setpoint
 from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.params import Params
+from jaxdrones.pytree import PyTreeNode
 from jaxdrones.state import State
 from jaxdrones.vector import sin_cos
 
-__all__ = ["Gains", "command", "control", "follow", "gains", "init"]
+
+class Gains(PyTreeNode):
+    """Gains of the outer loop (those of gym-pybullet-drones for its racer) and of the inner one."""
+
+    pos: Array
+    """(3,) 1/s^2."""
+    vel: Array
+    """(3,) 1/s."""
+    attitude: Array
+    """(3,) rad/s per half radian of error."""
+    rate: Array
+    """(3,) 1/s."""
 
 
 def gains() -> Gains:
-    """Gains of gym-pybullet-drones' racer for the outer loop; the inner one has 40 rad/s in roll, pitch, 15 in yaw."""
+    """Gains of gym-pybullet-drones for the outer loop; the inner loop has 40 rad/s in roll and pitch, 15 in yaw."""
     return Gains(
         pos=jnp.array([3.0, 3.0, 8.0]),
         vel=jnp.array([2.5, 2.5, 5.0]),
         attitude=jnp.array([5.0, 5.0, 1.0]),
         rate=jnp.array([40.0, 40.0, 15.0]),
     )
+
+
+def init() -> None:
+    """Empty memory."""
 
 
 def control(

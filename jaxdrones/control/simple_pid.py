@@ -11,12 +11,28 @@ from jaxtyping import Array, Float
 from jaxdrones import rotation, vector
 from jaxdrones.arguments import checked
 from jaxdrones.control.allocation import rpm_from_wrench
-from jaxdrones.control.pid import Gains
 from jaxdrones.control.single import OneParams, OneSetpoint, OneState
 from jaxdrones.pytree import PyTreeNode
 from jaxdrones.vector import atan2, safe_sqrt
 
 _MAX_TILT = jnp.pi / 6  # rad, of the roll and pitch targets
+
+
+class Gains(PyTreeNode):
+    """Gains of the two loops."""
+
+    pos_p: Array
+    """(3,) N/m."""
+    pos_i: Array
+    """(3,) N/(m s)."""
+    pos_d: Array
+    """(3,) N s/m."""
+    rpy_p: Array
+    """(3,) N m/rad."""
+    rpy_i: Array
+    """(3,) N m/(rad s)."""
+    rpy_d: Array
+    """(3,) N m s/rad."""
 
 
 class Memory(PyTreeNode):

@@ -39,7 +39,10 @@ LENGTHS = {"pos": 3, "quat": 4, "color": 4, "size": 3}
 
 
 class Obstacle(PyTreeNode, kw_only=True):
-    """Static convex solid, or many of one kind with leading axes on the arrays."""
+    """Static convex solid, or many of one kind with leading axes on the arrays.
+
+    A kind defines `half`, `interval` and `normals`, and `rounding` or `is_round` where they differ.
+    """
 
     pos: Any
     """(3,) position of the center, m, world."""

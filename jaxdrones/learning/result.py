@@ -13,6 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int
 
+from jaxdrones.accelerate.compiler import is_inside_jit
 from jaxdrones.arguments import Key, Scalar, checked
 from jaxdrones.checks import is_concrete
 from jaxdrones.envs import Env
@@ -126,7 +127,7 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
         """
         check_config(config, kind)
         callbacks = (callback,) if callable(callback) else tuple(callback)
-        if not all(map(is_concrete, (jnp.zeros(()) + 0, key, *vars(config).values()))):  # the first: inside jax.jit
+        if is_inside_jit() or not all(map(is_concrete, (key, *vars(config).values()))):
             if callbacks:
                 raise UserError("callback is not supported inside jax.jit and jax.vmap; call train outside")
             state = init(key, env, config, network) if state is None else state

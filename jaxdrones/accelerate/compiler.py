@@ -136,6 +136,11 @@ def is_zero(tangent: Any) -> bool:
     return type(tangent) is ad.Zero
 
 
+def instantiated(tangent: Any) -> Any:
+    """Tangent as an array, also if it is zero."""
+    return ad.instantiate_zeros(tangent)
+
+
 def is_linear(x: Any) -> bool:
     """Whether the operand of a transposed primitive is an input in which it is linear."""
     return ad.is_undefined_primal(x)

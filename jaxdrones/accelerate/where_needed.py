@@ -29,11 +29,11 @@ def _in_all_worlds(worlds: int, batched: list[bool], holds: Array) -> tuple[Arra
 
 
 def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | None = None) -> Callable[..., Any]:
-    """Build `(needed, *args) -> function(*args)`, with zeros where `needed` () is false.
+    """Build `(needed, *args, otherwise=None) -> function(*args)`, with `otherwise` or zeros where `needed` () is false.
 
     Under `jax.vmap` only worlds with `needed` are computed, in chunks of `chunk` worlds or of one in `one_in`.
-    Derivatives are those of the function where it is needed, else zero, and cost as many worlds; in reverse mode the
-    function is recomputed.
+    Derivatives are those of the function where it is needed, else those of `otherwise`, and cost as many worlds; in
+    reverse mode the function is recomputed.
 
     Args:
         function: pure function of arrays.
@@ -41,33 +41,32 @@ def where_needed(function: Callable[..., Any], one_in: int = 64, chunk: int | No
         chunk: number of worlds of a chunk, in place of `one_in`.
     """
 
-    def where(needed: Array, *args: Any) -> Any:
+    def where(needed: Array, *args: Any, otherwise: Any = None) -> Any:
         if not compiler.AVAILABLE:
-            return jax.tree.map(lambda x: jnp.where(needed, x, jnp.zeros_like(x)), function(*args))
+            found = function(*args)
+            rest = jax.tree.map(jnp.zeros_like, found) if otherwise is None else otherwise
+            return jax.tree.map(functools.partial(jnp.where, needed), found, rest)
         program, consts, shape = compiler.trace(function, *args)
+        rest = () if otherwise is None else jax.tree.leaves(jax.tree.map(_of_type, otherwise, shape))
         inputs = [*consts, *map(jnp.asarray, jax.tree.leaves(args))]
-        mapped = (False,) * len(inputs)
-        out = _where.bind(needed, *inputs, program=program, mapped=mapped, worlds=None, one_in=one_in, chunk=chunk)
+        params = dict(mapped=(False,) * len(inputs), worlds=None, one_in=one_in, chunk=chunk)
+        out = _where.bind(needed, *rest, *inputs, program=program, rest=len(rest), **params)
         return jax.tree.unflatten(jax.tree.structure(shape), out)
 
     return where
 
 
-def where_due(draw: Callable[..., Any], chunk: int) -> Callable[..., Any]:
-    """Build `(due, before, *args) -> draw(*args)`, with `before` where `due` () is false; see `where_needed`."""
-
-    def drawn(due: Array, before: Any, *args: Any) -> Any:
-        new = where_needed(draw, chunk=chunk)(due, *args)
-        return jax.tree.map(functools.partial(jnp.where, due), new, before)
-
-    return drawn
+def _of_type(value: Any, shape: jax.ShapeDtypeStruct) -> Array:
+    return jnp.asarray(value, shape.dtype)
 
 
-def _computed(needed: Array, *inputs: Array, program: Any, mapped: tuple, worlds: int | None, **of_chunk: Any) -> list:
-    evaluate = _function(program)
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in _results(program, worlds)]
+def _computed(
+    needed: Array, *inputs: Array, program: Any, rest: int, mapped: tuple, worlds: int | None, **of_chunk: Any
+) -> list:
+    evaluate, otherwise, inputs = _function(program), list(inputs[:rest]), inputs[rest:]
+    otherwise = otherwise or [jnp.zeros(x.shape, x.dtype) for x in _results(program, worlds)]
     if worlds is None:
-        return jax.lax.cond(needed, lambda: evaluate(*inputs), lambda: zeros)
+        return jax.lax.cond(needed, lambda: evaluate(*inputs), lambda: otherwise)
     count, size = jnp.sum(needed), _chunk(worlds, **of_chunk)
     every = jax.vmap(evaluate, [0 if varies else None for varies in mapped], axis_size=size)
 
@@ -80,9 +79,9 @@ def _computed(needed: Array, *inputs: Array, program: Any, mapped: tuple, worlds
             new = every(*(x[at] if varies else x for x, varies in zip(inputs, mapped, strict=True)))
             return [all.at[to].set(x, mode="drop") for all, x in zip(found, new, strict=True)]
 
-        return jax.lax.fori_loop(0, -(-count // size), advance, zeros)
+        return jax.lax.fori_loop(0, -(-count // size), advance, otherwise)
 
-    return jax.lax.cond(count > 0, of_needed, lambda: zeros)
+    return jax.lax.cond(count > 0, of_needed, lambda: otherwise)
 
 
 def _chunk(worlds: int, one_in: int, chunk: int | None) -> int:
@@ -96,7 +95,7 @@ def _results(program: Any, worlds: int | None) -> list[jax.ShapeDtypeStruct]:
 
 def _at_once(needed: Array, *inputs: Array, **params: Any) -> list[Array]:
     if params["worlds"] is None and needed:
-        return _function(params["program"])(*inputs)
+        return _function(params["program"])(*inputs[params["rest"] :])
     return jax.jit(functools.partial(_computed, **params))(needed, *inputs)
 
 
@@ -104,7 +103,7 @@ def _shapes(needed: Any, *inputs: Any, program: Any, worlds: int | None, **_: An
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in _results(program, worlds)]
 
 
-def _batched(args: Sequence, dims: Sequence, *, mapped: tuple, worlds: int | None, **params: Any) -> tuple:
+def _batched(args: Sequence, dims: Sequence, *, rest: int, mapped: tuple, worlds: int | None, **params: Any) -> tuple:
     """More worlds: an axis over worlds, or one over worlds of worlds, which becomes part of it."""
     size = next(x.shape[dim] for x, dim in zip(args, dims, strict=True) if dim is not None)
 
@@ -115,23 +114,26 @@ def _batched(args: Sequence, dims: Sequence, *, mapped: tuple, worlds: int | Non
         x = x if varies else x[:, None]
         return jnp.broadcast_to(x, (size, worlds, *x.shape[2:])).reshape(size * worlds, *x.shape[2:])
 
-    (needed, *inputs), (of_needed, *of_inputs) = args, dims
-    needed = leading(needed, of_needed, worlds is not None)
-    varying = tuple(varies or dim is not None for varies, dim in zip(mapped, of_inputs, strict=True))
-    inputs = [
-        leading(x, dim, was) if varies else x
-        for x, dim, was, varies in zip(inputs, of_inputs, mapped, varying, strict=True)
+    always = 1 + rest
+    was = (worlds is not None,) * always + mapped
+    varying = (True,) * always + tuple(v or dim is not None for v, dim in zip(mapped, dims[always:], strict=True))
+    operands = [
+        leading(x, dim, varied) if varies else x
+        for x, dim, varied, varies in zip(args, dims, was, varying, strict=True)
     ]
-    out = _where.bind(needed, *inputs, mapped=varying, worlds=size * (worlds or 1), **params)
+    out = _where.bind(*operands, rest=rest, mapped=varying[always:], worlds=size * (worlds or 1), **params)
     if worlds is not None:
         out = [x.reshape(size, worlds, *x.shape[1:]) for x in out]
     return out, [0] * len(out)
 
 
-def _differentiated(primals: Sequence, tangents: Sequence, *, program: Any, mapped: tuple, **params: Any) -> tuple:
+def _differentiated(
+    primals: Sequence, tangents: Sequence, *, program: Any, rest: int, mapped: tuple, **params: Any
+) -> tuple:
     """Results, and their changes by the program of the changes of one world."""
-    (needed, *inputs), changes = primals, tangents[1:]
-    out = _where.bind(needed, *inputs, program=program, mapped=mapped, **params)
+    out = _where.bind(*primals, program=program, rest=rest, mapped=mapped, **params)
+    needed, inputs = primals[0], primals[1 + rest :]
+    of_otherwise, changes = tangents[1 : 1 + rest], tangents[1 + rest :]
     moving = [i for i, change in enumerate(changes) if not compiler.is_zero(change)]
     smooth = [i for i, x in enumerate(out) if jnp.issubdtype(x.dtype, jnp.inexact)]
     evaluate = _function(program)
@@ -141,18 +143,27 @@ def _differentiated(primals: Sequence, tangents: Sequence, *, program: Any, mapp
             results = evaluate(*_replaced(inputs, moving, moved))
             return [results[i] for i in smooth]
 
+        if not changes:
+            return [jnp.zeros_like(x) for x in of_moving()]
         return jax.jvp(of_moving, [inputs[i] for i in moving], changes)[1]
 
     shapes = _inputs(program)
     linear, consts, _ = compiler.trace(changed, shapes, [shapes[i] for i in moving])
-    operands = [*consts, *inputs, *(changes[i] for i in moving)]
+    if all(map(compiler.is_zero, of_otherwise)):
+        kept = []
+    else:
+        kept = [compiler.instantiated(of_otherwise[i]) for i in smooth]
+    operands = [*kept, *consts, *inputs, *(changes[i] for i in moving)]
     mapped = (*(False for _ in consts), *mapped, *(mapped[i] for i in moving))
-    found = _where.bind(needed, *operands, program=linear, mapped=mapped, **params)
+    found = _where.bind(needed, *operands, program=linear, rest=len(kept), mapped=mapped, **params)
     return out, _replaced([compiler.zero_of(x) for x in out], smooth, found)
 
 
-def _transposed(given: Sequence, needed: Array, *inputs: Any, program: Any, mapped: tuple, **params: Any) -> list:
-    """Cotangents of the inputs in which the program is linear."""
+def _transposed(
+    given: Sequence, needed: Array, *inputs: Any, program: Any, rest: int, mapped: tuple, **params: Any
+) -> list:
+    """Cotangents of `otherwise`, and of the inputs in which the program is linear."""
+    otherwise, inputs = inputs[:rest], inputs[rest:]
     linear = [i for i, x in enumerate(inputs) if compiler.is_linear(x)]
     known = [i for i in range(len(inputs)) if i not in linear]
     used = [i for i, x in enumerate(given) if not compiler.is_zero(x)]
@@ -169,9 +180,17 @@ def _transposed(given: Sequence, needed: Array, *inputs: Any, program: Any, mapp
     operands = [*consts, *(inputs[i] for i in known), *(given[i] for i in used)]
     has_worlds = params["worlds"] is not None
     varying = (*(False for _ in consts), *(mapped[i] for i in known), *(has_worlds for _ in used))
-    found = _where.bind(needed, *operands, program=back, mapped=varying, **params)
+    found = _where.bind(needed, *operands, program=back, rest=0, mapped=varying, **params)
     found = [x.sum(axis=0) if has_worlds and not mapped[i] else x for i, x in zip(linear, found, strict=True)]
-    return [None, *_replaced([None] * len(inputs), linear, found)]
+    of_otherwise = [
+        _unneeded(needed, given[i]) if compiler.is_linear(x) and i in used else None for i, x in enumerate(otherwise)
+    ]
+    return [None, *of_otherwise, *_replaced([None] * len(inputs), linear, found)]
+
+
+def _unneeded(needed: Array, value: Array) -> Array:
+    """A value where the function is not needed, else zero."""
+    return jnp.where(jnp.expand_dims(needed, range(needed.ndim, value.ndim)), 0, value)
 
 
 def _function(program: Any) -> Callable[..., list]:
@@ -194,5 +213,5 @@ def _replaced(values: Sequence, places: Sequence[int], others: Sequence) -> list
 
 if compiler.AVAILABLE:
     _where = compiler.primitive("where_needed", _computed, _at_once, _shapes, _batched, _differentiated, _transposed)
-    """Operands are `needed` and the inputs of `program`. Those that are `mapped` have a leading axis over `worlds`, as
-    `needed` and the results have; without worlds (`None`) it is of one world."""
+    """Operands are `needed`, `rest` results where it is false, and the inputs of `program`. Inputs that are `mapped`,
+    and all other operands and results, have a leading axis over `worlds`. Without worlds (`None`) nothing has it."""

@@ -43,7 +43,10 @@ class AutoReset:
     def reset(self, key: jax.Array) -> tuple[Obs, Episode]:
         """Start the first episode."""
         obs, world = self.env.reset(key, *self._progress)
-        return obs, Episode(world, jnp.zeros(self.env.drones, world.drones.pos.dtype), jnp.zeros((), jnp.int32))
+        return obs, self._first(world)
+
+    def _first(self, world: World) -> Episode:
+        return Episode(world, jnp.zeros(self.env.drones, world.drones.pos.dtype), jnp.zeros((), jnp.int32))
 
     def step(
         self, key: jax.Array, episode: Episode, action: Float[Array, "n a"]
@@ -67,12 +70,10 @@ class AutoReset:
         """Replace worlds and observations by a new start where `ended`; `key` is that of the step."""
         world, key = episode.world, jax.random.fold_in(key, RESET)
         vector = obs["state"] if isinstance(obs, dict) else obs
-        fresh_obs, fresh = where_needed(self._fresh, one_in=256)(ended, key)
-        fresh = fresh.replace(**{name: getattr(world, name) for name in self._kept})
-        fresh = Episode(fresh, jnp.zeros_like(episode.episode_return), jnp.zeros_like(episode.length))
-        vector, episode = jax.tree.map(
-            lambda new, old: old if new is old else jnp.where(ended, new, old), (fresh_obs, fresh), (vector, episode)
-        )
+        renewed = where_needed(self._fresh, one_in=256)
+        vector, episode = renewed(ended, key, otherwise=(vector, self._without_kept(episode)))
+        kept = {name: getattr(world, name) for name in self._kept}
+        episode = episode.replace(world=episode.world.replace(**kept))
         if self.env.vision:
             episode = episode.replace(world=self.env.with_images("renewed", key, episode.world, ended))
         return observation(vector, episode.world), episode
@@ -82,7 +83,10 @@ class AutoReset:
         """Fields of a world that survive a reset: constant fields and images."""
         return (*self.env.constant_fields, "images", "poses")
 
-    def _fresh(self, key: jax.Array) -> tuple[Array, World]:
-        """Reset without images and constant fields."""
+    def _fresh(self, key: jax.Array) -> tuple[Array, Episode]:
+        """Reset without what survives it."""
         obs, world = self.env.begin(key, *self._progress)
-        return obs, world.replace(**dict.fromkeys(self._kept))
+        return obs, self._without_kept(self._first(world))
+
+    def _without_kept(self, episode: Episode) -> Episode:
+        return episode.replace(world=episode.world.replace(**dict.fromkeys(self._kept)))

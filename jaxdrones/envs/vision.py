@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdrones.accelerate.where_needed import where_due
+from jaxdrones.accelerate.where_needed import where_needed
 from jaxdrones.arguments import checked, choices
 from jaxdrones.engine.step import HostStep, Step, is_traced
 from jaxdrones.envs.functions import DrawScene
@@ -112,7 +112,7 @@ class Vision:
         if self.on_host and not is_traced((due, world.images, args)):
             return self._exposed(*args) if due else world.images
         worlds = 1 if self.on_host else max(1, pixels // (len(pose) * math.prod(self.camera.resolution)))
-        return where_due(self._exposed, worlds)(due, world.images, *args)
+        return where_needed(self._exposed, chunk=worlds)(due, *args, otherwise=world.images)
 
     def _exposed(self, key: Any, params: Params, pose: Float[Array, "n 7"], scene: Scene) -> dict[str, Array]:
         """Images from these poses, with noise."""

@@ -68,14 +68,14 @@ class AutoReset:
 
     def renewed(self, ended: Array, key: jax.Array, obs: Obs, episode: Episode) -> tuple[Obs, Episode]:
         """Replace worlds and observations by a new start where `ended`; `key` is that of the step."""
-        world, key = episode.world, jax.random.fold_in(key, RESET)
+        world = episode.world
         vector = obs["state"] if isinstance(obs, dict) else obs
         renewed = where_needed(self._fresh, one_in=256)
         vector, episode = renewed(ended, key, otherwise=(vector, self._without_kept(episode)))
         kept = {name: getattr(world, name) for name in self._kept}
         episode = episode.replace(world=episode.world.replace(**kept))
         if self.env.vision:
-            episode = episode.replace(world=self.env.with_images("renewed", key, episode.world, ended))
+            episode = episode.replace(world=self.env.with_images("renewed", _of_reset(key), episode.world, ended))
         return observation(vector, episode.world), episode
 
     @property
@@ -84,9 +84,14 @@ class AutoReset:
         return (*self.env.constant_fields, "images", "poses")
 
     def _fresh(self, key: jax.Array) -> tuple[Array, Episode]:
-        """Reset without what survives it."""
-        obs, world = self.env.begin(key, *self._progress)
+        """First episode, given the key of the step and without what survives a reset."""
+        obs, world = self.env.begin(_of_reset(key), *self._progress)
         return obs, self._without_kept(self._first(world))
 
     def _without_kept(self, episode: Episode) -> Episode:
         return episode.replace(world=episode.world.replace(**dict.fromkeys(self._kept)))
+
+
+def _of_reset(key: jax.Array) -> jax.Array:
+    """Random key of a reset, from that of the step."""
+    return jax.random.fold_in(key, RESET)

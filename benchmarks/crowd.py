@@ -22,7 +22,7 @@ from benchmarks import crowd_baselines
 from benchmarks.common import success_rate
 from jaxdrones.envs.observations import encounters
 from jaxdrones.learning import bptt, checkpoint, evaluate, ppo
-from jaxdrones.tasks.crossing import OBSERVATION
+from jaxdrones.tasks.crossing import OBSERVATION, OBSERVATION_AMONG_OBSTACLES
 from jaxdrones.tasks.task import Task, World
 from jaxdrones.training.presets import preset
 
@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=250.0, help="of the training by ppo, without compiling")
     parser.add_argument("--drones", type=int, nargs="+", default=list(WORLDS))
     parser.add_argument("--density", type=float, default=1.0, help="drones per cubic meter in flight")
+    parser.add_argument("--obstacles", type=float, default=0.0, help="balls per cubic meter, in training and flight")
     parser.add_argument("--patience", type=float, default=1.0, help="of the task")
     parser.add_argument("--downwash", action="store_true", help="each flies in the wakes of the others; not trained")
     parser.add_argument("--save", help="path of the policy to write, without a suffix")
@@ -50,6 +51,8 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
     if options.policy:
         policy, spent = checkpoint.load(options.policy), {}
     elif options.learner in BASELINES:
+        if options.obstacles:
+            raise SystemExit(f"{options.learner} does not avoid obstacles; leave out --obstacles")
         policy, spent = None, {}
     else:
         policy, spent = train(options)
@@ -62,14 +65,16 @@ def main(options: argparse.Namespace) -> tuple[dict, list[str]]:
         f" {success_rate(row['success'], row['interval'])} | {row['seconds']:.0f}"
         for row in rows
     ]
-    about = {name: getattr(options, name) for name in ("learner", "seed", "density", "patience", "downwash")}
+    about = {
+        name: getattr(options, name) for name in ("learner", "seed", "density", "obstacles", "patience", "downwash")
+    }
     return {"about": about | spent, "rows": rows}, lines
 
 
 def train(options: argparse.Namespace) -> tuple[jd.learning.networks.Policy, dict]:
     """Policy of a learner, and the seconds that it took, compiling included."""
     learner = LEARNERS[options.learner]
-    env, config = preset("crowd", learner.__name__.rpartition(".")[2], practice=True, observation=_observation(options))
+    env, config = preset("crowd", learner.__name__.rpartition(".")[2], practice=True, **_task(options))
     if options.learner == "stopped":
         env = _others_constant(env)
     if options.quick:
@@ -114,7 +119,7 @@ def _others_constant(env: jd.envs.Env) -> jd.envs.Env:
 
 def fly(policy: jd.learning.networks.Policy | None, drones: int, options: argparse.Namespace) -> dict:
     """Rates of success of a team of this size."""
-    made = dict(density=options.density, patience=options.patience, observation=_observation(options))
+    made = _task(options) | dict(density=options.density, patience=options.patience)
     env = jd.make("crowd", drones=drones, pairs=("downwash",) if options.downwash else (), **made)
     worlds = 2 if options.quick else WORLDS.get(drones, 20)
     start = time.perf_counter()
@@ -131,8 +136,9 @@ def fly(policy: jd.learning.networks.Policy | None, drones: int, options: argpar
     }
 
 
-def _observation(options: argparse.Namespace) -> tuple:
-    """Observation of the task, without a view of the others for `blind`."""
-    if options.learner != "blind":
-        return OBSERVATION
-    return (*OBSERVATION[:-1], encounters(8, reach=1e-3))
+def _task(options: argparse.Namespace) -> dict:
+    """Options of the task in training and flight; `blind` has no view of the others."""
+    observation = OBSERVATION_AMONG_OBSTACLES if options.obstacles else OBSERVATION
+    if options.learner == "blind":
+        observation = (*observation[:-1], encounters(8, reach=1e-3))
+    return {"observation": observation, "obstacles": options.obstacles}

@@ -184,7 +184,7 @@ def preset(
     if realistic and task in ("hover", "recovery", "landing"):
         options = (_ANY_VEHICLE if realistic == "any" else {"observation": _DELAYED_OBSERVATION}) | options
     if practice and isinstance(task, str):
-        options = _PRACTICE_OPTIONS.get(task, {}) | options
+        options = _practice_options(task, options) | options
     env = make(task, realistic=realistic, **options)
     if isinstance(task, str):
         settings = _CONFIGS.get((task, algorithm), {})
@@ -197,6 +197,14 @@ def preset(
     if lagging and getattr(config, "gradient", None) == "surrogate":  # without the lag; nothing would be learned
         config = dataclasses.replace(config, gradient="exact")
     return env, config
+
+
+def _practice_options(task: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Options of the environment in training; with contact, physics steps are not longer than in flight."""
+    practice = _PRACTICE_OPTIONS.get(task, {})
+    if not (options.get("obstacles") or options.get("contact")):
+        return practice
+    return {name: value for name, value in practice.items() if name != "substeps"}
 
 
 def realism(realistic: bool | str) -> str:

@@ -100,6 +100,14 @@ def test_every_preset_makes_sense(task, algorithm):
         Recipe.of(task, algorithm, realistic)
 
 
+@pytest.mark.parametrize("task, options", [("crowd", {"obstacles": 1.0}), ("race", {"contact": True})])
+def test_contact_can_be_trained(task, options):
+    """Two physics steps in a control step, as in training without contact, are too few: contact would be unstable."""
+    practice, _ = presets.preset(task, "bptt", practice=True, **options)
+    flown, _ = presets.preset(task, "bptt", **options)
+    assert practice.physics.dt == flown.physics.dt
+
+
 @pytest.mark.parametrize("rotors, gradient", [("instant", "surrogate"), ("lagging", "exact")])
 def test_the_preset_of_hover_has_no_surrogate_without_the_lag_of_the_rotors(rotors, gradient):
     """Trained with it, not one of 1,000 starts succeeded; with the exact gradient 998 or more, three seeds."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Annotated
@@ -29,6 +30,7 @@ _CAUGHT_UP = 1.0  # s: start of the evaluation of error and swing
 _CLOSE, _UPRIGHT = 0.1, 15.0  # m, degrees: limits of the rms error and of the largest swing
 _NEAR, _SLOW = 0.02, 0.1  # m, m/s; the reward terms are parabolas below
 _FAR, _FAST = 20.0, 30.0  # m, m/s: bounds of the observations
+_TILT = math.radians(35)  # of the cables of a shared load
 _SWING = 0.2  # largest slope of a cable at the start, in x and in y
 
 Length = Annotated[float, number("m", "length of the cable", at_least=0.1, at_most=5)]
@@ -56,8 +58,8 @@ def sling(
         period: period of the curve, s.
         duration: duration of an episode, s; of 1 s or less there is no criterion of success.
     """
-    about = "fly a load on a cable along a curve"
-    return _carrying("sling", about, drones, load, length, curve, period, duration, tilt=0.0, shared=False)
+    carrying = _Carrying(drones, load, length, curve, period, shared=False)
+    return carrying.task("sling", "fly a load on a cable along a curve", duration)
 
 
 @checked
@@ -81,101 +83,106 @@ def transport(
         period: period of the curve, s.
         duration: duration of an episode, s; of 1 s or less there is no criterion of success.
     """
-    about, tilt = "carry a load together along a curve", math.radians(35)
-    return _carrying("transport", about, drones, load, length, curve, period, duration, tilt=tilt, shared=True)
+    carrying = _Carrying(drones, load, length, curve, period, shared=True)
+    return carrying.task("transport", "carry a load together along a curve", duration)
 
 
-def _carrying(
-    name: str,
-    summary: str,
-    drones: int,
-    load: float,
-    length: float,
-    curve: str,
-    period: float,
-    duration: float,
-    tilt: float,
-    shared: bool,
-) -> Task:
-    """Task in which drones carry loads along a curve, or one if `shared`, on cables with an angle from the vertical."""
+@dataclasses.dataclass(frozen=True)
+class _Carrying:
+    """Drones that carry a load each along a curve, or together one `shared` load."""
 
-    def equip(params: Params) -> Params:
-        mass = load * (jnp.sum(params.mass) if shared else params.mass[0])
-        return with_payload(params, mass, length, cables=drones if shared else 1)
+    drones: int
+    load: float
+    """Mass of the load over that of its drones."""
+    length: float
+    """m, of the cables."""
+    curve: str
+    period: float
+    """s."""
+    shared: bool
 
-    def places(dtype: jnp.dtype) -> Float[Array, "n 3"]:
-        """Places of the drones relative to the load, m, world axes."""
-        angle = 2 * jnp.pi * jnp.arange(drones, dtype=dtype) / drones
-        beside, above = length * math.sin(tilt), length * math.cos(tilt)
-        return jnp.stack([beside * jnp.cos(angle), beside * jnp.sin(angle), jnp.full_like(angle, above)], axis=-1)
+    def task(self, name: str, summary: str, duration: float) -> Task:
+        """Task of this duration, s."""
+        place = ObservationTerm(self.way_to_place, _FAR, entries=_PLACE_ENTRIES)
+        return Task(
+            name=name,
+            summary=summary,
+            drones=self.drones,
+            duration=duration,
+            start=self.start,
+            target=self.target,
+            rewards={
+                "alive": (2.0, shaping.alive),
+                "position": (-1.0, _position),
+                "velocity": (-0.1, _velocity),
+                "place": (-0.5, self.out_of_place),
+                "omega": (-0.02, shaping.body_rates),
+                "action_change": (-0.02, shaping.action_change),
+            },
+            terminations=shaping.out_of_control(4.0 + SPACING * self.drones),
+            metrics={"error": _error, "swing": self.swing},
+            success=_close_and_upright if duration > _CAUGHT_UP else None,
+            observations=_OBSERVATIONS | {"place": place},
+            control_hz=50.0,
+            action="thrust_and_rates",
+            observation=(
+                *("load_error", "load_velocity_error", "load", *["place"] * self.shared),
+                *("rotation_matrix", "velocity", "omega", "last_action", "load_preview"),
+            ),
+            effects=(cable,),
+            models=(payload(self.shared),),
+            equip=self.equip,
+        )
 
-    def target(variables: dict[str, Array], t: Array) -> Setpoint:
+    def equip(self, params: Params) -> Params:
+        """Team with the loads on cables."""
+        mass = self.load * (jnp.sum(params.mass) if self.shared else params.mass[0])
+        return with_payload(params, mass, self.length, cables=self.drones if self.shared else 1)
+
+    def target(self, variables: dict[str, Array], t: Array) -> Setpoint:
         """Moving point on the curve, of the load."""
-        return curves.along(SHAPES[curve], period, variables, t)
+        return curves.along(SHAPES[self.curve], self.period, variables, t)
 
-    def start(key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
+    def start(self, key: jax.Array, params: Params) -> tuple[State, dict[str, Array]]:
         """Near a random point of the curve, in motion; a load of a single drone swings."""
         shape_key, phase_key, start_key, load_key = jax.random.split(key, 4)
-        n, dtype = drones, params.mass.dtype
-        loads = 1 if shared else n
+        n, dtype = self.drones, params.mass.dtype
+        loads = 1 if self.shared else n
         variables = curves.draw(shape_key, phase_key, loads, SPACING, HEIGHT, dtype)
         variables = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape[1:])), variables)
-        here, ring = target(variables, jnp.zeros((), dtype)), places(dtype)
+        here, places = self.target(variables, jnp.zeros((), dtype)), self.places(dtype)
         offset = jax.random.uniform(load_key, (loads, 3), dtype, -1, 1)
-        if shared:
+        if self.shared:
             beside = here.pos + 0.1 * offset
-            state = thrown(start_key, params, beside + ring, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)
+            state = thrown(start_key, params, beside + places, reach=0.0, speed=0.1, omega=0.1, tilt=0.1)
             carried = PointMass(beside, here.vel)
         else:
-            state = thrown(start_key, params, here.pos + ring, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
+            state = thrown(start_key, params, here.pos + places, reach=0.1, speed=0.1, omega=0.1, tilt=0.1)
             down = offset * jnp.array([[_SWING, _SWING, 0]], dtype) - jnp.array([[0, 0, 1]], dtype)
-            carried = PointMass(state.pos + length * down / norm(down)[:, None], here.vel)
+            carried = PointMass(state.pos + self.length * down / norm(down)[:, None], here.vel)
         return state.replace(vel=state.vel + here.vel, aux={"payload": carried}), variables
 
-    def out_of_place(task: Task, world: World) -> Float[Array, " n"]:
+    def places(self, dtype: jnp.dtype) -> Float[Array, "n 3"]:
+        """Places of the drones relative to the load, m, world axes: above it, or on a ring above a shared one."""
+        tilt = _TILT if self.shared else 0.0
+        angle = 2 * jnp.pi * jnp.arange(self.drones, dtype=dtype) / self.drones
+        beside, above = self.length * math.sin(tilt), self.length * math.cos(tilt)
+        return jnp.stack([beside * jnp.cos(angle), beside * jnp.sin(angle), jnp.full_like(angle, above)], axis=-1)
+
+    def out_of_place(self, task: Task, world: World) -> Float[Array, " n"]:
         """Distance of the drone from its place above the load, m."""
-        return shaping.length(way_to_place(task, world), _NEAR)
+        return shaping.length(self.way_to_place(task, world), _NEAR)
 
-    def way_to_place(task: Task, world: World) -> Float[Array, "n 3"]:
-        """Vector to the place of the drone on a ring above the load, m, world axes."""
-        return world.drones.aux["payload"].pos + places(world.drones.pos.dtype) - world.drones.pos
+    def way_to_place(self, task: Task, world: World) -> Float[Array, "n 3"]:
+        """Vector to the place of the drone above the load, m, world axes."""
+        return world.drones.aux["payload"].pos + self.places(world.drones.pos.dtype) - world.drones.pos
 
-    def swing(task: Task, world: World) -> Float[Array, " n"]:
+    def swing(self, task: Task, world: World) -> Float[Array, " n"]:
         """Angle between the vertical and the line from the load to its drone, or to the middle of the team, degrees."""
         pos = world.drones.pos
-        middle = jnp.broadcast_to(jnp.mean(pos, axis=0), pos.shape) if shared else pos
+        middle = jnp.broadcast_to(jnp.mean(pos, axis=0), pos.shape) if self.shared else pos
         x, y, z = (middle - world.drones.aux["payload"].pos).T
         return jnp.degrees(jnp.arctan2(jnp.sqrt(x**2 + y**2 + 1e-12), z))
-
-    return Task(
-        name=name,
-        summary=summary,
-        drones=drones,
-        duration=duration,
-        start=start,
-        target=target,
-        rewards={
-            "alive": (2.0, shaping.alive),
-            "position": (-1.0, _position),
-            "velocity": (-0.1, _velocity),
-            "place": (-0.5, out_of_place),
-            "omega": (-0.02, shaping.body_rates),
-            "action_change": (-0.02, shaping.action_change),
-        },
-        terminations=shaping.out_of_control(4.0 + SPACING * drones),
-        metrics={"error": _error, "swing": swing},
-        success=_close_and_upright if duration > _CAUGHT_UP else None,
-        observations=_OBSERVATIONS | {"place": ObservationTerm(way_to_place, _FAR, entries=_PLACE_ENTRIES)},
-        control_hz=50.0,
-        action="thrust_and_rates",
-        observation=(
-            *("load_error", "load_velocity_error", "load", *["place"] * shared),
-            *("rotation_matrix", "velocity", "omega", "last_action", "load_preview"),
-        ),
-        effects=(cable,),
-        models=(payload(shared),),
-        equip=equip,
-    )
 
 
 def _load_error(task: Task, world: World) -> Float[Array, "n 3"]:

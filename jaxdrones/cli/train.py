@@ -6,6 +6,7 @@ import io
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -191,29 +192,20 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
     from jaxdrones.learning import Diverged
     from jaxdrones.learning.loggers import named_loggers
     from jaxdrones.training import loop
-    from jaxdrones.training.presets import settings_known
     from jaxdrones.training.run import Run
 
-    recipe, print_line = trainer.recipe, train_output.quiet if request.json else print
-    if not request.resume and not settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any"):
-        train_output.warn_of_unknown_settings(recipe)
-    config, what = recipe.config, described(recipe) + f", {request.row}" * bool(request.row)
-    print_line(f"{what}: {config.worlds} worlds x {config.horizon} control steps an update; compiling")
+    print_line = train_output.quiet if request.json else print
+    config, what = trainer.recipe.config, described(trainer.recipe) + f", {request.row}" * bool(request.row)
     loggers = {seed: named_loggers(request.log, run.folder) for seed, run in runs.items()}
-    trainer.compile()
-    started = [run for run in runs.values() if request.resume and run.started]
-    made = max((run.sidecar_entry("state", "update") for run in started), default=0)
+    _compile(request, runs, trainer, what, print_line)
     deadlines.start()
-    total = config.updates if request.seconds is None else None
-    so_far = f", {made} of them made" * (made > 0)
-    print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {total or 'as many as the time allows'}{so_far}")
     if not request.resume:
         for run in (*runs.values(), Run(request.output)):
             run.clear()
 
     with live_server(request.live, request.json) as live:
         for seed, run in remaining(runs, config.updates, request.seconds).items():
-            label = f"seed {seed}" if len(runs) > 1 else "training"
+            total, label = _updates(request, config), f"seed {seed}" if len(runs) > 1 else "training"
             display = train_output.ProgressDisplay(total, label, trainer.episodes, print_line)
             on_progress = display.update
             if live:
@@ -223,16 +215,39 @@ def _train_runs(request: Request, runs: dict, trainer: Any, deadlines: train_out
                 with display:
                     loop.train(trainer, run, seed, on_progress, deadlines.next(), loggers[seed], request.keep_history)
             except KeyboardInterrupt:
-                if not (run.folder / "last.json").exists():
-                    return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
-                train_output.draw_curves(request, {seed: run}, run.folder)
-                where = (
-                    f"interrupted at update {run.sidecar_entry('last', 'update')}; {train_output.remaining_best(run)}"
-                )
-                return print_error(where + f"; continue with: {request.again}" * run.started, INTERRUPTED)
+                return _interrupted(request, seed, run)
             except Diverged as error:
                 train_output.draw_curves(request, {seed: run}, run.folder)
                 return print_error(f"training diverged: {error}; {train_output.remaining_best(run)}", 1)
     code = train_output.show_results(request, runs)
     deadlines.warn_if_missed()
     return code
+
+
+def _compile(request: Request, runs: dict, trainer: Any, what: str, print_line: Callable) -> None:
+    """Compile the programs, and print what is trained and for how long."""
+    from jaxdrones.training.presets import settings_known
+
+    recipe, config = trainer.recipe, trainer.recipe.config
+    if not request.resume and not settings_known(recipe.task, recipe.algorithm, recipe.realistic == "any"):
+        train_output.warn_of_unknown_settings(recipe)
+    print_line(f"{what}: {config.worlds} worlds x {config.horizon} control steps an update; compiling")
+    trainer.compile()
+    started = [run for run in runs.values() if request.resume and run.started]
+    made = max((run.sidecar_entry("state", "update") for run in started), default=0)
+    updates = f"{_updates(request, config) or 'as many as the time allows'}" + f", {made} of them made" * (made > 0)
+    print_line(f"compiled in {trainer.compile_seconds:.1f} s; updates: {updates}")
+
+
+def _updates(request: Request, config: Any) -> int | None:
+    """Number of updates; `None` with a budget of time."""
+    return config.updates if request.seconds is None else None
+
+
+def _interrupted(request: Request, seed: int, run: Any) -> int:
+    """Print what was kept of an interrupted run."""
+    if not (run.folder / "last.json").exists():
+        return print_error("interrupted before the first update; there is nothing to continue", INTERRUPTED)
+    train_output.draw_curves(request, {seed: run}, run.folder)
+    where = f"interrupted at update {run.sidecar_entry('last', 'update')}; {train_output.remaining_best(run)}"
+    return print_error(where + f"; continue with: {request.again}" * run.started, INTERRUPTED)

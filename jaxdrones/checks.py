@@ -23,7 +23,8 @@ UNIT_LENGTH = 1e-3  # tolerance of the length of a unit quaternion, far above fl
 _NUMBERS = "biuf"  # kinds of dtypes
 POSITIVE = ("mass", "inertia", "kf", "rotor_rise_time", "rotor_fall_time", "max_rpm")
 """Constants of a vehicle that must be positive."""
-_NOT_NEGATIVE = ("km", "gravity", "air_density")
+NOT_NEGATIVE = ("km", "gravity", "air_density")
+"""Constants that must not be negative."""
 _MAY_BE_INFINITE = ("max_rpm",)
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 _NO_ARRAYS = (list, tuple, dict, str, type(None))
@@ -222,7 +223,7 @@ def check_params(params: Any, finite: bool = True) -> None:
         check_finite(
             "params", params.replace(**{name: _without_infinity(constants[name]) for name in _MAY_BE_INFINITE})
         )
-    for bound, words, names in (0, "positive numbers", POSITIVE), (-_SMALLEST, "numbers of at least 0", _NOT_NEGATIVE):
+    for bound, words, names in (0, "positive numbers", POSITIVE), (-_SMALLEST, "numbers of at least 0", NOT_NEGATIVE):
         for name in names:
             leaf = constants[name]
             if is_concrete(leaf) and not (np.asarray(leaf) > bound).all():

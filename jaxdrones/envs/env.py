@@ -134,9 +134,8 @@ class Env:
     @functools.cached_property
     def term_sizes(self) -> list[int]:
         """Length of every observation term of a drone."""
-        return check_episode(
-            self.task, self.params, self.scene, self.terms, self.dt, functools.partial(episode.first_world, self)
-        )
+        first_world = functools.partial(episode.first_world, self)
+        return check_episode(self.task, self.params, self.draws, self.scene, self.terms, self.dt, first_world)
 
     @functools.cached_property
     def observation_bound(self) -> np.ndarray:

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdrones.checks import check_params, short_repr
+from jaxdrones.checks import check_finite, check_params, check_quaternion, is_concrete, short_repr
 from jaxdrones.control import Setpoint
-from jaxdrones.envs.actions import Action
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.sensing import Scene
@@ -59,16 +58,18 @@ def _is_own(function: Any) -> bool:
 def check_episode(
     task: Task,
     params: Params,
+    draws: Sequence[Callable],
     scene: Any,
     terms: Sequence[ObservationTerm],
     dt: float,
     first_world: Callable[[jax.Array], World],
 ) -> list[int]:
-    """Validate the results of a task's functions by tracing them, without computation.
+    """Validate the results of users' functions by tracing them; those of starts and randomizations for some keys.
 
     Args:
         task: the task.
         params: nominal parameters of the team.
+        draws: randomizations of the parameters.
         scene: scene of all episodes, or a function for random scenes.
         terms: observation terms.
         dt: control period, s.
@@ -80,16 +81,49 @@ def check_episode(
     Raises:
         UserError: an invalid result; the message names the function and its file.
     """
+    one = jax.tree.map(lambda x: x[0], params)
 
     def sizes(key: jax.Array) -> list[Any]:
-        _check_randomizations(task, params)
+        for function in draws:
+            _check_randomization(function, key, one)
         _check_start(task, params, scene, key)
         world = first_world(key)
         _check_functions(task, world, dt)
         _check_terms(task, terms, world)
         return [term.observe(task, world) for term in terms]
 
-    return [x.shape[-1] for x in jax.eval_shape(sizes, jax.random.key(0))]
+    lengths = [x.shape[-1] for x in jax.eval_shape(sizes, jax.random.key(0))]
+    for function in draws:
+        if not _is_own(function):
+            _check_values("a randomization", function, lambda key, draw=function: draw(key, one), check_params)
+    if not _is_own(task.start):
+        _check_values("start", task.start, lambda key: task.begin(key, params, _scene_of(scene, key))[0], _check_state)
+    return lengths
+
+
+def _scene_of(scene: Scene | DrawScene, key: jax.Array) -> Scene:
+    return scene if isinstance(scene, Scene) else scene(key)
+
+
+def _check_state(state: State) -> None:
+    check_finite("state", state)
+    check_quaternion("state.quat", state.quat)
+
+
+def _check_values(what: str, function: Callable, draw: Callable, check: Callable) -> None:
+    """Check the values that a user's function draws with some random keys, unless they are traced."""
+    drawn = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(0), _DRAWS))
+    if not all(map(is_concrete, jax.tree.leaves(drawn))):
+        return
+    drawn = jax.device_get(drawn)
+    try:
+        for i in range(_DRAWS):
+            check(jax.tree.map(lambda x, i=i: x[i], drawn))
+    except UserError as error:
+        raise UserError(f"{_where(what, function)} returns what cannot fly: {error}") from None
+
+
+_DRAWS = 64  # random keys
 
 
 def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None:
@@ -97,7 +131,7 @@ def _check_start(task: Task, params: Params, scene: Any, key: jax.Array) -> None
     if _is_own(task.start):
         return
     where, n = _where("start", task.start), task.drones
-    returned = task.begin(key, params, scene if isinstance(scene, Scene) else scene(key))
+    returned = task.begin(key, params, _scene_of(scene, key))
     if not (isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[0], State)):
         raise UserError(f"{where} returns {_kind(returned)}; return a State of the team and the task's variables")
     _check_like(where, "a state", returned[0], State.at_rest(jnp.zeros((n, 3))))
@@ -119,16 +153,14 @@ def equipped(task: Task, params: Params) -> Params:
     return returned
 
 
-def _check_randomizations(task: Task, params: Params) -> None:
-    """Raise unless each randomization of a task returns the parameters of one drone."""
-    one = jax.tree.map(lambda x: x[0], params)
-    for function in task.randomize:
-        if not _is_own(function):
-            where = _where("a randomization", function)
-            returned = function(jax.random.key(0), one)
-            if not isinstance(returned, Params):
-                raise UserError(f"{where} returns {_kind(returned)}; return params.replace(...)")
-            _check_like(where, "parameters", returned, one)
+def _check_randomization(function: Callable, key: jax.Array, one: Params) -> None:
+    """Raise unless a randomization returns the parameters of one drone."""
+    returned = function(key, one)
+    if not _is_own(function):
+        where = _where("a randomization", function)
+        if not isinstance(returned, Params):
+            raise UserError(f"{where} returns {_kind(returned)}; return params.replace(...)")
+        _check_like(where, "parameters", returned, one)
 
 
 def _check_terms(task: Task, terms: Sequence[ObservationTerm], world: World) -> None:
@@ -263,25 +295,3 @@ def _where(what: str, function: Any) -> str:
     """Role and location of a function of a task, for error messages."""
     where = place(function)
     return f"{where}: {what}" if where else what
-
-
-_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
-_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
-
-
-def check_controller(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:
-    """Raise for a control rate or a rotor lag at which the controller of an action type is unstable."""
-    if action.for_vehicle is None:
-        return
-    if dt > _MAX_PERIOD * (1 + 1e-6):
-        raise UserError(
-            f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
-            f"{1 / _MAX_PERIOD:g} or more"
-        )
-    time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
-    if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
-        raise UserError(
-            f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
-            f"{_MAX_ROTOR_TIME} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
-            "action type that commands rotors, thrust and torques, or rates"
-        )

@@ -6,12 +6,13 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxdrones import rotation, vehicles
 from jaxdrones.accelerate import compiler
 from jaxdrones.arguments import checked, choice, number
-from jaxdrones.checks import POSITIVE, check_function, check_number, short_repr
+from jaxdrones.checks import NOT_NEGATIVE, POSITIVE, check_function, check_number, is_concrete, short_repr
 from jaxdrones.errors import UserError
 from jaxdrones.params import Params
 from jaxdrones.quantity import described
@@ -38,8 +39,8 @@ def _check_range(field: str, low: float, high: float) -> None:
 def scaled(field: Field, low: float, high: float) -> Randomization:
     """Nominal value times U(low, high), one factor for the whole array."""
     _check_range(field, low, high)
-    if field in POSITIVE:
-        check_number(f"lower bound of {field}", low, "a factor", above=0)
+    sign: dict[str, Any] = {"above": 0} if field in POSITIVE else {"at_least": 0} if field in NOT_NEGATIVE else {}
+    check_number(f"lower bound of {field}", low, "a factor", **sign)
 
     def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
@@ -55,6 +56,8 @@ def shifted(field: Field, low: float, high: float) -> Randomization:
 
     def randomize(key: jax.Array, params: Params) -> Params:
         value = getattr(params, field)
+        if field in POSITIVE and is_concrete(value) and (lowest := float(np.asarray(value).min())) + low <= 0:
+            raise UserError(f"shifted({field!r}, {low}, {high}): {field} is {lowest:g}; give a lower bound above it")
         return params.replace(**{field: value + jax.random.uniform(key, value.shape, value.dtype, low, high)})
 
     return described(f"{field} plus U({low:g}, {high:g}), each entry", randomize)

@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, cast
 
+import numpy as np
+
 from jaxdrones.arguments import Count, Hertz, checked, choice, function, sequence
 from jaxdrones.checks import check_choice, check_finite, check_switch, short_repr
 from jaxdrones.dynamics import EFFECTS, INTEGRATORS, PAIRS, ROTORS
@@ -24,7 +26,7 @@ from jaxdrones.engine.wrenches import TeamEffect
 from jaxdrones.envs.actions import ACTIONS, Action
 from jaxdrones.envs.disturbances import Disturbance
 from jaxdrones.envs.env import Env
-from jaxdrones.envs.functions import DrawScene, check_controller, check_process, equipped, scene_example
+from jaxdrones.envs.functions import DrawScene, check_process, equipped, scene_example
 from jaxdrones.envs.named_tasks import make_task
 from jaxdrones.envs.observations import OBSERVATIONS, reading
 from jaxdrones.envs.randomize import (
@@ -237,7 +239,7 @@ def _action(action: str | Action, nominal: Params, lagging: bool, dt: float) -> 
         raise UserError(
             f"action is {short_repr(kind)}; give an object of Action, or a name of ACTIONS: {', '.join(ACTIONS)}"
         )
-    check_controller(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
+    _check_controller(action if isinstance(action, str) else "given", kind, nominal, lagging, dt)
     return dataclasses.replace(kind, name=action if isinstance(action, str) else kind.name).fitted(nominal)
 
 
@@ -265,3 +267,25 @@ def _vision(
     if camera is not None:
         raise UserError("camera is given without vision; give for example vision=('depth',), or leave it out")
     return None
+
+
+_MAX_PERIOD = 1 / 30  # s; at 27 Hz the PID loses a Crazyflie; the geometric controller is stable down to 15 Hz
+_MAX_ROTOR_TIME = 0.02  # s, mean of rise and fall; with 0.022 the PID loses a Crazyflie at 48 Hz
+
+
+def _check_controller(name: str, action: Action, params: Params, lagging: bool, dt: float) -> None:
+    """Raise for a control rate or a rotor lag at which the controller of an action type is unstable."""
+    if action.for_vehicle is None:
+        return
+    if dt > _MAX_PERIOD * (1 + 1e-6):
+        raise UserError(
+            f"control_hz is {1 / dt:g}; the action type {name!r} is flown by a controller that needs "
+            f"{1 / _MAX_PERIOD:g} or more"
+        )
+    time = float(np.max(params.rotor_rise_time + params.rotor_fall_time)) / 2
+    if lagging and time > _MAX_ROTOR_TIME * (1 + 1e-6):
+        raise UserError(
+            f"the action type {name!r} is flown by a controller that needs rotors with a time constant of up to "
+            f"{_MAX_ROTOR_TIME} s; those of this vehicle, which lag, have {time:.2g} s; give rotors='instant', or an "
+            "action type that commands rotors, thrust and torques, or rates"
+        )

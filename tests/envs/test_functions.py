@@ -3,12 +3,14 @@
 import dataclasses
 import itertools
 
+import jax
 import jax.numpy as jnp
 import pytest
 
 import jaxdrones as jd
 from jaxdrones.control import Setpoint
 from jaxdrones.envs.explanation import explain
+from jaxdrones.envs.randomize import shifted
 from jaxdrones.errors import UserError
 from jaxdrones.tasks import ObservationTerm, Quantity, Task
 
@@ -46,7 +48,24 @@ def of_whole_numbers(key, params):
     return state.replace(pos=jnp.ones((N, 3), int)), variables
 
 
+def turned(length):
+    """Start with a quaternion that has this length for every other key."""
+
+    def of_a_length(key, params):
+        state, variables = start(key, params)
+        return state.replace(quat=state.quat * jnp.where(jax.random.bernoulli(key), length, 1.0)), variables
+
+    return of_a_length
+
+
+def light(key, params):
+    return params.replace(mass=params.mass * (0.9 - jax.random.uniform(key)))
+
+
 MISTAKES = [
+    (dict(start=turned(1.01)), "start returns what cannot fly: state.quat has length 1.01: .*; give a unit quaternion"),
+    (dict(start=turned(jnp.nan)), r"start returns what cannot fly: state.quat is not finite: "),
+    (dict(randomize=(light,)), r"a randomization returns what cannot fly: params.mass is -.*; give positive numbers"),
     (dict(start=of_whole_numbers), "start returns a state whose pos is .*int.*; give an array .* of float"),
     (dict(equip=lambda params: None), "equip returns None; return params.replace"),
     (dict(equip=lambda params: params.replace(mass=jnp.ones(7))), r"equip returns .* mass is an array \(7,\)"),
@@ -71,6 +90,27 @@ MISTAKES = [
 def test_what_a_function_of_a_task_returns_is_refused_where_nothing_can_be_flown_with_it(change, said):
     with pytest.raises(UserError, match=said):
         jd.make(dataclasses.replace(TASK, **change))
+
+
+@pytest.mark.parametrize(
+    ("randomization", "said"),
+    [
+        (light, r"test_functions.py, line \d+: a randomization returns what cannot fly: params.mass is -"),
+        (lambda key, params: params.mass, r"a randomization returns .*; return params.replace"),
+        (
+            shifted("inertia", -2e-5, 1e-5),
+            r"shifted\('inertia', -2e-05, 1e-05\): inertia is 1.4e-05; give a lower bound",
+        ),
+    ],
+)
+def test_randomizations_given_to_make_are_checked_like_those_of_a_task(randomization, said):
+    with pytest.raises(UserError, match=said):
+        jd.make("hover", randomize=(randomization,))
+
+
+def test_functions_of_a_task_that_are_first_seen_in_a_program_are_traced_with_it():
+    env = dataclasses.replace(jd.make(TASK), task=dataclasses.replace(TASK, start=turned(1.0)))
+    assert jax.jit(lambda key: env.reset(key)[0])(jax.random.key(0)).shape == (N, 1)
 
 
 def test_a_duration_and_a_rate_may_be_arrays():

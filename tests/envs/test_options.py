@@ -130,6 +130,7 @@ def test_an_unknown_option_is_pythons_error_and_names_the_closest(call, message)
         (lambda: random_pushes(0.1, duration=np.nan), "duration is nan"),
         (lambda: constant_wind(-1), "speed of the wind is -1"),
         (lambda: scaled("mass", -1, 1), "lower bound of mass is -1"),
+        (lambda: scaled("km", -1, 1), "lower bound of km is -1; give a number of at least 0"),
         (lambda: shifted("mass", 0, np.inf), "upper bound of mass is inf"),
         (lambda: ObservationTerm(lambda task, world: world.drones.pos, np.nan), "bound of an observation is nan"),
         (lambda: circle(radius=np.nan), r"circle\['radius'\] is not finite"),

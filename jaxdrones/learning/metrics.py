@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdrones.arguments import Scalar
 from jaxdrones.envs import Env
 from jaxdrones.learning import collect
+
+_KNOWN = "return_known"  # name of a metric of programs
 
 
 def measure(
@@ -32,6 +35,23 @@ def measure(
         "termination_rate": jnp.mean(trajectory.terminated.astype(trajectory.reward.dtype), where=counts),
         "return": jnp.where(could_end, mean_return(worlds), jnp.nan),
     }
+
+
+def without_unknown(metrics: dict[str, Array]) -> dict[str, Array]:
+    """Metrics as outputs of a program, in which JAX_DEBUG_NANS finds no NaN of a return before the first."""
+    if "return" not in metrics:
+        return metrics
+    known = ~jnp.isnan(metrics["return"])
+    return metrics | {"return": jnp.where(known, metrics["return"], 0), _KNOWN: known}
+
+
+def with_unknown(metrics: dict[str, Array]) -> dict[str, Array]:
+    """Inverse of `without_unknown`, outside a program."""
+    if _KNOWN not in metrics:
+        return metrics
+    with jax.debug_nans(False):
+        returns = jnp.where(metrics[_KNOWN], metrics["return"], jnp.nan)
+    return {name: x for name, x in metrics.items() if name != _KNOWN} | {"return": returns}
 
 
 def with_returns(worlds: collect.Worlds, trajectory: collect.Trajectory, restart_fraction: Scalar) -> collect.Worlds:

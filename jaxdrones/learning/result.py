@@ -19,6 +19,7 @@ from jaxdrones.checks import is_concrete
 from jaxdrones.envs import Env
 from jaxdrones.errors import UserError
 from jaxdrones.learning import collect, compilation
+from jaxdrones.learning.metrics import with_unknown, without_unknown
 from jaxdrones.learning.networks import Policy
 from jaxdrones.learning.settings import Config, check_config
 from jaxdrones.pytree import PyTreeNode
@@ -149,9 +150,10 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
             nonfinite = rows[-1]["nonfinite_gradients"]
             if is_concrete(nonfinite):  # not so when an environment with traced parameters is mapped
                 streak = check_gradients(np.asarray(nonfinite), min(PATIENCE, total), streak, step - count)
-            values = {name: x[0].item() for name, x in rows[-1].items()} if callbacks else {}
+            newest = with_unknown({name: x[0] for name, x in rows[-1].items()}) if callbacks else {}
+            values = {name: x.item() for name, x in newest.items()}
             stop = any([call(step, values, state) is True for call in callbacks])
-        history = {name: jnp.concatenate([row[name] for row in rows]) for name in rows[0]}
+        history = with_unknown({name: jnp.concatenate([row[name] for row in rows]) for name in rows[0]})
         return Result(state.policy, state, history)
 
     train.__module__, train.__qualname__ = kind.__module__, "train"
@@ -159,11 +161,15 @@ def make_train(kind: type[Settings], init: Callable, update: Callable) -> Train[
 
 
 def advance(update: Callable, env: Env, config: Any, state: Any, count: Array, total: Array) -> tuple[Any, dict]:
-    """Run `count` updates, at most `MAX_CALL`, of a training of `total`; the metrics are arrays (MAX_CALL,)."""
+    """Run `count` updates, at most `MAX_CALL`, of a training of `total`.
+
+    The metrics are arrays (MAX_CALL,) for `metrics.with_unknown`.
+    """
 
     @jax.jit  # traced once, for the shapes and the loop
     def updated(state: Any, total: Array) -> tuple[Any, dict]:
-        return update(env, dataclasses.replace(config, updates=total), state)
+        state, metrics = update(env, dataclasses.replace(config, updates=total), state)
+        return state, without_unknown(metrics)
 
     metrics = jax.tree.map(lambda x: jnp.zeros((MAX_CALL, *x.shape), x.dtype), jax.eval_shape(updated, state, total)[1])
 

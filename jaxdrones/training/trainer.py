@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxdrones.learning import compilation, sharding
 from jaxdrones.learning.evaluation import check_episodes, compile_evaluation
+from jaxdrones.learning.metrics import with_unknown
 from jaxdrones.learning.result import advance
 from jaxdrones.limits import check_memory
 from jaxdrones.training import algorithms
@@ -42,7 +43,7 @@ class Trainer:
         check_memory(f"a training of {what}", size, "give fewer worlds, a shorter horizon or smaller networks")
         start = time.perf_counter()
         self._traced = self._trace_updates()
-        self.metrics = sorted(self._traced.out_info[1])
+        self.metrics = sorted(jax.eval_shape(with_unknown, self._traced.out_info[1]))
         self.compile_seconds = time.perf_counter() - start
 
     def compile(self) -> None:
@@ -70,7 +71,7 @@ class Trainer:
         """Run at most `MAX_CALL` updates in one call: the next state, and (updates,) of every metric."""
         total = jnp.asarray(self.recipe.config.updates, jnp.int32)
         state, metrics = self._advance(state, jnp.asarray(updates, jnp.int32), total)
-        return state, {name: np.asarray(x)[:updates] for name, x in metrics.items()}
+        return state, {name: np.asarray(x)[:updates] for name, x in with_unknown(metrics).items()}
 
     def _trace_updates(self) -> Any:
         count = jnp.zeros((), jnp.int32)

@@ -138,6 +138,29 @@ def test_the_statistics_of_observations_are_those_of_the_steps_of_episodes(learn
 
 
 @pytest.mark.float32
+@pytest.mark.parametrize("ends", ["truncated", "terminated"])
+def test_an_episode_that_ends_inside_a_trajectory_of_shac_is_worth_the_same_as_one_that_ends_with_it(ends):
+    """Without rewards the gradient is that of the terminal value, which a time limit and a cut have."""
+
+    class Unrewarded(DoubleIntegrator):
+        steps = 3
+
+        def step(self, key, world, action):
+            obs, world, reward, terminated, truncated, info = super().step(key, world, action)
+            fails = truncated if ends == "terminated" else terminated
+            return obs, world, 0 * reward, fails, truncated, info | {"terminated": fails[None]}
+
+    def gradient(horizon):
+        config = dataclasses.replace(SMALL[shac], horizon=horizon, gamma=0.9)
+        state = shac.init(jax.random.key(0), Unrewarded(), config).replace(step=jnp.asarray(2))
+        return horizon * shac.update(Unrewarded(), config, state)[1]["gradient_norm"]
+
+    cut, alone, inside = jit_unoptimized(lambda: (gradient(2), gradient(3), gradient(8)))()
+    assert cut > 0 and (alone > 0) == (ends == "truncated")
+    np.testing.assert_allclose(inside, alone, rtol=1e-5)
+
+
+@pytest.mark.float32
 def test_a_centralized_critic_is_bootstrapped_with_the_actions_that_follow():
     """With lambda 0 a target is the reward and the value of what the critic takes in the next step."""
     env = Clock(steps=5, drones=2)

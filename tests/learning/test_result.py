@@ -54,6 +54,15 @@ def test_gradients_that_are_not_finite_are_counted_and_stop_training_when_they_r
     assert np.all(np.isfinite(history["reward"])) and np.all(history["nonfinite_gradients"] >= 1)
 
 
+def test_a_healthy_training_runs_where_jax_finds_nan_and_has_no_return_before_an_episode_ended():
+    seen = []
+    with jax.debug_nans(True):
+        result = bptt.train(
+            KEY, DoubleIntegrator(), SMALL[bptt], callback=lambda _, now, __: seen.append(now["return"])
+        )
+    assert np.all(np.isnan(seen)) and np.all(np.isnan(result.history["return"])) and len(seen) == 3
+
+
 @pytest.mark.slow
 def test_finite_gradients_are_counted_as_none():
     assert np.all(bptt.train(KEY, DoubleIntegrator(), SMALL[bptt]).history["nonfinite_gradients"] == 0)

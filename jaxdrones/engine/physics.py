@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -175,4 +176,20 @@ def check_functions(name: str, functions: Sequence[Callable]) -> tuple[Callable,
                 f"{name}: {describe([function])} has a scene of its own; give that to make_step(scene=...), and the "
                 "effect without it"
             )
+        if contact := _undeclared_contact(function):
+            called, wrapped = describe([function]), describe([contact])
+            raise UserError(
+                f"{name}: {called} calls {wrapped} and does not declare it, so fast drones and long steps would pass "
+                f"unseen; give functools.wraps({wrapped})({called})"
+            )
     return functions
+
+
+def _undeclared_contact(function: Callable) -> Callable | None:
+    """Contact effect that a function names without being declared as contact."""
+    if needs_of(function).contact or not inspect.isfunction(function):
+        return None
+    named = inspect.getclosurevars(function)
+    values = [*named.nonlocals.values(), *named.globals.values()]
+    values += [vars(x).get(name) for x in values if inspect.ismodule(x) for name in named.unbound]
+    return next((x for x in values if callable(x) and needs_of(x).contact), None)

@@ -74,6 +74,25 @@ def test_contact_with_bound_arguments_is_the_same_contact(kind):
         assert len(other.contacts("ground", "obstacles", "drones")) == 1
 
 
+def stiff(params, state, scene):
+    return jd.obstacle_contact(params, state, scene)
+
+
+@pytest.mark.parametrize("enclosed", [jd.obstacle_contact])
+def test_a_function_around_contact_declares_it_or_is_refused(enclosed):
+    """Undeclared, the disc of a drone at 20 m/s would pass a thin wall."""
+    for around in stiff, lambda params, state, scene: enclosed(params, state, scene):
+        name = around.__name__
+        with pytest.raises(
+            ValueError, match=rf"{name} calls obstacle_contact .*give functools.wraps\(obstacle_contact\)"
+        ):
+            jd.make_step(effects=[around])
+        assert Physics([functools.wraps(jd.obstacle_contact)(around)]).touches(SCENE)
+    with pytest.raises(ValueError, match="pairs: <lambda> calls drone_contact"):
+        jd.make_step(pairs=[lambda *both: jd.drone_contact(*both)])
+    jd.make_step(pairs=[lambda *both: jd.downwash(*both)])
+
+
 @pytest.mark.needs("pybullet")
 def test_bullet_refuses_contact_with_bound_arguments():
     with pytest.raises(ValueError, match="ground_contact is given and Bullet resolves"):

@@ -60,7 +60,10 @@ def init(settings: Settings, params: Params, state: State) -> Memory:
 def control(
     settings: Settings, params: OneParams, memory: Memory, state: OneState, setpoints: Setpoint, *, dt: float
 ) -> tuple[Memory, Float[Array, "4"]]:
-    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`, with three setpoints; see `jaxdrones.optimal`."""
+    """Rotor speeds of one drone, RPM, between 0 and `max_rpm`, with three setpoints; see `jaxdrones.optimal`.
+
+    There is no plan, and so no status: those of a state that is not finite are not finite.
+    """
     check_period(settings.step, dt)
     target = reference(params, setpoints, state.aux, dt)
     return memory, feedback(params, memory.gain, state, jax.tree.map(lambda x: x[0], target.state), target.rpm[0])

@@ -31,7 +31,7 @@ SOLVERS: dict[str, dict[str, Any]] = {
 Ipopt uses the Gauss-Newton Hessian; fatrop uses the exact one, and the structure in time.
 """
 
-_LARGEST = 1e3  # m, m/s, rad/s; solvers may never return from larger errors
+_LARGEST = 1e3  # m, m/s; solvers may never return from larger errors, or from more than half a turn in an interval
 _INSIDE = 1e-6  # distance of the bounds from the limits of the motors, over the largest rotor speed
 
 
@@ -63,7 +63,7 @@ class Mpc:
             ValueError: a model of a team, or an unknown solver.
         """
         check_shape("model.params.mass", model.params.mass, (), "the controller is of one drone; make one for each")
-        self.model, self.horizon = model, horizon
+        self.model, self.horizon, self._dt = model, horizon, dt
         self.seconds = float("nan")
         """Duration of the last call of the solver, s."""
         self.status = Status.OK
@@ -157,7 +157,7 @@ class Mpc:
         """
         n = len(self._kept)
         check_plan(self.horizon, setpoints, on_failure, params, state)
-        if _is_flyable(state, setpoints):
+        if self._is_flyable(state, setpoints):
             self._plan = self._solved(state, setpoints, params)
             self.status = Status.NOT_CONVERGED if self._plan is None else Status.OK
         else:
@@ -167,6 +167,12 @@ class Mpc:
         elif on_failure == "raise":
             raise PlanningError(self.status, f"mpc, {self.message}")
         return self._held.copy()
+
+    def _is_flyable(self, state: State, setpoints: Setpoint) -> bool:
+        """Whether all values are finite, and errors, velocities and turns in an interval small enough for a solver."""
+        *sizes, omega = jax.device_get((state.pos[None] - setpoints.pos, state.vel, state.omega))
+        small = max(np.abs(x).max() for x in sizes) <= _LARGEST and np.linalg.norm(omega) * self._dt <= np.pi
+        return bool(small and is_finite((state, setpoints)))
 
     def _solved(self, state: State, setpoints: Setpoint, params: Params | None) -> np.ndarray | None:
         """Concatenated states and commands of the plan; `None` without convergence."""
@@ -206,12 +212,6 @@ class Mpc:
         """Clear the last plan and command, before another flight."""
         self._plan = None
         self._held = np.full(4, min(self._unit, float(self.model.params.max_rpm)))
-
-
-def _is_flyable(state: State, setpoints: Setpoint) -> bool:
-    """Whether all values are finite, and errors and velocities small enough for a solver."""
-    sizes = jax.device_get((state.pos[None] - setpoints.pos, state.vel, state.omega))
-    return bool(is_finite((state, setpoints))) and max(np.abs(x).max() for x in sizes) <= _LARGEST
 
 
 def _moving(model: CasadiModel) -> np.ndarray:

@@ -64,7 +64,8 @@ def test_a_state_that_is_not_finite_or_a_plan_that_does_not_converge_gives_the_l
         (lost, near, Status.INVALID_STATE),
         (state, near.replace(yaw=near.yaw.at[1].set(jnp.inf)), Status.INVALID_STATE),
         (state.replace(omega=jnp.full(3, 1e12)), near, Status.INVALID_STATE),
-        (state.replace(omega=jnp.full(3, 900.0)), near, Status.NOT_CONVERGED),
+        (state.replace(omega=jnp.array([0.8, 0, -0.61]) * jnp.pi / DT), near, Status.INVALID_STATE),
+        (state.replace(vel=jnp.full(3, 500.0)), near, Status.NOT_CONVERGED),
     ):
         assert np.array_equal(mpc(unlucky, target), first) and mpc.status == status
         with pytest.raises(PlanningError, match=status.sentence) as error:
@@ -73,6 +74,8 @@ def test_a_state_that_is_not_finite_or_a_plan_that_does_not_converge_gives_the_l
         again = mpc(state, near)
         np.testing.assert_array_equal(again, first)  # planned as if it were the first
         assert mpc.status == Status.OK and mpc.message == "Solve_Succeeded"
+    mpc(state.replace(omega=jnp.array([0.7, 0, -0.7]) * jnp.pi / DT), near)  # less than half a turn in an interval
+    assert mpc.status != Status.INVALID_STATE
 
 
 @pytest.mark.slow

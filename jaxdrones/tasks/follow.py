@@ -207,7 +207,7 @@ def _level(v: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
 
 def _followed(metrics: Mapping[str, Array], dt: float, distance: float) -> Array:
     """Whether a drone kept the distance on average and the other drone in view, and touched nothing."""
-    settled = round(_SETTLED / dt)
-    close = jnp.mean(metrics["distance_error"][settled:], axis=0) < _TOLERANCE * distance
-    in_view = jnp.mean(metrics["in_view"][settled:], axis=0) >= _IN_VIEW
+    error, in_view = (shaping.caught_up(metrics[name], _SETTLED, dt) for name in ("distance_error", "in_view"))
+    close = jnp.mean(error, axis=0) < _TOLERANCE * distance
+    in_view = jnp.mean(in_view, axis=0) >= _IN_VIEW
     return close & in_view & (metrics["touched"][-1] == 0)

@@ -224,7 +224,7 @@ def _velocity(task: Task, world: World) -> Float[Array, " n"]:
 
 def _close_and_upright(metrics: Mapping[str, Array], dt: float) -> Array:
     """Whether after the first second the rms error was below 10 cm and the largest swing below 15 degrees."""
-    error, swing = (metrics[name][round(_CAUGHT_UP / dt) :] for name in ("error", "swing"))
+    error, swing = (shaping.caught_up(metrics[name], _CAUGHT_UP, dt) for name in ("error", "swing"))
     return (jnp.sqrt(jnp.mean(error**2, axis=0)) < _CLOSE) & (jnp.max(swing, axis=0) < _UPRIGHT)
 
 

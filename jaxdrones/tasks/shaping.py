@@ -31,6 +31,11 @@ def length(v: Float[Array, "n 3"], small: float) -> Float[Array, " n"]:
     return jnp.sqrt(square(v) + small**2) - small
 
 
+def caught_up(metric: Float[Array, "T n"], seconds: float, dt: float) -> Float[Array, "t n"]:
+    """Metric of an episode without its first seconds, or of its last step in a shorter one."""
+    return metric[min(round(seconds / dt), len(metric) - 1) :]
+
+
 def alive(task: Task, world: World) -> Float[Array, " n"]:
     """One in every step."""
     return jnp.ones_like(world.drones.pos[:, 0])

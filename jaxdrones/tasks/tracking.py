@@ -74,5 +74,5 @@ def tracking(
 
 def _close_throughout(metrics: Mapping[str, Array], dt: float) -> Array:
     """Whether the root mean square of the error after the first second was below 5 cm."""
-    error = metrics["error"][round(_CAUGHT_UP / dt) :]
+    error = shaping.caught_up(metrics["error"], _CAUGHT_UP, dt)
     return jnp.sqrt(jnp.mean(error**2, axis=0)) < 0.05

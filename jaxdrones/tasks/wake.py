@@ -108,4 +108,4 @@ def _altitude_deviation(task: Task, world: World) -> Float[Array, " n"]:
 
 def _kept_altitude(metrics: Mapping[str, Array], dt: float) -> Array:
     """Whether a drone was within 5 cm of its altitude after the first second."""
-    return jnp.all(metrics["altitude_error"][round(_CAUGHT_UP / dt) :] < _TOLERANCE, axis=0)
+    return jnp.all(shaping.caught_up(metrics["altitude_error"], _CAUGHT_UP, dt) < _TOLERANCE, axis=0)

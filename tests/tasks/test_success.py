@@ -75,6 +75,25 @@ def test_tasks_whose_goal_cannot_be_reached_have_no_criterion():
         assert TASKS[name](duration=least).success is None and TASKS[name](duration=least + 0.5).success is not None
 
 
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("wake", {"altitude_error": 0.04}, {"altitude_error": 0.06}),
+        ("tracking", {"error": 0.04}, {"error": 0.06}),
+        ("sling", {"error": 0.09, "swing": 14.0}, {"error": 0.09, "swing": 16.0}),
+        ("follow", {"distance_error": 0.1, "in_view": 1.0}, {"distance_error": 0.1, "in_view": 0.0}),
+    ],
+)
+def test_an_episode_no_longer_than_what_its_criterion_leaves_out_is_judged_by_its_last_step(name, good, bad):
+    task = TASKS[name](duration=3.0)
+
+    def succeeds(end):
+        metrics = {metric: jnp.full((20, task.drones), jnp.inf).at[-1].set(x) for metric, x in end.items()}
+        return task.success(metrics | {"touched": jnp.zeros((20, task.drones))}, 0.1 if name == "follow" else 0.05)
+
+    assert jnp.all(succeeds(good)) and not jnp.any(succeeds(bad))
+
+
 @pytest.mark.parametrize("name", [*HEIGHTS, "fly-through-gate", "tune", "meetup", "gates"])
 def test_starts_are_one_unless_a_spread_is_given(name):
     """Every drone has a start of its own, within the spread, and what the task keeps of the start is the same."""

@@ -3,6 +3,7 @@
 import dataclasses
 import signal
 import socket
+import struct
 import threading
 import time
 import urllib.error
@@ -210,6 +211,17 @@ def test_silent_connections_neither_pile_up_nor_keep_a_viewer_out(record, monkey
         assert threading.active_count() <= before
         for connection in silent:
             connection.close()
+
+
+def test_a_browser_that_closes_before_the_answer_leaves_nothing_on_the_terminal(capfd):
+    with Live() as live:
+        for path in "/", f"/{live.url.split('/')[3]}/", f"/{live.url.split('/')[3]}/events":
+            for _ in range(20):
+                with socket.create_connection((HOST, live._server.server_port)) as client:
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset at close
+                    client.sendall(f"GET {path} HTTP/1.1\r\nHost: {HOST}\r\n\r\n".encode())
+        time.sleep(0.3)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_port_that_is_taken_is_refused_in_one_line(capsys):

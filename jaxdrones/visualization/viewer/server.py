@@ -6,6 +6,7 @@ import contextlib
 import http.server
 import secrets
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -80,6 +81,11 @@ class Server(http.server.ThreadingHTTPServer):
             for request, since in list(self._silent.items()):
                 if time.monotonic() - since > _SILENT:
                     self._end(request)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print the traceback of an error, but not of a connection that its peer closed."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
 
     def _end(self, request: socket.socket) -> None:
         """End the thread of an idle connection."""

@@ -93,8 +93,14 @@ def open_policy(
     if not policy.exists() and not is_bundled(policy) and (close := hint(str(policy), assets.policies())):
         raise UserError(f"{policy}/best.json does not exist, and {policy} is no bundled policy{close}")
     run = Run(assets.policies()[str(policy)] if is_bundled(policy) else policy)
-    recipe = run.sidecar_entry("last" if last else "best", "recipe")
+    warn_of_code(run, "last" if last else "best")
+    return run
+
+
+def warn_of_code(run: Any, name: str) -> None:
+    """Write to stderr that the recipe of a checkpoint of a run has code, before it is executed."""
+    recipe = run.sidecar_entry(name, "recipe")
     names = recipe.get("files", ()) if isinstance(recipe, dict) else ()
     if code := " and ".join(name for name in names if is_reference(name)):
-        print(f"jaxdrones: {policy} holds {code}, which is executed; open only runs that you trust", file=sys.stderr)
-    return run
+        said = f"jaxdrones: {run.folder} holds {code}, which is executed; open only runs that you trust"
+        print(said, file=sys.stderr)

@@ -11,6 +11,7 @@ from typing import Any
 
 from jaxdrones import arguments
 from jaxdrones.cli.common import check_options, run_folder
+from jaxdrones.cli.policies import warn_of_code
 from jaxdrones.cli.settings import asked_settings
 from jaxdrones.errors import UserError
 from jaxdrones.limits import LARGEST_COUNT
@@ -124,6 +125,7 @@ class Request(argparse.Namespace):
         for run in started:
             for name in ("best", "state", *["last"] * (run.folder / "last.json").exists()):
                 run.verify(name)
+            warn_of_code(run, "state")
         recipes = [Recipe.from_dict(run.sidecar_entry("state", "recipe")) for run in started]
         folder, recipe = started[0].folder, max(recipes, key=lambda recipe: recipe.config.updates)
         had = {"task": recipe.task, "algo": recipe.algorithm, "realistic": recipe.realistic}

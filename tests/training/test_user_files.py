@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import jax
@@ -11,8 +12,11 @@ from documents import ROOT, blocks
 
 import jaxdrones as jd
 from jaxdrones import assets, user_code
+from jaxdrones.cli import main
+from jaxdrones.learning import Policy
 from jaxdrones.training import user_files
 from jaxdrones.training.recipe import Recipe
+from jaxdrones.training.run import Run
 
 TASK = blocks(ROOT / "docs" / "own-task.md", "python")[0].code
 URDF = assets.vehicles()["cf2x"].read_text().replace('mass value="0.027"', 'mass value="0.032"')
@@ -63,6 +67,20 @@ def test_kept_files_stand_in_for_those_that_are_gone_and_changed_ones_are_refuse
     with pytest.raises(ValueError, match=r"mine\.urdf has changed since runs/x was started; undo the change"):
         user_files.check_unchanged(Path("runs/x"), kept, found)
     user_files.check_unchanged(Path("runs/x"), kept, {"my_task.py": TASK})
+
+
+@pytest.mark.parametrize("command", ["eval", "fly --policy", "view --history", "train evil.py:task --resume --output"])
+def test_code_of_a_run_is_announced_where_it_is_opened_before_it_is_executed(command, tmp_path, capsys):
+    policy = Policy.init(jax.random.key(0), jd.make("hover"), (4,))
+    recipe = Recipe.of("hover").as_dict() | {"task": "evil.py:task", "files": {"evil.py": "raise ValueError('done')"}}
+    about = {"recipe": recipe, "run_id": "1", "seed": 0, "episodes": 8, "update": 1}
+    run = Run(tmp_path)
+    for name in "best", "last":
+        run.save_policy(name, policy, **about)
+    run.save_state(policy, **about)
+    run.keep_policy(policy, **about)
+    assert main([*command.split(), str(tmp_path)]) == 2
+    assert re.search("holds evil.py, which is executed.*\n.*evil.py: line 1 raises .*done", capsys.readouterr().err)
 
 
 def test_a_task_of_a_file_is_made_with_its_options(files):

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_loop import distance, hovering, one, team_of
+from helpers import jit_unoptimized
 
 import jaxdrones as jd
 from jaxdrones import optimal
 from jaxdrones.control import Setpoint, for_team, pid
+from jaxdrones.dynamics.rotors import rotor_wrench
 from jaxdrones.optimal import ilqr, lqr, mppi
 from jaxdrones.optimal.box_qp import box_qp
 from jaxdrones.optimal.mppi import importance
@@ -121,6 +123,63 @@ def test_setpoints_that_do_not_fit_the_horizon_are_refused():
 def _control(module):
     settings = module.settings(jd.make_step(dt=DT), horizon=2, **({"samples": 8} if module is mppi else {}))
     return settings, jax.jit(functools.partial(module.control, settings, dt=DT))
+
+
+def _blank(module, settings, params, state):
+    """Memory without a regulator, as the time of a test is that of its linearization."""
+    keys = (jax.random.key(0),) if module is mppi else ()
+    shapes = jax.eval_shape(functools.partial(module.init, settings), params, state, *keys)
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes.replace(key=None) if keys else shapes)
+    return blank.replace(rpm=jnp.full(4, 12345.0), **({"key": keys[0]} if keys else {}))
+
+
+@pytest.mark.float32
+@pytest.mark.parametrize("module", [mppi, ilqr], ids=["mppi", "ilqr"])
+def test_a_planner_moves_its_plan_on_by_a_step_or_drops_it_and_holds_its_command(module):
+    """MPPI without noise and with equal weights plans the mean of its samples: the last plan, but one is zero."""
+    team = team_of("cf2x")
+    params, state = one(team), one(hovering(team))
+    options = dict(samples=8, temperature=1e9) if module is mppi else dict(iterations=1)
+    settings = module.settings(jd.make_step(dt=DT), horizon=2, **options)
+    settings = settings.replace(noise=jnp.zeros(4)) if module is mppi else settings
+    memory = _blank(module, settings, params, state).replace(correction=0.01 * jnp.arange(8.0).reshape(2, 4))
+    memory = memory if module is mppi else memory.replace(started=jnp.ones((), bool))
+    control = jit_unoptimized(functools.partial(module.control, settings, dt=DT))
+    stay = Setpoint.at(jnp.broadcast_to(state.pos, (3, 3)))
+    after, rpm = control(params, memory, state, stay)
+    assert after.status == Status.OK and np.array_equal(rpm, after.rpm) and np.all(rpm != 12345)
+    lost, held = control(params, memory, state.replace(vel=state.vel * jnp.nan), stay)
+    assert lost.status == Status.INVALID_STATE and np.all(held == 12345) and np.all(lost.rpm == 12345)
+    assert not np.any(lost.correction)
+    if module is ilqr:
+        assert after.started and not lost.started
+    else:
+        np.testing.assert_allclose(after.correction, memory.correction[jnp.array([1, 1])] * 7 / 8, rtol=1e-4)
+        assert not np.array_equal(jax.random.key_data(after.key), jax.random.key_data(memory.key))
+
+
+def test_the_rotor_speeds_of_a_reference_obey_eulers_equation():
+    """Torque = I dw/dt + w x I w, for a drone that turns about its yaw axis and tilts on a circle."""
+    params = jd.load_params("hb")
+    params = params.replace(inertia=params.inertia * jnp.array([0.02, 0.03, 0.08]))
+    dt = 1e-3
+
+    def along(t):
+        place = lambda t: 0.1 * jnp.stack([jnp.cos(6 * t), jnp.sin(6 * t), 0 * t])  # noqa: E731
+        return setpoint_on(place, t).replace(yaw=8 * t)
+
+    @jit_unoptimized
+    def planned():
+        reference = optimal.reference(params, jax.vmap(along)(dt * jnp.arange(6)), {}, dt)
+        torque = jax.vmap(lambda state: rotor_wrench(params, state).torque)(reference.state)
+        return torque[1], reference.state.omega
+
+    torque, omega = map(np.asarray, planned())
+    momentum = np.asarray(params.inertia) * omega
+    turning = np.cross(omega[1], momentum[1])
+    expected = (momentum[2] - momentum[1]) / dt + turning
+    assert np.linalg.norm(turning) > 0.1 * np.linalg.norm(expected)
+    np.testing.assert_allclose(torque, expected, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -140,7 +140,8 @@ def test_rows_at_uneven_times_are_resampled(columns, tmp_path):
         return {"pos": pos, "quat": quat, "vel": vel, "omega": 2 * np.cos(2 * t)[:, None] * np.array([0.3, 0.2, 2.0])}
 
     rpm = 15_000 + 1000 * np.sin(3 * t)[:, None] * np.ones(4)
-    log = load(tmp_path, motion(t) | {"t": t, "rpm": rpm}, allow_inconsistent=True)
+    target = {"target_pos": motion(t)["pos"], "target_yaw": (2.5 * t + np.pi) % (2 * np.pi) - np.pi}
+    log = load(tmp_path, motion(t) | target | {"t": t, "rpm": rpm}, allow_inconsistent=True)
     np.testing.assert_allclose(np.diff(log.t), 0.01, atol=1e-12)
     assert log.t[0] == t[0] and t[-1] - 0.01 < log.t[-1] <= t[-1]
     true = motion(log.t)
@@ -150,6 +151,8 @@ def test_rows_at_uneven_times_are_resampled(columns, tmp_path):
         )
     apart = Rotation.from_quat(true["quat"]).inv() * Rotation.from_quat(log.quat[:, 0])
     assert apart.magnitude().max() < 0.012**2 / 8 * 8.2
+    turned = log.target_yaw[:, 0] - 2.5 * log.t  # whole turns, also in between
+    np.testing.assert_allclose(turned, 2 * np.pi * np.round(turned / (2 * np.pi)), atol=1e-9)
     np.testing.assert_allclose(log.rpm[:, 0, 0], 15_000 + 1000 * np.sin(3 * log.t), atol=0.012**2 / 8 * 9000)
 
 

@@ -87,6 +87,13 @@ def test_the_field_that_a_magnetometer_feels_is_that_of_the_world_in_body_axes()
     np.testing.assert_allclose(jd.rotation.rotate(state.quat, read), EUROPE, rtol=1e-12, atol=1e-12)
 
 
+def test_a_barometer_without_errors_reads_the_height():
+    sensor, params, (state, rate) = barometer(Noise()), jd.load_params("cf2x"), random_state(4)
+    state = state.replace(pos=jnp.array([1.0, 2.0, 3.0]))
+    _, read = sensor.measure(KEY, params, state, rate, jd.Scene(), sensor.init(KEY, params))
+    assert read.tolist() == [3.0]
+
+
 @pytest.mark.parametrize(("delay", "age"), [(0.0, 0.0), (0.03, 3.0), (0.025, 2.5)])
 def test_a_pose_is_as_old_as_the_delay(delay, age):
     sensor = motion_capture(MotionCaptureSystem(rate=100.0, delay=delay))
